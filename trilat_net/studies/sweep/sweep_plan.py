@@ -1,9 +1,12 @@
-"""The plan of a sweep: the scenario, the axes with their values, the control laws and the
-seeds.
+"""Plans a sweep: a grid of runs of one scenario over axes, control laws and seeds.
 
-Invariant: a plan that cannot run is refused before the first run. Cells are numbered row by
-row, and a cell is a function of the plan and its number. An axis value is the text of an
-override; steps are counted in decimals, so 0.2:3:0.1 contains 0.3 and not 0.30000000000000004.
+The axes, laws and seeds are parsed, combined with the scenario, and checked.
+
+Invariant:
+    - A plan that cannot run is refused before the first run.
+    - Cells are numbered row by row; a cell is a function of the plan and its number.
+    - The value of an axis is the text of an override.
+    - Steps are counted in decimals: 0.2:3:0.1 contains 0.3, not 0.30000000000000004.
 """
 
 import math
@@ -29,18 +32,19 @@ from ..study_folder import format_command, format_toml_value, set_options
 from . import sweep_cell
 
 _ON_GRID = Decimal("1e-9")
-"""An end that is no further than this from the grid, in steps, lies on it."""
-_ELSEWHERE = {
+"""Largest distance from the grid, in steps, at which the end of a range is included."""
+_KEYS_WITH_OPTIONS = {
     "seed": "seeds have an option of their own, as in --seeds 1..20",
-    "duration_s": "how long a cell runs follows from its verdict: --duration says how long at first, "
-    "--longest how long at most",
+    "duration_s": "how long a cell runs follows from its verdict: "
+    "--duration says how long at first, --longest how long at most",
 }
-_MOST = 10**12
-_HOW = "as in KEY=0:1600:50 (from, to, step) or KEY=1,2,5"
+"""Keys that cannot be swept, each with the option that sets the key instead."""
+_MAX_AXIS_VALUES = 10**12
+_VALUES_EXAMPLE = "as in KEY=0:1600:50 (from, to, step) or KEY=1,2,5"
 
 
 class _Steps:
-    """The values a, a + step, ... as texts, made as they are asked for."""
+    """Sequence of the values `first` + n `step` as texts, each formatted on access."""
 
     def __init__(self, first: Decimal, step: Decimal, count: int) -> None:
         self._first = first
@@ -50,14 +54,18 @@ class _Steps:
     def __len__(self) -> int:
         return self._count
 
-    def __getitem__(self, place: int) -> str:
-        n = range(self._count)[place]
+    def __getitem__(self, index: int) -> str:
+        n = range(self._count)[index]  # range checks the bounds and resolves negative indices
         return f"{self._first + n * self._step:f}"
 
 
 class SweepAxis(NamedTuple):
-    """One axis, asked for as "KEY=a:b:step" or "KEY=v1,v2,v3"; its values are texts of
-    overrides.
+    """One axis of a sweep.
+
+    Attributes:
+        asked: the description of the axis: "KEY=a:b:step" or "KEY=v1,v2,v3".
+        key: the scenario key that the axis varies.
+        texts: the values of the axis, as texts of overrides.
     """
 
     asked: str
@@ -65,51 +73,57 @@ class SweepAxis(NamedTuple):
     texts: tuple[str, ...] | _Steps
 
     def value(self, number: int) -> float | str:
-        """Returns one value: a number where it is one, else its text."""
-        value = _read(self.texts[number])
-        return float(value) if is_number(value) else self.texts[number]
+        """Returns value `number` of the axis: a float if it is a number, else its text."""
+        text = self.texts[number]
+        value = _parse_value(text)
+        return float(value) if is_number(value) else text
 
     @property
     def numeric(self) -> bool:
-        """True where every value is a number."""
-        return isinstance(self.texts, _Steps) or all(map(is_number, map(_read, self.texts)))
+        """True if all values of the axis are numbers."""
+        if isinstance(self.texts, _Steps):
+            return True
+        return all(is_number(_parse_value(text)) for text in self.texts)
 
     def override(self, number: int) -> str:
-        """Returns the override that sets one value."""
+        """Returns the override that sets value `number` of the axis."""
         return f"{self.key}={self.texts[number]}"
 
 
-def parse_axis(asked: str) -> SweepAxis:
+def parse_axis(description: str) -> SweepAxis:
     """Returns the axis that a text describes.
 
     Args:
-        asked: "KEY=a:b:step", with b where it lies on the grid, or "KEY=v1,v2,v3" with numbers,
-            words or other TOML values.
+        description: "KEY=a:b:step", where b is included if it lies on the grid, or
+            "KEY=v1,v2,v3" with numbers, words or other TOML values.
 
     Raises:
-        ScenarioError: it has no key, no values, or values that make no grid.
+        ScenarioError: the text has no key or no values, or its values form no grid.
     """
-    key, equals, text = (part.strip() for part in str(asked).partition("="))
+    key, equals, text = (part.strip() for part in str(description).partition("="))
     if not equals or not key:
-        raise ScenarioError(f"--over reads KEY=VALUES, {_HOW}, not {asked!r}")
-    if key in _ELSEWHERE:
-        raise ScenarioError(f"is no axis: {_ELSEWHERE[key]}", path=key)
-    parts = _split(text, ":")
+        raise ScenarioError(f"--over reads KEY=VALUES, {_VALUES_EXAMPLE}, not {description!r}")
+    if key in _KEYS_WITH_OPTIONS:
+        raise ScenarioError(f"is no axis: {_KEYS_WITH_OPTIONS[key]}", path=key)
+    parts = _split_outside_brackets(text, ":")
     if len(parts) not in (1, 3):
-        raise ScenarioError(
-            f"values read {_HOW.removeprefix('as in ')}, not {text!r}", path=key
-        )
-    texts = (
-        _listed(key, text)
-        if len(parts) == 1
-        else _steps(key, *(_decimal(key, part) for part in parts))
-    )
+        example = _VALUES_EXAMPLE.removeprefix("as in ")
+        raise ScenarioError(f"values read {example}, not {text!r}", path=key)
+    texts: tuple[str, ...] | _Steps
+    if len(parts) == 1:
+        texts = _parse_list(key, text)
+    else:
+        first, last, step = (_parse_decimal(key, part) for part in parts)
+        texts = _build_range(key, first, last, step)
     return SweepAxis(f"{key}={text}", key, texts)
 
 
 def list_axes(over: str | Sequence[str] | Mapping[str, Any]) -> list[str]:
-    """Returns axes as texts, as of `parse_axis`; by their keys they may be lists or arrays of
-    values.
+    """Returns the descriptions of the axes, as texts for `parse_axis`.
+
+    Args:
+        over: one description, a list of descriptions, or a mapping from keys to values: a list,
+            an array, or the text after "KEY=".
     """
     if isinstance(over, Mapping):
         return [f"{key}={_join_values(values)}" for key, values in over.items()]
@@ -120,14 +134,14 @@ def _join_values(values: Any) -> str:
     if isinstance(values, str):
         return values
     entries = values if isinstance(values, list | tuple) else np.atleast_1d(values)
-    is_word = (isinstance(one, str) and one.isidentifier() for one in entries)
-    return ",".join(
-        one if word else format_toml_value(one)
-        for one, word in zip(entries, is_word, strict=True)
-    )
+    texts = list[str]()
+    for entry in entries:
+        is_word = isinstance(entry, str) and entry.isidentifier()
+        texts.append(entry if is_word else format_toml_value(entry))
+    return ",".join(texts)
 
 
-def _steps(key: str, first: Decimal, last: Decimal, step: Decimal) -> _Steps:
+def _build_range(key: str, first: Decimal, last: Decimal, step: Decimal) -> _Steps:
     if step == 0:
         raise ScenarioError(f"a step of 0 never comes from {first:f} to {last:f}", path=key)
     if (last - first) * step < 0:
@@ -135,17 +149,20 @@ def _steps(key: str, first: Decimal, last: Decimal, step: Decimal) -> _Steps:
         problem = f"a step of {step:f} does not lead from {first:f} to {last:f}"
         raise ScenarioError(f"is empty: {problem}; did you mean {right}?", path=key)
     count = int((last - first) / step + _ON_GRID) + 1
-    if count > _MOST:
+    if count > _MAX_AXIS_VALUES:
         raise ScenarioError(f"has {Decimal(count):.3g} values: take a larger step", path=key)
     return _Steps(first, step, count)
 
 
-def _decimal(key: str, text: str) -> Decimal:
+def _parse_decimal(key: str, text: str) -> Decimal:
     text = text.strip()
     try:
         number = Decimal(text)
     except InvalidOperation:
-        problem = f"a range is of numbers, a:b:step, and {text!r} is none; words go as in KEY=first,second"
+        problem = (
+            f"a range is of numbers, a:b:step, and {text!r} is none; "
+            "words go as in KEY=first,second"
+        )
         raise ScenarioError(problem, path=key) from None
     if not number.is_finite():
         raise ScenarioError(f"a range is of finite numbers, and {text!r} is none", path=key)
@@ -156,20 +173,28 @@ def _decimal(key: str, text: str) -> Decimal:
     return number
 
 
-def _listed(key: str, text: str) -> tuple[str, ...]:
-    texts = tuple(part.strip() for part in _split(text, ","))
+def _parse_list(key: str, text: str) -> tuple[str, ...]:
+    """Returns the values of a list "v1,v2,v3" as texts.
+
+    Raises:
+        ScenarioError: a value is empty, not finite, or appears twice.
+    """
+    texts = tuple(part.strip() for part in _split_outside_brackets(text, ","))
     if "" in texts:
-        raise ScenarioError(f"is empty: say which values, {_HOW}", path=key)
-    values = list(map(_read, texts))
-    for n, (one, value) in enumerate(zip(texts, values, strict=True)):
-        if value in values[:n]:
-            raise ScenarioError(f"has {one} twice", path=key)
+        raise ScenarioError(f"is empty: say which values, {_VALUES_EXAMPLE}", path=key)
+    values = list[Any]()
+    for value_text in texts:
+        value = _parse_value(value_text)
+        if value in values:
+            raise ScenarioError(f"has {value_text} twice", path=key)
         if isinstance(value, float) and not math.isfinite(value):
-            raise ScenarioError(f"must be finite numbers, one is {one}", path=key)
+            raise ScenarioError(f"must be finite numbers, one is {value_text}", path=key)
+        values.append(value)
     return texts
 
 
-def _split(text: str, mark: str) -> list[str]:
+def _split_outside_brackets(text: str, mark: str) -> list[str]:
+    """Returns the parts of a text between the marks that stand outside brackets and quotes."""
     parts = [""]
     depth = 0
     quote = ""
@@ -186,7 +211,8 @@ def _split(text: str, mark: str) -> list[str]:
     return parts
 
 
-def _read(text: str) -> Any:
+def _parse_value(text: str) -> Any:
+    """Returns the TOML value of a text, or the text itself if it is not valid TOML."""
     try:
         return tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
@@ -197,21 +223,22 @@ MAX_SEEDS = 100_000
 MAX_EXTENSION = 8.0
 """Default limit of an undecided cell's duration, in durations of the scenario."""
 MAX_SCENARIO_S = 86_400.0
-"""No scenario is longer, s."""
+"""Longest duration that a scenario may have, in s."""
 JUDGES = ("verdict", "twins")
-"""What colours a map: the classes of the cells, or the growth exponents of their twins."""
+"""Quantities that can colour a map: the cells' classes, or the growth exponents of twins."""
 _CHECKED_VALUES = 32
-"""Values of an axis that are tried before anything runs."""
+"""Largest number of values of an axis that are checked before the first run."""
 
 
 class SweepCell(NamedTuple):
-    """One place of a sweep.
+    """One point of a sweep's grid.
 
     Attributes:
-        number: row by row, from 0: laws change slowest, the last axis fastest.
-        law: which of the swept laws, or "".
-        values: along every axis, numbers as numbers.
-        overrides: what makes it of the experiment, as texts KEY=VALUE.
+        number: the number of the cell, row by row from 0; laws change slowest, the last axis
+            fastest.
+        law: the swept law of the cell, or "" if the sweep has no laws.
+        values: the cell's value on each axis: a float if the value is a number, else a text.
+        overrides: the overrides, as texts KEY=VALUE, that turn the experiment into the cell.
     """
 
     number: int
@@ -221,20 +248,20 @@ class SweepCell(NamedTuple):
 
 
 class SweepPlan(NamedTuple):
-    """A sweep.
+    """A sweep, checked and ready to run.
 
     Attributes:
-        written: the experiment, as its author wrote it.
-        overrides: what is changed of it everywhere, as texts KEY=VALUE.
-        base: the same, resolved.
-        axes: what is swept; the last changes fastest.
-        laws: what puts each law into force; swept around the axes, slowest; none: the
-            experiment's own.
-        seeds: of the runs of a cell in which anything is random; in others the first alone is
-            run.
-        longest_s: how long a cell may be extended, s.
-        judge: of `JUDGES`.
-        metrics: keys of `docs/metrics.md` that are measured of every run besides.
+        written: the experiment as its author wrote it.
+        overrides: the overrides of all cells, as texts KEY=VALUE.
+        base: the experiment with `overrides`, resolved.
+        axes: the swept axes; the last changes fastest.
+        laws: the overrides that select each swept law, by the name of the law; laws change
+            slowest. If empty, all cells keep the experiment's laws.
+        seeds: the seeds of a cell that draws random numbers; other cells run with the first
+            seed only.
+        longest_s: longest duration to which an undecided cell is extended, in s.
+        judge: a name of `JUDGES`.
+        metrics: keys of `docs/metrics.md` that are measured in each run in addition.
     """
 
     written: ExperimentText
@@ -249,60 +276,65 @@ class SweepPlan(NamedTuple):
 
     @property
     def default_longest_s(self) -> float:
-        """How long a cell may be extended unless asked for, s: an exponent needs no extension."""
-        return min(
-            MAX_SCENARIO_S,
-            (1.0 if self.judge == "twins" else MAX_EXTENSION) * self.base.duration_s,
-        )
+        """Default of `longest_s`, in s: growth exponents need no extension."""
+        extension = 1.0 if self.judge == "twins" else MAX_EXTENSION
+        return min(MAX_SCENARIO_S, extension * self.base.duration_s)
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """How many laws (1 where none is swept), and how many values along every axis."""
-        return (max(1, len(self.laws)), *(len(one.texts) for one in self.axes))
+        """Number of laws (1 if no laws are swept), then the number of values of each axis."""
+        return (max(1, len(self.laws)), *(len(axis.texts) for axis in self.axes))
 
     @property
     def cells(self) -> int:
-        """How many cells there are."""
+        """Number of cells of the grid."""
         return math.prod(self.shape)
 
     def cell(self, number: int) -> SweepCell:
-        """Returns a cell by its number.
+        """Returns the cell with a number.
 
         Raises:
-            UsageError: there is none of that number.
+            UsageError: the grid has no cell with this number.
         """
         if not 0 <= number < self.cells:
             raise UsageError(
                 f"there is no cell {number}: they are numbered from 0 to {self.cells - 1}"
             )
         rest = number
-        places = list[int]()
+        indices = list[int]()
         for count in reversed(self.shape):
-            rest, place = divmod(rest, count)
-            places.insert(0, place)
-        place, *others = places  # of the law, 0 where none is swept
-        law, fixed = list(self.laws.items())[place] if self.laws else ("", ())
-        along = list(zip(self.axes, others, strict=True))
-        values = tuple(axis.value(n) for axis, n in along)
-        return SweepCell(
-            number, law, values, (*fixed, *(axis.override(n) for axis, n in along))
-        )
+            rest, index = divmod(rest, count)
+            indices.insert(0, index)
+        law_index, *axis_indices = indices
+        law = ""
+        overrides = list[str]()
+        if self.laws:
+            law = list(self.laws)[law_index]
+            overrides.extend(self.laws[law])
+        values = list[float | str]()
+        for axis, index in zip(self.axes, axis_indices, strict=True):
+            values.append(axis.value(index))
+            overrides.append(axis.override(index))
+        return SweepCell(number, law, tuple(values), tuple(overrides))
 
     def scenario(self, *more: str) -> Scenario:
-        """Returns the experiment, with some more overrides.
+        """Returns the experiment with further overrides.
+
+        Args:
+            more: the further overrides, as texts KEY=VALUE.
 
         Raises:
-            ScenarioError: it is not valid with them.
+            ScenarioError: the experiment is not valid with these overrides.
         """
         return self.written.load([*self.overrides, *more])
 
     def facts(self) -> dict[str, Any]:
-        """Returns all that names it, as plain values; `plan_from_json` reads them."""
+        """Returns the plan as plain JSON values, which `plan_from_json` reads."""
         return {
             "source": self.written.label,
             "folder": None if self.written.folder is None else str(self.written.folder),
             "overrides": list(self.overrides),
-            "over": [one.asked for one in self.axes],
+            "over": [axis.asked for axis in self.axes],
             "laws": list(self.laws),
             "seeds": list(self.seeds),
             "longest_s": self.longest_s,
@@ -325,35 +357,35 @@ def plan_sweep(
     judge: str = "verdict",
     metrics: Sequence[str] = (),
 ) -> SweepPlan:
-    """Returns a sweep, checked and ready to run; overrides are texts KEY=VALUE.
+    """Returns the plan of a sweep, checked and ready to run.
 
-    The other arguments are those of `trilat_net.sweep`. A law that all sites have stays with
-    the gains of the scenario; another one replaces the law of every site, with its default
-    gains. Overrides of gains count for either.
+    A swept law that all sites already have keeps the gains of the scenario. Any other swept law
+    replaces the law of every site and has its default gains. Overrides of gains apply to both.
+
+    The arguments are those of `trilat_net.sweep`; overrides are texts KEY=VALUE.
 
     Raises:
-        ScenarioError: the scenario, an axis or one of its values cannot be right, or cannot
-            run.
-        UsageError: another argument cannot be right.
+        ScenarioError: the scenario, an axis or a value of an axis is not valid or cannot run.
+        UsageError: another argument is not valid.
     """
     written = read_experiment(source)
     texts = tuple(overrides)
     axes = tuple(map(parse_axis, list_axes(over)))
-    named = [laws] if isinstance(laws, str | type) else laws
-    chosen = list(map(name_law_classes, named))
-    for law in chosen:
+    law_list = [laws] if isinstance(laws, str | type) else laws
+    law_names = list(map(name_law_classes, law_list))
+    for law in law_names:
         _check_law_name(law)
-    before = _load_base(written, texts, axes, chosen)
-    base = before.scenario
-    keys = Counter(one.key for one in axes)
+    loaded = _load_base(written, texts, axes, law_names)
+    base = loaded.scenario
+    keys = Counter(axis.key for axis in axes)
     for key, count in keys.items():
         if count > 1:
             raise ScenarioError("is swept twice: give one --over with all its values", path=key)
-    if chosen and "control.law" in keys:
+    if law_names and "control.law" in keys:
         raise ScenarioError(
             "is swept twice: give either --law or --over control.law", path="control.law"
         )
-    forced = {law: _law_overrides(written, texts, before, law) for law in chosen}
+    law_overrides = {law: _law_overrides(written, texts, loaded, law) for law in law_names}
     if judge not in JUDGES:
         raise UsageError(f"--judge is one of {', '.join(JUDGES)}, not {judge!r}")
     plan = SweepPlan(
@@ -361,9 +393,9 @@ def plan_sweep(
         overrides=texts,
         base=base,
         axes=axes,
-        laws=forced,
-        seeds=_seeds(seeds, base.seed),
-        longest_s=0.0,
+        laws=law_overrides,
+        seeds=_resolve_seeds(seeds, base.seed),
+        longest_s=0.0,  # set below: the default depends on the plan
         judge=judge,
         metrics=_list_metrics(metrics),
     )
@@ -371,69 +403,88 @@ def plan_sweep(
         longest_s = plan.default_longest_s
     elif not base.duration_s <= longest_s <= MAX_SCENARIO_S:
         raise UsageError(
-            f"--longest is how long an undecided cell may run, from its {base.duration_s:g} s to "
-            f"{MAX_SCENARIO_S:g} s, not {longest_s:g}"
+            "--longest is how long an undecided cell may run, "
+            f"from its {base.duration_s:g} s to {MAX_SCENARIO_S:g} s, not {longest_s:g}"
         )
     plan = plan._replace(longest_s=longest_s)
-    for law in range(plan.shape[0]):
-        _refuse_unfit(plan, law)
+    for law_index in range(plan.shape[0]):
+        _check_axes(plan, law_index)
     return plan
 
 
 def plan_from_json(facts: dict[str, Any]) -> SweepPlan:
-    """Returns the plan that was kept as facts, from its own text; files that it names are read
-    again.
+    """Returns the plan that `SweepPlan.facts` stored as JSON values.
+
+    The scenario is parsed from its stored text; files that the scenario names are read again.
 
     Raises:
-        ScenarioError: it cannot run here.
+        ScenarioError: the plan cannot run here.
     """
     folder = None if facts["folder"] is None else Path(facts["folder"])
     written = ExperimentText(facts["source"], facts["text"], folder)
     texts = tuple(facts["overrides"])
     axes = tuple(map(parse_axis, facts["over"]))
-    before = _load_base(written, texts, axes, facts["laws"])
-    base = allow_own_code(before.scenario)
-    forced = {law: _law_overrides(written, texts, before, law) for law in facts["laws"]}
-    more = (facts["longest_s"], facts.get("judge", "verdict"), tuple(facts.get("metrics", ())))
-    return SweepPlan(written, texts, base, axes, forced, tuple(facts["seeds"]), *more)
+    loaded = _load_base(written, texts, axes, facts["laws"])
+    base = allow_own_code(loaded.scenario)
+    laws = {law: _law_overrides(written, texts, loaded, law) for law in facts["laws"]}
+    return SweepPlan(
+        written=written,
+        overrides=texts,
+        base=base,
+        axes=axes,
+        laws=laws,
+        seeds=tuple(facts["seeds"]),
+        longest_s=facts["longest_s"],
+        judge=facts.get("judge", "verdict"),
+        metrics=tuple(facts.get("metrics", ())),
+    )
 
 
-def _list_metrics(asked: Sequence[str]) -> tuple[str, ...]:
-    """Returns the metrics that are asked for, each once.
+def _list_metrics(names: Sequence[str]) -> tuple[str, ...]:
+    """Returns the keys of the requested metrics, without duplicates.
 
     Raises:
-        UsageError: there is no such metric.
+        UsageError: a metric does not exist.
     """
-    keys = [asked] if isinstance(asked, str) else asked
+    keys = [names] if isinstance(names, str) else names
     try:
         return tuple(dict.fromkeys(find_quantity(key).key for key in keys))
     except KeyError as error:
         raise UsageError(f"--metric: {error.args[0]}") from None
 
 
-def _seeds(asked: int | Sequence[int], own: int) -> tuple[int, ...]:
-    if isinstance(asked, int | str):
-        if isinstance(asked, str) or not 1 <= asked <= MAX_SEEDS:
+def _resolve_seeds(seeds: int | Sequence[int], scenario_seed: int) -> tuple[int, ...]:
+    """Returns the seeds of a sweep, without duplicates.
+
+    Args:
+        seeds: the seeds, or their number: then they count up from the scenario's seed.
+        scenario_seed: the scenario's seed; the only seed of the sweep if `seeds` is empty.
+
+    Raises:
+        UsageError: a seed or the number of seeds is out of range.
+    """
+    if isinstance(seeds, int | str):
+        if isinstance(seeds, str) or not 1 <= seeds <= MAX_SEEDS:
             raise UsageError(
-                f"--seeds is how many, 1 to {MAX_SEEDS}, or which, as in 1..20; not {asked}"
+                f"--seeds is how many, 1 to {MAX_SEEDS}, or which, as in 1..20; not {seeds}"
             )
-        asked = range(own, own + asked)
-    if len(asked) > MAX_SEEDS:
-        raise UsageError(
-            f"{count_nouns(len(asked), 'seed is', 'seeds are')} more than {MAX_SEEDS}"
-        )
-    for seed in asked:
+        seeds = range(scenario_seed, scenario_seed + seeds)
+    if len(seeds) > MAX_SEEDS:
+        seed_count = count_nouns(len(seeds), "seed is", "seeds are")
+        raise UsageError(f"{seed_count} more than {MAX_SEEDS}")
+    for seed in seeds:
         if not 0 <= seed < 2**63:
             raise UsageError(f"a seed is from 0 to 2^63 - 1, not {seed}")
-    return tuple(dict.fromkeys(asked)) or (own,)
+    return tuple(dict.fromkeys(seeds)) or (scenario_seed,)
 
 
 class _Base(NamedTuple):
-    """The experiment without what is swept.
+    """The experiment without its swept axes and laws, as far as it is valid without them.
 
     Attributes:
         scenario: the experiment.
-        forced: whether it is valid under a swept law only, and has the first of them.
+        forced: True if the experiment is valid only under a swept law; the scenario then has
+            the first of the swept laws.
     """
 
     scenario: Scenario
@@ -446,27 +497,29 @@ def _load_base(
     axes: Sequence[SweepAxis],
     laws: Sequence[str],
 ) -> _Base:
-    """Returns the experiment without its axes and swept laws.
+    """Returns the experiment without its swept axes and laws.
 
-    Overrides may need them: a link of another model needs the delay that an axis gives, and a
-    gain belongs to a law that is swept. The experiment is then that at the first value of each
-    axis, and under the first law.
+    Overrides may need a swept axis or law: a link of another model needs the delay that an axis
+    sets, and a gain may belong to a swept law. In this case the experiment takes the first
+    value of each axis, and the first law.
 
     Raises:
-        ScenarioError: the experiment is not valid even there.
+        ScenarioError: the experiment is not valid even with the first values and law.
     """
-    first = [axis.override(0) for axis in axes]
+    first_values = [axis.override(0) for axis in axes]
     problem: ScenarioError | None = None
     for law in ("", *laws[:1]):
-        of_law = _force_law(written, overrides, law) if law else ()
-        for of_axes in ((), first):
+        law_overrides = _force_law(written, overrides, law) if law else ()
+        for axis_overrides in ((), first_values):
             try:
-                scenario = written.load([*overrides, *of_law, *of_axes])
+                scenario = written.load([*overrides, *law_overrides, *axis_overrides])
             except ScenarioError as error:
                 problem = error
             else:
                 return _Base(scenario, forced=bool(law))
-        written.load()  # an experiment that is not valid as written is refused for that
+        # An experiment that is not valid as written is refused with that error: it says more
+        # than an error of the sweep's overrides.
+        written.load()
     assert problem is not None
     raise problem
 
@@ -475,66 +528,85 @@ def _check_law_name(law: str) -> None:
     """Refuses a law that does not exist.
 
     Raises:
-        UsageError: no built-in law has this name, and it names no class.
+        UsageError: the name is neither a built-in law nor a class, as in mylaws:Law.
     """
-    ours = [name for name in LAWS if name != "own"]
-    if law not in ours and ":" not in law:
-        hint = (
-            suggest_nearest(law, ours)
-            or f"; laws are {', '.join(ours)}, and your own, as in mylaws:Law"
-        )
+    built_in = [name for name in LAWS if name != "own"]
+    if law not in built_in and ":" not in law:
+        hint = suggest_nearest(law, built_in)
+        if not hint:
+            hint = f"; laws are {', '.join(built_in)}, and your own, as in mylaws:Law"
         raise UsageError(f"--law: there is no law {law!r}{hint}")
 
 
 def _force_law(written: ExperimentText, overrides: Sequence[str], law: str) -> tuple[str, ...]:
-    """Returns overrides that put a law into force at every site."""
+    """Returns the overrides that give a law to every site."""
     tables = tomllib.loads(written.text)
     apply_overrides(tables, overrides)
-    own = [name for name, site in tables.get("sites", {}).items() if "control" in site]
-    return (f"control.law={law}", *(f"sites.{name}.control.law={law}" for name in own))
+    law_overrides = [f"control.law={law}"]
+    for name, site in tables.get("sites", {}).items():
+        if "control" in site:  # the site's table would win over the common one
+            law_overrides.append(f"sites.{name}.control.law={law}")
+    return tuple(law_overrides)
 
 
 def _law_overrides(
     written: ExperimentText, overrides: Sequence[str], base: _Base, law: str
 ) -> tuple[str, ...]:
+    """Returns the overrides that select a swept law; empty if all sites already have it."""
     sites = base.scenario.sites.values()
     if not base.forced and all(identify_law(spec.control) == law for spec in sites):
         return ()
     return _force_law(written, overrides, law)
 
 
-def _refuse_unfit(plan: SweepPlan, law: int) -> None:
-    origin = [law] + [0] * len(plan.axes)
-    for n, one in enumerate(plan.axes, 1):
-        seen: dict[str, str] = {}
-        count = len(one.texts)
-        few = min(count, _CHECKED_VALUES)  # the first, the last, and some between them
-        for place in (k * (count - 1) // max(1, few - 1) for k in range(few)):
-            scenario = _checked(plan, [*origin[:n], place, *origin[n + 1 :]])
-            text = one.texts[place]
-            if scenario.sha256 in seen:
-                raise ScenarioError(
-                    f"{seen[scenario.sha256]} and {text} are the same experiment: nothing here follows this "
-                    "key; a site or link may have one of its own, as in sites.NAME.control or links.A->B",
-                    path=one.key,
-                    source=plan.written.label,
-                )
-            seen[scenario.sha256] = text
-    ends = [(law,), *(sorted({0, len(one.texts) - 1}) for one in plan.axes)]
-    for places in product(*ends):
-        _checked(plan, places)
+def _check_axes(plan: SweepPlan, law_index: int) -> None:
+    """Refuses a plan if a sample of its cells under one law cannot run.
 
-
-def _checked(plan: SweepPlan, places: Sequence[int]) -> Scenario:
-    """Returns the scenario of a cell.
+    The sample has up to `_CHECKED_VALUES` evenly spread values of each axis, the other axes at
+    their first values, and the corners of the grid.
 
     Raises:
-        ScenarioError: there is none, or it cannot run here; says with which law where several
-            are swept.
+        ScenarioError: a cell cannot run, or two values of an axis give the same scenario.
+    """
+    origin = [law_index] + [0] * len(plan.axes)
+    for dimension, axis in enumerate(plan.axes, 1):
+        value_of_digest: dict[str, str] = {}
+        for index in _spread_indices(len(axis.texts)):
+            indices = origin.copy()
+            indices[dimension] = index
+            digest = _load_cell(plan, indices).sha256
+            text = axis.texts[index]
+            if digest in value_of_digest:
+                raise ScenarioError(
+                    f"{value_of_digest[digest]} and {text} are the same experiment: "
+                    "nothing here follows this key; a site or link may have one of its own, "
+                    "as in sites.NAME.control or links.A->B",
+                    path=axis.key,
+                    source=plan.written.label,
+                )
+            value_of_digest[digest] = text
+    axis_ends = [sorted({0, len(axis.texts) - 1}) for axis in plan.axes]
+    for corner in product([law_index], *axis_ends):
+        _load_cell(plan, corner)
+
+
+def _spread_indices(count: int) -> list[int]:
+    """Returns indices of `count` values: the first, the last, and some between them."""
+    checked = min(count, _CHECKED_VALUES)
+    intervals = max(1, checked - 1)
+    return [k * (count - 1) // intervals for k in range(checked)]
+
+
+def _load_cell(plan: SweepPlan, indices: Sequence[int]) -> Scenario:
+    """Returns the scenario of the cell with these indices of the law and of each axis.
+
+    Raises:
+        ScenarioError: the scenario is not valid or cannot run here; the message names the law
+            if laws are swept.
     """
     number = 0
-    for count, place in zip(plan.shape, places, strict=True):
-        number = number * count + place
+    for count, index in zip(plan.shape, indices, strict=True):
+        number = number * count + index
     cell = plan.cell(number)
     try:
         scenario = plan.scenario(*cell.overrides)
@@ -552,6 +624,7 @@ _GAINS = {
     "Kd": "N m s/rad",
     "Lambda": "1/s",
 }
+"""Units of the gains, whose keys do not end in a unit."""
 
 
 def label_axis(key: str, scenario: Scenario | None = None) -> str:
@@ -570,11 +643,12 @@ def label_setting(key: str, value: Any, scenario: Scenario | None = None) -> str
 
 
 def describe_key(key: str, scenario: Scenario | None = None) -> tuple[str, str]:
-    """Returns what a key sets, in words, and its unit, "" where it has none."""
+    """Returns the name of a key's quantity, in words, and its unit, or "" without a unit."""
     *folders, last = key.split(".")
     number = ""
-    if last.isdigit() and folders:  # one of several joints or parameters
-        *folders, last, number = *folders, f"[{last}]"
+    if last.isdigit() and folders:  # an element of a list over joints or parameters
+        number = f"[{last}]"
+        last = folders.pop()
     words, unit = split_unit(last)
     if not unit and len(last) <= 3:  # a symbol
         words = last
@@ -583,14 +657,15 @@ def describe_key(key: str, scenario: Scenario | None = None) -> tuple[str, str]:
 
 
 def _describe_owner(folders: list[str], scenario: Scenario | None) -> str:
-    """Returns whose key it is, in words; "" for a group's."""
+    """Returns the site, link or actor of a key, in words, or "" for a common key."""
     match folders:
         case ["sites", site, ("hands" | "environment") as group, number]:
             kind = "hand" if group == "hands" else "environment"
             if scenario is not None and site in scenario.sites and number.isdigit():
-                some = getattr(scenario.sites[site], group)
-                if int(number) < len(some):
-                    kind = str(some[int(number)].__struct_config__.tag).replace("_", " ")
+                actors = getattr(scenario.sites[site], group)
+                if int(number) < len(actors):
+                    tag = actors[int(number)].__struct_config__.tag
+                    kind = str(tag).replace("_", " ")
             return f", {kind} of {site}"
         case ["sites", site, *_]:
             return f" of {site}"
@@ -603,30 +678,43 @@ def _describe_owner(folders: list[str], scenario: Scenario | None) -> str:
 
 
 def build_sweep_command(plan: SweepPlan, *more: str) -> str:
-    """Returns the command that makes a sweep."""
-    words = set_options(plan.overrides)
-    words += [word for one in plan.axes for word in ("--over", one.asked)]
-    own = plan.base.seed
+    """Returns the command that runs a sweep.
+
+    Args:
+        plan: the sweep.
+        more: further arguments of the command.
+    """
+    arguments = set_options(plan.overrides)
+    for axis in plan.axes:
+        arguments += ["--over", axis.asked]
+    scenario_seed = plan.base.seed
     count = len(plan.seeds)
-    if plan.seeds == tuple(range(own, own + count)):
-        words += ["--seeds", str(count)] if count > 1 else []
-    else:
-        words += ["--seeds", ",".join(map(str, plan.seeds)) + ("," if count == 1 else "")]
-    words += ["--law", ",".join(plan.laws)] if plan.laws else []
-    words += ["--judge", plan.judge] if plan.judge != "verdict" else []
-    words += [word for key in plan.metrics for word in ("--metric", key)]
+    if plan.seeds != tuple(range(scenario_seed, scenario_seed + count)):
+        seeds = ",".join(map(str, plan.seeds))
+        # a lone seed needs a comma: a number alone is a number of seeds
+        arguments += ["--seeds", f"{seeds}," if count == 1 else seeds]
+    elif count > 1:
+        arguments += ["--seeds", str(count)]
+    if plan.laws:
+        arguments += ["--law", ",".join(plan.laws)]
+    if plan.judge != "verdict":
+        arguments += ["--judge", plan.judge]
+    for key in plan.metrics:
+        arguments += ["--metric", key]
     if plan.longest_s != plan.default_longest_s:
-        words += ["--longest", format_override_value(plan.longest_s)]
-    return format_command("sweep", plan.written.label, *words, *more)
+        arguments += ["--longest", format_override_value(plan.longest_s)]
+    return format_command("sweep", plan.written.label, *arguments, *more)
 
 
 def format_override(key: str, value: Any) -> str:
-    """Returns an override that sets a value: a whole number as one, a word as it is."""
-    return f"{key}={format_override_value(value) if is_number(value) else value}"
+    """Returns the override that sets a key; whole numbers without a decimal point."""
+    text = format_override_value(value) if is_number(value) else value
+    return f"{key}={text}"
 
 
 def format_override_value(value: float) -> str:
-    """Returns a number as an override's text, which reads as just that number; whole ones
-    without a point.
+    """Returns the text of a number that parses back to exactly this number.
+
+    Whole numbers have no decimal point.
     """
     return repr(value).removesuffix(".0")

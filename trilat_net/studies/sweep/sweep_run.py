@@ -1,9 +1,13 @@
-"""Runs a sweep in its folder, which has the plan, the journal of finished runs, and at the end
-the results.
+"""Runs a sweep in its folder.
 
-Invariant: a folder belongs to one sweep on one arithmetic; any other is refused and never mixed
-in. Results are a function of the plan; the number of processes, their order and the number of
-interruptions do not enter. A run that is in the journal is never made again.
+The folder holds the plan, the journal of finished runs, and, once the sweep has finished, its
+results.
+
+Invariant:
+    - A folder belongs to one sweep on one arithmetic; any other sweep is refused.
+    - The results are a function of the plan: they do not depend on the number of processes, on
+      the order of the runs, or on interruptions.
+    - A run in the journal is not repeated.
 """
 
 import hashlib
@@ -53,85 +57,96 @@ _DIFFERENCES = {
     "arithmetic": "another kind of arithmetic",
     "versions": "another version of the program",
 }
-"""What two sweeps may differ in, in words, in the order of messages."""
+"""Keys of the plan in which two sweeps may differ, in words, in the order of messages."""
 
 
 SweepFolder = StudyFolder[SweepPlan, CellRun]
 
 
-def _folder(path: Path, plan: SweepPlan, facts: Mapping[str, Any]) -> SweepFolder:
-    study = hashlib.sha256(_text(facts).encode()).hexdigest()
+def _build_folder(path: Path, plan: SweepPlan, facts: Mapping[str, Any]) -> SweepFolder:
+    """Returns the sweep folder at a path, whose journal is tied to the digest of the plan."""
+    study = hashlib.sha256(_encode_plan(facts).encode()).hexdigest()
     remedy = build_resume_hint("sweep", "--resume", str(path))
-    return SweepFolder(
-        path,
-        plan,
-        facts,
-        remedy,
-        lambda: RunJournal(path / JOURNAL_FILE, study, CellRun, remedy),
-    )
+
+    def open_journal() -> RunJournal[CellRun]:
+        return RunJournal(path / JOURNAL_FILE, study, CellRun, remedy)
+
+    return SweepFolder(path, plan, facts, remedy, open_journal)
 
 
 def prepare_sweep_folder(plan: SweepPlan, path: Path | None) -> SweepFolder:
-    """Returns the folder of a sweep, made, or as it was left.
+    """Returns the folder of a sweep: a new one, or the existing folder with its finished runs.
+
+    Args:
+        plan: the sweep.
+        path: the path of the folder; None: a new folder with a default name.
 
     Raises:
-        UsageError: it holds something else, or another sweep, or cannot be made.
+        UsageError: the folder holds other files or another sweep, or cannot be made.
     """
     if path is not None and (path / PLAN_FILE).exists():
         return open_sweep_folder(path, plan)
-    facts = _describe(plan)
-    chosen = make_results_folder(path, f"sweep-{plan.base.name}", force=None)
-    folder = _folder(chosen, plan, facts)
-    write_whole(chosen / PLAN_FILE, _text(facts), remedy=folder.remedy)
+    facts = _list_facts(plan)
+    folder_path = make_results_folder(path, f"sweep-{plan.base.name}", force=None)
+    folder = _build_folder(folder_path, plan, facts)
+    write_whole(folder_path / PLAN_FILE, _encode_plan(facts), remedy=folder.remedy)
     return folder
 
 
-def open_sweep_folder(path: Path, asked: SweepPlan | None = None) -> SweepFolder:
-    """Returns the folder of a sweep that was begun.
+def open_sweep_folder(path: Path, expected: SweepPlan | None = None) -> SweepFolder:
+    """Returns the folder of a sweep that was started before.
 
     Args:
-        path: of the folder.
-        asked: the sweep that it must hold; None: any that this arithmetic and program began.
+        path: the path of the folder.
+        expected: the sweep that the folder must hold; None: any sweep that was started with
+            the arithmetic and program versions of this process.
 
     Raises:
-        UsageError: there is none, or it is another one.
-        ScenarioError: its scenario cannot run here.
+        UsageError: the folder holds no sweep, or another sweep.
+        ScenarioError: the scenario of the sweep cannot run here.
     """
-    before = _read(path)
-    now = _describe(asked or plan_from_json(before))
-    for key, words in _DIFFERENCES.items():
-        if before.get(key) != now.get(key):
-            there, here = (_shown(key, facts) for facts in (before, now))
+    stored = _read_facts(path)
+    current = _list_facts(expected or plan_from_json(stored))
+    for key, difference in _DIFFERENCES.items():
+        if stored.get(key) != current.get(key):
+            stored_text = _format_fact(key, stored)
+            current_text = _format_fact(key, current)
             raise UsageError(
-                f"{path}: holds a sweep of {words}: there {there}, here {here}; results are not mixed: "
-                "choose another folder"
+                f"{path}: holds a sweep of {difference}: there {stored_text}, "
+                f"here {current_text}; results are not mixed: choose another folder"
             )
-    return _folder(path, plan_from_json(before), before)
+    return _build_folder(path, plan_from_json(stored), stored)
 
 
-def _shown(key: str, facts: Mapping[str, Any]) -> str:
+def _format_fact(key: str, facts: Mapping[str, Any]) -> str:
+    """Returns the value of a key of the plan, as messages show it."""
     value = facts.get(key, JUDGES[0] if key == "judge" else [])
     if key in ("text", "scenario_sha256"):
-        digest = (
-            hashlib.sha256(str(value).encode()).hexdigest() if key == "text" else str(value)
-        )
+        digest = str(value)
+        if key == "text":
+            digest = hashlib.sha256(digest.encode()).hexdigest()
         return f"{facts.get('name')} (sha256 {digest[:12]})"
     if isinstance(value, dict):
-        return ", ".join(
-            f"{name.removeprefix('version_')} {one}" for name, one in value.items()
-        )
-    if (
-        key == "seeds"
-        and isinstance(value, list)
-        and value == list(range(value[0], value[-1] + 1))
-    ):
-        return f"{value[0]}..{value[-1]}"
+        versions = [
+            f"{name.removeprefix('version_')} {version}" for name, version in value.items()
+        ]
+        return ", ".join(versions)
+    if key == "seeds" and isinstance(value, list):
+        first = value[0]
+        last = value[-1]
+        if value == list(range(first, last + 1)):
+            return f"{first}..{last}"
     if isinstance(value, list):
         return ", ".join(map(str, value)) or "none"
     return f"{value:g} s" if isinstance(value, float) else str(value)
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _read_facts(path: Path) -> dict[str, Any]:
+    """Returns the stored facts of the plan in a folder.
+
+    Raises:
+        UsageError: the folder has no plan, or the plan cannot be read.
+    """
     file = path / PLAN_FILE
     try:
         facts = json.loads(file.read_text(encoding="utf-8"))
@@ -140,37 +155,43 @@ def _read(path: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "is not JSON"
         raise UsageError(f"{file}: cannot be read: {reason}") from None
-    # older plans name none
-    needed = {"source", "folder", "name", *_DIFFERENCES} - {
-        "judge",
-        "metrics",
-    }
-    if not isinstance(facts, dict) or not needed <= facts.keys():
+    # a plan at the default judge without metrics does not store these keys
+    optional = {"judge", "metrics"}
+    required = {"source", "folder", "name", *_DIFFERENCES} - optional
+    if not isinstance(facts, dict) or not required <= facts.keys():
         raise UsageError(f"{file}: is no plan of a sweep")
     return facts
 
 
-def _describe(plan: SweepPlan) -> dict[str, Any]:
+def _list_facts(plan: SweepPlan) -> dict[str, Any]:
+    """Returns the facts of the plan, with the arithmetic and versions of this program."""
     arithmetic, versions = describe_program()
     return {**plan.facts(), "arithmetic": arithmetic, "versions": versions}
 
 
-def _text(facts: Mapping[str, Any]) -> str:
+def _encode_plan(facts: Mapping[str, Any]) -> str:
+    """Returns the text of the plan file."""
     return json.dumps(facts, indent=2, ensure_ascii=False, sort_keys=True) + "\n"
 
 
 MAX_RUNS = 1_000_000
+"""Number of runs above which a sweep needs a confirmation."""
 MAX_SWEEP_S = 86_400.0
-"""A sweep of more runs, or one that would take longer, needs a confirmation."""
+"""Wall time above which a sweep needs a confirmation, in s."""
 _PROBES = 7
+"""Largest number of runs from which the duration of a sweep is estimated."""
 _PROBING_S = 3.0
-"""Runs of an estimate; fewer, once they have taken so long."""
+"""Wall time after which an estimate starts no further run, in s."""
 _RESUME_HINT = "; what is done is kept: go on with --resume"
 
 
 class DurationEstimate(NamedTuple):
-    """Duration of the runs that a sweep has left at most, estimated by a few of them, which are
-    done then.
+    """Estimated duration of the remaining runs of a sweep.
+
+    Attributes:
+        runs: the largest number of runs that remain.
+        seconds: their estimated wall time, in s.
+        entries: the runs that were made for the estimate; the sweep does not repeat them.
     """
 
     runs: int
@@ -179,13 +200,15 @@ class DurationEstimate(NamedTuple):
 
 
 class FinishedSweep(NamedTuple):
-    """A finished sweep, and what was run of it this time.
+    """A finished sweep, with the effort since it was last started or resumed.
 
     Attributes:
-        results: of all its runs.
-        folder: where they are.
-        runs, simulated_s: how many runs and how much time of the experiment were simulated, in
-        wall_s, jobs: so long by so many processes.
+        results: the results of all runs of the sweep.
+        folder: the folder of the sweep.
+        runs: number of runs since the start.
+        simulated_s: simulated time of these runs, in s.
+        wall_s: wall time of these runs, in s.
+        jobs: number of worker processes.
     """
 
     results: SweepResults
@@ -197,7 +220,7 @@ class FinishedSweep(NamedTuple):
 
 
 class CellItem(NamedTuple):
-    """One run of a cell, to be made: picklable, with all that a worker needs."""
+    """Task of a worker: one run of a cell. Picklable and self-contained."""
 
     plan: SweepPlan
     cell: SweepCell
@@ -208,10 +231,10 @@ class CellItem(NamedTuple):
 
 
 def run_cell(task: CellItem) -> CellRun:
-    """Runs one task, in whatever process.
+    """Runs one cell with one seed; any process can do it.
 
     Raises:
-        ScenarioError: there is no such experiment; says of which cell.
+        ScenarioError: the scenario is not valid or cannot run; the message names the cell.
     """
     plan = task.plan
     cell = task.cell
@@ -219,87 +242,97 @@ def run_cell(task: CellItem) -> CellRun:
         scenario = plan.scenario(*cell.overrides, f"seed={task.seed}")
         sweep_cell.check_sweepable(scenario)
     except ScenarioError as error:
-        raise ScenarioError(
-            f"cell {cell.number} ({', '.join(cell.overrides)}): {error}"
-        ) from None
-    outcome = sweep_cell.classify_cell(scenario.text, max(plan.longest_s, scenario.duration_s))
+        overrides = ", ".join(cell.overrides)
+        raise ScenarioError(f"cell {cell.number} ({overrides}): {error}") from None
+    longest_s = max(plan.longest_s, scenario.duration_s)
+    outcome = sweep_cell.classify_cell(scenario.text, longest_s)
     if plan.judge == "twins":
-        outcome = msgspec.structs.replace(
-            outcome, exponent_per_s=sweep_cell.measure_exponent(scenario)
-        )
+        exponent_per_s = sweep_cell.measure_exponent(scenario)
+        outcome = msgspec.structs.replace(outcome, exponent_per_s=exponent_per_s)
     metrics: dict[str, float | None] = {}
-    if further := [key for key in plan.metrics if key not in CellResult.__struct_fields__]:
-        measured = measure_run(simulate_scenario(scenario), further)
-        metrics = {key: measured[key].value for key in further}
-    laws = ", ".join(
-        dict.fromkeys(identify_law(site.control) for site in scenario.sites.values())
-    )
-    text = sweep_cell.diff_lines(scenario.text, plan.base.text)
+    # the outcome has the other metrics already: only further metrics need a run with a log
+    log_metrics = [key for key in plan.metrics if key not in CellResult.__struct_fields__]
+    if log_metrics:
+        measured = measure_run(simulate_scenario(scenario), log_metrics)
+        metrics = {key: measured[key].value for key in log_metrics}
+    laws = dict.fromkeys(identify_law(site.control) for site in scenario.sites.values())
     return CellRun(
-        cell.number, task.seed, scenario.random, laws, scenario.sha256, text, outcome, metrics
+        cell=cell.number,
+        seed=task.seed,
+        random=scenario.random,
+        law=", ".join(laws),
+        sha256=scenario.sha256,
+        scenario=sweep_cell.diff_lines(scenario.text, plan.base.text),
+        outcome=outcome,
+        metrics=metrics,
     )
 
 
 def estimate_sweep(
     plan: SweepPlan, done: Iterable[tuple[int, int]] = (), jobs: int | None = None
 ) -> DurationEstimate:
-    """Returns how long a sweep will take, by its first and last run and some between.
+    """Estimates the duration of a sweep from its first and last cells and some between them.
 
-    The runs of cells and seeds that are `done` already are left out.
+    Args:
+        plan: the sweep.
+        done: the finished runs, as pairs of cell number and seed; they are left out.
+        jobs: number of worker processes; None: as many as there are cores.
     """
-    known = set(done)
-    places = dict.fromkeys(n * (plan.cells - 1) // (_PROBES - 1) for n in range(_PROBES))
+    finished = set(done)
+    numbers = dict.fromkeys(n * (plan.cells - 1) // (_PROBES - 1) for n in range(_PROBES))
     seed = plan.seeds[0]
-    probes = [CellItem(plan, plan.cell(n), seed) for n in places if (n, seed) not in known]
+    probes = [
+        CellItem(plan, plan.cell(number), seed)
+        for number in numbers
+        if (number, seed) not in finished
+    ]
     if not probes:
-        return DurationEstimate(plan.cells * len(plan.seeds) - len(known), 0.0, [])
+        return DurationEstimate(plan.cells * len(plan.seeds) - len(finished), 0.0, [])
     brief_s = min(1.0, plan.base.duration_s)
-    warm = plan.scenario(*probes[0].cell.overrides, f"duration_s={brief_s!r}")
-    sweep_cell.classify_cell(warm.text, brief_s)  # compiles, once for all processes
+    brief = plan.scenario(*probes[0].cell.overrides, f"duration_s={brief_s!r}")
+    sweep_cell.classify_cell(brief.text, brief_s)  # compiles, once for all processes
     clock = SystemClock()
-    began_ns = clock.monotonic_ns()
+    started_ns = clock.monotonic_ns()
     entries: list[CellRun] = []
-    took_s = 0.0
-    while len(entries) < len(probes) and took_s < _PROBING_S:
-        entries.append(run_cell(probes[len(entries)]))
-        took_s = (clock.monotonic_ns() - began_ns) * 1e-9
+    elapsed_s = 0.0
+    for probe in probes:
+        entries.append(run_cell(probe))
+        elapsed_s = (clock.monotonic_ns() - started_ns) * 1e-9
+        if elapsed_s >= _PROBING_S:
+            break
     seeds = len(plan.seeds) if any(entry.random for entry in entries) else 1
-    left = max(len(entries), plan.cells * seeds - len(known))
-    return DurationEstimate(
-        left, took_s / len(entries) * left / min(jobs or count_cores(), left), entries
-    )
+    runs = max(len(entries), plan.cells * seeds - len(finished))
+    workers = min(jobs or count_cores(), runs)
+    seconds = elapsed_s / len(entries) * runs / workers
+    return DurationEstimate(runs, seconds, entries)
 
 
 def refuse_oversized_sweep(
     plan: SweepPlan, expected: DurationEstimate, jobs: int | None = None
 ) -> None:
-    """Refuses a sweep of very many runs, or of more than a day.
+    """Refuses a sweep of more than `MAX_RUNS` runs or `MAX_SWEEP_S` seconds.
 
     Raises:
-        UsageError: it is one; says how many runs, and how long they would take.
+        UsageError: the sweep is too large; the message has its size and estimated duration.
     """
     if expected.runs <= MAX_RUNS and expected.seconds <= MAX_SWEEP_S:
         return
     sizes = " x ".join(str(count) for count in plan.shape if count > 1)
     seeds = f", {count_nouns(len(plan.seeds), 'seed')} each" if len(plan.seeds) > 1 else ""
+    cells = count_nouns(plan.cells, "cell")
+    cores = count_nouns(jobs or count_cores(), "core")
     raise UsageError(
-        f"{count_nouns(plan.cells, 'cell')} ({sizes}{seeds}) would take about "
-        f"{format_wall_time(expected.seconds)} on "
-        ""
-        f"{count_nouns(jobs or count_cores(), 'core')}; larger steps make it fewer, --yes "
-        "runs it all the same"
+        f"{cells} ({sizes}{seeds}) would take about {format_wall_time(expected.seconds)} "
+        f"on {cores}; larger steps make it fewer, --yes runs it all the same"
     )
 
 
 def format_wall_time(seconds: float) -> str:
-    """Returns a duration for people."""
-    for unit, size, from_s in (
-        ("days", 86_400.0, 172_800.0),
-        ("h", 3600.0, 5400.0),
-        ("min", 60.0, 90.0),
-    ):
-        if seconds >= from_s:
-            return f"{seconds / size:.3g} {unit}"
+    """Returns a duration as a text with a readable unit, as in "2.5 h"."""
+    units = (("days", 86_400.0, 172_800.0), ("h", 3600.0, 5400.0), ("min", 60.0, 90.0))
+    for unit, unit_s, smallest_s in units:
+        if seconds >= smallest_s:
+            return f"{seconds / unit_s:.3g} {unit}"
     return f"{max(1, round(seconds))} s"
 
 
@@ -310,23 +343,27 @@ def run_sweep(
     known: Iterable[CellRun] = (),
     on: executor.Workers = None,
 ) -> FinishedSweep:
-    """Runs what is left of a sweep, writes its results, and returns them.
+    """Runs the remaining runs of a sweep, writes its results, and returns them.
 
-    What the journal of the folder has, and the runs that are `known` from an estimate, are not
-    made again; `progress` gets the runs that are done, and their number as far as it is known.
+    Args:
+        folder: the folder of the sweep; the runs in its journal are not repeated.
+        jobs: number of worker processes; None: as many as there are cores.
+        progress: called with the number of finished runs and the number of runs known so far.
+        known: finished runs, as from an estimate; they enter the journal and are not repeated.
+        on: the workers to use; None: processes of this computer.
 
     Raises:
-        ScenarioError: a cell cannot run; says which. What is done is kept.
-        RunFailed: a cell ended its workers, or the cluster is gone. What is done is kept.
+        ScenarioError: a cell cannot run; the message names it. Finished runs are kept.
+        RunFailed: a cell ended its workers, or the cluster is gone. Finished runs are kept.
     """
     plan = folder.plan
     clock = SystemClock()
     with folder.journal() as journal:
         for entry in known:
             journal.add(entry)
-        before = set(journal.done)
-        began_ns = clock.monotonic_ns()
-        left = plan.cells * len(plan.seeds) - len(before)
+        finished_before = set(journal.done)
+        started_ns = clock.monotonic_ns()
+        left = plan.cells * len(plan.seeds) - len(finished_before)
         laws = list_imported_code([plan.base])
         workers = on if left else None
         with executor.open_worker_pool(
@@ -334,8 +371,8 @@ def run_sweep(
         ) as pool:
             count = pool.workers
             _run_cells(plan, journal, pool, progress)
-        wall_s = (clock.monotonic_ns() - began_ns) * 1e-9
-        made = [entry for key, entry in journal.done.items() if key not in before]
+        wall_s = (clock.monotonic_ns() - started_ns) * 1e-9
+        new_runs = [run for key, run in journal.done.items() if key not in finished_before]
         rows = build_result_rows(plan, list(journal.done.values()))
     results = SweepResults(plan, rows)
     if len(plan.seeds) > 1:
@@ -343,11 +380,11 @@ def run_sweep(
         write_whole(folder.path / GRID_POINTS_FILE, points, remedy=folder.remedy)
     table = encode_results(plan, rows)
     write_whole(folder.path / RESULTS_FILE, table, remedy=folder.remedy)
-    simulated_s = sum(entry.outcome.ran_s for entry in made)
+    simulated_s = sum(run.outcome.ran_s for run in new_runs)
     return FinishedSweep(
         results=results,
         folder=folder,
-        runs=len(made),
+        runs=len(new_runs),
         simulated_s=simulated_s,
         wall_s=wall_s,
         jobs=count,
@@ -360,29 +397,34 @@ def _run_cells(
     pool: executor.WorkerPool,
     progress: executor.Progress,
 ) -> None:
-    first, *others = plan.seeds
+    """Runs all cells with the first seed, then those that draw random numbers with the others.
 
-    def make(runs: Iterable[tuple[int, int]], count: int) -> None:
+    Only the first run of a cell tells whether the cell is random.
+    """
+    first_seed, *other_seeds = plan.seeds
+
+    def run_pending(runs: Iterable[tuple[int, int]], count: int) -> None:
         tasks = (
-            CellItem(plan, plan.cell(n), seed)
-            for n, seed in runs
-            if (n, seed) not in journal.done
+            CellItem(plan, plan.cell(number), seed)
+            for number, seed in runs
+            if (number, seed) not in journal.done
         )
         journal.run_pending(pool, run_cell, tasks, len(journal.done), count, progress)
 
-    make(((number, first) for number in range(plan.cells)), plan.cells)
-    again = [
-        number for number in range(plan.cells) if others and journal.done[number, first].random
-    ]
-    make(
-        ((number, seed) for number in again for seed in others),
-        plan.cells + len(again) * len(others),
-    )
+    run_pending(((number, first_seed) for number in range(plan.cells)), plan.cells)
+    random_cells = list[int]()
+    if other_seeds:
+        random_cells = [
+            number for number in range(plan.cells) if journal.done[number, first_seed].random
+        ]
+    repetitions = ((number, seed) for number in random_cells for seed in other_seeds)
+    run_pending(repetitions, plan.cells + len(random_cells) * len(other_seeds))
 
 
 def describe_sweep_speed(speed: FinishedSweep) -> str:
-    """Returns the speed in words."""
-    on = count_nouns(speed.jobs, "process")
-    times = speed.simulated_s / (speed.wall_s * speed.jobs) if speed.wall_s else math.nan
-    took = f"{speed.simulated_s:.4g} s simulated in {format_wall_time(speed.wall_s)} by {on}"
-    return f"speed: {times:.3g} times real time per process; {took}"
+    """Returns the speed of a sweep as a sentence."""
+    processes = count_nouns(speed.jobs, "process")
+    wall_time = format_wall_time(speed.wall_s)
+    ratio = speed.simulated_s / (speed.wall_s * speed.jobs) if speed.wall_s else math.nan
+    effort = f"{speed.simulated_s:.4g} s simulated in {wall_time} by {processes}"
+    return f"speed: {ratio:.3g} times real time per process; {effort}"
