@@ -1,19 +1,23 @@
-"""A stability map: the plane of a sweep's results with the lines of theory, and the commands
-that make both.
+"""Builds a stability map: the results of a sweep on a plane, with the limits of theory.
 
-The plane has two numeric axes with their labels, a panel per setting of the others, class
-counts per grid point, and the measured edges. Lines are those of closed-form stability criteria
-and of the dominant root of the linear loop, where either is marginal.
+The plane has two numeric axes with their labels, a panel per setting of the other axes, class
+counts per grid point, and the measured edges. The lines show where a closed-form stability
+criterion, or the dominant root of the linear loop, is marginal.
 
-Invariant: the runs come from the results and the lines from the plan alone. Every run is in
-exactly one grid point of one panel. A label takes its words from the scenario key and its unit
-from the key's suffix; a gain has the unit that its control law states. An edge lies between two
-decided grid points of a column, one stable and one not; undecided ones widen it, the majority
-of the runs decides, and a draw decides nothing. A line is the zero set of a quantity that
-theory gives, found between any two places of a column of which just one is stable. A criterion
-applies only if all of its hypotheses hold, and its excess is positive where it is met. P+d
-counts as it is computed, from tick to tick; of the roots' line only those with scheme `digital`
-do.
+Invariant:
+    - The runs come from the results alone, the lines from the plan alone.
+    - Every run is in exactly one grid point of one panel.
+    - A label takes its words from the scenario key and its unit from the key's suffix; a gain
+      has the unit that its control law states.
+    - A measured edge lies between two decided grid points of a column, one stable and one not.
+      The majority of the runs decides a grid point; a draw leaves it undecided. Undecided grid
+      points widen an edge.
+    - A line is the zero set of a quantity of theory. It is located between two neighbouring
+      grid points of a column of which exactly one is stable.
+    - A criterion applies only if all of its hypotheses hold; its excess is positive if it is
+      met.
+    - The criterion of P+d covers the law as computed from tick to tick. The line of the roots
+      does so only under scheme `digital`.
 """
 
 import math
@@ -48,11 +52,16 @@ RunCounts = NDArray[np.int64]
 CELL_CLASSES = tuple(CellClass)
 """The order of the last axis of `MapPanel.counts`."""
 MAX_PANELS = 12
+"""Largest number of panels of a map."""
 
 
 class PlaneAxis(NamedTuple):
-    """One axis of a plane: a dotted key, the numbers that it takes, rising, in its unit, and a
-    label.
+    """One axis of a plane.
+
+    Attributes:
+        key: the scenario key of the axis.
+        values: the values of the axis in the unit of the key, in rising order.
+        label: the text at the axis.
     """
 
     key: str
@@ -61,31 +70,28 @@ class PlaneAxis(NamedTuple):
 
     @property
     def even(self) -> bool:
-        """True where its values are as far apart, each from the next."""
+        """True if the values are equally spaced."""
         steps = np.diff(self.values)
         return len(steps) < 2 or bool(np.ptp(steps) <= 1e-6 * np.abs(steps).max())
 
     @property
     def places(self) -> Array:
-        """Where its values are drawn: at themselves where they are even, else one apart from
-        the next.
-        """
-        return (
-            np.array(self.values)
-            if self.even
-            else np.arange(len(self.values), dtype=np.float64)
-        )
+        """Drawing positions of the values: the values if equally spaced, else indices."""
+        if self.even:
+            return np.array(self.values)
+        return np.arange(len(self.values), dtype=np.float64)
 
 
 class MapPanel(NamedTuple):
-    """One plane's worth of runs.
+    """The runs with one setting of the axes that are not drawn.
 
     Attributes:
-        title: where it lies along the axes that are not drawn; "" where there are none.
-        settings: the same as overrides, key by key; "law" among them where laws were swept.
-        counts: runs per place and class, shape (y, x, 4), in the order of `CELL_CLASSES`.
-        exponents_per_s: growth exponents, 1/s, means of the seeds, shape (y, x); NaN where
-            there is none.
+        title: the setting of the axes that are not drawn, in words; "" without such axes.
+        settings: this setting, as pairs of key and value; with the key "law" if laws are swept.
+        counts: number of runs per grid point and class, shape (y, x, 4), in the order of
+            `CELL_CLASSES`.
+        exponents_per_s: mean growth exponents over the seeds, in 1/s, shape (y, x); NaN without
+            an exponent.
     """
 
     title: str
@@ -95,28 +101,25 @@ class MapPanel(NamedTuple):
 
     @property
     def runs(self) -> RunCounts:
-        """Runs per place, shape (y, x)."""
+        """Number of runs per grid point, shape (y, x)."""
         total: RunCounts = self.counts.sum(axis=2)
         return total
 
     @property
     def stable(self) -> RunCounts:
-        """Stable runs per place, shape (y, x)."""
-        stable: RunCounts = self.counts[
-            :, :, [verdict.stable is True for verdict in CELL_CLASSES]
-        ].sum(axis=2)
+        """Number of stable runs per grid point, shape (y, x)."""
+        is_stable = [verdict.stable is True for verdict in CELL_CLASSES]
+        stable: RunCounts = self.counts[:, :, is_stable].sum(axis=2)
         return stable
 
     @property
     def decided(self) -> RunCounts:
-        """Decided runs per place, shape (y, x)."""
+        """Number of decided runs per grid point, shape (y, x)."""
         return self.runs - self.counts[:, :, CELL_CLASSES.index(CellClass.UNDECIDED)]
 
     @property
     def share(self) -> Array:
-        """Share of stable runs among the decided ones, shape (y, x); NaN where none was
-        decided.
-        """
+        """Share of the decided runs that are stable, shape (y, x); NaN without decided runs."""
         stable = self.stable
         decided = self.decided
         share: Array = np.full(decided.shape, np.nan)
@@ -125,9 +128,10 @@ class MapPanel(NamedTuple):
 
 
 class MapPlane(NamedTuple):
-    """What a map shows of a scenario: a panel per place of the axes that are not drawn.
+    """The results of a sweep, on panels with the same two axes.
 
-    Where only one axis was swept, y has an empty key and a single value.
+    There is a panel per setting of the axes that are not drawn. If only one axis is drawn, y
+    has an empty key and a single value.
     """
 
     scenario: str
@@ -137,29 +141,27 @@ class MapPlane(NamedTuple):
 
     @property
     def judged_by_twins(self) -> bool:
-        """True if there are growth exponents to be drawn."""
+        """True if a panel has growth exponents."""
         return any(np.isfinite(panel.exponents_per_s).any() for panel in self.panels)
 
     @property
     def seeds(self) -> int:
-        """The largest number of runs of a place."""
+        """Largest number of runs at a grid point."""
         return max(int(panel.runs.max()) for panel in self.panels)
 
 
 def build_plane(
     rows: Sequence[Mapping[str, Any]], axes: Sequence[str], scenario: Scenario
 ) -> MapPlane:
-    """Returns the plane of results: its first two axes of numbers, a panel per place of all
-    others.
+    """Returns the plane of the results over the first two numeric axes.
 
     Args:
-        rows: one mapping per run: a value per axis, and "verdict" as its text.
-        axes: the keys of the axes, in the order in which they were given; "law" where laws were
-            swept.
-        scenario: the experiment that was swept, for its words.
+        rows: one mapping per run, with a value per axis and the text of its "verdict".
+        axes: the keys of the axes, in their given order; with "law" if laws are swept.
+        scenario: the swept experiment, for the labels.
 
     Raises:
-        UsageError: there is nothing to draw, or there are too many panels to see any.
+        UsageError: there is nothing to draw, or there would be more than `MAX_PANELS` panels.
     """
     if not rows:
         raise UsageError("no cell has run: there is nothing to draw")
@@ -168,57 +170,64 @@ def build_plane(
         raise UsageError(
             f"a map needs an axis of numbers, and {', '.join(axes)} has words only"
         )
-    sides = [  # whole numbers stay whole
-        PlaneAxis(key, tuple(sorted({row[key] for row in rows})), label_axis(key, scenario))
-        for key in drawn
+    values = {key: {row[key] for row in rows} for key in axes}
+    plane_axes = [
+        PlaneAxis(key, tuple(sorted(values[key])), label_axis(key, scenario)) for key in drawn
     ]
-    if len(sides) == 1:
-        sides.append(PlaneAxis("", (0.0,), ""))
-    others = [key for key in axes if key not in drawn and len({row[key] for row in rows}) > 1]
-    settings = list(dict.fromkeys(tuple((key, row[key]) for key in others) for row in rows))
-    if len(settings) > MAX_PANELS:
-        found = (
-            f"at most {MAX_PANELS} panels, and {', '.join(others)} would make {len(settings)}"
+    if len(plane_axes) == 1:
+        plane_axes.append(PlaneAxis("", (0.0,), ""))
+    x, y = plane_axes
+    panel_keys = [key for key in axes if key not in drawn and len(values[key]) > 1]
+    row_settings = [tuple((key, row[key]) for key in panel_keys) for row in rows]
+    all_settings = list(dict.fromkeys(row_settings))
+    if len(all_settings) > MAX_PANELS:
+        raise UsageError(
+            f"a map has at most {MAX_PANELS} panels, and {', '.join(panel_keys)} would make "
+            f"{len(all_settings)}: sweep fewer values of what is not drawn"
         )
-        raise UsageError(f"a map has {found}: sweep fewer values of what is not drawn")
-    shape = len(sides[1].values), len(sides[0].values), len(CELL_CLASSES)
-    panels = [
-        MapPanel(
-            _title(one, scenario), one, np.zeros(shape, dtype=np.int64), np.zeros(shape[:2])
-        )
-        for one in settings
-    ]
-    of = dict(zip(settings, panels, strict=True))
-    place = [{value: n for n, value in enumerate(side.values)} for side in sides]
-    verdicts = {verdict.value: n for n, verdict in enumerate(CELL_CLASSES)}
-    for row in rows:
-        j, i = (place[n][row[side.key]] if side.key else 0 for n, side in enumerate(sides))
-        panel = of[tuple((key, row[key]) for key in others)]
-        panel.counts[i, j, verdicts[row["verdict"]]] += 1
+    shape = (len(y.values), len(x.values))
+    panels: dict[tuple[tuple[str, Any], ...], MapPanel] = {}
+    for settings in all_settings:
+        counts = np.zeros((*shape, len(CELL_CLASSES)), dtype=np.int64)
+        title = _format_panel_title(settings, scenario)
+        panels[settings] = MapPanel(title, settings, counts, np.zeros(shape))
+    columns = {value: n for n, value in enumerate(x.values)}
+    lines = {value: n for n, value in enumerate(y.values)}
+    classes = {verdict.value: n for n, verdict in enumerate(CELL_CLASSES)}
+    for row, settings in zip(rows, row_settings, strict=True):
+        i = lines[row[y.key]] if y.key else 0
+        j = columns[row[x.key]]
+        panel = panels[settings]
+        panel.counts[i, j, classes[row["verdict"]]] += 1
         exponent = row.get("exponent_per_s")
         panel.exponents_per_s[i, j] += np.nan if exponent is None else exponent
-    for panel in panels:
+    for panel in panels.values():
         panel.exponents_per_s[...] /= np.maximum(panel.runs, 1)
         panel.exponents_per_s[panel.runs == 0] = np.nan
-    return MapPlane(scenario.name, sides[0], sides[1], tuple(panels))
+    return MapPlane(scenario.name, x, y, tuple(panels.values()))
 
 
-def _title(settings: Sequence[tuple[str, Any]], scenario: Scenario) -> str:
+def _format_panel_title(settings: Sequence[tuple[str, Any]], scenario: Scenario) -> str:
+    """Returns the settings of a panel in words, as in "p d, delay 200 ms"."""
     words = []
     for key, value in settings:
-        spaced = value.replace("_", " ") if isinstance(value, str) and key != "law" else value
-        words.append(spaced if isinstance(spaced, str) else label_setting(key, value, scenario))
+        if not isinstance(value, str):
+            words.append(label_setting(key, value, scenario))
+        elif key == "law":
+            words.append(value)
+        else:
+            words.append(value.replace("_", " "))
     return ", ".join(words)
 
 
 class StableInterval(NamedTuple):
-    """A change between stable and not, along one key.
+    """An edge of stability along one key.
 
     Attributes:
-        low: the last value below it that was decided.
-        high: the first one above it.
-        stable_below: whether what lies below is the stable side.
-        sharp: True if nothing between the two stayed undecided.
+        low: the largest decided value below the edge.
+        high: the smallest decided value above the edge.
+        stable_below: True if the values below the edge are stable.
+        sharp: True if no value between `low` and `high` is undecided.
     """
 
     low: float
@@ -228,35 +237,42 @@ class StableInterval(NamedTuple):
 
     @property
     def middle(self) -> float:
-        """The value half way."""
+        """The value halfway between `low` and `high`."""
         return 0.5 * (self.low + self.high)
 
 
 def find_map_edges(plane: MapPlane, panel: MapPanel) -> list[tuple[float, StableInterval]]:
-    """Returns the edges of a panel with the values of their columns, each column from below."""
-    found = []
+    """Returns the measured edges of a panel, each with the x value of its column.
+
+    The edges of a column are in rising order.
+    """
+    edges = []
     y = plane.y.values
     for x, share in zip(plane.x.values, panel.share.T, strict=True):
         decided = np.flatnonzero(np.isfinite(share) & (share != 0.5))
         stable = share[decided] > 0.5
         for n in np.flatnonzero(stable[1:] != stable[:-1]):
             low, high = decided[n : n + 2].tolist()
-            found.append((x, StableInterval(y[low], y[high], bool(stable[n]), high == low + 1)))
-    return found
+            edge = StableInterval(y[low], y[high], bool(stable[n]), high == low + 1)
+            edges.append((x, edge))
+    return edges
 
 
 _GRAVITY = slice(3, 5)
-"""The parameters of Eq. (24) that gravity's torque consists of."""
+"""The parameters of Eq. (24) in the gravity torque."""
 _ROUNDING = 1e-6
+"""Tolerance of delays, in ticks, and of the position of an edge, as a share of an interval."""
 
 
 class StabilityCriterion(NamedTuple):
-    """A condition, at one scenario.
+    """A stability condition in closed form, evaluated at one scenario.
 
     Attributes:
-        symbol: its edge, as a legend has it; `text`: the same for plain text.
-        source: where it is from, and what it is worth.
-        excess: how much more there is than it asks for, in its own unit; positive: it is met.
+        symbol: the equation of the condition's limit, for a legend.
+        text: the same equation as plain text.
+        source: the origin of the condition, and whether it is necessary or sufficient.
+        excess: margin by which the condition is met, in the unit of the condition; positive if
+            it is met.
     """
 
     symbol: str
@@ -266,36 +282,37 @@ class StabilityCriterion(NamedTuple):
 
 
 def evaluate_criterion(scenario: Scenario) -> StabilityCriterion | None:
-    """Returns the condition in closed form that covers a scenario, or None."""
-    if scenario.timeline or any(
-        spec.on_stale.action != "use" for spec in scenario.sites.values()
-    ):
+    """Returns the stability condition in closed form that covers a scenario, or None."""
+    holds_stale = any(spec.on_stale.action != "use" for spec in scenario.sites.values())
+    if scenario.timeline or holds_stale:
         return None
     if any(arm.shares_pose for arm in scenario.arms.values()):
         return None
-    chains = any(arm.chain is not None for arm in scenario.arms.values())
-    return _damped(scenario) or (None if chains else _sampled(scenario))
+    criterion = _evaluate_damping_criterion(scenario)
+    if criterion is not None:
+        return criterion
+    if any(arm.chain is not None for arm in scenario.arms.values()):
+        return None
+    return _evaluate_sampling_criterion(scenario)
 
 
-def _damped(scenario: Scenario) -> StabilityCriterion | None:
-    """P+d: 4 d1 d2 > (T1 + T2)^2 K1 K2 for two sites, d > max(abs(lambda_min), 0.2172) K T for
-    N equal ones.
+def _evaluate_damping_criterion(scenario: Scenario) -> StabilityCriterion | None:
+    """Returns the condition on the damping of P+d, or None if it does not cover the scenario.
 
-    Of N sites the shares must be reversible. It is the condition for no root on the unit circle
-    whatever the masses, down to d h: lighter arms no damping steadies at this tick rate
-    (docs/errata.md, 13).
+    For two sites: 4 d1 d2 > (T1 + T2)^2 K1 K2. For N equal sites with reversible shares:
+    d > max(abs(lambda_min), 0.2172) K T.
+
+    Under this condition the loop has no root on the unit circle for all masses down to d h. No
+    damping stabilises lighter arms at this tick rate (docs/errata.md, 13).
     """
     delays_s = _delays_s(scenario)
     rates_hz = {spec.rate_hz for spec in scenario.sites.values()}
     gains = [_scalar_gains(spec) for spec in scenario.sites.values()]
     K = [gain[0] for gain in gains if gain]
     d = [gain[1] for gain in gains if gain]
-    if (
-        delays_s is None
-        or len(K) < len(gains)
-        or len(rates_hz) > 1
-        or scenario.scheme != "second_order"
-    ):
+    if delays_s is None or len(K) < len(gains):
+        return None
+    if len(rates_hz) > 1 or scenario.scheme != "second_order":
         return None
     rate_hz = rates_hz.pop()
     if max(d) / rate_hz >= min(map(_least_inertia, scenario.arms.values())):
@@ -309,7 +326,7 @@ def _damped(scenario: Scenario) -> StabilityCriterion | None:
     least = find_least_reversible(scenario.alpha)
     if len({*K}) > 1 or len({*d}) > 1 or len({*ticks}) > 1 or least is None:
         return None
-    excess = d[0] - K[0] * _find_asked_share(least, ticks[0]) * ticks[0] / rate_hz
+    excess = d[0] - K[0] * _compute_required_share(least, ticks[0]) * ticks[0] / rate_hz
     if -least < COMMON_MOTION_SHARE:
         return StabilityCriterion(r"$d = 0.2172\,K\,T$", "d = 0.2172 K T", source, excess)
     symbol = r"$d = |\lambda_{\min}(\alpha)|\,K\,T$"
@@ -317,8 +334,9 @@ def _damped(scenario: Scenario) -> StabilityCriterion | None:
 
 
 def _scalar_gains(spec: SiteSpec) -> tuple[float, float] | None:
-    """Returns K and d of P+d with known gravity, if they are alike at all joints, which the arm
-    couples.
+    """Returns K and d of P+d with full gravity compensation, or None.
+
+    None unless all joints have the same gains: the arm couples its joints.
     """
     law: Any = spec.control
     if law.kind is not PD or law.gravity != 1.0 or len({*law.K}) + len({*law.d}) > 2:
@@ -327,54 +345,64 @@ def _scalar_gains(spec: SiteSpec) -> tuple[float, float] | None:
 
 
 def _tick_angles(ticks: float) -> tuple[Array, Array, Array]:
-    """Returns angles phi = w h of z from almost 0 to almost pi, 2 tan(phi / 2), and the
-    scheme's lag.
+    """Returns angles phi = w h of z on the unit circle, 2 tan(phi / 2), and the scheme's lag.
 
-    The first turn of a delay of so many ticks has the more of them.
+    The angles go from almost 0 to almost pi. They are denser over the first turn of a delay of
+    `ticks`, up to phi = 2 pi / `ticks`.
     """
-    first = np.linspace(0.0, min(2.0 * np.pi / ticks, 3.0), 400)[1:]
-    phi = np.concatenate([[1e-7 / ticks], first, np.linspace(0.0, np.pi, 400)[1:-1]])
+    first_turn = np.linspace(0.0, min(2.0 * np.pi / ticks, 3.0), 400)[1:]
+    half_circle = np.linspace(0.0, np.pi, 400)[1:-1]
+    phi = np.concatenate([[1e-7 / ticks], first_turn, half_circle])
     t = np.tan(0.5 * phi)
     return phi, 2.0 * t, 2.0 * t**3 / (1.0 + 3.0 * t**2)
 
 
-def _find_asked_share(least: float, ticks: int) -> float:
+def _compute_required_share(least: float, ticks: int) -> float:
+    """Returns the least stable d / (K T) of equal sites with reversible shares.
+
+    Args:
+        least: the least eigenvalue of the share matrix; its largest eigenvalue is 1.
+        ticks: the delay T, in ticks.
+    """
     phi, w, lag = _tick_angles(ticks)
-    asked = [
+    shares = [
         (lag * (1.0 - a * np.cos(ticks * phi)) - a * np.sin(ticks * phi)) / (w * ticks)
         for a in (least, 1.0)
     ]
-    return float(np.max(asked))
+    return float(np.max(shares))
 
 
 def _excess_of_two(K: list[float], d: list[float], ticks: float, rate_hz: float) -> float:
-    """Returns the least of 2 sqrt(d1 d2) - (T1 + T2) sqrt(K1 K2) over all frequencies, T1 + T2
-    = 2 ticks.
+    """Returns the least of 2 sqrt(d1 d2) - (T1 + T2) sqrt(K1 K2) over all frequencies.
+
+    The scheme's lag reduces each damping, and T1 + T2 is 2 `ticks`.
     """
     phi, w, lag = _tick_angles(ticks)
-    first, second = (
-        np.maximum(damping - K_i * lag / (w * rate_hz), 0.0)
-        for K_i, damping in zip(K, d, strict=True)
-    )
-    across = np.abs(np.sin(ticks * phi) + lag * np.cos(ticks * phi)) / (w * rate_hz)
-    return float(2.0 * np.min(np.sqrt(first * second) - math.sqrt(K[0] * K[1]) * across))
+    first_damping = np.maximum(d[0] - K[0] * lag / (w * rate_hz), 0.0)
+    second_damping = np.maximum(d[1] - K[1] * lag / (w * rate_hz), 0.0)
+    delay_s = np.abs(np.sin(ticks * phi) + lag * np.cos(ticks * phi)) / (w * rate_hz)
+    excess = np.sqrt(first_damping * second_damping) - math.sqrt(K[0] * K[1]) * delay_s
+    return float(2.0 * np.min(excess))
 
 
 def _least_inertia(arm: ArmModel) -> float:
-    """Returns what the least eigenvalue of M(q) exceeds in all poses, kg m^2.
+    """Returns a lower bound of the least eigenvalue of M(q) over all poses, in kg m^2.
 
-    Of the planar arm it lies at cos q2 = 1 or -1; a chain has at least the inertia of its
-    drives.
+    The planar arm has its least eigenvalue at cos q2 = 1 or -1. A chain has at least the
+    inertia of its drives.
     """
     if arm.chain is not None:
         return min(joint.armature_kg_m2 for joint in arm.chain.joints)
-    ends = PlacedArm(0.0, arm.lengths_m, np.array([[0.0, 0.0], [0.0, np.pi]]))
-    return float(np.linalg.eigvalsh(ends.inertia_matrix(arm.theta).T).min())
+    extreme_poses = PlacedArm(0.0, arm.lengths_m, np.array([[0.0, 0.0], [0.0, np.pi]]))
+    inertia_kg_m2 = extreme_poses.inertia_matrix(arm.theta).T
+    return float(np.linalg.eigvalsh(inertia_kg_m2).min())
 
 
-def _sampled(scenario: Scenario) -> StabilityCriterion | None:
-    """The adaptive law as `digital` computes it, without delay: it rests where Gamma g^2 h <
-    Kp, about.
+def _evaluate_sampling_criterion(scenario: Scenario) -> StabilityCriterion | None:
+    """Returns the condition on the tick of the adaptive law, or None if it does not apply.
+
+    Without delay and under scheme `digital`, the arms come to rest if Gamma g^2 h < Kp,
+    approximately.
     """
     delays_s = _delays_s(scenario)
     if scenario.scheme != "digital" or delays_s is None:
@@ -386,13 +414,17 @@ def _sampled(scenario: Scenario) -> StabilityCriterion | None:
         if law.kind is not Adaptive or max(delays_s) > h_s:
             return None
         excess.append(min(law.Kp) - max(law.Gamma[_GRAVITY]) * spec.arm.g_m_s2**2 * h_s)
-    source = "a rule for arms of about 1 m and no delay: the estimate of gravity against the lag of a tick"
+    source = (
+        "a rule for arms of about 1 m and no delay: "
+        "the estimate of gravity against the lag of a tick"
+    )
     return StabilityCriterion(r"$\Gamma g^2 h = K_p$", "Gamma g² h = Kp", source, min(excess))
 
 
 def _delays_s(scenario: Scenario) -> list[float] | None:
-    """Returns the delays of all links that carry a share, s; None where one is not constant or
-    loses.
+    """Returns the delays of all links that carry a share, in s.
+
+    None if a delay is not constant, or if a link loses messages.
     """
     delays_s = []
     for name in scenario.names:
@@ -400,12 +432,9 @@ def _delays_s(scenario: Scenario) -> list[float] | None:
             if scenario.dominance[name].get(peer, 0.0) == 0.0:
                 continue
             link: LinkBase = scenario.links[f"{peer}->{name}"]
-            if (
-                not isinstance(link, ConstantDelay | NoDelay)
-                or link.random
-                or link.loss
-                or link.outages_s
-            ):
+            if not isinstance(link, ConstantDelay | NoDelay):
+                return None
+            if link.random or link.loss or link.outages_s:
                 return None
             delays_s.append(max(link.moments().mean_ms, link.playout_ms) / 1e3)
     return delays_s
@@ -414,22 +443,23 @@ def _delays_s(scenario: Scenario) -> list[float] | None:
 ScenarioAt = Callable[[float, float], Scenario]
 """The scenario of a panel at (x, y)."""
 
-_PAIR = ((None, -1), (1, None))
-"""All places but the last along an axis, and all but the first."""
-_MOST_STEPS = 500
+_NEIGHBOURS = (slice(None, -1), slice(1, None))
+"""The grid points of an axis without the last, and without the first."""
+_MAX_ROOT_STEPS = 500
 LINEAR_ANALYSIS = "linear analysis"
 _ABOUT = "where the rightmost root of the loop, linearised, crosses the imaginary axis"
 
 
 class MapLine(NamedTuple):
-    """One line.
+    """One stability limit on a panel: the zero set of a quantity.
 
     Attributes:
-        label: what the legend calls it; `text`: the same for plain text.
-        about: where it is from.
-        spare: what is zero on it and positive on its stable side, shape (y, x), and goes
-            straight from one value of a column to the next; NaN where it is silent.
-        rank: how it is drawn: 0 is the first look, and so on; -1 is that of what was measured.
+        label: the name of the line, for a legend.
+        text: the same name as plain text.
+        about: the origin of the line.
+        spare: quantity that is zero on the line and positive on its stable side, shape (y, x);
+            linear between the grid points of a column, NaN where theory makes no statement.
+        rank: index of the line style; -1 is the style of measured lines.
     """
 
     label: str
@@ -440,23 +470,28 @@ class MapLine(NamedTuple):
 
     @property
     def there(self) -> bool:
-        """Whether it goes through the map: between four places that theory speaks of, some on
-        either side.
+        """True if the line crosses the map.
+
+        The line does if four neighbouring grid points all have a value, and only some of them
+        are on its stable side.
         """
-        corners = np.array([self.spare[a:b, c:d] for a, b in _PAIR for c, d in _PAIR])
-        stable = (corners > 0.0).sum(axis=0)
-        return bool(
-            (np.isfinite(corners).all(axis=0) & (stable > 0) & (stable < len(corners))).any()
+        corners = np.array(
+            [self.spare[rows, columns] for rows in _NEIGHBOURS for columns in _NEIGHBOURS]
         )
+        has_values = np.isfinite(corners).all(axis=0)
+        stable = (corners > 0.0).sum(axis=0)
+        crossed = has_values & (stable > 0) & (stable < len(corners))
+        return bool(crossed.any())
 
     def crossings(self, column: int, y: PlaneAxis) -> list[float]:
-        """Returns where it crosses a column, from below."""
-        at = y.values
+        """Returns the values of y at which the line crosses a column, in rising order."""
+        values = y.values
         spare = self.spare[:, column].tolist()
-        return [
-            at[n] + (at[n + 1] - at[n]) * spare[n] / (spare[n] - spare[n + 1])
-            for n in _changes(spare)
-        ]
+        crossings = list[float]()
+        for n in _find_sign_changes(spare):
+            step = values[n + 1] - values[n]
+            crossings.append(values[n] + step * spare[n] / (spare[n] - spare[n + 1]))
+        return crossings
 
 
 ZERO_EXPONENT = "exponent = 0"
@@ -464,7 +499,7 @@ _TWINS = "where a small push of the run neither grows nor dies away, straight fr
 
 
 def trace_zero_exponent(panel: MapPanel) -> MapLine | None:
-    """Returns the line on which the growth exponents of a panel are zero; None if it has none."""
+    """Returns the line of zero growth exponents of a panel; None if no line crosses the map."""
     line = MapLine(
         label=ZERO_EXPONENT,
         text=ZERO_EXPONENT,
@@ -476,24 +511,27 @@ def trace_zero_exponent(panel: MapPanel) -> MapLine | None:
 
 
 def trace_closed_form(at: ScenarioAt, x: PlaneAxis, y: PlaneAxis) -> MapLine | None:
-    """Returns the line of the condition in closed form; None where there is none, or not within
-    the map.
-    """
-    found = [[evaluate_criterion(at(right, up)) for up in y.values] for right in x.values]
-    first = next((one for column in found for one in column if one is not None), None)
+    """Returns the line of the closed-form criterion; None if no line crosses the map."""
+    first: StabilityCriterion | None = None
+    columns = []
+    for x_value in x.values:
+
+        def evaluate(y_value: float, x_value: float = x_value) -> StabilityCriterion | None:
+            return evaluate_criterion(at(x_value, y_value))
+
+        criteria = [evaluate(y_value) for y_value in y.values]
+        applicable = [criterion for criterion in criteria if criterion is not None]
+        if first is None and applicable:
+            first = applicable[0]
+        excess = [np.nan if criterion is None else criterion.excess for criterion in criteria]
+        edges: dict[int, float] = {}
+        for n in _find_sign_changes(excess):
+            edge = find_criterion_edge(evaluate, y.values[n], y.values[n + 1])
+            if edge is not None:
+                edges[n] = edge
+        columns.append(_straighten(y.values, excess, edges))
     if first is None:
         return None
-    columns = []
-    for right, column in zip(x.values, found, strict=True):
-        excess = [np.nan if one is None else one.excess for one in column]
-        edges: dict[int, float] = {}
-        for n in _changes(excess):
-            edge = find_criterion_edge(
-                lambda up, right=right: evaluate_criterion(at(right, up)),  # type: ignore[misc]
-                *y.values[n : n + 2],
-            )
-            edges |= {} if edge is None else {n: edge}
-        columns.append(_straighten(y.values, excess, edges))
     line = MapLine(
         label=first.symbol,
         text=first.text,
@@ -507,14 +545,22 @@ def trace_closed_form(at: ScenarioAt, x: PlaneAxis, y: PlaneAxis) -> MapLine | N
 def trace_linear_analysis(
     columns: Sequence[GrowthColumn], y: PlaneAxis
 ) -> tuple[MapLine | None, list[str]]:
-    """Returns the line of the linear analysis from its columns, and what is to be known of it."""
-    spare = [
-        _straighten(
-            y.values, [np.nan if np.isinf(s) else -s for s in one.growth_per_s], one.edges
-        )
-        for one in columns
-    ]
-    remarks = list(dict.fromkeys(remark for one in columns for remark in one.remarks))
+    """Returns the line of the linear analysis, and remarks on the analysis.
+
+    The line is None if it does not cross the map.
+
+    Args:
+        columns: the analysis of each column of the map.
+        y: the axis along the columns.
+    """
+    spare = []
+    all_remarks = list[str]()
+    for column in columns:
+        # a rate of -infinity means that nothing moves: the grid point is on neither side
+        decay_per_s = [np.nan if np.isinf(rate) else -rate for rate in column.growth_per_s]
+        spare.append(_straighten(y.values, decay_per_s, column.edges))
+        all_remarks.extend(column.remarks)
+    remarks = list(dict.fromkeys(all_remarks))
     line = MapLine(
         label=LINEAR_ANALYSIS,
         text=LINEAR_ANALYSIS,
@@ -525,30 +571,38 @@ def trace_linear_analysis(
     return line if line.there else None, remarks
 
 
-def _changes(spare: Sequence[float]) -> list[int]:
-    pairs = enumerate(pairwise(spare))
-    return [n for n, (a, b) in pairs if np.isfinite([a, b]).all() and (a > 0.0) != (b > 0.0)]
+def _find_sign_changes(values: Sequence[float]) -> list[int]:
+    """Returns each index n at which finite values n and n + 1 differ in being positive."""
+    indices = list[int]()
+    for n, (value, following) in enumerate(pairwise(values)):
+        finite = np.isfinite([value, following]).all()
+        if finite and (value > 0.0) != (following > 0.0):
+            indices.append(n)
+    return indices
 
 
 def _straighten(
     values: Sequence[float], spare: Sequence[float], edges: Mapping[int, float]
 ) -> Array:
-    """Returns what is zero at the edges of a column and goes straight between its values, shape
-    (y,).
+    """Returns a column of `MapLine.spare`: linear interpolation of it is zero at the edges.
 
-    Elsewhere it is `spare`, by which a line that rises steeply finds its way between two
-    columns. An edge that is not given is where `spare` itself, if it went straight, would be
-    zero.
+    Away from the edges the result is `spare`, which steers a steep line between two columns.
+
+    Args:
+        values: the values of the axis along the column, shape (y,).
+        spare: the quantity at these values, shape (y,).
+        edges: the edge in the interval from value n to value n + 1, by n; an edge that is
+            missing is the zero of the linear interpolation of `spare`.
     """
     straight: Array = np.where(np.isfinite(spare), spare, np.nan)
     straight[straight == 0.0] = -_ROUNDING
-    for n in _changes(spare):
-        low, high = values[n : n + 2]
-        share = (
-            (edges[n] - low) / (high - low)
-            if n in edges
-            else spare[n] / (spare[n] - spare[n + 1])
-        )
+    for n in _find_sign_changes(spare):
+        if n in edges:
+            low = values[n]
+            high = values[n + 1]
+            share = (edges[n] - low) / (high - low)
+        else:
+            share = spare[n] / (spare[n] - spare[n + 1])
         share = min(max(share, _ROUNDING), 1.0 - _ROUNDING)
         straight[n + 1] = straight[n] * (1.0 - 1.0 / share)
     return straight
@@ -557,23 +611,31 @@ def _straighten(
 def find_criterion_edge(
     criterion: Callable[[float], StabilityCriterion | None], low: float, high: float
 ) -> float | None:
-    """Returns where between two values a criterion is just met; None if nowhere, or if it may
-    not be asked.
+    """Returns the value at which a criterion is marginal, found by Brent's method.
 
-    The criterion of a value may refuse it by ScenarioError, as between whole numbers.
+    None if the criterion does not change between `low` and `high`, or does not apply to a value
+    between them.
+
+    Args:
+        criterion: evaluates the criterion at a value; may raise ScenarioError for a value that
+            is not valid, as between whole numbers.
+        low: the first value of the interval.
+        high: the last value of the interval.
     """
-    from scipy.optimize import brentq  # takes half a second, which most commands can do without
+    # imported late: SciPy costs half a second, and most commands do not need it
+    from scipy.optimize import brentq
 
     def excess(value: float) -> float:
-        found = criterion(value)
-        if found is None:
+        evaluated = criterion(value)
+        if evaluated is None:
             raise ScenarioError("no criterion covers it")
-        return found.excess
+        return evaluated.excess
 
+    tolerance = 1e-8 * (high - low)
     try:
         if (excess(low) > 0.0) == (excess(high) > 0.0):
             return None
-        return float(brentq(excess, low, high, xtol=1e-8 * (high - low), maxiter=_MOST_STEPS))
+        return float(brentq(excess, low, high, xtol=tolerance, maxiter=_MAX_ROOT_STEPS))
     except ScenarioError:
         return None
 
@@ -582,14 +644,14 @@ LAW_AXIS = "law"
 
 
 class StabilityMap(NamedTuple):
-    """A map.
+    """A stability map: measured results with the lines of theory.
 
     Attributes:
-        plane: what it shows.
-        lines: per panel the lines of theory.
-        remarks: on these lines.
-        commands: that make the map.
-        title: of its page.
+        plane: the results.
+        lines: the lines of each panel.
+        remarks: remarks on the lines.
+        commands: the commands that make the map.
+        title: the title of the map's page.
         fixed: the gains that were not swept, a text per law.
     """
 
@@ -610,67 +672,89 @@ def build_stability_map(
     linearly: bool = True,
     on: Workers = None,
 ) -> StabilityMap:
-    """Returns the map of results.
+    """Returns the stability map of a sweep's results.
+
+    Args:
+        results: the results of the sweep.
+        commands: the commands that make the map.
+        jobs: number of worker processes; None: as many as there are cores.
+        progress: called while the linear analysis runs.
+        linearly: True to add the line of the linear analysis.
+        on: the workers to use; None: processes of this computer.
 
     Raises:
-        UsageError: there is nothing to draw, or too many panels.
+        UsageError: there is nothing to draw, or there are too many panels.
     """
     plan = results.plan
-    keys = [*([LAW_AXIS] if len(plan.laws) > 1 else []), *(one.key for one in plan.axes)]
-    drawn = build_plane(results.rows, keys, plan.base)
-    title = plan.base.title or plan.base.name
-    fixed = tuple(describe_fixed_gains(plan))
-    if not drawn.y.key or len(drawn.y.values) < 2:
-        return StabilityMap(
-            plane=drawn,
-            lines=((),) * len(drawn.panels),
-            remarks=(),
-            commands=commands,
-            title=title,
-            fixed=fixed,
-        )
-    at = [panel_scenarios(plan, panel, drawn.x.key, drawn.y.key) for panel in drawn.panels]
-    lines = [
-        [trace_zero_exponent(panel), trace_closed_form(one, drawn.x, drawn.y)]
-        for panel, one in zip(drawn.panels, at, strict=True)
+    keys = [axis.key for axis in plan.axes]
+    if len(plan.laws) > 1:
+        keys.insert(0, LAW_AXIS)
+    plane = build_plane(results.rows, keys, plan.base)
+    stability_map = StabilityMap(
+        plane=plane,
+        lines=((),) * len(plane.panels),
+        remarks=(),
+        commands=commands,
+        title=plan.base.title or plan.base.name,
+        fixed=tuple(describe_fixed_gains(plan)),
+    )
+    x = plane.x
+    y = plane.y
+    if not y.key or len(y.values) < 2:
+        return stability_map
+    loaders = [panel_scenarios(plan, panel, x.key, y.key) for panel in plane.panels]
+    panel_lines = [
+        [trace_zero_exponent(panel), trace_closed_form(load, x, y)]
+        for panel, load in zip(plane.panels, loaders, strict=True)
     ]
     remarks: dict[str, None] = {}
     if linearly:
-        tasks = [(one, x, drawn.y) for one in at for x in drawn.x.values]
+        tasks = [(load, x_value, y) for load in loaders for x_value in x.values]
         with open_worker_pool(jobs, on, most=len(tasks)) as pool:
-            columns = iter(pool.map(_column, tasks, progress))
-        for some in lines:
-            line, why = trace_linear_analysis([next(columns) for _ in drawn.x.values], drawn.y)
-            some.append(line)
-            remarks |= dict.fromkeys(why)
-    kept = tuple(tuple(line for line in some if line is not None) for some in lines)
-    return StabilityMap(
-        plane=drawn,
-        lines=kept,
-        remarks=tuple(remarks),
-        commands=commands,
-        title=title,
-        fixed=fixed,
-    )
+            columns = iter(pool.map(_analyse_column, tasks, progress))
+        for lines in panel_lines:
+            panel_columns = [next(columns) for _ in x.values]
+            line, line_remarks = trace_linear_analysis(panel_columns, y)
+            lines.append(line)
+            remarks |= dict.fromkeys(line_remarks)
+    crossing = [tuple(line for line in lines if line is not None) for lines in panel_lines]
+    return stability_map._replace(lines=tuple(crossing), remarks=tuple(remarks))
 
 
-def _column(task: tuple[ScenarioAt, float, PlaneAxis]) -> GrowthColumn:
+def _analyse_column(task: tuple[ScenarioAt, float, PlaneAxis]) -> GrowthColumn:
+    """Returns the linear analysis of one column of a panel; any worker can do it."""
     at, x, y = task
-    return compute_growth_column([at(x, up) for up in y.values], y.key, y.values)
+    scenarios = [at(x, y_value) for y_value in y.values]
+    return compute_growth_column(scenarios, y.key, y.values)
 
 
 def panel_scenarios(plan: SweepPlan, panel: MapPanel, x: str, y: str) -> ScenarioAt:
-    """Returns what makes the scenario of any place of a panel along the keys x and y; it is
-    picklable.
+    """Returns the function that loads the scenario at any point of a panel; it is picklable.
+
+    Args:
+        plan: the sweep.
+        panel: the panel.
+        x: the key of the horizontal axis.
+        y: the key of the vertical axis.
     """
     settings = dict(panel.settings)
-    fixed = plan.laws.get(settings.pop(LAW_AXIS, next(iter(plan.laws), "")), ())
-    others = tuple(format_override(key, value) for key, value in settings.items())
-    return partial(load_place, plan, (*fixed, *others), x, y)
+    only_law = next(iter(plan.laws), "")
+    law_overrides = plan.laws.get(settings.pop(LAW_AXIS, only_law), ())
+    overrides = [format_override(key, value) for key, value in settings.items()]
+    return partial(load_place, plan, (*law_overrides, *overrides), x, y)
 
 
 def load_place(
-    plan: SweepPlan, fixed: Sequence[str], x: str, y: str, right: float, up: float
+    plan: SweepPlan, fixed: Sequence[str], x: str, y: str, x_value: float, y_value: float
 ) -> Scenario:
-    """Returns the scenario of a place, of a cell or between some, along the keys x and y."""
-    return plan.scenario(*fixed, format_override(x, right), format_override(y, up))
+    """Returns the scenario at a point of a panel, which may lie between its cells.
+
+    Args:
+        plan: the sweep.
+        fixed: the overrides that are common to the panel.
+        x: the key of the horizontal axis.
+        y: the key of the vertical axis.
+        x_value: the value of `x`.
+        y_value: the value of `y`.
+    """
+    return plan.scenario(*fixed, format_override(x, x_value), format_override(y, y_value))
