@@ -1,9 +1,9 @@
-"""Confirmation of a map over a real network: runs cells near its edges live and compares the
-classes.
+"""Confirms a map over a real network: runs cells near its edges live and compares classes.
 
-Invariant: a cell is confirmed if the log of the live session, classified over the same
-duration, has the class of virtual time. A failed session confirms nothing, unless it failed by
-diverging.
+Invariant:
+    - A cell is confirmed if the log of the live session, classified over the same duration, has
+      the class of virtual time.
+    - A failed session confirms nothing, unless it failed because an arm diverged.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -23,27 +23,27 @@ from .sweep_plan import label_axis
 from .sweep_results import ResultRow
 
 MAX_SESSION_S = 60.0
-"""A live session lasts as long as the cell ran: longer ones are passed over, s."""
-_BEYOND_S = 0.5
-"""A cell that diverged runs so much longer than it needed to, s: not to end on the very tick.
-"""
+"""Longest cell that is confirmed, in s: a live session lasts as long as the cell ran."""
+_EXTRA_S = 0.5
+"""Extra duration of a cell that diverged, in s, so that it does not end on the same tick."""
 
 
 SessionRunner = Callable[[Scenario, str], tuple[Path, Sequence[str]]]
-"""Runs a scenario over a network, called by a name; returns its log, which may be missing, and
-what went wrong, in order.
+"""Runs a scenario over a network under a name.
+
+Returns the path of its log, which may not exist, and the problems of the session, in order.
 """
 
 
 class ConfirmedCell(NamedTuple):
-    """One cell, run live.
+    """One cell that was run live.
 
     Attributes:
-        row: the cell, as its results have it.
-        virtual: its class in virtual time.
-        live: the class of the log; None where there is none.
-        text: what the log shows in numbers, or what went wrong.
-        log: where it lies; None where there is none.
+        row: the cell's run in the results of the sweep.
+        virtual: the class in virtual time.
+        live: the class of the log of the live session; None if the session failed.
+        text: the figures of the log, or the problems of the session.
+        log: the path of the log; None if the session left no log.
     """
 
     row: ResultRow
@@ -54,85 +54,85 @@ class ConfirmedCell(NamedTuple):
 
     @property
     def same(self) -> bool:
-        """Whether both verdicts are the same."""
+        """True if the classes of virtual time and of the live session agree."""
         return self.virtual is self.live
 
 
 def choose_cells_near_edges(
     rows: Sequence[ResultRow], axes: Sequence[str], count: int
 ) -> list[ResultRow]:
-    """Returns cells next to edges, as many on the stable side as on the other.
+    """Returns the cells nearest to edges, with the same target number on either side.
 
-    How far a cell is from an edge is counted in steps along one axis, to the first cell that
-    was decided the other way. The nearest are taken whose runs were short enough; of more than
-    are asked for, those that are spread most evenly along the edge.
+    The distance of a cell from an edge is the number of steps along one axis to the nearest
+    cell with the opposite verdict. Cells that ran longer than `MAX_SESSION_S` are left out. If
+    more than `count` cells are equally near, those spread most evenly along the edge are
+    chosen.
 
     Args:
         rows: one mapping per run, with its axes, "law", "seed", "cell", "verdict", "ran_s".
         axes: the keys of the axes.
-        count: how many on each side.
+        count: largest number of cells on each side.
 
     Raises:
-        UsageError: there is no edge, or no cell next to one that ran short enough.
+        UsageError: the results have no edge, or all cells on one side of it ran too long.
     """
     if count < 1:
         raise UsageError(f"--confirm takes a number of cells from 1 on, not {count}")
-    places = _index_rows(rows, axes)
-    away = _steps_away(places, len(axes))
-    if not away:
+    row_at = _index_rows(rows, axes)
+    distances = _compute_edge_distances(row_at, len(axes))
+    if not distances:
         raise UsageError(
             "no two cells along an axis were decided differently: there is no edge to confirm"
         )
     chosen = []
-    for side in (True, False):
-        brief = [
-            place
-            for place in away
-            if CellClass(places[place]["verdict"]).stable is side
-            and places[place]["ran_s"] <= MAX_SESSION_S
-        ]
-        if not brief:
-            word = "stable" if side else "other"
+    for stable in (True, False):
+        candidates = list[GridIndex]()
+        for index in distances:
+            row = row_at[index]
+            short = row["ran_s"] <= MAX_SESSION_S
+            if short and CellClass(row["verdict"]).stable is stable:
+                candidates.append(index)
+        if not candidates:
+            side = "stable" if stable else "other"
             raise UsageError(
-                f"every cell on the {word} side of an edge ran longer than {MAX_SESSION_S:g} s"
+                f"every cell on the {side} side of an edge ran longer than {MAX_SESSION_S:g} s"
             )
-        farthest = sorted(away[place] for place in brief)[min(count, len(brief)) - 1]
-        near = [place for place in brief if away[place] <= farthest]
-        near.sort(key=lambda place: (*map(str, place[2:]), *place[:2]))
+        limit = sorted(distances[index] for index in candidates)[:count][-1]
+        near = [index for index in candidates if distances[index] <= limit]
+        near.sort(key=lambda index: (*map(str, index[2:]), *index[:2]))
         spread = np.linspace(0, len(near) - 1, min(count, len(near))).round().astype(int)
-        chosen += [places[near[n]] for n in spread]
+        chosen += [row_at[near[n]] for n in spread]
     return chosen
 
 
 def confirm_cell(row: ResultRow, run: SessionRunner) -> ConfirmedCell:
-    """Runs a cell over a network and compares verdicts."""
+    """Runs a cell over a network and compares the classes.
+
+    Args:
+        row: the cell's run in the results of the sweep.
+        run: runs a scenario over a network.
+    """
     virtual = CellClass(row["verdict"])
-    extra_s = _BEYOND_S if row["diverged_s"] is not None else 0.0
-    lasts_s = min(row["ran_s"] + extra_s, MAX_SESSION_S + _BEYOND_S)
-    scenario = msgspec.structs.replace(parse_scenario(row["scenario"]), duration_s=lasts_s)
-    file, problems = run(scenario, f"cell-{row['cell']}")
-    log = file if file.exists() else None
+    extra_s = _EXTRA_S if row["diverged_s"] is not None else 0.0
+    duration_s = min(row["ran_s"] + extra_s, MAX_SESSION_S + _EXTRA_S)
+    scenario = msgspec.structs.replace(parse_scenario(row["scenario"]), duration_s=duration_s)
+    path, problems = run(scenario, f"cell-{row['cell']}")
+    log = path if path.exists() else None
     try:
-        found = classify_log_end(open_log(file))
+        end = classify_log_end(open_log(path))
     except LogError as error:
-        return ConfirmedCell(
-            row=row,
-            virtual=virtual,
-            live=None,
-            text="; ".join([*problems, str(error)]),
-            log=log,
-        )
-    if problems and found.behaviour is not EndBehaviour.DIVERGED:  # that ends all, as it should
-        return ConfirmedCell(
-            row=row, virtual=virtual, live=None, text="; ".join(problems), log=log
-        )
-    return ConfirmedCell(
-        row=row, virtual=virtual, live=classify_end(found), text=found.text, log=log
-    )
+        text = "; ".join([*problems, str(error)])
+        return ConfirmedCell(row, virtual, live=None, text=text, log=log)
+    # a divergence ends the session by design and reports a problem
+    if problems and end.behaviour is not EndBehaviour.DIVERGED:
+        return ConfirmedCell(row, virtual, live=None, text="; ".join(problems), log=log)
+    return ConfirmedCell(row, virtual, live=classify_end(end), text=end.text, log=log)
 
 
-def tabulate_confirmations(found: Sequence[ConfirmedCell], axes: Sequence[str]) -> TextTable:
-    """Returns a row per cell: where it lies, both verdicts, what the log shows and where it is."""
+def tabulate_confirmations(
+    confirmations: Sequence[ConfirmedCell], axes: Sequence[str]
+) -> TextTable:
+    """Returns a table with a row per cell: its values, both classes, figures and log."""
     heads = (
         "cell",
         *map(label_axis, axes),
@@ -144,51 +144,59 @@ def tabulate_confirmations(found: Sequence[ConfirmedCell], axes: Sequence[str]) 
         "log",
     )
     rows = []
-    for one in found:
-        values = [one.row[key] for key in axes]
-        place = [value if isinstance(value, str) else f"{value:g}" for value in values]
-        live = "none" if one.live is None else one.live.value
-        same = "same" if one.same else "DIFFERS"
-        where = "none" if one.log is None else str(one.log)
-        cell = str(one.row["cell"])
-        seed = str(one.row["seed"])
-        rows.append((cell, *place, seed, one.virtual.value, live, same, one.text, where))
+    for confirmed in confirmations:
+        row = confirmed.row
+        values = [row[key] for key in axes]
+        texts = [value if isinstance(value, str) else f"{value:g}" for value in values]
+        virtual = confirmed.virtual.value
+        live = "none" if confirmed.live is None else confirmed.live.value
+        agreement = "same" if confirmed.same else "DIFFERS"
+        log = "none" if confirmed.log is None else str(confirmed.log)
+        cell = str(row["cell"])
+        seed = str(row["seed"])
+        rows.append((cell, *texts, seed, virtual, live, agreement, confirmed.text, log))
     return TextTable(heads, rows)
 
 
 GridIndex = tuple[Any, ...]
+"""Position of a run in the grid: its index on each axis, then its law and its seed."""
 
 
 def _index_rows(rows: Sequence[ResultRow], axes: Sequence[str]) -> dict[GridIndex, ResultRow]:
-    values = [
-        sorted({row[key] for row in rows}, key=lambda one: (isinstance(one, str), one))
-        for key in axes
-    ]
-    numbers = [{value: n for n, value in enumerate(some)} for some in values]
+    """Returns the rows by their position in the grid; numbers precede texts on an axis."""
+    ranks: dict[str, dict[Any, int]] = {}
+    for key in axes:
+        values = {row[key] for row in rows}
+        ordered = sorted(values, key=lambda value: (isinstance(value, str), value))
+        ranks[key] = {value: rank for rank, value in enumerate(ordered)}
+    row_at: dict[GridIndex, ResultRow] = {}
+    for row in rows:
+        position = [ranks[key][row[key]] for key in axes]
+        row_at[*position, row.get("law"), row.get("seed")] = row
+    return row_at
 
-    def index(row: ResultRow) -> GridIndex:
-        places = (number[row[key]] for key, number in zip(axes, numbers, strict=True))
-        return (*places, row.get("law"), row.get("seed"))
 
-    return {index(row): row for row in rows}
+def _compute_edge_distances(
+    row_at: Mapping[GridIndex, ResultRow], axis_count: int
+) -> dict[GridIndex, int]:
+    """Returns the distance of decided runs from the nearest run with the opposite verdict.
 
-
-def _steps_away(places: Mapping[GridIndex, ResultRow], axes: int) -> dict[GridIndex, int]:
-    """Returns of decided places how many steps along an axis the first one is that was decided
-    otherwise.
+    Distances are counted in steps along one axis, the other axes, the law and the seed being
+    equal. Runs without an opposite verdict on any of their lines are left out.
     """
-    stable = {place: CellClass(row["verdict"]).stable for place, row in places.items()}
+    stable = {index: CellClass(row["verdict"]).stable for index, row in row_at.items()}
     lines: dict[GridIndex, list[GridIndex]] = {}
-    for place, side in stable.items():
-        if side is not None:
-            for n in range(axes):
-                lines.setdefault((n, *place[:n], *place[n + 1 :]), []).append(place)
-    away: dict[GridIndex, int] = {}
-    for (n, *_), line in lines.items():
-        for place in line:
-            others = [
-                abs(one[n] - place[n]) for one in line if stable[one] is not stable[place]
-            ]
-            if others:
-                away[place] = min(min(others), away.get(place, min(others)))
-    return away
+    for index, verdict in stable.items():
+        if verdict is None:
+            continue
+        for axis in range(axis_count):
+            line = (axis, *index[:axis], *index[axis + 1 :])
+            lines.setdefault(line, []).append(index)
+    distances: dict[GridIndex, int] = {}
+    for (axis, *_), indices in lines.items():
+        for index in indices:
+            opposite = [other for other in indices if stable[other] is not stable[index]]
+            if opposite:
+                distance = min(abs(other[axis] - index[axis]) for other in opposite)
+                distances[index] = min(distance, distances.get(index, distance))
+    return distances

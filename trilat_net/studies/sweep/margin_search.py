@@ -1,11 +1,13 @@
-"""Stability margins.
+"""Searches stability margins: the edges of stability along one key.
 
-Per grid point the edges along one key by a scan and bisection, with the edges of theory, as a
-table, a Markdown page and plain values.
+Each grid point is scanned along the key, and each edge narrowed by bisection. The edges are
+reported beside those of theory, as a table, a Markdown page and plain values.
 
-Invariant: an edge lies between two values that were run, one stable and one not. Undecided
-values widen it and count for neither side; every edge that the scan sees is kept. The margin of
-a grid point is a function of its scenario, its seed and the range.
+Invariant:
+    - An edge lies between two values that were run, one stable and one not.
+    - Undecided values widen an edge and count for neither side.
+    - All edges that the scan detects are kept.
+    - The margin of a grid point is a function of its scenario, its seed and the range.
 """
 
 import json
@@ -38,24 +40,24 @@ from .sweep_plan import (
 )
 
 SCAN_POINTS = 9
-"""Values of the scan: islands that are wider than an eighth of the range are seen."""
+"""Number of values of the scan: it detects islands wider than an eighth of the range."""
 MARGIN_TOLERANCE = 0.005
-_MOST = 60
+"""Default largest width of an edge, as a share of its value."""
+_MAX_HALVINGS = 60
 
 StabilityTest = Callable[[float], bool | None]
-"""Returns True if a run at a value is stable, None if undecided."""
+"""Returns True if the run at a value is stable, False if it is not, None if it is undecided."""
 
 
 class KeyMargin(NamedTuple):
-    """Edges along one key.
+    """The edges of stability along one key.
 
     Attributes:
-        spans: the edges, from below; none where nothing changes, more than one where the scan
-            saw islands.
-        stable: where there is no edge, whether all that was decided is stable; None where
-            nothing was.
-        undecided: how many values stayed undecided.
-        runs: how many values were run.
+        spans: the edges, in rising order: several if the scan detected islands.
+        stable: without edges, True if the decided values are stable, False if they are not;
+            None with edges, or if no value was decided.
+        undecided: number of undecided values.
+        runs: number of values that were run.
     """
 
     spans: tuple[StableInterval, ...]
@@ -77,59 +79,66 @@ def search_key_margin(
     Args:
         stable: runs and classifies one value.
         low: the first value of the range.
-        high: the last one.
-        tolerance: how wide an edge may be, over its value.
-        whole: whether only whole numbers can be run.
+        high: the last value of the range.
+        tolerance: largest width of an edge, as a share of its value.
+        whole: True if only whole numbers can be run.
     """
-    known: dict[float, bool | None] = {}
+    results: dict[float, bool | None] = {}
 
-    def ask(value: float) -> bool | None:
-        if value not in known:
-            known[value] = stable(value)
-        return known[value]
+    def classify(value: float) -> bool | None:
+        if value not in results:
+            results[value] = stable(value)
+        return results[value]
 
     scan = np.linspace(low, high, SCAN_POINTS)
-    values = list(dict.fromkeys((np.round(scan) if whole else scan).tolist()))
-    decided = [value for value in values if ask(value) is not None]
-    spans = tuple(
-        _narrowed(ask=ask, low=a, high=b, tolerance=tolerance, whole=whole)
-        for a, b in pairwise(decided)
-        if known[a] != known[b]
-    )
-    everywhere = known[decided[0]] if decided and not spans else None
-    return KeyMargin(spans, everywhere, sum(one is None for one in known.values()), len(known))
+    if whole:
+        scan = np.round(scan)
+    values = list(dict.fromkeys(scan.tolist()))
+    decided = [value for value in values if classify(value) is not None]
+    spans = list[StableInterval]()
+    for below, above in pairwise(decided):
+        if results[below] != results[above]:
+            spans.append(_narrow_edge(classify, below, above, tolerance=tolerance, whole=whole))
+    stable_everywhere = results[decided[0]] if decided and not spans else None
+    undecided = sum(result is None for result in results.values())
+    return KeyMargin(tuple(spans), stable_everywhere, undecided, len(results))
 
 
-def _narrowed(
-    ask: StabilityTest, low: float, high: float, tolerance: float, whole: bool
+def _narrow_edge(
+    classify: StabilityTest, low: float, high: float, *, tolerance: float, whole: bool
 ) -> StableInterval:
-    first = ask(low)
-    last = ask(high)
-    low, above = _halved(
-        holds=lambda value: ask(value) is first,
-        low=low,
-        high=high,
-        tolerance=tolerance,
-        whole=whole,
-    )
-    sharp = ask(above) is not None
+    """Returns the edge between two values that were decided differently."""
+    low_stable = classify(low)
+    high_stable = classify(high)
+
+    def is_low_side(value: float) -> bool:
+        return classify(value) is low_stable
+
+    def is_not_high_side(value: float) -> bool:
+        return classify(value) is not high_stable
+
+    low, above = _bisect(is_low_side, low, high, tolerance=tolerance, whole=whole)
+    sharp = classify(above) is not None
     if sharp:
         high = above
-    else:
-        _, high = _halved(
-            holds=lambda value: ask(value) is not last,
-            low=above,
-            high=high,
-            tolerance=tolerance,
-            whole=whole,
-        )
-    return StableInterval(low, high, first is True, sharp)
+    else:  # an undecided zone: its upper end is searched by itself
+        _, high = _bisect(is_not_high_side, above, high, tolerance=tolerance, whole=whole)
+    return StableInterval(low, high, low_stable is True, sharp)
 
 
-def _halved(
-    holds: Callable[[float], bool], low: float, high: float, tolerance: float, whole: bool
+def _bisect(
+    holds: Callable[[float], bool], low: float, high: float, *, tolerance: float, whole: bool
 ) -> tuple[float, float]:
-    for _ in range(_MOST):
+    """Returns a narrow interval from a value where a condition holds to one where it does not.
+
+    Args:
+        holds: the condition; it holds at `low` and not at `high`.
+        low: the first value.
+        high: the last value.
+        tolerance: largest width of the interval, as a share of its larger end.
+        whole: True to bisect whole numbers, down to a width of 1.
+    """
+    for _ in range(_MAX_HALVINGS):
         if high - low <= (1.0 if whole else tolerance * max(abs(low), abs(high))):
             break
         middle = 0.5 * (low + high)
@@ -142,7 +151,14 @@ def _halved(
 
 
 class SearchRange(NamedTuple):
-    """Where edges are looked for; `tolerance`: how wide an edge may be, over its value."""
+    """The range of a search for edges.
+
+    Attributes:
+        key: the scenario key along which edges are searched.
+        low: the first value.
+        high: the last value.
+        tolerance: largest width of an edge, as a share of its value.
+    """
 
     key: str
     low: float
@@ -151,7 +167,7 @@ class SearchRange(NamedTuple):
 
 
 class MarginItem(NamedTuple):
-    """A grid point to be searched: picklable, and all that a process needs."""
+    """Task of a worker: the search at one grid point. Picklable and self-contained."""
 
     plan: SweepPlan
     cell: SweepCell
@@ -159,20 +175,20 @@ class MarginItem(NamedTuple):
     range: SearchRange
 
     def __str__(self) -> str:
-        return f"the search at {', '.join(self.cell.overrides) or 'the scenario'}, seed {self.seed}"
+        position = ", ".join(self.cell.overrides) or "the scenario"
+        return f"the search at {position}, seed {self.seed}"
 
 
 class GridPointMargin(NamedTuple):
-    """A grid point that was searched.
+    """The edges of stability at one grid point.
 
     Attributes:
-        cell: the grid point; its values lie along the axes.
-        seed: of its runs.
-        margin: what the runs show.
-        linear: where the linear analysis has edges in the range, from below.
-        remark: what is to be known of those, or "".
-        closed: where the criterion in closed form has its edge; None where it has none in the
-            range.
+        cell: the grid point, with its values along the axes.
+        seed: the seed of its runs.
+        margin: the edges from the runs.
+        linear: the edges of the linear analysis in the range, in rising order.
+        remark: a remark on the linear analysis, or "".
+        closed: the edge of the closed-form criterion in the range, or None.
     """
 
     cell: SweepCell
@@ -184,15 +200,15 @@ class GridPointMargin(NamedTuple):
 
 
 def parse_search_range(text: str, tolerance: float = MARGIN_TOLERANCE) -> SearchRange:
-    """Returns the range that a text such as "control.d=0.2:3" names.
+    """Returns the range that a text such as "control.d=0.2:3" describes.
 
     Raises:
-        UsageError: it names none.
+        UsageError: the text describes no range, or the tolerance is not within (0, 1).
     """
     key, _, ends = text.partition("=")
     low, colon, high = ends.partition(":")
     try:
-        found = SearchRange(key.strip(), float(low), float(high), tolerance)
+        search_range = SearchRange(key.strip(), float(low), float(high), tolerance)
     except ValueError:
         raise UsageError(
             f"--margin reads KEY=FROM:TO, as in control.d=0.2:3, not {text!r}"
@@ -201,15 +217,21 @@ def parse_search_range(text: str, tolerance: float = MARGIN_TOLERANCE) -> Search
         raise UsageError(
             f"--tolerance is a share of the edge's value, as in 0.005, not {tolerance:g}"
         )
-    if not colon or not found.key or not -float("inf") < found.low < found.high < float("inf"):
+    rising = -float("inf") < search_range.low < search_range.high < float("inf")
+    if not colon or not search_range.key or not rising:
         form = "KEY=FROM:TO with FROM below TO, as in control.d=0.2:3"
         raise UsageError(f"--margin reads {form}, not {text!r}")
-    return found
+    return search_range
 
 
-def format_range_axis(found: SearchRange) -> str:
-    """Returns a range as an axis of its two ends: a plan with it has been checked at both."""
-    return f"{found.key}={format_override_value(found.low)},{format_override_value(found.high)}"
+def format_range_axis(search_range: SearchRange) -> str:
+    """Returns the description of an axis with the two ends of a range.
+
+    Planning a sweep with this axis checks the scenario at both ends.
+    """
+    low = format_override_value(search_range.low)
+    high = format_override_value(search_range.high)
+    return f"{search_range.key}={low},{high}"
 
 
 def search_margins(
@@ -219,14 +241,21 @@ def search_margins(
     progress: Progress = ignore_progress,
     on: Workers = None,
 ) -> list[GridPointMargin]:
-    """Returns the edges of every place of a plan and every seed.
+    """Returns the edges at each grid point of a plan and each seed.
+
+    Args:
+        plan: the plan; its last axis has the two ends of the range.
+        within: the range.
+        jobs: number of worker processes; None: as many as there are cores.
+        progress: called with the number of finished and of all searches.
+        on: the workers to use; None: processes of this computer.
 
     Raises:
-        ScenarioError: some value makes no scenario.
-        RunFailed: a process was ended.
+        ScenarioError: the scenario is not valid at a value of the range.
+        RunFailed: a worker process ended.
     """
     searches = []
-    for number in range(0, plan.cells, 2):  # the last axis has the two ends of the range
+    for number in range(0, plan.cells, 2):  # each grid point has two cells, one per end
         end = plan.cell(number)
         cell = end._replace(values=end.values[:-1], overrides=end.overrides[:-1])
         seeds = plan.seeds if plan.scenario(*end.overrides).random else plan.seeds[:1]
@@ -237,30 +266,30 @@ def search_margins(
 
 
 def search_margin_task(task: MarginItem) -> GridPointMargin:
-    """Searches one grid point, and asks theory for the same.
+    """Returns the edges at one grid point, from runs and from theory.
 
     Raises:
-        ScenarioError: some value makes no scenario.
+        ScenarioError: the scenario is not valid at a value of the range.
     """
     key, low, high, tolerance = task.range
 
-    def at(value: float) -> Scenario:
-        more = format_override(key, value), f"seed={task.seed}"
-        return task.plan.scenario(*task.cell.overrides, *more)
+    def load(value: float) -> Scenario:
+        overrides = (*task.cell.overrides, format_override(key, value), f"seed={task.seed}")
+        return task.plan.scenario(*overrides)
 
     def stable(value: float) -> bool | None:
-        scenario = at(value)
+        scenario = load(value)
         longest_s = max(task.plan.longest_s, scenario.duration_s)
         return sweep_cell.classify_cell(scenario.text, longest_s).verdict.stable
 
+    whole = False
     try:
-        at(low + (high - low) / 3.0**0.5)
-        whole = False
+        load(low + (high - low) / 3.0**0.5)  # not a whole number
     except ScenarioError:  # the key takes whole numbers only
         whole = True
     margin = search_key_margin(stable, low, high, tolerance, whole=whole)
-    closed = find_criterion_edge(lambda value: evaluate_criterion(at(value)), low, high)
-    linear, remark = find_root_crossings(at(high), key, low, high)
+    closed = find_criterion_edge(lambda value: evaluate_criterion(load(value)), low, high)
+    linear, remark = find_root_crossings(load(high), key, low, high)
     return GridPointMargin(
         cell=task.cell,
         seed=task.seed,
@@ -278,7 +307,13 @@ def _find_nearest(value: float, edges: Sequence[float]) -> float | None:
 
 @dataclass(frozen=True, repr=False)
 class SweepMargins(Result):
-    """The edges of every place of a plan and every seed, in a range along one key."""
+    """The edges along one key, at each grid point of a plan and for each seed.
+
+    Attributes:
+        plan: the plan; its last axis has the two ends of the range.
+        within: the range of the search.
+        found: the edges of each grid point and seed.
+    """
 
     plan: SweepPlan
     within: SearchRange
@@ -286,52 +321,56 @@ class SweepMargins(Result):
 
     @property
     def command(self) -> str:
-        """The command that searches them."""
-        key, *numbers = self.within
-        low, high, tolerance = map(format_override_value, numbers)
-        words = ["--margin", f"{key}={low}:{high}", "--tolerance", tolerance]
-        return build_sweep_command(self.plan._replace(axes=self.plan.axes[:-1]), *words)
+        """The command that repeats the search."""
+        low = format_override_value(self.within.low)
+        high = format_override_value(self.within.high)
+        tolerance = format_override_value(self.within.tolerance)
+        search_range = f"{self.within.key}={low}:{high}"
+        plan = self.plan._replace(axes=self.plan.axes[:-1])
+        return build_sweep_command(plan, "--margin", search_range, "--tolerance", tolerance)
 
     def table(self) -> TextTable:
-        """Returns a row per edge, or per place that has none."""
+        """Returns a table with a row per edge, and a row per grid point without edges."""
         plan = self.plan
-        axes = self.plan.axes[:-1]
-        seeds = len({one.seed for one in self.found}) > 1
-        closed = any(one.closed is not None for one in self.found)
-        heads = [
-            *(label_axis(axis.key, plan.base) for axis in axes),
-            *(["law"] if plan.laws else []),
-        ]
-        heads += [
-            *(["seed"] if seeds else []),
-            f"edge of {label_axis(self.within.key, plan.base)}",
-        ]
+        several_seeds = len({point.seed for point in self.found}) > 1
+        has_closed_form = any(point.closed is not None for point in self.found)
+        heads = [label_axis(axis.key, plan.base) for axis in plan.axes[:-1]]
+        if plan.laws:
+            heads.append("law")
+        if several_seeds:
+            heads.append("seed")
+        heads.append(f"edge of {label_axis(self.within.key, plan.base)}")
         heads += ["stable is", "linear", "difference"]
-        heads += [*(["closed form", "difference"] if closed else []), "runs"]
+        if has_closed_form:
+            heads += ["closed form", "difference"]
+        heads.append("runs")
         rows = []
-        for one in self.found:
-            place = [
-                value if isinstance(value, str) else f"{value:g}" for value in one.cell.values
+        for point in self.found:
+            position = [
+                value if isinstance(value, str) else f"{value:g}" for value in point.cell.values
             ]
-            place += [
-                *([one.cell.law] if plan.laws else []),
-                *([str(one.seed)] if seeds else []),
-            ]
-            for span in one.margin.spans or (None,):
-                near = self.within.low if span is None else span.middle
-                linear = _find_nearest(near, one.linear)
-                cells = [*place, *_edge_cells(one.margin, span), *_theory_cells(span, linear)]
-                cells += _theory_cells(span, one.closed) if closed else []
-                rows.append((*cells, str(one.margin.runs)))
+            if plan.laws:
+                position.append(point.cell.law)
+            if several_seeds:
+                position.append(str(point.seed))
+            for span in point.margin.spans or (None,):
+                value = self.within.low if span is None else span.middle
+                linear = _find_nearest(value, point.linear)
+                row = [*position, *_format_edge(point.margin, span)]
+                row += _format_theory(span, linear)
+                if has_closed_form:
+                    row += _format_theory(span, point.closed)
+                row.append(str(point.margin.runs))
+                rows.append(tuple(row))
         return TextTable(tuple(heads), rows)
 
     def blocks(self) -> Iterator[TextTable]:
-        """Yields its text."""
+        """Yields the table of the edges."""
         yield self.table()
 
     def headline(self) -> str:
-        """Returns how many edges were found where."""
-        edges = sum(len(one.margin.spans) for one in self.found)
+        """Returns the number of edges and the range of the search, as a sentence."""
+        edges = sum(len(point.margin.spans) for point in self.found)
         low = self.within.low
         high = self.within.high
         return (
@@ -348,37 +387,41 @@ class SweepMargins(Result):
             **self.within._asdict(),
             "places": [
                 {
-                    **dict(zip(keys, one.cell.values, strict=True)),
-                    **({"law": one.cell.law} if self.plan.laws else {}),
-                    "seed": one.seed,
-                    "edges": [span._asdict() for span in one.margin.spans],
-                    "stable_everywhere": one.margin.stable,
-                    "undecided": one.margin.undecided,
-                    "runs": one.margin.runs,
-                    "linear": list(one.linear),
-                    "closed_form": one.closed,
-                    "remark": one.remark,
+                    **dict(zip(keys, point.cell.values, strict=True)),
+                    **({"law": point.cell.law} if self.plan.laws else {}),
+                    "seed": point.seed,
+                    "edges": [span._asdict() for span in point.margin.spans],
+                    "stable_everywhere": point.margin.stable,
+                    "undecided": point.margin.undecided,
+                    "runs": point.margin.runs,
+                    "linear": list(point.linear),
+                    "closed_form": point.closed,
+                    "remark": point.remark,
                 }
-                for one in self.found
+                for point in self.found
             ],
         }
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a row per edge, or per place that has none."""
-        return [
-            {**{key: one for key, one in place.items() if not isinstance(one, list)}, **edge}
-            for place in self.to_dict()["places"]
-            for edge in place["edges"] or [{}]
-        ]
+        """Returns a row per edge, and a row per grid point without edges."""
+        rows = list[dict[str, Any]]()
+        for point in self.to_dict()["places"]:
+            columns = {
+                key: value for key, value in point.items() if not isinstance(value, list)
+            }
+            edges = point["edges"] or [{}]
+            rows.extend({**columns, **edge} for edge in edges)
+        return rows
 
     def page(self) -> str:
-        """Returns them as a page in Markdown."""
+        """Returns the margins as a page in Markdown."""
         base = self.plan.base
         parts = [f"# {base.title or base.name}: margin", f"```sh\n{self.command}\n```"]
         parts.append(self.table().markdown())
-        remarks = dict.fromkeys(one.remark for one in self.found if one.remark)
+        remarks = dict.fromkeys(point.remark for point in self.found if point.remark)
         parts += [f"{remark[0].upper()}{remark[1:]}." for remark in remarks]
-        if islands := sum(len(one.margin.spans) > 1 for one in self.found):
+        islands = sum(len(point.margin.spans) > 1 for point in self.found)
+        if islands:
             where = f"in {islands} of {count_nouns(len(self.found), 'place')}"
             parts.append(f"Stability is not monotone {where}: they have several edges.")
         fixed = "; ".join(describe_fixed_gains(self.plan))
@@ -388,26 +431,31 @@ class SweepMargins(Result):
 
     def write(self, folder: Path) -> list[Path]:
         """Writes margin.json and margin.md, and returns their paths."""
-        paths = [folder / "margin.json", folder / "margin.md"]
-        write_whole(paths[0], json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n")
-        write_whole(paths[1], self.page())
-        return paths
+        json_path = folder / "margin.json"
+        page_path = folder / "margin.md"
+        write_whole(json_path, json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n")
+        write_whole(page_path, self.page())
+        return [json_path, page_path]
 
 
-def _edge_cells(margin: KeyMargin, span: StableInterval | None) -> list[str]:
+def _format_edge(margin: KeyMargin, span: StableInterval | None) -> list[str]:
+    """Returns the table cells of an edge and of its stable side."""
     if span is None:
-        words = {
+        texts = {
             True: "none: all stable",
             False: "none: nothing stable",
             None: "none: nothing decided",
         }
-        return [words[margin.stable], "-"]
-    digits, blur = (5, "") if span.sharp else (4, " (undecided between)")
-    place = f"{span.low:.{digits}g} to {span.high:.{digits}g}{blur}"
-    return [place, "below" if span.stable_below else "above"]
+        return [texts[margin.stable], "-"]
+    if span.sharp:
+        interval = f"{span.low:.5g} to {span.high:.5g}"
+    else:
+        interval = f"{span.low:.4g} to {span.high:.4g} (undecided between)"
+    return [interval, "below" if span.stable_below else "above"]
 
 
-def _theory_cells(span: StableInterval | None, value: float | None) -> list[str]:
+def _format_theory(span: StableInterval | None, value: float | None) -> list[str]:
+    """Returns the table cells of an edge of theory and of its relative difference."""
     if value is None:
         return ["-", "-"]
     difference = "-" if span is None else f"{100.0 * (value / span.middle - 1.0):+.2f} %"
