@@ -1,13 +1,13 @@
-"""The results of a sweep: its runs as a CSV table, grid points over seeds, and both in words.
+"""Holds the results of a sweep: a CSV table of runs, the grid points, and a summary of both.
 
 Invariant:
-- Results are a function of the plan, and their bytes of the runs alone.
-- Reading the table gives every number back bit for bit.
-- Each row's scenario, run again, reproduces the row.
-- A grid point counts every run once; its stable share is taken over the decided runs and
-  carries a 95 % Wilson interval within [0, 1].
-- Every command shown works: a reproduced run has the scenario hash of its row; if the swept
-  scenario has changed since, the row's own text is written out and named instead.
+    - Results are a function of the plan; the bytes of their files depend on the runs alone.
+    - Reading the table restores all numbers bit for bit.
+    - The scenario of a row, run again, reproduces the row.
+    - A grid point counts each run once. Its stable share is taken over the decided runs and
+      has a 95 % Wilson interval within [0, 1].
+    - All commands that are shown work: a reproduced run has the scenario hash of its row. If
+      the swept scenario has changed since, the command runs a file with the row's scenario.
 """
 
 import csv
@@ -33,25 +33,30 @@ from .sweep_plan import SweepPlan, plan_from_json
 
 RESULTS_FILE = "results.csv"
 PLAN_FILE = "plan.json"
-"""The request of a sweep, in its folder: what `results.csv` is read with."""
+"""The plan of a sweep in its folder, which is needed to read `results.csv`."""
 
 
 ResultRow = Mapping[str, Any]
-"""A run: `cell`, a value per axis under its key, `law`, `seed`, `random`, the metrics that were
-asked for under their keys, every field of `CellResult`, `scenario_sha256`, `command` and
-`scenario`, its canonical text. Verdict and motion are their words.
+"""A run: `cell`, the value of each axis by key, `law`, `seed`, `random`, the further metrics by
+key, all fields of `CellResult`, `scenario_sha256`, `command` and `scenario`.
+Verdict and motion are texts; `scenario` is the canonical text of the scenario.
 """
 
 
 @dataclass(frozen=True, repr=False)
 class SweepResults(Result):
-    """Results of a sweep: its runs by cell, and then in the order of the seeds."""
+    """Results of a sweep.
+
+    Attributes:
+        plan: the sweep.
+        rows: a row per run, ordered by cell and then by seed.
+    """
 
     plan: SweepPlan
     rows: Sequence[ResultRow]
 
     def blocks(self) -> Iterator[str]:
-        """Yields its text."""
+        """Yields the lines of the plan and of the summary."""
         yield from (*describe_sweep_plan(self.plan), *summarize_sweep(self))
 
     def to_rows(self) -> Sequence[ResultRow]:
@@ -66,31 +71,32 @@ class SweepResults(Result):
         """Returns the runs of a cell, one per seed.
 
         Raises:
-            UsageError: there is no such cell.
+            UsageError: the sweep has no cell with this number.
         """
         self.plan.cell(number)
         return [row for row in self.rows if row["cell"] == number]
 
     def outcome(self, row: ResultRow) -> CellResult:
         """Returns the result of a run."""
-        # whose defaults stand for what older files lack
+        # the defaults of CellResult fill in fields that older files lack
         return msgspec.convert(row, CellResult)
 
 
 def build_result_rows(plan: SweepPlan, entries: Sequence[CellRun]) -> list[ResultRow]:
-    """Returns the rows that runs make, in their order."""
-    order = {seed: n for n, seed in enumerate(plan.seeds)}
-    seeds = Counter(entry.cell for entry in entries)
+    """Returns the rows of finished runs, ordered by cell and then by seed."""
+    seed_rank = {seed: rank for rank, seed in enumerate(plan.seeds)}
+    runs_of_cell = Counter(entry.cell for entry in entries)
     rows: list[ResultRow] = []
-    for entry in sorted(entries, key=lambda one: (one.cell, order[one.seed])):
+    for entry in sorted(entries, key=lambda entry: (entry.cell, seed_rank[entry.seed])):
         cell = plan.cell(entry.cell)
-        which = "" if seeds[entry.cell] == 1 else f"-seed-{entry.seed}"
-        lasts_s = reproduction_duration_s(plan, entry.outcome)
-        log = f"cell-{cell.number}{which}.mcap"
+        suffix = "" if runs_of_cell[entry.cell] == 1 else f"-seed-{entry.seed}"
+        duration_s = reproduction_duration_s(plan, entry.outcome)
+        axis_keys = [axis.key for axis in plan.axes]
+        log = f"cell-{cell.number}{suffix}.mcap"
         rows.append(
             {
                 "cell": cell.number,
-                **{one.key: value for one, value in zip(plan.axes, cell.values, strict=True)},
+                **dict(zip(axis_keys, cell.values, strict=True)),
                 "law": entry.law,
                 "seed": entry.seed,
                 "random": entry.random,
@@ -101,7 +107,7 @@ def build_result_rows(plan: SweepPlan, entries: Sequence[CellRun]) -> list[Resul
                     plan=plan,
                     overrides=cell.overrides,
                     seed=entry.seed,
-                    duration_s=lasts_s,
+                    duration_s=duration_s,
                     log=log,
                 ),
                 "scenario": apply_diff(entry.scenario, plan.base.text),
@@ -113,19 +119,20 @@ def build_result_rows(plan: SweepPlan, entries: Sequence[CellRun]) -> list[Resul
 def build_sim_command(
     plan: SweepPlan, overrides: Sequence[str], seed: int, duration_s: float, log: str
 ) -> str:
-    """Returns the command that makes a log of a run."""
-    others = [
-        text
-        for text in (*plan.overrides, *overrides)
-        if text.partition("=")[0].strip() not in ("seed", "duration_s")
-    ]
-    run = ["--seed", str(seed), "--duration", f"{duration_s:.12g}", "-o", log]
-    return format_command("sim", plan.written.label, *set_options(others), *run)
+    """Returns the command that records the log of a run."""
+    kept_overrides = list[str]()
+    for override in (*plan.overrides, *overrides):
+        key = override.partition("=")[0].strip()
+        if key not in ("seed", "duration_s"):  # these have options of their own
+            kept_overrides.append(override)
+    options = ["--seed", str(seed), "--duration", f"{duration_s:.12g}", "-o", log]
+    return format_command("sim", plan.written.label, *set_options(kept_overrides), *options)
 
 
 def reproduction_duration_s(plan: SweepPlan, outcome: CellResult) -> float:
-    """Returns a duration that makes a run again: as long as it ran, or until it diverges by
-    itself, s.
+    """Returns a duration that reproduces a run, in s.
+
+    A run that diverged gets the duration it was planned for, and ends by diverging again.
     """
     if outcome.diverged_s is None:
         return outcome.ran_s
@@ -133,19 +140,17 @@ def reproduction_duration_s(plan: SweepPlan, outcome: CellResult) -> float:
 
 
 _SCENARIO_COLUMN = "scenario_changes"
-"""The column of the table that holds a row's scenario: as JSON, by what it differs from the
-swept one.
-"""
+"""Column of the table with the row's scenario, as a JSON diff against the swept scenario."""
 
 _LONGEST_CELL = 2**26
-"""Letters of a cell at most; the csv module reads 131 072, and a scenario with a trace has
-more.
+"""Largest number of characters in a table cell: a scenario with a trace exceeds the default
+limit of the csv module, 131 072.
 """
 
 
 def encode_results(plan: SweepPlan, rows: Sequence[ResultRow]) -> str:
-    """Returns results as CSV, a line per run."""
-    kinds = _kinds_of_results(plan)
+    """Returns the results as CSV, with a line per run."""
+    kinds = _list_result_columns(plan)
     lines = []
     for row in rows:
         changes = diff_lines(row["scenario"], plan.base.text)
@@ -154,25 +159,24 @@ def encode_results(plan: SweepPlan, rows: Sequence[ResultRow]) -> str:
     return encode_csv(lines, [*kinds, _SCENARIO_COLUMN])
 
 
-def _kinds_of_results(plan: SweepPlan) -> dict[str, type]:
+def _list_result_columns(plan: SweepPlan) -> dict[str, type]:
     """Returns the type of each column of the table, except that of the scenarios."""
-    kinds = {**_kinds_of_axes(plan), "seed": int, "random": bool}
+    kinds = {**_list_axis_columns(plan), "seed": int, "random": bool}
     kinds |= dict.fromkeys((*plan.metrics, *CellResult.__struct_fields__), float)
     kinds |= dict.fromkeys(("verdict", "motion", "reasons", "scenario_sha256", "command"), str)
     return kinds | {"extended": int}
 
 
-def _kinds_of_axes(plan: SweepPlan) -> dict[str, type]:
-    return {
-        "cell": int,
-        **{one.key: float if one.numeric else str for one in plan.axes},
-        "law": str,
-    }
+def _list_axis_columns(plan: SweepPlan) -> dict[str, type]:
+    """Returns the type of each column that locates a cell."""
+    axes = {axis.key: float if axis.numeric else str for axis in plan.axes}
+    return {"cell": int, **axes, "law": str}
 
 
 def _format_cell(value: Any, kind: type) -> str:
-    """Returns a value as the table has it: numbers so that they are read back bit for bit; None
-    is empty.
+    """Returns the text of a table cell, from which numbers parse back bit for bit.
+
+    None becomes an empty text.
     """
     if value is None:
         return ""
@@ -182,10 +186,11 @@ def _format_cell(value: Any, kind: type) -> str:
 
 
 def _parse_cell(text: str, kind: type) -> Any:
-    """Returns the value of a cell.
+    """Returns the value of a table cell.
 
     Raises:
-        ValueError: the text is no value of this type.
+        ValueError: the text is not an integer or a float.
+        KeyError: the text is not a bool.
     """
     if kind is str:
         return text
@@ -195,10 +200,13 @@ def _parse_cell(text: str, kind: type) -> Any:
 
 
 def read_results(path: Path) -> SweepResults:
-    """Returns the results of a sweep, by its folder or its table.
+    """Returns the results of a sweep.
+
+    Args:
+        path: the folder of the sweep, or its table.
 
     Raises:
-        UsageError: there are none, or the sweep has not come to its end.
+        UsageError: there are no results, they cannot be read, or the sweep has not finished.
     """
     file = path / RESULTS_FILE if path.is_dir() else path
     if not file.is_file():
@@ -228,7 +236,7 @@ def read_results(path: Path) -> SweepResults:
 def _read_row(line: Mapping[str, str], plan: SweepPlan) -> ResultRow:
     """Returns a line of the table as a row, with its scenario as text."""
     row = {
-        name: _parse_cell(line[name], kind) for name, kind in _kinds_of_results(plan).items()
+        name: _parse_cell(line[name], kind) for name, kind in _list_result_columns(plan).items()
     }
     changes = json.loads(line[_SCENARIO_COLUMN])
     return {**row, "scenario": apply_diff(changes, plan.base.text)}
@@ -241,10 +249,12 @@ class GridPoint(NamedTuple):
     """One cell with all its seeds.
 
     Attributes:
-        cell, law, values: its place.
-        counts: how many runs came to each class, in the order of `CellClass`.
-        means: of each number of a run that `list_totals` names its mean over the runs that
-            stayed within their limits; None of fewer than two runs.
+        cell: the number of the cell.
+        law: the laws of its sites.
+        values: the value on each axis.
+        counts: number of runs of each class, in the order of `CellClass`.
+        means: the mean of each quantity of `list_totals` over the runs that stayed within
+            their limits; None for fewer than two runs.
     """
 
     cell: int
@@ -255,38 +265,34 @@ class GridPoint(NamedTuple):
 
     @property
     def decided(self) -> int:
-        """How many runs showed whether they are stable."""
-        return sum(
-            n
-            for n, verdict in zip(self.counts, CellClass, strict=True)
-            if verdict.stable is not None
-        )
+        """Number of decided runs."""
+        classes = zip(self.counts, CellClass, strict=True)
+        return sum(count for count, verdict in classes if verdict.stable is not None)
 
     @property
     def stable(self) -> int:
-        """How many runs are stable."""
-        return sum(
-            n for n, verdict in zip(self.counts, CellClass, strict=True) if verdict.stable
-        )
+        """Number of stable runs."""
+        classes = zip(self.counts, CellClass, strict=True)
+        return sum(count for count, verdict in classes if verdict.stable)
 
     @property
     def doubtful(self) -> bool:
-        """True where some runs are stable and some are not."""
+        """True if some of the decided runs are stable and some are not."""
         return 0 < self.stable < self.decided
 
     @property
     def interval(self) -> tuple[float, float]:
-        """The 95 % interval of the share of stable runs, among those that decide."""
+        """95 % Wilson interval of the stable share of the decided runs."""
         return wilson_interval(self.stable, self.decided)
 
 
 def list_totals(plan: SweepPlan) -> list[str]:
-    """Returns the keys of the numbers of a run that are averaged over its seeds."""
+    """Returns the keys of the quantities that are averaged over the seeds of a cell."""
     return list(dict.fromkeys((*RunTotals._fields, *plan.metrics)))
 
 
 def collect_grid_points(results: SweepResults) -> list[GridPoint]:
-    """Returns every grid point of a sweep, in the order of the cells."""
+    """Returns the grid points of a sweep, in the order of the cells."""
     rows_of: dict[tuple[int, str], list[ResultRow]] = {}
     for row in results.rows:
         rows_of.setdefault((row["cell"], row["law"]), []).append(row)
@@ -297,45 +303,29 @@ def collect_grid_points(results: SweepResults) -> list[GridPoint]:
         kept = [row for row in rows if row["diverged_s"] is None]
         means = tuple(mean_interval([row.get(key) for row in kept]) for key in totals)
         values = results.plan.cell(cell).values
-        points.append(
-            GridPoint(
-                cell=cell,
-                law=law,
-                values=values,
-                counts=tuple(counts[one.value] for one in CellClass),
-                means=means,
-            )
-        )
+        class_counts = tuple(counts[verdict.value] for verdict in CellClass)
+        points.append(GridPoint(cell, law, values, class_counts, means))
     return points
 
 
-def encode_grid_points(plan: SweepPlan, found: Sequence[GridPoint]) -> str:
-    """Returns grid points as CSV: counts, and the share of stable runs with its interval."""
-    kinds = _kinds_of_axes(plan) | dict.fromkeys(
-        ("runs", *(one.value for one in CellClass)), int
-    )
+def encode_grid_points(plan: SweepPlan, points: Sequence[GridPoint]) -> str:
+    """Returns grid points as CSV: counts, stable share with its interval, and means."""
+    kinds = _list_axis_columns(plan)
+    kinds["runs"] = int
+    kinds |= {verdict.value: int for verdict in CellClass}
     kinds |= dict.fromkeys(("stable_share", "stable_share_low", "stable_share_high"), float)
-    kinds |= dict.fromkeys(
-        (f"{key}_{word}" for key in list_totals(plan) for word in MeanInterval._fields), float
-    )
+    for key in list_totals(plan):
+        kinds |= {f"{key}_{field}": float for field in MeanInterval._fields}
     rows = []
-    for one in found:
-        low, high = one.interval
-        numbers = [number for mean in one.means for number in mean or (None, None)]
-        share = one.stable / one.decided if one.decided else None
-        cells = (
-            one.cell,
-            *one.values,
-            one.law,
-            sum(one.counts),
-            *one.counts,
-            share,
-            low,
-            high,
-            *numbers,
-        )
-        named = zip(kinds.items(), cells, strict=True)
-        rows.append({name: _format_cell(cell, kind) for (name, kind), cell in named})
+    for point in points:
+        share = point.stable / point.decided if point.decided else None
+        cells: list[Any] = [point.cell, *point.values, point.law]
+        cells += [sum(point.counts), *point.counts]
+        cells += [share, *point.interval]
+        for mean in point.means:
+            cells += mean or (None, None)
+        columns = zip(kinds.items(), cells, strict=True)
+        rows.append({name: _format_cell(cell, kind) for (name, kind), cell in columns})
     return encode_csv(rows, list(kinds))
 
 
@@ -348,12 +338,12 @@ _TOTALS = {
 
 
 _MAX_DOUBTFUL_SHOWN = 8
-"""Most doubtful grid points printed; all stand in the file."""
+"""Largest number of doubtful grid points in the summary; the file has all of them."""
 
 
 def describe_sweep_plan(plan: SweepPlan) -> list[str]:
-    """Returns the plan in lines, before it runs."""
-    sizes = " x ".join(str(len(one.texts)) for one in plan.axes) or "1"
+    """Returns the lines that describe a sweep before it runs."""
+    sizes = " x ".join(str(len(axis.texts)) for axis in plan.axes) or "1"
     laws = f" x laws {', '.join(plan.laws)}" if plan.laws else ""
     count = len(plan.seeds)
     seeds = (
@@ -362,15 +352,14 @@ def describe_sweep_plan(plan: SweepPlan) -> list[str]:
         else f"{count_nouns(count, 'seed')} each where anything is random"
     )
     lines = [f"{plan.base.name}: {count_nouns(plan.cells, 'cell')} ({sizes}{laws}), {seeds}"]
-    for one in plan.axes:
-        texts = one.texts
+    for axis in plan.axes:
+        texts = axis.texts
         count = len(texts)
-        shown = (
-            [texts[0], texts[1], "...", texts[-1]]
-            if count > 4
-            else [texts[n] for n in range(count)]
-        )
-        lines.append(f"  over {one.asked}: {', '.join(shown)}")
+        if count > 4:
+            values = [texts[0], texts[1], "...", texts[-1]]
+        else:
+            values = [texts[n] for n in range(count)]
+        lines.append(f"  over {axis.asked}: {', '.join(values)}")
     first_s = plan.base.duration_s
     longest_s = plan.longest_s
     extended = f", an undecided one up to {longest_s:g} s" if longest_s > first_s else ""
@@ -379,11 +368,12 @@ def describe_sweep_plan(plan: SweepPlan) -> list[str]:
 
 
 def summarize_sweep(results: SweepResults) -> Iterator[str]:
-    """Yields a summary: verdicts, extensions, seeds."""
+    """Yields the lines of a summary: verdicts, extensions, ranges, exponents and seeds."""
     rows = results.rows
     counts = Counter(row["verdict"] for row in rows)
-    words = ", ".join(f"{counts[verdict.value]} {verdict.value}" for verdict in CellClass)
-    yield f"{count_nouns(len(rows), 'run')} of {count_nouns(results.plan.cells, 'cell')}: {words}"
+    verdicts = ", ".join(f"{counts[verdict.value]} {verdict.value}" for verdict in CellClass)
+    runs = count_nouns(len(rows), "run")
+    yield f"{runs} of {count_nouns(results.plan.cells, 'cell')}: {verdicts}"
     extended = [row for row in rows if row["extended"]]
     if extended:
         longest_s = max(row["ran_s"] for row in extended)
@@ -392,38 +382,40 @@ def summarize_sweep(results: SweepResults) -> Iterator[str]:
         yield f"{len(extended)} were undecided after {first_s:g} s {continued}"
     kept = [row for row in rows if row["diverged_s"] is None]
     ranges = []
-    asked = {one.key: (one.name, one.unit) for one in map(find_quantity, results.plan.metrics)}
-    for key, (name, unit) in {**asked, **_TOTALS}.items():
+    metrics = map(find_quantity, results.plan.metrics)
+    quantities = {metric.key: (metric.name, metric.unit) for metric in metrics}
+    for key, (name, unit) in {**quantities, **_TOTALS}.items():
         values = [row[key] for row in kept if row.get(key) is not None]
-        ranges += (
-            [f"{name} {min(values):.3g} to {max(values):.3g} {unit}".rstrip()] if values else []
-        )
+        if values:
+            text = f"{name} {min(values):.3g} to {max(values):.3g} {unit}"
+            ranges.append(text.rstrip())
     if ranges:
         yield f"within their limits {len(kept)}: {', '.join(ranges)}"
-    found = [row["exponent_per_s"] for row in rows if row.get("exponent_per_s") is not None]
-    if found:
-        grow = f"{sum(one > 0.0 for one in found)} of {len(found)} grow"
-        yield f"growth exponents of small pushes {min(found):+.3g} to {max(found):+.3g} /s: {grow}"
+    rates = [row["exponent_per_s"] for row in rows if row.get("exponent_per_s") is not None]
+    if rates:
+        growing = sum(rate > 0.0 for rate in rates)
+        interval = f"{min(rates):+.3g} to {max(rates):+.3g} /s"
+        yield f"growth exponents of small pushes {interval}: {growing} of {len(rates)} grow"
     if len(results.plan.seeds) > 1:
-        yield from _of_seeds(results)
+        yield from _summarize_seeds(results)
 
 
-def _of_seeds(results: SweepResults) -> Iterator[str]:
+def _summarize_seeds(results: SweepResults) -> Iterator[str]:
+    """Yields the lines on cells without random numbers, and on doubtful grid points."""
     fixed = sum(not row["random"] for row in results.rows)
     if fixed:
         yield f"in {_cells(fixed)} nothing is random: one seed was run there, for all"
-    doubtful = [place for place in collect_grid_points(results) if place.doubtful]
+    doubtful = [point for point in collect_grid_points(results) if point.doubtful]
     if doubtful:
         yield f"stable with some seeds and not with others, {_cells(len(doubtful))}:"
-    for place in doubtful[:_MAX_DOUBTFUL_SHOWN]:
-        axes = zip(results.plan.axes, place.values, strict=True)
-        where = [
-            *([place.law] if results.plan.laws else []),
-            *(f"{one.key} {value}" for one, value in axes),
-        ]
-        low, high = (100.0 * end for end in place.interval)
+    for point in doubtful[:_MAX_DOUBTFUL_SHOWN]:
+        position = [point.law] if results.plan.laws else []
+        for axis, value in zip(results.plan.axes, point.values, strict=True):
+            position.append(f"{axis.key} {value}")
+        low, high = (100.0 * end for end in point.interval)
         yield (
-            f"  cell {place.cell} ({', '.join(where)}): {place.stable} of {place.decided} stable, "
+            f"  cell {point.cell} ({', '.join(position)}): "
+            f"{point.stable} of {point.decided} stable, "
             f"95 % interval {low:.0f} to {high:.0f} %"
         )
     if len(doubtful) > _MAX_DOUBTFUL_SHOWN:
@@ -436,32 +428,37 @@ def _cells(count: int) -> str:
 
 def list_next_commands(folder: Path) -> list[str]:
     """Returns commands that use the results."""
-    where = format_command("sweep", str(folder))
+    command = format_command("sweep", str(folder))
     return [
-        f"{where} --cell 0      # the command that makes a log of a cell",
-        f"{where} --map         # its map, with the lines of theory",
+        f"{command} --cell 0      # the command that makes a log of a cell",
+        f"{command} --map         # its map, with the lines of theory",
     ]
 
 
 def build_reproduce_command(
     results: SweepResults, row: ResultRow, folder: Path
 ) -> tuple[str, str]:
-    """Returns the command that repeats a row, and a note on it or ""."""
+    """Returns the command that repeats the run of a row, and a note on the command, or "".
+
+    If the scenario's source has changed since the sweep, the row's scenario is written to a
+    file in `folder`, which the command names.
+    """
     plan = results.plan
     source = plan.written.label
-    try:  # is it still what was swept?
-        text, home = read_source(source)
-        now = plan._replace(written=plan.written._replace(text=text, folder=home))
-        again = now.scenario(*plan.cell(row["cell"]).overrides, f"seed={row['seed']}").sha256
+    overrides = plan.cell(row["cell"]).overrides
+    try:
+        text, source_folder = read_source(source)
+        written = plan.written._replace(text=text, folder=source_folder)
+        current = plan._replace(written=written).scenario(*overrides, f"seed={row['seed']}")
+        digest = current.sha256
     except ScenarioError:
-        again = ""
-    if again == row["scenario_sha256"]:
+        digest = ""
+    if digest == row["scenario_sha256"]:
         return row["command"], ""
     name = f"cell-{row['cell']}-seed-{row['seed']}"
     file = folder / f"{name}.toml"
     write_whole(file, row["scenario"])
-    lasts_s = reproduction_duration_s(plan, results.outcome(row))
-    command = format_command(
-        "sim", str(file), "--duration", f"{lasts_s:.12g}", "-o", f"{name}.mcap"
-    )
+    duration_s = reproduction_duration_s(plan, results.outcome(row))
+    options = ["--duration", f"{duration_s:.12g}", "-o", f"{name}.mcap"]
+    command = format_command("sim", str(file), *options)
     return command, f"{source} is not what was swept any more, or not here; as it ran: {file}"
