@@ -1,13 +1,14 @@
-"""Statistics of experiments with people: means, comparisons, a mixed model, power, a methods
-paragraph.
+"""Statistics of experiments with people: means, tests, power, and a methods paragraph.
 
-Rows are tidy: a mapping per trial with `participant`, `pair`, `condition` and the measures by
-their names, as `trials.csv` has them. A trial without a number, None or "", does not count.
+The rows are tidy: each trial is a mapping with `participant`, `pair`, `condition` and the
+measures by their names, as in `trials.csv`. A trial whose value is None or "" does not count.
 
-Invariant: trials are averaged per participant and condition before anything is tested, so that
-more trials are not more participants. A measure of a pair, which both of its users share, is
-tested with `unit="pair"`. What the numbers cannot tell is None. Equal rows and seeds give equal
-numbers.
+Invariant:
+    - Trials are averaged per participant and condition before any test, so that more trials
+      do not count as more participants.
+    - A measure that both users of a pair share is tested with `unit="pair"`.
+    - A statistic that the data do not determine is None.
+    - Equal rows and seeds give equal numbers.
 """
 
 import math
@@ -29,92 +30,103 @@ from ...files import import_extra
 from ..intervals import mean_interval, wilson_interval
 
 Row = Mapping[str, Any]
-"""A trial: its keys, and its measures by name."""
+"""A trial: its participant, pair and condition, and its measures by name."""
 CONFIDENCE = 0.95
+"""Confidence level of all intervals."""
 RESAMPLES = 5000
-"""Of the bootstrap."""
+"""Number of resamples of the bootstrap."""
 _ROUNDING = 1e-12
-"""Of the largest value: a smaller spread is none."""
+"""Spread relative to the largest value, below which values count as equal."""
 
 
 def import_scipy_stats() -> Any:
-    """Returns the statistics of SciPy."""
-    from scipy import stats  # takes half a second, which most commands can do without
+    """Returns the module `scipy.stats`."""
+    from scipy import stats  # the import takes half a second, and most commands do not need it
 
     return stats
 
 
-# --- means -----------------------------------------------------------------------------------------------
+# --- means ------------------------------------------------------------------------------------
 
 
 def average_trials(
     rows: Sequence[Row], measure: str, unit: str = "participant"
 ) -> dict[str, dict[str, float]]:
-    """Returns the mean of a measure over the trials of every condition and unit, in the order
-    of the rows.
+    """Returns the mean of a measure over the trials of each condition and unit.
+
+    The result maps conditions, and in each of them units, to means, in the order of the rows.
 
     Args:
         rows: trials.
         measure: the name of the measure.
-        unit: the key of what is sampled independently: "participant" or "pair".
+        unit: the key of the independently sampled unit: "participant" or "pair".
 
     Raises:
         UsageError: no row has the measure, a row lacks a key, or a value is not a finite
             number.
     """
-    found: dict[str, dict[str, list[float]]] = {}
+    values: dict[str, dict[str, list[float]]] = {}
     for row in rows:
         if missing := [key for key in (unit, "condition") if key not in row]:
             raise UsageError(
                 f"a row without {' and '.join(missing)}: tidy rows have a key for each"
             )
-        each = found.setdefault(str(row["condition"]), {})
-        if (value := row.get(measure)) not in (None, ""):
-            each.setdefault(str(row[unit]), []).append(read_number(value, measure, row))
-    means = {
-        name: {u: math.fsum(v) / len(v) for u, v in each.items()}
-        for name, each in found.items()
-    }
+        values_by_unit = values.setdefault(str(row["condition"]), {})
+        value = row.get(measure)
+        if value not in (None, ""):
+            number = read_number(value, measure, row)
+            values_by_unit.setdefault(str(row[unit]), []).append(number)
+    means = {}
+    for condition, values_by_unit in values.items():
+        means[condition] = {
+            name: math.fsum(numbers) / len(numbers) for name, numbers in values_by_unit.items()
+        }
     if not any(means.values()):
-        names = sorted(
-            {key for row in rows for key in row} - {"participant", "pair", "condition"}
-        )
+        keys = {key for row in rows for key in row}
+        names = sorted(keys - {"participant", "pair", "condition"})
         raise UsageError(
-            f"no trial has a number for {measure}; the rows have {', '.join(names) or 'nothing'}"
+            f"no trial has a number for {measure}; "
+            f"the rows have {', '.join(names) or 'nothing'}"
         )
     return means
 
 
 def read_number(value: Any, measure: str, row: Row) -> float:
-    """Returns the value of a measure in a row, which may be the text of a CSV file.
+    """Returns the value of a measure in a row as a number.
+
+    Args:
+        value: a number, or its text from a CSV file.
+        measure: the name of the measure, for the error message.
+        row: the trial, for the error message.
 
     Raises:
-        UsageError: the value is no finite number.
+        UsageError: the value is not a finite number.
     """
     try:
         number = float(value)
     except (TypeError, ValueError):
         number = math.nan
     if not math.isfinite(number):
-        where = ", ".join(
-            f"{key} {row[key]}" for key in ("participant", "condition", "trial") if key in row
-        )
-        raise UsageError(f"{measure} = {value!r} ({where}): give a finite number, or nothing")
+        keys = ("participant", "condition", "trial")
+        trial = ", ".join(f"{key} {row[key]}" for key in keys if key in row)
+        raise UsageError(f"{measure} = {value!r} ({trial}): give a finite number, or nothing")
     return number
 
 
 class ConditionMean(NamedTuple):
-    """What a measure came to under a condition, over units.
+    """Mean and spread of a measure under a condition, over units.
+
+    Deviation and intervals are None for fewer than two units.
 
     Args:
-        condition: its name.
-        number: of units with at least one trial.
-        mean: over the means of the units.
-        deviation: their standard deviation; None for fewer than two.
-        interval: of 95 % by Student's t; None likewise.
-        bootstrap: of 95 % by the bias-corrected and accelerated bootstrap (BCa); None likewise.
-        missing: how many trials, or questionnaires, have no number; they are counted and not
-            averaged.
+        condition: name of the condition.
+        number: number of units with at least one trial.
+        mean: mean of the means of the units.
+        deviation: standard deviation of the means of the units.
+        interval: 95 % interval of the mean by Student's t.
+        bootstrap: 95 % interval of the mean by the bias-corrected and accelerated bootstrap
+            (BCa).
+        missing: number of trials, or questionnaires, without a number; they are not averaged.
     """
 
     condition: str
@@ -129,19 +141,22 @@ class ConditionMean(NamedTuple):
 def summarise_conditions(
     rows: Sequence[Row], measure: str, *, unit: str = "participant", seed: int = 0
 ) -> list[ConditionMean]:
-    """Returns mean, spread and intervals of every condition with a number, in the order of the
-    rows.
+    """Returns mean, spread and intervals of each condition that has a number.
+
+    The conditions are in the order of the rows; `seed` is that of the bootstrap.
     """
     means = average_trials(rows, measure, unit)
-    lacking = Counter(str(row["condition"]) for row in rows if row.get(measure) in (None, ""))
-    return [
-        _summarise(name, list(each.values()), seed)._replace(missing=lacking[name])
-        for name, each in means.items()
-        if each
-    ]
+    missing = Counter(str(row["condition"]) for row in rows if row.get(measure) in (None, ""))
+    summaries = []
+    for condition, means_by_unit in means.items():
+        if means_by_unit:
+            summary = _summarise(condition, list(means_by_unit.values()), seed)
+            summaries.append(summary._replace(missing=missing[condition]))
+    return summaries
 
 
 def _summarise(condition: str, values: list[float], seed: int) -> ConditionMean:
+    """Returns mean, spread and intervals of the means of the units, without missing trials."""
     mean = mean_interval(values)
     if mean is None:
         return ConditionMean(
@@ -152,21 +167,20 @@ def _summarise(condition: str, values: list[float], seed: int) -> ConditionMean:
             interval=None,
             bootstrap=None,
         )
-    low_high = (mean.mean - mean.half, mean.mean + mean.half)
-    deviation = float(np.std(values, ddof=1))
-    boot = bootstrap_interval(values, seed)
     return ConditionMean(
         condition=condition,
         number=len(values),
         mean=mean.mean,
-        deviation=deviation,
-        interval=low_high,
-        bootstrap=boot,
+        deviation=float(np.std(values, ddof=1)),
+        interval=(mean.mean - mean.half, mean.mean + mean.half),
+        bootstrap=bootstrap_interval(values, seed),
     )
 
 
 def bootstrap_interval(values: Sequence[float], seed: int = 0) -> tuple[float, float] | None:
-    """Returns the 95 % interval of a mean by the BCa bootstrap; None of fewer than two values.
+    """Returns the 95 % interval of a mean by the BCa bootstrap.
+
+    The interval is None for fewer than two values.
 
     Source: Efron, "Better bootstrap confidence intervals", J. American Statistical Association
     82 (1987).
@@ -175,41 +189,43 @@ def bootstrap_interval(values: Sequence[float], seed: int = 0) -> tuple[float, f
     if sample.size < 2:
         return None
     if np.ptp(sample) <= _ROUNDING * np.abs(sample).max():
+        # BCa divides by the spread of the sample and returns NaN for equal values
         return float(sample.mean()), float(sample.mean())
-    generator = np.random.default_rng(seed)
-    found = import_scipy_stats().bootstrap(
+    result = import_scipy_stats().bootstrap(
         (sample,),
         np.mean,
         n_resamples=RESAMPLES,
         confidence_level=CONFIDENCE,
         method="BCa",
-        rng=generator,
+        rng=np.random.default_rng(seed),
     )
-    return float(found.confidence_interval.low), float(found.confidence_interval.high)
+    interval = result.confidence_interval
+    return float(interval.low), float(interval.high)
 
 
-# --- paired comparisons ----------------------------------------------------------------------------------
+# --- paired comparisons -----------------------------------------------------------------------
 
 
 class Comparison(NamedTuple):
-    """Two conditions of a measure, compared within units; what fewer than two units cannot tell
-    is None.
+    """Comparison of a measure between two conditions, within units.
+
+    Interval, tests and effect sizes need two units; with fewer they are None.
 
     Args:
-        measure: its name.
-        first: a condition.
-        second: the other one.
-        number: of units that have both.
+        measure: name of the measure.
+        first: name of the first condition.
+        second: name of the second condition.
+        number: number of units that have both conditions.
         difference: mean of second minus first.
-        interval: of the difference, 95 % by Student's t.
-        t: of the paired test, with number - 1 degrees of freedom; None if all differences are
-            the same.
-        p: two-sided.
+        interval: 95 % interval of the difference by Student's t.
+        t: statistic of the paired test, with number - 1 degrees of freedom; None if all
+            differences are equal.
+        p: two-sided p value of the paired test.
         p_holm: p corrected for all comparisons of the measure.
         d_z: difference over the standard deviation of the differences.
         d_av: difference over the mean of the standard deviations of both conditions.
-        p_wilcoxon: of the signed-rank test, two-sided, not corrected; zero differences are left
-            out.
+        p_wilcoxon: two-sided p value of the signed-rank test, not corrected; differences of
+            zero are left out.
     """
 
     measure: str
@@ -229,67 +245,84 @@ class Comparison(NamedTuple):
 def compare_conditions(
     rows: Sequence[Row], measure: str, *, unit: str = "participant"
 ) -> list[Comparison]:
-    """Returns the comparison of every two conditions, in the order of the rows.
+    """Returns the comparison of each pair of conditions, in the order of the rows.
 
     Sources: Holm, "A simple sequentially rejective multiple test procedure", Scandinavian J.
     Statistics 6 (1979); Lakens, "Calculating and reporting effect sizes to facilitate
     cumulative science", Frontiers in Psychology 4:863 (2013), for d_z and d_av.
     """
     means = average_trials(rows, measure, unit)
-    found = [
+    comparisons = [
         _compare(measure, first, second, means) for first, second in combinations(means, 2)
     ]
-    corrected = correct_holm([one.p for one in found])
-    return [one._replace(p_holm=p) for one, p in zip(found, corrected, strict=True)]
+    corrected = correct_holm([comparison.p for comparison in comparisons])
+    return [
+        comparison._replace(p_holm=p)
+        for comparison, p in zip(comparisons, corrected, strict=True)
+    ]
 
 
 def _compare(
     measure: str, first: str, second: str, means: Mapping[str, Mapping[str, float]]
 ) -> Comparison:
-    both = [unit for unit in means[first] if unit in means[second]]
-    one, other = (np.array([means[name][unit] for unit in both]) for name in (first, second))
-    differences = other - one
-    empty = Comparison(measure, first, second, len(both))
-    if len(both) < 2:
-        return empty._replace(difference=float(differences[0])) if both else empty
+    """Returns the comparison of two conditions over the units that have both."""
+    units = [unit for unit in means[first] if unit in means[second]]
+    first_means = np.array([means[first][unit] for unit in units])
+    second_means = np.array([means[second][unit] for unit in units])
+    differences = second_means - first_means
+    untested = Comparison(measure, first, second, len(units))
+    if not units:
+        return untested
+    if len(units) < 2:
+        return untested._replace(difference=float(differences[0]))
     mean = float(differences.mean())
     spread = float(differences.std(ddof=1))
-    if spread <= _ROUNDING * max(np.abs(one).max(), np.abs(other).max()):
-        return empty._replace(difference=mean, interval=(mean, mean))
+    largest = max(np.abs(first_means).max(), np.abs(second_means).max())
+    if spread <= _ROUNDING * largest:
+        return untested._replace(difference=mean, interval=(mean, mean))
     stats = import_scipy_stats()
-    test = stats.ttest_rel(other, one)
+    test = stats.ttest_rel(second_means, first_means)
     low, high = test.confidence_interval(CONFIDENCE)
-    average = float(one.std(ddof=1) + other.std(ddof=1)) / 2.0
-    return empty._replace(
+    mean_deviation = float(first_means.std(ddof=1) + second_means.std(ddof=1)) / 2.0
+    return untested._replace(
         difference=mean,
         interval=(float(low), float(high)),
         t=float(test.statistic),
         p=float(test.pvalue),
         d_z=mean / spread,
-        d_av=mean / average,
+        d_av=mean / mean_deviation,
         p_wilcoxon=float(stats.wilcoxon(differences).pvalue),
     )
 
 
 def correct_holm(p: Sequence[float | None]) -> list[float | None]:
-    """Returns p values corrected for their number, in their order; those that are None do not
-    count.
+    """Returns p values corrected for their number by Holm's method, in the order of `p`.
+
+    A value of None does not count as a test and stays None.
     """
-    order = sorted((value, n) for n, value in enumerate(p) if value is not None)
+    ascending = sorted((value, index) for index, value in enumerate(p) if value is not None)
     corrected: list[float | None] = [None] * len(p)
-    least = 0.0
-    for rank, (value, n) in enumerate(order):
-        least = max(least, min(1.0, (len(order) - rank) * value))
-        corrected[n] = least
+    largest = 0.0
+    for rank, (value, index) in enumerate(ascending):
+        # a corrected value is never below that of a smaller p
+        largest = max(largest, min(1.0, (len(ascending) - rank) * value))
+        corrected[index] = largest
     return corrected
 
 
-# --- mixed model -----------------------------------------------------------------------------------------
+# --- mixed model ------------------------------------------------------------------------------
 
 
 class MixedEffect(NamedTuple):
-    """A condition against the first: estimate, its standard error and 95 % interval, t and
-    two-sided p.
+    """Effect of a condition relative to the first condition.
+
+    Args:
+        condition: name of the condition.
+        estimate: estimated difference from the first condition.
+        error: standard error of the estimate.
+        interval: 95 % interval of the estimate.
+        t: estimate over its standard error.
+        p: two-sided p value of t.
     """
 
     condition: str
@@ -301,17 +334,18 @@ class MixedEffect(NamedTuple):
 
 
 class MixedModel(NamedTuple):
-    """`measure ~ condition + (1 | pair/participant)`, fitted to the means of participants by
-    REML.
+    """Mixed model of a measure, fitted to the means of participants by REML.
+
+    The formula is `measure ~ condition + (1 | pair/participant)`.
 
     Args:
-        measure: its name.
-        reference: the first condition, which the others are held against.
-        effects: of every other condition.
-        freedom: degrees of freedom of t: observations less participants less effects, as in the
-            analysis of variance if everybody has all conditions.
-        variances: of "pair", of "participant" within it, and "residual".
-        notes: what the fit complains of, as a variance at 0.
+        measure: name of the measure.
+        reference: the first condition, with which the other conditions are compared.
+        effects: the effect of each other condition.
+        freedom: degrees of freedom of t: observations less participants less effects. They
+            equal those of the analysis of variance if all participants have all conditions.
+        variances: variance of "pair", of "participant" within a pair, and of the "residual".
+        notes: warnings of the fit, for example of a variance at 0.
     """
 
     measure: str
@@ -323,27 +357,33 @@ class MixedModel(NamedTuple):
 
 
 def fit_mixed_model(rows: Sequence[Row], measure: str) -> MixedModel:
-    """Returns the mixed model of a measure, of users within pairs.
+    """Returns the mixed model of a measure, with users nested within pairs.
 
-    What both users of a pair share in a trial is no part of it: such a measure has
-    `unit="pair"` in `compare_conditions`. Needs `pip install 'trilat-net[stats]'`.
+    The model is for measures of single users. A measure that both users of a pair share is
+    tested by `compare_conditions` with `unit="pair"`. The fit needs
+    `pip install 'trilat-net[stats]'`.
 
     Raises:
-        UsageError: statsmodels is not installed, a participant has two pairs, or nothing is
-            left to compare.
+        UsageError: statsmodels is not installed, a participant is in two pairs, or there are
+            too few means to compare.
     """
     formulas = import_extra("statsmodels.formula.api", "stats", "mixed models")
     frames = import_extra("pandas", "stats", "mixed models")
-    means = {name: each for name, each in average_trials(rows, measure).items() if each}
+    means = {
+        condition: means_by_user
+        for condition, means_by_user in average_trials(rows, measure).items()
+        if means_by_user
+    }
     pairs = _find_pairs(rows)
-    records = [
-        (pairs[u], u, name, mean) for name, each in means.items() for u, mean in each.items()
-    ]
-    people = {u for _, u, *_ in records}
-    freedom = len(records) - len(people) - len(means) + 1
+    records = []
+    for condition, means_by_user in means.items():
+        for user, mean in means_by_user.items():
+            records.append((pairs[user], user, condition, mean))
+    users = {user for _, user, _, _ in records}
+    freedom = len(records) - len(users) - len(means) + 1
     if len(means) < 2 or freedom < 1:
         raise UsageError(
-            f"{measure}: {len(records)} means of {count_nouns(len(people), 'participant')}; "
+            f"{measure}: {len(records)} means of {count_nouns(len(users), 'participant')}; "
             "two conditions need more"
         )
     frame = frames.DataFrame(records, columns=["pair", "participant", "condition", "measure"])
@@ -352,9 +392,12 @@ def fit_mixed_model(rows: Sequence[Row], measure: str) -> MixedModel:
         warnings.simplefilter("always")
         fit = _fit(formulas, frame, measure)
     effects = [_read_effect(fit, name, freedom) for name in list(means)[1:]]
-    parts = {"pair": fit.cov_re.iloc[0, 0], "participant": fit.vcomp[0], "residual": fit.scale}
-    variances = {name: float(value) for name, value in parts.items()}
-    notes = list(dict.fromkeys(str(one.message) for one in caught))
+    variances = {
+        "pair": float(fit.cov_re.iloc[0, 0]),
+        "participant": float(fit.vcomp[0]),
+        "residual": float(fit.scale),
+    }
+    notes = list(dict.fromkeys(str(warning.message) for warning in caught))
     return MixedModel(
         measure=measure,
         reference=next(iter(means)),
@@ -366,26 +409,35 @@ def fit_mixed_model(rows: Sequence[Row], measure: str) -> MixedModel:
 
 
 def _fit(formulas: Any, frame: Any, measure: str) -> Any:
-    """Returns the likelier of two fits: by the gradient alone it may end before a variance that
-    is at 0.
+    """Returns the fit with the larger likelihood, of two optimizers.
+
+    Raises:
+        UsageError: neither optimizer gives finite numbers.
     """
     parts = {"participant": "0 + C(participant)"}
     model = formulas.mixedlm(
         "measure ~ condition", frame, groups="pair", re_formula="1", vc_formula=parts
     )
     fits = []
+    # the gradient method alone may stop before it reaches a variance of 0; Powell's does not
+    # use the gradient
     for method in ("powell", "lbfgs"):
         with suppress(np.linalg.LinAlgError):
             fits.append(model.fit(reml=True, method=method))
-    fits = [fit for fit in fits if np.isfinite([fit.llf, *fit.bse_fe]).all()]
-    if not fits:
+    finite_fits = [fit for fit in fits if np.isfinite([fit.llf, *fit.bse_fe]).all()]
+    if not finite_fits:
         raise UsageError(
             f"{measure}: a mixed model cannot be fitted to it; compare conditions instead"
         )
-    return max(fits, key=lambda fit: float(fit.llf))
+    return max(finite_fits, key=lambda fit: float(fit.llf))
 
 
 def _find_pairs(rows: Sequence[Row]) -> dict[str, str]:
+    """Returns the pair of each participant.
+
+    Raises:
+        UsageError: a participant is in two pairs, or no pair has two participants.
+    """
     pairs: dict[str, str] = {}
     for row in rows:
         user = str(row["participant"])
@@ -400,6 +452,7 @@ def _find_pairs(rows: Sequence[Row]) -> dict[str, str]:
 
 
 def _read_effect(fit: Any, condition: str, freedom: int) -> MixedEffect:
+    """Returns the effect of a condition from a fit, with `freedom` degrees of freedom."""
     stats = import_scipy_stats()
     name = f"condition[T.{condition}]"
     estimate = float(fit.fe_params[name])
@@ -416,15 +469,21 @@ def _read_effect(fit: Any, condition: str, freedom: int) -> MixedEffect:
     )
 
 
-# --- power -----------------------------------------------------------------------------------------------
+# --- power ------------------------------------------------------------------------------------
 
 
 def power(d_z: float, number: int, *, alpha: float = 0.05) -> float:
-    """Returns the chance that a paired t test, two-sided, finds an effect of a size d_z with so
-    many units.
+    """Returns the power of a two-sided paired t test, by the noncentral t distribution.
 
-    Source: Cohen, "Statistical power analysis for the behavioral sciences" (1988); by the
-    noncentral t.
+    Source: Cohen, "Statistical power analysis for the behavioral sciences" (1988).
+
+    Args:
+        d_z: the effect: mean over standard deviation of the differences.
+        number: number of units.
+        alpha: significance level.
+
+    Raises:
+        UsageError: there are fewer than two units, or alpha is not between 0 and 1.
     """
     if number < 2 or not 0.0 < alpha < 1.0:
         raise UsageError(
@@ -434,21 +493,23 @@ def power(d_z: float, number: int, *, alpha: float = 0.05) -> float:
     shift = abs(d_z) * math.sqrt(number)
     freedom = number - 1
     critical = stats.t.ppf(1.0 - alpha / 2.0, freedom)
-    # the lower tail by its mirror image: of small ones `nct.cdf` returns NaN
-    return float(sum(stats.nct.sf(critical, freedom, sign * shift) for sign in (1.0, -1.0)))
+    # the lower tail is computed from its mirror image: `nct.cdf` returns NaN for small tails
+    tails = [stats.nct.sf(critical, freedom, sign * shift) for sign in (1.0, -1.0)]
+    return float(sum(tails))
 
 
 def find_least_number(
     d_z: float, *, wanted: float = 0.8, alpha: float = 0.05, most: int = 10_000
 ) -> int:
-    """Returns the least number of units with which `power` is at least what is wanted.
+    """Returns the smallest number of units whose `power` is at least `wanted`.
 
     Raises:
-        UsageError: more than `most` are needed.
+        UsageError: more than `most` units are needed, or `wanted` is not between 0 and 1.
     """
     if not 0.0 < wanted < 1.0 or power(d_z, most, alpha=alpha) < wanted:
         raise UsageError(
-            f"power {wanted} at d_z = {d_z}: not with {most} units; give a larger effect, or less power"
+            f"power {wanted} at d_z = {d_z}: not with {most} units; "
+            "give a larger effect, or less power"
         )
     return bisect_left(
         range(most), wanted, lo=2, key=lambda number: power(d_z, number, alpha=alpha)
@@ -456,15 +517,15 @@ def find_least_number(
 
 
 class SimulatedPower(NamedTuple):
-    """How often two conditions were found to differ in experiments that were drawn.
+    """Share of simulated experiments in which two conditions differ significantly.
 
     Args:
-        first: a condition.
-        second: the other one.
-        d_z: the size of the effect that was drawn.
+        first: name of the first condition.
+        second: name of the second condition.
+        d_z: the size of the simulated effect.
         found: share of the experiments with p below alpha.
-        interval: of that share, 95 %.
-        found_holm: share of those with the corrected p below alpha.
+        interval: 95 % interval of `found`.
+        found_holm: share of the experiments with the corrected p below alpha.
     """
 
     first: str
@@ -486,61 +547,70 @@ def simulate_power(
     repetitions: int = 500,
     seed: int = 0,
 ) -> list[SimulatedPower]:
-    """Returns how often each two conditions are found to differ, by drawing trials and
-    comparing them.
+    """Returns the power for each pair of conditions, from simulated experiments.
+
+    Trials are drawn from normal distributions and compared by `compare_conditions`.
 
     Args:
         means: the expected mean of a measure by condition.
-        number: of participants.
+        number: number of participants.
         trial_deviation: standard deviation from trial to trial.
-        trials: of a participant under a condition.
-        effect_deviation: standard deviation, over participants, of what a condition does to
-            them.
-        alpha: of the tests.
-        repetitions: experiments that are drawn.
-        seed: of what is drawn.
+        trials: number of trials of a participant under a condition.
+        effect_deviation: standard deviation, over participants, of the effect of a condition.
+        alpha: significance level of the tests.
+        repetitions: number of simulated experiments.
+        seed: seed of the random numbers.
     """
     generator = np.random.default_rng(seed)
-    runs = []
+    experiments = []
     for _ in range(repetitions):
-        own = generator.normal(0.0, effect_deviation, (number, len(means), 1))
-        values = own + generator.normal(0.0, trial_deviation, (number, len(means), trials))
-        runs.append(compare_conditions(_list_rows(values, means), "measure"))
-    deviation = math.sqrt(
-        2.0 * (float(effect_deviation) ** 2 + float(trial_deviation) ** 2 / trials)
-    )
-    return [
-        _count_found(
-            each, float(means[each[0].second] - means[each[0].first]) / deviation, alpha
-        )
-        for each in zip(*runs, strict=True)
-    ]
+        effects = generator.normal(0.0, effect_deviation, (number, len(means), 1))
+        noise = generator.normal(0.0, trial_deviation, (number, len(means), trials))
+        rows = _list_rows(effects + noise, means)
+        experiments.append(compare_conditions(rows, "measure"))
+    # of a difference of two means over trials, which both vary by effect and by trial
+    variance = 2.0 * (float(effect_deviation) ** 2 + float(trial_deviation) ** 2 / trials)
+    deviation = math.sqrt(variance)
+    powers = []
+    for comparisons in zip(*experiments, strict=True):
+        difference = float(means[comparisons[0].second] - means[comparisons[0].first])
+        powers.append(_count_significant(comparisons, difference / deviation, alpha))
+    return powers
 
 
 def _list_rows(values: Array, means: Mapping[str, float]) -> list[Row]:
-    return [
-        {"participant": user, "condition": name, "measure": mean + value}
-        for n, (name, mean) in enumerate(means.items())
-        for user, drawn in enumerate(values[:, n])
-        for value in drawn.tolist()
-    ]
+    """Returns a row for each simulated trial.
+
+    Args:
+        values: deviations from the means, by participant, condition and trial.
+        means: the expected mean of each condition.
+    """
+    rows: list[Row] = []
+    for index, (condition, mean) in enumerate(means.items()):
+        for user, deviations in enumerate(values[:, index]):
+            measures = [mean + deviation for deviation in deviations.tolist()]
+            rows += [
+                {"participant": user, "condition": condition, "measure": measure}
+                for measure in measures
+            ]
+    return rows
 
 
-def _count_found(runs: Sequence[Comparison], d_z: float, alpha: float) -> SimulatedPower:
-    found = sum(run.p is not None and run.p < alpha for run in runs)
-    holm = sum(run.p_holm is not None and run.p_holm < alpha for run in runs)
-    interval = wilson_interval(found, len(runs))
+def _count_significant(runs: Sequence[Comparison], d_z: float, alpha: float) -> SimulatedPower:
+    """Returns the share of comparisons of two conditions whose p is below alpha."""
+    significant = sum(run.p is not None and run.p < alpha for run in runs)
+    significant_holm = sum(run.p_holm is not None and run.p_holm < alpha for run in runs)
     return SimulatedPower(
         first=runs[0].first,
         second=runs[0].second,
         d_z=d_z,
-        found=found / len(runs),
-        interval=interval,
-        found_holm=holm / len(runs),
+        found=significant / len(runs),
+        interval=wilson_interval(significant, len(runs)),
+        found_holm=significant_holm / len(runs),
     )
 
 
-# --- methods paragraph -----------------------------------------------------------------------------------
+# --- methods paragraph ------------------------------------------------------------------------
 
 _METHODS = (
     ("participants", "The data of {} participants"),
@@ -562,37 +632,46 @@ _METHODS = (
     ("measures", ". Measures were {}, averaged"),
     ("unit", " per {}"),
 )  # fmt: skip
-"""Facts, in the order of the paragraph, and what is said of each."""
+"""Each fact and the text that states it, in the order of the paragraph."""
 COMPUTED = (
-    "t tests", "wilcoxon", "effect sizes", "intervals", "bootstrap", "sign tests", "mixed models",
+    "t tests", "wilcoxon", "effect sizes", "intervals", "bootstrap", "sign tests",
+    "mixed models",
 )  # fmt: skip
 """Analyses that the paragraph describes if they were computed."""
 _ENDING = ("correction", "alpha", "completion", "answers", "computed")
-"""Facts of the last sentences."""
-_WELCOME = (
-    "pairs", "exclusions", "blocks", "training", "staircase", "rate_hz", "program", "digest", "unit", "alpha",
-    "completion", "answers", "computed",
+"""Facts that the last sentences state."""
+_OPTIONAL = (
+    "pairs", "exclusions", "blocks", "training", "staircase", "rate_hz", "program", "digest",
+    "unit", "alpha", "completion", "answers", "computed",
 )  # fmt: skip
+"""Facts that may be missing."""
 
 
 def write_methods(facts: Mapping[str, Any]) -> str:
-    """Returns the paragraph on methods of a paper, with every number that is given.
+    """Returns the methods paragraph of a paper, which states every number of the facts.
 
     Args:
-        facts: `participants`, whose data count; `excluded`, how many more; `exclusions`, why;
-            `pairs`; `design`; `blocks`; `trials` of a participant under a condition; `training`
-            or `staircase`, what they were; `conditions`, by name what each was, with its delay
-            as measured (`delay_ms`); `law`; `gains`; `rate_hz`; `seeds`; `measures`;
-            `correction` of p; `unit`; `alpha`; `program`, its version; `digest` of the
-            protocol; `computed`, which of `COMPUTED` were, by default none; `completion` and
-            `answers`, sentences on trials that were not completed and on missing answers. Keys
-            end in their unit.
+        facts: facts by name; keys of numbers end in their unit.
+            `participants`: number of participants whose data count.
+            `excluded`: number of further participants; `exclusions`: the reasons.
+            `pairs`, `design`, `blocks`: number of pairs, the design, number of blocks.
+            `trials`: number of trials of a participant under a condition.
+            `training`, `staircase`: their descriptions.
+            `conditions`: the settings of each condition by its name, with the measured delay
+            (`delay_ms`).
+            `law`, `gains`, `rate_hz`, `seeds`: of the arms' control and the random numbers.
+            `measures`: names of the measures; `unit`: the unit over which they are averaged.
+            `correction`, `alpha`: correction of p, and the significance level.
+            `program`, `digest`: version of the program, and digest of the protocol.
+            `computed`: the analyses of `COMPUTED` that were computed, by default none of them.
+            `completion`, `answers`: sentences on trials that were not completed and on missing
+            answers.
 
     Raises:
         UsageError: a fact is missing or unknown, or a condition has no delay.
     """
     known = [*(key for key, _ in _METHODS), *_ENDING]
-    if missing := [key for key in known if key not in facts and key not in _WELCOME]:
+    if missing := [key for key in known if key not in facts and key not in _OPTIONAL]:
         raise UsageError(f"a methods paragraph needs {', '.join(missing)}")
     if unknown := [key for key in facts if key not in known]:
         raise UsageError(f"{', '.join(unknown)}: facts are {', '.join(known)}")
@@ -601,44 +680,50 @@ def write_methods(facts: Mapping[str, Any]) -> str:
     for name, condition in facts["conditions"].items():
         if not any(key.startswith("delay") for key in condition):
             raise UsageError(
-                f"condition {name} has no delay: give delay_ms, as measured, 0 if there was none"
+                f"condition {name} has no delay: give delay_ms, as measured, "
+                "0 if there was none"
             )
-    told = {key: _tell(value, key) for key, value in facts.items()}
-    told["conditions"] = "; ".join(
-        f"{name} ({_tell(each)})" for name, each in facts["conditions"].items()
+    texts = {key: _format_fact(value, key) for key, value in facts.items()}
+    texts["conditions"] = "; ".join(
+        f"{name} ({_format_fact(condition)})" for name, condition in facts["conditions"].items()
     )
-    told["measures"] = ", ".join(
+    texts["measures"] = ", ".join(
         " in ".join(filter(None, split_unit(name))) for name in facts["measures"]
     )
-    first = "".join(text.format(told[key]) for key, text in _METHODS if told.get(key))
+    first = "".join(text.format(texts[key]) for key, text in _METHODS if texts.get(key))
     sentences = [
         f"{first} over the trials of a condition",
-        told.get("completion"),
-        told.get("answers"),
+        texts.get("completion"),
+        texts.get("answers"),
     ]
-    sentences += _describe_computed(frozenset(facts.get("computed", ())), told)
+    sentences += _describe_computed(frozenset(facts.get("computed", ())), texts)
     text = " ".join(f"{_capitalise(sentence)}." for sentence in sentences if sentence)
     singular = re.sub(r"(?<![\w.])1 (participant|pair|block|trial)s\b", r"1 \1", text)
     return singular.replace("; 1 more were excluded", "; 1 more was excluded")
 
 
-def _describe_computed(computed: Collection[str], told: Mapping[str, str]) -> Iterator[str]:
-    """Yields a sentence for each analysis that was computed, or that conditions were not
-    compared.
+def _describe_computed(computed: Collection[str], texts: Mapping[str, str]) -> Iterator[str]:
+    """Yields a sentence for each analysis that was computed.
+
+    A sentence says so if the conditions were not compared by any test.
     """
-    correction = f"with p corrected by {told['correction']} over all comparisons of a measure"
-    level = f", at alpha = {told['alpha']}" if told.get("alpha") else ""
+    correction = f"with p corrected by {texts['correction']} over all comparisons of a measure"
+    level = f", at alpha = {texts['alpha']}" if texts.get("alpha") else ""
     if "t tests" in computed:
         wilcoxon = (
             " and by Wilcoxon's signed-rank test beside them" if "wilcoxon" in computed else ""
         )
-        yield f"conditions were compared by two-sided paired t tests, {correction}{level}{wilcoxon}"
+        tests = "conditions were compared by two-sided paired t tests"
+        yield f"{tests}, {correction}{level}{wilcoxon}"
     if "sign tests" in computed:
         rule = "in which one that was not reached is longer than any that was"
         by_sign = f"by exact two-sided sign tests on the medians, {rule}"
         yield f"completion times were compared {by_sign}, {correction}{level}"
     if "mixed models" in computed:
-        yield "forces of users were compared by mixed models, with pair and user as random effects (REML)"
+        yield (
+            "forces of users were compared by mixed models, "
+            "with pair and user as random effects (REML)"
+        )
     if not {"t tests", "sign tests", "mixed models"} & {*computed}:
         yield "conditions were not compared by tests"
     if "effect sizes" in computed:
@@ -656,17 +741,15 @@ def _capitalise(sentence: str) -> str:
     return sentence[0].upper() + sentence[1:]
 
 
-def _tell(value: Any, key: str = "") -> str:
-    """Returns numbers with all their digits and the unit of their key, and what holds numbers
-    in words.
-    """
+def _format_fact(value: Any, key: str = "") -> str:
+    """Returns a fact as text, its numbers with all their digits and the unit of their key."""
     if isinstance(value, str):
         return value
     if isinstance(value, Mapping):
         return ", ".join(
-            f"{split_unit(name)[0]} {_tell(one, name)}" for name, one in value.items()
+            f"{split_unit(name)[0]} {_format_fact(item, name)}" for name, item in value.items()
         )
     if isinstance(value, Sequence):
-        return ", ".join(_tell(one, key) for one in value)
+        return ", ".join(_format_fact(item, key) for item in value)
     number = str(value) if isinstance(value, int) else repr(float(value)).removesuffix(".0")
     return f"{number} {split_unit(key)[1]}".strip()
