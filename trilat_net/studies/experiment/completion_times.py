@@ -1,17 +1,16 @@
-"""Completion times of trials that may run into a time limit: medians, their intervals, and sign
-tests.
+"""Completion times of trials with a time limit: medians, their intervals, and sign tests.
 
-A trial that was not completed has no completion time: it is known only that the time is longer
-than the limit (right censoring), or, of a trial that failed before the limit, that the task was
-never done. Both count as longer than every time that was measured. Order statistics need no
-more than that: the median, which is that of Kaplan and Meier, is exact as long as more than
-half of the trials were completed, and otherwise it was not reached. A mean would need the times
-themselves, and the limit in their place makes conditions look alike that are not.
+A trial that was not completed has no completion time. If the trial reached the limit, its time
+is known only to be longer than the limit (right censoring); if the trial failed before the
+limit, the task was never completed. Both count as longer than every measured time. Order
+statistics need no more information: the median of Kaplan and Meier is exact as long as more
+than half of the trials were completed, and otherwise it was not reached. A mean would need the
+times themselves; replacing them by the limit would make different conditions look alike.
 
 Invariant:
-- The limit never enters a sum or a difference.
-- Trials are summarised per unit and condition before units are compared, so that more trials
-  are not more participants.
+    - The limit never enters a sum or a difference.
+    - Trials are summarised per unit and condition before units are compared, so that more
+      trials do not count as more participants.
 
 Sources: Kaplan and Meier, "Nonparametric estimation from incomplete observations", J. American
 Statistical Association 53 (1958); Conover, "Practical nonparametric statistics", 3rd edition
@@ -32,18 +31,19 @@ SUCCESS = "succeeded"
 
 
 class CompletionTime(NamedTuple):
-    """How long it took to complete trials under a condition.
+    """Completion time of the trials under a condition.
 
     Attributes:
-        condition: its name.
-        trials: how many count.
-        censored: how many of them were not completed: `timed_out` and those that failed sooner.
-        timed_out: how many of them ran into the time limit.
-        number: of units.
-        median: over units, of each unit's median time, s; None: it was not reached.
-        interval: of that median, 95 % or more, by order statistics, s; its upper end is None if
-            it was not reached. None: there are too few units, or the lower end was not reached
-            either.
+        condition: name of the condition.
+        trials: number of trials that count.
+        censored: number of trials that were not completed: `timed_out` and those that failed
+            sooner.
+        timed_out: number of trials that reached the time limit.
+        number: number of units.
+        median: median over units of each unit's median time, s; None if it was not reached.
+        interval: interval of the median, 95 % or more, by order statistics, s. Its upper end is
+            None if it was not reached. The interval is None if there are too few units, or if
+            its lower end was not reached either.
     """
 
     condition: str
@@ -56,18 +56,19 @@ class CompletionTime(NamedTuple):
 
 
 class CompletionComparison(NamedTuple):
-    """Two conditions, compared within units by which of them took longer.
+    """Comparison of the completion times of two conditions, within units.
 
     Attributes:
-        first: a condition.
-        second: the other one.
-        number: of units that have both.
-        longer: of units whose median was longer under the second condition.
-        shorter: of units whose median was shorter there; the rest are ties, as two that were
-            not reached.
-        difference: median over units of second minus first, s; None if the limit hides it.
-        p: of the sign test, two-sided and exact, ties left out; None of fewer than two units
-            that differ.
+        first: name of the first condition.
+        second: name of the second condition.
+        number: number of units that have both conditions.
+        longer: number of units whose median was longer under the second condition.
+        shorter: number of units whose median was shorter under the second condition. The other
+            units are ties, for example if both medians were not reached.
+        difference: median over units of second minus first, s; None if it depends on medians
+            that were not reached.
+        p: p value of the two-sided exact sign test, ties left out; None for fewer than two
+            units that differ.
         p_holm: p corrected for all comparisons.
     """
 
@@ -82,121 +83,135 @@ class CompletionComparison(NamedTuple):
 
 
 def is_completed(row: Row) -> bool:
-    """Returns whether a trial was completed; a row that does not say so was."""
+    """Returns whether a trial was completed; a row without `succeeded` counts as completed."""
     return str(row.get(SUCCESS, 1)).strip() not in ("0", "0.0", "False")
 
 
 def find_median(times_s: Sequence[float]) -> float:
-    """Returns the median of times, s, of which a censored one is infinite.
+    """Returns the median of times, s; censored times are infinite.
 
-    It is infinite, not reached, if half of the trials or more were not completed.
+    The median is infinite (not reached) if half of the trials or more were not completed.
     """
     ordered = sorted(times_s)
-    return (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]) / 2.0
+    lower = ordered[(len(ordered) - 1) // 2]
+    upper = ordered[len(ordered) // 2]
+    return (lower + upper) / 2.0
 
 
 def find_unit_medians(
     rows: Sequence[Row], unit: str = "participant"
 ) -> dict[str, dict[str, float]]:
-    """Returns the median completion time of every condition and unit, s; infinite: not reached.
+    """Returns the median completion time of each condition and unit, s.
+
+    A median that was not reached is infinite.
 
     Args:
-        rows: trials with `completion_s` and `succeeded`, as `trials.csv` has them.
-        unit: the key of what is sampled independently: "participant" or "pair".
+        rows: trials with `completion_s` and `succeeded`, as in `trials.csv`.
+        unit: the key of the independently sampled unit: "participant" or "pair".
 
     Raises:
-        UsageError: a time is no finite number.
+        UsageError: a time is not a finite number.
     """
     times_s: dict[str, dict[str, list[float]]] = {}
     for row in rows:
-        if (value := row.get(COMPLETION)) in (None, ""):
+        value = row.get(COMPLETION)
+        if value in (None, ""):
             continue
         time_s = read_number(value, COMPLETION, row) if is_completed(row) else math.inf
-        times_s.setdefault(str(row["condition"]), {}).setdefault(str(row[unit]), []).append(
-            time_s
-        )
+        times_by_unit = times_s.setdefault(str(row["condition"]), {})
+        times_by_unit.setdefault(str(row[unit]), []).append(time_s)
     return {
-        condition: {who: find_median(own) for who, own in each.items()}
-        for condition, each in times_s.items()
+        condition: {name: find_median(times) for name, times in times_by_unit.items()}
+        for condition, times_by_unit in times_s.items()
     }
 
 
 def summarise_times(
     rows: Sequence[Row], limit_s: float, *, unit: str = "participant"
 ) -> list[CompletionTime]:
-    """Returns the completion time of every condition, in the order of the rows.
+    """Returns the completion time of each condition, in the order of the rows.
 
     Args:
-        rows: as of `find_unit_medians`.
-        limit_s: after which a trial was ended.
-        unit: likewise.
+        rows: trials, as for `find_unit_medians`.
+        limit_s: time limit of a trial, s.
+        unit: "participant" or "pair".
     """
-    found = []
-    for condition, medians in find_unit_medians(rows, unit).items():
+    summaries = []
+    for condition, medians_by_unit in find_unit_medians(rows, unit).items():
+        medians = list(medians_by_unit.values())
         trials = [row for row in rows if str(row["condition"]) == condition]
         failed = [row for row in trials if not is_completed(row)]
         ended_s = [read_number(row[COMPLETION], COMPLETION, row) for row in failed]
-        found.append(
+        summaries.append(
             CompletionTime(
                 condition=condition,
                 trials=len(trials),
                 censored=len(failed),
                 timed_out=sum(time_s >= limit_s - 1e-6 for time_s in ended_s),
                 number=len(medians),
-                median=_finite(find_median(list(medians.values()))),
-                interval=find_median_interval(list(medians.values())),
+                median=_finite(find_median(medians)),
+                interval=find_median_interval(medians),
             )
         )
-    return found
+    return summaries
 
 
 def find_median_interval(times_s: Sequence[float]) -> tuple[float, float | None] | None:
-    """Returns the interval of a median of at least 95 % by order statistics; None of fewer than
-    six times.
+    """Returns an interval of at least 95 % for a median, by order statistics, s.
 
-    The r-th smallest and the r-th largest time enclose the median with probability 1 - 2 P(B <
-    r), B binomial with p = 1/2; r is the largest for which that is 95 % or more. Censored times
-    are infinite.
+    The r-th smallest and the r-th largest time enclose the median with probability
+    1 - 2 P(B < r), where B is binomial with p = 1/2; r is the largest rank for which this
+    probability is 95 % or more. There is no such rank, and the interval is None, for fewer than
+    six times. Censored times are infinite; an upper end that was not reached is None.
     """
     ordered = sorted(times_s)
     tail = (1.0 - CONFIDENCE) / 2.0
     binomial = import_scipy_stats().binom(len(ordered), 0.5)
-    ranks = [r for r in range(1, len(ordered) // 2 + 1) if float(binomial.cdf(r - 1)) <= tail]
-    if not ranks or math.isinf(ordered[ranks[-1] - 1]):
+    candidates = range(1, len(ordered) // 2 + 1)
+    ranks = [rank for rank in candidates if float(binomial.cdf(rank - 1)) <= tail]
+    if not ranks:
         return None
-    return ordered[ranks[-1] - 1], _finite(ordered[-ranks[-1]])
+    low = ordered[ranks[-1] - 1]
+    high = ordered[-ranks[-1]]
+    return None if math.isinf(low) else (low, _finite(high))
 
 
 def compare_times(
     rows: Sequence[Row], *, unit: str = "participant"
 ) -> list[CompletionComparison]:
-    """Returns the comparison of every two conditions, in the order of the rows.
+    """Returns the comparison of each pair of conditions, in the order of the rows.
 
-    A unit counts by which of its two medians is longer; one that was not reached is longer than
-    any that was, and two that were not reached are a tie.
+    Each unit counts for the condition under which its median is longer. A median that was not
+    reached is longer than any that was reached, and two medians that were not reached are a
+    tie.
 
     Args:
-        rows: as of `find_unit_medians`.
-        unit: likewise.
+        rows: trials, as for `find_unit_medians`.
+        unit: "participant" or "pair".
     """
     medians = find_unit_medians(rows, unit)
-    found = []
+    comparisons = []
     for first, second in combinations(medians, 2):
-        both = [who for who in medians[first] if who in medians[second]]
-        pairs = [(medians[first][who], medians[second][who]) for who in both]
-        found.append(_compare(first, second, pairs))
-    corrected = correct_holm([one.p for one in found])
-    return [one._replace(p_holm=p) for one, p in zip(found, corrected, strict=True)]
+        units = [name for name in medians[first] if name in medians[second]]
+        pairs = [(medians[first][name], medians[second][name]) for name in units]
+        comparisons.append(_compare(first, second, pairs))
+    corrected = correct_holm([comparison.p for comparison in comparisons])
+    return [
+        comparison._replace(p_holm=p)
+        for comparison, p in zip(comparisons, corrected, strict=True)
+    ]
 
 
 def _compare(
     first: str, second: str, pairs: Sequence[tuple[float, float]]
 ) -> CompletionComparison:
-    """Returns the comparison of two conditions by the medians that each unit has under them, s."""
-    longer = sum(after > before for before, after in pairs)
-    shorter = sum(after < before for before, after in pairs)
+    """Returns the comparison of two conditions from pairs of medians, one pair per unit, s."""
+    longer = sum(second_s > first_s for first_s, second_s in pairs)
+    shorter = sum(second_s < first_s for first_s, second_s in pairs)
     untied = longer + shorter
-    p = float(import_scipy_stats().binomtest(longer, untied).pvalue) if untied > 1 else None
+    p = None
+    if untied > 1:
+        p = float(import_scipy_stats().binomtest(longer, untied).pvalue)
     return CompletionComparison(
         first=first,
         second=second,
@@ -211,24 +226,29 @@ def _compare(
 def _find_median_difference(pairs: Sequence[tuple[float, float]]) -> float | None:
     """Returns the median difference, s; None if it depends on medians that were not reached.
 
-    Such a median may lie anywhere above 0, so that each difference lies between two bounds.
-    Their median is known where the medians of both bounds agree.
+    A median that was not reached may have any value above 0, so that each difference lies
+    between two bounds. The median difference is known if the medians of both bounds agree.
     """
     if not pairs:
         return None
-    least = [(after if math.isfinite(after) else 0.0) - before for before, after in pairs]
-    most = [after - (before if math.isfinite(before) else 0.0) for before, after in pairs]
-    low, high = (float(np.median(bounds)) for bounds in (least, most))
+    lower_bounds = [
+        (second_s if math.isfinite(second_s) else 0.0) - first_s for first_s, second_s in pairs
+    ]
+    upper_bounds = [
+        second_s - (first_s if math.isfinite(first_s) else 0.0) for first_s, second_s in pairs
+    ]
+    low = float(np.median(lower_bounds))
+    high = float(np.median(upper_bounds))
     return low if low == high else None
 
 
 def _finite(time_s: float) -> float | None:
-    """Returns a median, or None for one that was not reached."""
+    """Returns a median, or None if the median was not reached."""
     return time_s if math.isfinite(time_s) else None
 
 
 def to_table(
-    found: Sequence[CompletionTime] | Sequence[CompletionComparison],
+    results: Sequence[CompletionTime] | Sequence[CompletionComparison],
 ) -> list[dict[str, Any]]:
     """Returns a row for each condition or comparison."""
-    return [one._asdict() for one in found]
+    return [result._asdict() for result in results]
