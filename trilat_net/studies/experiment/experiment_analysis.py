@@ -1,13 +1,14 @@
-"""What an experiment found: means by condition, comparisons, a mixed model, figures, a methods
-paragraph.
+"""Analysis of an experiment: means, comparisons, mixed models, figures, a methods paragraph.
 
 Invariant:
-- It is a function of the journals. Practice and catch trials do not count.
-- A trial that was not completed counts, and its completion time is censored: longer than any
-  (see `completion_times`).
-- Every measure that trials have is summarised, also where all values are equal; every one that
-  is missing somewhere says how often. Every number of a figure or a sentence is in a table.
-- The methods paragraph describes the analyses that were computed, and no others.
+    - The analysis is a function of the journals alone.
+    - Practice and catch trials do not count.
+    - A trial that was not completed counts, and its completion time is censored: longer than
+      that of any completed trial (see `completion_times`).
+    - Every measure that trials have is summarised, also if all its values are equal; a measure
+      with missing numbers states how many are missing.
+    - Every number in a figure or a sentence is also in a table.
+    - The methods paragraph describes the analyses that were computed, and no others.
 """
 
 import json
@@ -15,12 +16,14 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 
+from ...core.vectors import Array
 from ...errors import UsageError, count_nouns
 from ...files import find_version, make_folder, make_subfolder, write_whole
 from ...reporting import style
@@ -57,27 +60,29 @@ from .statistics import (
 )
 
 MEASURES = (
-    "completion_s", "throughput_bits_s", "error_end_mm", "error_rms_mm", "path_m", "sparc", "force_mean_n",
-    "force_mean_user1_n", "force_mean_user2_n", "wall_force_n", "error_force_n", "error_handover_mm",
-    "first_settled", "internal_rms_n", "useful_rms_n", "internal_share", "first_effort_share", "first_work_j",
-    "second_work_j", "first_taken_j", "second_taken_j", "succeeded",
+    "completion_s", "throughput_bits_s", "error_end_mm", "error_rms_mm", "path_m", "sparc",
+    "force_mean_n", "force_mean_user1_n", "force_mean_user2_n", "wall_force_n",
+    "error_force_n", "error_handover_mm", "first_settled", "internal_rms_n", "useful_rms_n",
+    "internal_share", "first_effort_share", "first_work_j", "second_work_j", "first_taken_j",
+    "second_taken_j", "succeeded",
 )  # fmt: skip
-"""What is compared, as far as trials have it."""
+"""Measures that are compared between conditions if trials have them."""
 FOLDER = "analysis"
+"""Folder of the analysis inside the folder of the experiment."""
 NOT_REACHED = "not reached"
-"""Said of a median if half of the trials or more were not completed."""
+"""Text of a median if half of the trials or more were not completed."""
 
 
 class MissingAnswers(NamedTuple):
-    """How many items of a questionnaire were left out under a condition.
+    """Number of items of a questionnaire without an answer under a condition.
 
     Attributes:
-        questionnaire: its name.
-        condition: its block's; "" of a questionnaire after the experiment.
-        asked: how many items were asked, of all who were asked.
-        missing: how many of them have no answer.
-        forms: how many questionnaires that is.
-        unscored: how many of these have no score because an answer is missing.
+        questionnaire: name of the questionnaire.
+        condition: condition of the block; "" for a questionnaire after the experiment.
+        asked: number of items, over all completed questionnaires.
+        missing: number of these items without an answer.
+        forms: number of questionnaires.
+        unscored: number of questionnaires without a score because an answer is missing.
     """
 
     questionnaire: str
@@ -92,19 +97,23 @@ class ExperimentAnalysis(Result):
     """The statistics of an experiment.
 
     Attributes:
-        rows: the trials that count, after a training if there is one; `learning_rows` has all
-        of its phases. throughput_rows, gain_rows, threshold_rows: a row for each participant,
-        or pair, and condition.
-        means: by measure, for each condition; `completion_s` is among them if every trial was
+        rows: the trials that count; with a training, only those after it.
+        learning_rows: the trials that count in all phases of a training.
+        throughput_rows: a row for each unit (participant or pair) and condition.
+        gain_rows: a row for each unit and condition.
+        threshold_rows: a row for each unit and condition.
+        means: for each measure, the mean under each condition; `completion_s` is included only
+            if all trials were completed.
+        comparisons: for each measure, the comparison of each pair of conditions.
+        times: the completion time under each condition, for a task with a time limit.
+        time_comparisons: comparison of each pair of conditions, if some trials were not
             completed.
-        comparisons: by measure, of every two conditions.
-        times: of a task with a time limit, the completion time for each condition.
-        time_comparisons: of every two conditions, if trials were not completed.
-        missing_answers: of every questionnaire and condition.
-        absent: measures that this experiment could have and that no trial has a number for,
-            with the reasons.
-        methods: the paragraph of a paper.
-        paths: the files that were written.
+        missing_answers: missing answers of each questionnaire and condition.
+        absent: the reason for each measure that this experiment could have but that no trial
+            has a number for.
+        models: mixed models of the forces of users within pairs.
+        methods: the methods paragraph of a paper.
+        paths: the written files.
     """
 
     def __init__(self, experiment: Experiment, exclude: Mapping[str, str] = {}) -> None:
@@ -113,16 +122,17 @@ class ExperimentAnalysis(Result):
         protocol = experiment.plan.protocol
         self.unit = experiment.unit
         order = list(protocol.conditions).index
-        who = {"-".join(group) for group in protocol.groups}
-        if unknown := sorted(exclude.keys() - who):
+        names = {"-".join(group) for group in protocol.groups}
+        if unknown := sorted(exclude.keys() - names):
             raise UsageError(
-                f"there is no {self.unit} {', '.join(unknown)}: there are {', '.join(sorted(who))}"
+                f"there is no {self.unit} {', '.join(unknown)}: "
+                f"there are {', '.join(sorted(names))}"
             )
         kept = (row for row in experiment.to_rows() if row[self.unit] not in exclude)
         counted = [row for row in kept if not (row["practice"] or row["catch"])]
         self.learning_rows = sorted(counted, key=lambda row: order(row["condition"]))
-        left_out = ("before", "training", "retention")
-        self.rows = [row for row in self.learning_rows if row.get("phase") not in left_out]
+        other_phases = ("before", "training", "retention")
+        self.rows = [row for row in self.learning_rows if row.get("phase") not in other_phases]
         if not self.rows:
             raise UsageError(f"{experiment.folder}: no trial that counts is done yet")
         self.throughput_rows = list(self._find_throughput())
@@ -135,17 +145,19 @@ class ExperimentAnalysis(Result):
         forms = [form.name for form in protocol.questionnaires if form.after == "block"]
         self.means: dict[str, list[ConditionMean]] = {}
         self.comparisons: dict[str, list[Comparison]] = {}
-        once = [key for row in (*self.gain_rows[:1], *self.threshold_rows[:1]) for key in row]
-        own = [key for key in once if key.startswith(("gain_", "threshold_"))]
+        examples = self.gain_rows[:1] + self.threshold_rows[:1]
+        keys = [key for row in examples for key in row]
+        unit_measures = [key for key in keys if key.startswith(("gain_", "threshold_"))]
         self.times: list[CompletionTime] = []
         self.time_comparisons: list[CompletionComparison] = []
         if protocol.task.has_limit:
             self._summarise_times()
         self.absent = self._find_absent(forms)
         censored = any(time.censored for time in self.times)
-        for measure in (*MEASURES, *forms, *own):
+        for measure in (*MEASURES, *forms, *unit_measures):
             rows = self.of(measure)
             is_measured = any(row.get(measure) not in (None, "") for row in rows)
+            # a mean of censored times is biased: `times` has their medians instead
             if is_measured and not (measure == COMPLETION and censored):
                 self.means[measure] = summarise_conditions(rows, measure, unit=self.unit)
                 self.comparisons[measure] = compare_conditions(rows, measure, unit=self.unit)
@@ -158,6 +170,10 @@ class ExperimentAnalysis(Result):
     def _limit_s(self) -> float:
         return self._experiment.plan.protocol.task.longest_s
 
+    @property
+    def _is_reaching(self) -> bool:
+        return self._experiment.plan.protocol.task.description.startswith("reaching")
+
     def _summarise_times(self) -> None:
         """Summarises the completion times, and compares them if trials were not completed."""
         self.times = summarise_times(self.rows, self._limit_s, unit=self.unit)
@@ -165,7 +181,7 @@ class ExperimentAnalysis(Result):
             self.time_comparisons = compare_times(self.rows, unit=self.unit)
 
     def _find_absent(self, forms: Sequence[str]) -> dict[str, str]:
-        """Returns the measures that this experiment could have and lacks, each with the reason."""
+        """Returns the reason for each measure that this experiment could have and lacks."""
         absent = {}
         for name in forms:
             scores = [row.get(name) for row in self.of(name)]
@@ -173,15 +189,14 @@ class ExperimentAnalysis(Result):
                 absent[name] = "nobody has answered it"
             elif all(score is None for score in scores):
                 absent[name] = "every questionnaire lacks an answer"
-        is_reaching = self._experiment.plan.protocol.task.description.startswith("reaching")
-        if is_reaching and not self.throughput_rows:
+        if self._is_reaching and not self.throughput_rows:
             absent["throughput_bits_s"] = (
                 f"no {self.unit} has enough completed trials under a condition"
             )
         return absent
 
     def _count_missing_answers(self) -> Iterator[MissingAnswers]:
-        """Yields how many items were left out, for each questionnaire and condition."""
+        """Yields the missing answers of each questionnaire and condition."""
         protocol = self._experiment.plan.protocol
         after = {form.name: form.after for form in protocol.questionnaires}
         groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
@@ -205,125 +220,130 @@ class ExperimentAnalysis(Result):
 
     def of(self, measure: str) -> Sequence[Row]:
         """Returns the rows that have a measure."""
-        found = {
+        rows_by_kind = {
             "throughput": self.throughput_rows,
             "gain": self.gain_rows,
             "threshold": self.threshold_rows,
         }
-        kind, named, _ = measure.partition("_")
-        if named and kind in found:
-            return found[kind]
-        return (
-            self.rows
-            if measure in MEASURES
-            else [row for row in self._scores if measure in row]
-        )
+        kind, separator, _ = measure.partition("_")
+        if separator and kind in rows_by_kind:
+            return rows_by_kind[kind]
+        if measure in MEASURES:
+            return self.rows
+        return [row for row in self._scores if measure in row]
 
     def _find_throughput(self) -> Iterator[dict[str, Any]]:
-        """Yields the throughput of each participant and condition, where the task is to reach."""
-        by: dict[tuple[str, str], list[dict[str, Any]]] = {}
+        """Yields the throughput of each unit and condition, if the task is reaching."""
+        if not self._is_reaching:
+            return
+        groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
         for row in self.rows:
-            by.setdefault((row[self.unit], row["condition"]), []).append(row)
-        for (who, condition), rows in by.items():
-            done = [row for row in rows if row["succeeded"]]
-            if (
-                self._experiment.plan.protocol.task.description.startswith("reaching")
-                and len(done) > 1
-            ):
-                left, aims, ends = (
-                    np.array([[row[f"{name}_{axis}_m"] for axis in "xy"] for row in done])
-                    for name in ("start", "target", "end")
-                )
-                found = measure_throughput(
-                    left, aims, ends, [row["completion_s"] for row in done]
-                )
-                if found is not None:
-                    yield {
-                        self.unit: who,
-                        "condition": condition,
-                        "throughput_bits_s": found.bits_s,
-                    }
+            groups.setdefault((row[self.unit], row["condition"]), []).append(row)
+        for (unit, condition), rows in groups.items():
+            completed = [row for row in rows if row["succeeded"]]
+            if len(completed) < 2:
+                continue
+            times_s = [row["completion_s"] for row in completed]
+            throughput = measure_throughput(
+                _list_points(completed, "start"),
+                _list_points(completed, "target"),
+                _list_points(completed, "end"),
+                times_s,
+            )
+            if throughput is not None:
+                yield {
+                    self.unit: unit,
+                    "condition": condition,
+                    "throughput_bits_s": throughput.bits_s,
+                }
 
     def _find_gains(self) -> Iterator[dict[str, Any]]:
-        """Yields by how much each pair has become better by a training: at once (transfer), and
-        later.
+        """Yields the gain of each unit and condition by a training.
+
+        A gain is the mean before the training minus the mean right after it (transfer), or
+        minus the mean in the later test (retention).
         """
         learnt = self._experiment.plan.protocol.task.learning_measure
         means = dict[str, Any]()
         for phase in ("before", "after", "retention"):
             if rows := [row for row in self.learning_rows if row.get("phase") == phase]:
                 means[phase] = self._average_learnt(rows, learnt)
-        for condition, each in means.pop("before", {}).items():
-            for who, before in each.items():
-                of = {
-                    phase: found.get(condition, {}).get(who) for phase, found in means.items()
-                }
-                gains = {
-                    f"gain_{phase}_{learnt}": before - mean
-                    for phase, mean in of.items()
-                    if mean
-                }
-                yield {self.unit: who, "condition": condition, **gains}
+        means_before = means.pop("before", {})
+        for condition, means_by_unit in means_before.items():
+            for unit, before in means_by_unit.items():
+                gains = {}
+                for phase, phase_means in means.items():
+                    mean = phase_means.get(condition, {}).get(unit)
+                    if mean:
+                        gains[f"gain_{phase}_{learnt}"] = before - mean
+                yield {self.unit: unit, "condition": condition, **gains}
 
     def _is_censored(self, measure: str) -> bool:
-        """Whether a measure is the completion time of trials of which some were not completed."""
+        """Returns whether a measure is the completion time and some trials are censored."""
         has_limit = self._experiment.plan.protocol.task.has_limit
-        return (
-            measure == COMPLETION
-            and has_limit
-            and not all(map(is_completed, self.learning_rows))
-        )
+        if measure != COMPLETION or not has_limit:
+            return False
+        return not all(map(is_completed, self.learning_rows))
 
     def _average_learnt(self, rows: Sequence[Row], learnt: str) -> dict[str, dict[str, float]]:
-        """Returns what is learnt by condition and unit: means, or medians of times that may be
-        censored.
+        """Returns the mean of the measure `learnt` for each condition and unit.
 
-        A median that is longer than the limit is left out.
+        Completion times of which some are censored are summarised by medians instead. A median
+        longer than the time limit is left out.
         """
         if not self._is_censored(learnt):
             return average_trials(rows, learnt, self.unit)
         medians = find_unit_medians(rows, self.unit)
         return {
-            condition: {who: median for who, median in each.items() if math.isfinite(median)}
-            for condition, each in medians.items()
+            condition: {
+                unit: median for unit, median in unit_medians.items() if math.isfinite(median)
+            }
+            for condition, unit_medians in medians.items()
         }
 
     def _find_thresholds(self) -> Iterator[dict[str, Any]]:
-        """Yields the threshold of each participant and condition, of a staircase that turned
-        often enough.
+        """Yields the threshold of each unit and condition.
+
+        Staircases without enough reversals have no threshold.
         """
         plan = self._experiment.plan
         choices = self._experiment.list_choices()
-        if (stairs := plan.protocol.staircase) is None:
+        staircase = plan.protocol.staircase
+        if staircase is None:
             return
-        for trial in (one for one in plan.trials if one.trial == 1):
-            threshold = stairs.find_threshold(plan.judge_choices(trial, choices))
-            if threshold is not None and (who := "-".join(trial.group)) not in self._exclude:
-                yield {self.unit: who, "condition": trial.condition, stairs.measure: threshold}
+        # the first trial of a block stands for its staircase
+        for trial in [trial for trial in plan.trials if trial.trial == 1]:
+            threshold = staircase.find_threshold(plan.judge_choices(trial, choices))
+            unit = "-".join(trial.group)
+            if threshold is not None and unit not in self._exclude:
+                yield {
+                    self.unit: unit,
+                    "condition": trial.condition,
+                    staircase.measure: threshold,
+                }
 
     def _write_methods(self) -> str:
+        """Returns the methods paragraph."""
         plan = self._experiment.plan
         protocol = plan.protocol
         scenario = next(iter(plan.scenarios.values()))
-        who = dict.fromkeys(row[self.unit] for row in self.rows)
-        rows_of = {
-            name: [row for row in self.rows if row["condition"] == name]
-            for name in protocol.conditions
-        }
-        delays = {
-            name: {"delay_ms": round(float(np.mean([row["delay_ms"] for row in rows])), 1)}
-            for name, rows in rows_of.items()
-            if rows
-        }
-        control = msgspec.to_builtins(scenario.sites[protocol.users[0]].control)
+        number = len({row[self.unit] for row in self.rows})
+        participants = number * len(protocol.users)
+        delays = {}
+        for name in protocol.conditions:
+            delays_ms = [row["delay_ms"] for row in self.rows if row["condition"] == name]
+            if delays_ms:
+                delays[name] = {"delay_ms": round(float(np.mean(delays_ms)), 1)}
+        site = scenario.sites[protocol.users[0]]
+        control = msgspec.to_builtins(site.control)
         reasons = ", ".join(
-            f"{name}: {why}" if why else name for name, why in self._exclude.items()
+            f"{name}: {reason}" if reason else name for name, reason in self._exclude.items()
         )
-        facts: dict[str, Any] = {  # "": there is nothing to say of it
-            "participants": len(who) * len(protocol.users),
-            "pairs": len(who) if self.unit == "pair" else "",
-            "excluded": len(protocol.groups) * len(protocol.users)
-            - len(who) * len(protocol.users),
+        # the paragraph does not mention a fact of ""
+        facts: dict[str, Any] = {
+            "participants": participants,
+            "pairs": number if self.unit == "pair" else "",
+            "excluded": len(protocol.groups) * len(protocol.users) - participants,
             "exclusions": reasons,
             "training": protocol.training.describe() if protocol.training else "",
             "staircase": protocol.staircase.describe() if protocol.staircase else "",
@@ -332,7 +352,7 @@ class ExperimentAnalysis(Result):
             "trials": protocol.trials,
             "conditions": delays,
             "law": control.pop("law"),
-            "rate_hz": scenario.sites[protocol.users[0]].rate_hz,
+            "rate_hz": site.rate_hz,
             "gains": control,
             "seeds": [protocol.seed],
             "program": f"trilat-net {find_version()}",
@@ -347,22 +367,22 @@ class ExperimentAnalysis(Result):
         return write_methods(facts)
 
     def _list_computed(self) -> list[str]:
-        """Returns which analyses were computed, of those that a methods paragraph describes."""
-        compared = [one for found in self.comparisons.values() for one in found]
-        summarised = [one for found in self.means.values() for one in found]
-        computed = {
-            "intervals": any(one.interval is not None for one in summarised),
-            "bootstrap": any(one.bootstrap is not None for one in summarised),
-            "t tests": any(one.p is not None for one in compared),
-            "wilcoxon": any(one.p_wilcoxon is not None for one in compared),
-            "effect sizes": any(one.d_z is not None for one in compared),
-            "sign tests": any(one.p is not None for one in self.time_comparisons),
+        """Returns the computed analyses, of those that a methods paragraph describes."""
+        tests = list(chain.from_iterable(self.comparisons.values()))
+        means = list(chain.from_iterable(self.means.values()))
+        is_computed = {
+            "intervals": any(mean.interval is not None for mean in means),
+            "bootstrap": any(mean.bootstrap is not None for mean in means),
+            "t tests": any(test.p is not None for test in tests),
+            "wilcoxon": any(test.p_wilcoxon is not None for test in tests),
+            "effect sizes": any(test.d_z is not None for test in tests),
+            "sign tests": any(test.p is not None for test in self.time_comparisons),
             "mixed models": bool(self.models),
         }
-        return [name for name, was in computed.items() if was]
+        return [name for name, computed in is_computed.items() if computed]
 
     def _describe_times(self) -> str:
-        """Returns the sentence on trials that were not completed; "" if all were."""
+        """Returns the sentence on trials that were not completed, "" if all were completed."""
         trials = sum(time.trials for time in self.times)
         censored = sum(time.censored for time in self.times)
         if not censored:
@@ -372,16 +392,16 @@ class ExperimentAnalysis(Result):
         failed = f" and {sooner} failed sooner" if sooner else ""
         return (
             f"{timed_out} of {count_nouns(trials, 'trial')} ran into the time limit of "
-            f"{self._limit_s:g} s{failed}; their "
-            "completion times are right-censored, and completion is summarised by the median of Kaplan and "
-            f"Meier per {self.unit} and condition"
+            f"{self._limit_s:g} s{failed}; their completion times are right-censored, "
+            "and completion is summarised by the median of Kaplan and Meier "
+            f"per {self.unit} and condition"
         )
 
     def _describe_missing_answers(self) -> str:
-        """Returns the sentence on answers that are missing; "" if none is."""
-        missing = sum(one.missing for one in self.missing_answers)
-        asked = sum(one.asked for one in self.missing_answers)
-        unscored = sum(one.unscored for one in self.missing_answers)
+        """Returns the sentence on missing answers, "" if no answer is missing."""
+        missing = sum(answers.missing for answers in self.missing_answers)
+        asked = sum(answers.asked for answers in self.missing_answers)
+        unscored = sum(answers.unscored for answers in self.missing_answers)
         if not missing:
             return ""
         plural = "questionnaire has" if unscored == 1 else "questionnaires have"
@@ -391,28 +411,46 @@ class ExperimentAnalysis(Result):
         )
 
     def write(self, folder: Path) -> "ExperimentAnalysis":
-        """Writes tables, figures, the paragraph and all as JSON into a folder; `paths` names
-        them.
+        """Writes tables, figures, the methods paragraph and the JSON file into a folder.
+
+        `paths` then lists the written files.
         """
-        made = make_folder(folder)
+        folder = make_folder(folder)
+        self.paths = []
+        for name, text in self._encode_files().items():
+            self.paths.append(folder / name)
+            write_whole(self.paths[-1], text, force=True)
+        figures = self._draw_figures()
+        page = folder / "report.md"
+        write_whole(page, self.compose_page(list(figures)), force=True)
+        self.paths.append(page)
+        for name, figure in figures.items():
+            self.paths.append(folder / f"{name}.png")
+            style.write_figure(figure, self.paths[-1], style.REPORT_DPI)
+        return self
+
+    def _encode_files(self) -> dict[str, str]:
+        """Returns the contents of the text files by file name."""
         tables = {
             "conditions.csv": self._list_means(),
             "comparisons.csv": self.to_rows(),
+        }
+        optional_tables = {
             "completion_times.csv": to_table(self.times),
             "completion_comparisons.csv": to_table(self.time_comparisons),
-            "missing_answers.csv": [one._asdict() for one in self.missing_answers],
+            "missing_answers.csv": [answers._asdict() for answers in self.missing_answers],
         }
-        optional = ("completion_times.csv", "completion_comparisons.csv", "missing_answers.csv")
-        tables = {name: rows for name, rows in tables.items() if rows or name not in optional}
+        tables |= {name: rows for name, rows in optional_tables.items() if rows}
         texts = {
             name: encode_csv([dict(_flatten(row)) for row in rows])
             for name, rows in tables.items()
         }
-        whole = json.dumps(self.to_dict(), indent=1)
-        texts |= {"methods.txt": f"{self.methods}\n", "analysis.json": f"{whole}\n"}
-        for name, text in texts.items():
-            write_whole(made / name, text, force=True)
-        self.paths = [made / name for name in texts]
+        texts["methods.txt"] = f"{self.methods}\n"
+        texts["analysis.json"] = json.dumps(self.to_dict(), indent=1) + "\n"
+        return texts
+
+    def _draw_figures(self) -> dict[str, Any]:
+        """Returns the figures by name."""
         figures = {
             name: draw_conditions(self.of(name), name, unit=self.unit) for name in self.means
         }
@@ -425,13 +463,7 @@ class ExperimentAnalysis(Result):
             figures["learning"] = draw_learning(
                 self.learning_rows, learnt, unit=self.unit, limit_s=limit_s
             )
-        page = made / "report.md"
-        write_whole(page, self.compose_page(list(figures)), force=True)
-        self.paths.append(page)
-        for name, figure in figures.items():
-            self.paths.append(made / f"{name}.png")
-            style.write_figure(figure, self.paths[-1], style.REPORT_DPI)
-        return self
+        return figures
 
     def compose_page(self, figures: Sequence[str]) -> str:
         """Returns the text of the analysis with its figures, as Markdown.
@@ -442,65 +474,66 @@ class ExperimentAnalysis(Result):
         protocol = self._experiment.plan.protocol
         parts = [f"# {protocol.title or protocol.name}"]
         for block in compose(self):
-            text = (
-                block.markdown() if isinstance(block, TextTable) else "\n".join(block.lines())
-            )
-            parts += [text] if text.strip() else []
+            if isinstance(block, TextTable):
+                text = block.markdown()
+            else:
+                text = "\n".join(block.lines())
+            if text.strip():
+                parts.append(text)
         parts += [f"![{name}]({name}.png)" for name in figures]
         return "\n\n".join(parts) + "\n"
 
     def fit_models(self) -> Iterator[MixedModel]:
-        """Yields mixed models of the forces of users within pairs, where statsmodels is
-        installed.
+        """Yields mixed models of the forces of users within pairs.
+
+        There are models only if statsmodels is installed.
         """
         pairs = {row[self.unit] for row in self.rows}
         if self.unit == "participant" or len(pairs) < 2 or find_spec("statsmodels") is None:
             return
         for measure in ("force_mean", "force_peak"):
-            rows = [
-                {**row, "participant": name, measure + "_n": row[f"{measure}_user{place}_n"]}
-                for row in self.rows
-                for place, name in enumerate(row["pair"].split("-"), 1)
-            ]
-            with suppress(UsageError):  # too few pairs for it
+            rows = []
+            for row in self.rows:
+                for user, name in enumerate(row["pair"].split("-"), 1):
+                    force_n = row[f"{measure}_user{user}_n"]
+                    rows.append({**row, "participant": name, measure + "_n": force_n})
+            with suppress(UsageError):  # there are too few pairs for a model
                 yield fit_mixed_model(rows, measure + "_n")
 
     def _list_means(self) -> list[dict[str, Any]]:
+        """Returns a row for each measure and condition."""
         return [
-            {"measure": name, **one._asdict()}
-            for name, means in self.means.items()
-            for one in means
+            {"measure": measure, **mean._asdict()}
+            for measure, means in self.means.items()
+            for mean in means
         ]
 
     def to_rows(self) -> list[dict[str, Any]]:
         """Returns a row for each comparison."""
-        return [one._asdict() for found in self.comparisons.values() for one in found]
+        return [test._asdict() for test in chain.from_iterable(self.comparisons.values())]
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns it as `trilat experiment analyse --json`."""
-        facts = {
-            "name": self._experiment.plan.protocol.name,
-            "digest": self._experiment.plan.digest,
-        }
+        """Returns the analysis as `trilat experiment analyse --json` prints it."""
         models = {model.measure: model._asdict() for model in self.models}
         for model in models.values():
             model["effects"] = [effect._asdict() for effect in model["effects"]]
         return {
-            **facts,
+            "name": self._experiment.plan.protocol.name,
+            "digest": self._experiment.plan.digest,
             "conditions": self._list_means(),
             "comparisons": self.to_rows(),
             "completion_times": to_table(self.times),
             "completion_comparisons": to_table(self.time_comparisons),
-            "missing_answers": [one._asdict() for one in self.missing_answers],
+            "missing_answers": [answers._asdict() for answers in self.missing_answers],
             "absent": self.absent,
             "mixed_models": models,
             "methods": self.methods,
         }
 
     def blocks(self) -> Iterator[Block]:
-        """Yields its text: completion, the measures, what is missing, and the paragraph.
+        """Yields the text: completion, measures, missing numbers, and the methods paragraph.
 
-        With one unit there is nothing to compare it with, and all measures stand in one table.
+        With a single unit there are no comparisons, and all measures are in one table.
         """
         yield from self._write_time_blocks()
         units = {row[self.unit] for row in self.rows}
@@ -509,29 +542,30 @@ class ExperimentAnalysis(Result):
         else:
             yield from self._write_single_unit_block(next(iter(units)))
         yield from self._write_model_blocks()
-        for one in self.missing_answers:
-            under = f", {one.condition}" if one.condition else ""
-            without = (
-                (f"; {one.unscored} of {one.forms} have no score for that reason")
-                if one.missing
-                else ""
-            )
+        for answers in self.missing_answers:
+            condition = f", {answers.condition}" if answers.condition else ""
+            unscored = ""
+            if answers.missing:
+                unscored = (
+                    f"; {answers.unscored} of {answers.forms} have no score for that reason"
+                )
             yield (
-                f"{one.questionnaire}{under}: {one.missing} of "
-                f"{count_nouns(one.asked, 'answer is', 'answers are')} missing{without}"
+                f"{answers.questionnaire}{condition}: {answers.missing} of "
+                f"{count_nouns(answers.asked, 'answer is', 'answers are')} missing{unscored}"
             )
-        yield from (
-            f"{name}: no number, because {reason}" for name, reason in self.absent.items()
-        )
+        for measure, reason in self.absent.items():
+            yield f"{measure}: no number, because {reason}"
         if self.missing_answers or self.absent:
             yield ""
         yield self.methods
 
     def _write_time_blocks(self) -> Iterator[Block]:
-        """Yields how many trials were completed, and how long that took."""
+        """Yields the numbers of completed trials and the completion times."""
         if not self.times:
             return
-        yield f"{COMPLETION}, median over {self.unit}s of the median of each {self.unit}'s trials"
+        yield (
+            f"{COMPLETION}, median over {self.unit}s of the median of each {self.unit}'s trials"
+        )
         yield "a trial that was not completed counts as longer than any"
         rows = [
             (
@@ -541,7 +575,7 @@ class ExperimentAnalysis(Result):
                 str(time.censored - time.timed_out),
                 str(time.number),
                 NOT_REACHED if time.median is None else f"{time.median:.4g}",
-                _span(time.interval),
+                _format_interval(time.interval),
             )
             for time in self.times
         ]
@@ -549,53 +583,52 @@ class ExperimentAnalysis(Result):
         yield TextTable(heads, rows, align="lrrrrrl")
         yield ""
         if self.time_comparisons:
-            found = [
+            comparison_rows = [
                 (
-                    f"{one.second} - {one.first}",
-                    f"{one.longer} of {one.number}",
-                    f"{one.shorter} of {one.number}",
-                    format_number(one.difference),
-                    format_number(one.p),
-                    format_number(one.p_holm),
+                    f"{test.second} - {test.first}",
+                    f"{test.longer} of {test.number}",
+                    f"{test.shorter} of {test.number}",
+                    format_number(test.difference),
+                    format_number(test.p),
+                    format_number(test.p_holm),
                 )
-                for one in self.time_comparisons
+                for test in self.time_comparisons
             ]
             columns = ("difference", "longer", "shorter", "median", "p, sign test", "p, Holm")
-            yield TextTable(columns, found, align="lrrrrr")
+            yield TextTable(columns, comparison_rows, align="lrrrrr")
             yield ""
 
     def _write_measure_blocks(self) -> Iterator[Block]:
-        """Yields a table of conditions and one of comparisons for each measure."""
+        """Yields a table of conditions and a table of comparisons for each measure."""
         for measure, means in self.means.items():
             yield f"{measure}, mean over {self.unit}s, {100 * CONFIDENCE:g} % interval"
             rows = [
                 (
-                    one.condition,
-                    str(one.number),
-                    str(one.missing),
-                    f"{one.mean:.4g}",
-                    _span(one.interval),
+                    mean.condition,
+                    str(mean.number),
+                    str(mean.missing),
+                    f"{mean.mean:.4g}",
+                    _format_interval(mean.interval),
                 )
-                for one in means
+                for mean in means
             ]
-            yield TextTable(
-                ("condition", "n", "missing", "mean", "interval"), rows, align="lrrrl"
-            )
+            heads: tuple[str, ...] = ("condition", "n", "missing", "mean", "interval")
+            yield TextTable(heads, rows, align="lrrrl")
             yield ""
-            found = [
+            comparison_rows = [
                 (
-                    f"{one.second} - {one.first}",
-                    format_number(one.difference),
-                    _span(one.interval),
-                    format_number(one.t),
-                    format_number(one.p_holm),
-                    format_number(one.d_z),
+                    f"{test.second} - {test.first}",
+                    format_number(test.difference),
+                    _format_interval(test.interval),
+                    format_number(test.t),
+                    format_number(test.p_holm),
+                    format_number(test.d_z),
                 )
-                for one in self.comparisons[measure]
+                for test in self.comparisons[measure]
             ]
-            if found:
+            if comparison_rows:
                 heads = ("difference", "mean", "interval", "t", "p, Holm", "d_z")
-                yield TextTable(heads, found, align="lrlrrr")
+                yield TextTable(heads, comparison_rows, align="lrlrrr")
                 yield ""
 
     def _write_model_blocks(self) -> Iterator[Block]:
@@ -606,7 +639,7 @@ class ExperimentAnalysis(Result):
                 (
                     effect.condition,
                     f"{effect.estimate:.4g}",
-                    _span(effect.interval),
+                    _format_interval(effect.interval),
                     format_number(effect.t),
                     format_number(effect.p),
                 )
@@ -615,13 +648,16 @@ class ExperimentAnalysis(Result):
             yield TextTable(("condition", "effect", "interval", "t", "p"), rows, align="lrlrr")
             yield ""
 
-    def _write_single_unit_block(self, who: str) -> Iterator[Block]:
-        """Yields one table of all measures, a column for each condition."""
+    def _write_single_unit_block(self, unit: str) -> Iterator[Block]:
+        """Yields a table of all measures, with a column for each condition."""
         conditions = list(dict.fromkeys(row["condition"] for row in self.rows))
-        yield f"means over the trials of a condition; one {self.unit}, {who}, allows no interval and no test"
+        yield (
+            f"means over the trials of a condition; one {self.unit}, {unit}, "
+            "allows no interval and no test"
+        )
         rows = []
         for measure, means in self.means.items():
-            by_condition = {one.condition: _describe_mean(one) for one in means}
+            by_condition = {mean.condition: _describe_mean(mean) for mean in means}
             rows.append((measure, *(by_condition.get(name, "-") for name in conditions)))
         yield TextTable(("measure", *conditions), rows, align="l" + "r" * len(conditions))
         yield ""
@@ -633,37 +669,40 @@ def analyse_experiment(
     *,
     exclude: Mapping[str, str] = {},
 ) -> ExperimentAnalysis:
-    """Returns the statistics of an experiment, written into its folder; `trilat experiment
-    analyse`.
+    """Returns the statistics of an experiment and writes them into its folder.
 
-    >>> found = tn.analyse_experiment("runs/experiment-reaching-001")  # doctest: +SKIP
-    >>> found.means["completion_s"][0].interval  # doctest: +SKIP
+    The command is `trilat experiment analyse`.
+
+    >>> analysis = tn.analyse_experiment("runs/experiment-reaching-001")  # doctest: +SKIP
+    >>> analysis.means["completion_s"][0].interval  # doctest: +SKIP
     (3.06, 3.22)
 
     Args:
-        folder: of the experiment.
-        out: where tables and figures go; by default its folder `analysis`.
+        folder: folder of the experiment.
+        out: folder for tables and figures; by default the experiment's folder `analysis`.
         exclude: participants or pairs whose data do not count, with the reasons.
 
     Raises:
-        UsageError: there is no experiment, no trial is done, or nobody is called what is
-            excluded.
+        UsageError: there is no experiment, no trial is done, or an excluded participant or
+            pair does not exist.
     """
     experiment = open_experiment(folder)
-    return ExperimentAnalysis(experiment, exclude).write(
-        make_subfolder(experiment.folder / FOLDER) if out is None else Path(out)
-    )
+    analysis = ExperimentAnalysis(experiment, exclude)
+    if out is None:
+        return analysis.write(make_subfolder(experiment.folder / FOLDER))
+    return analysis.write(Path(out))
 
 
 class PowerOfExperiment(Result):
-    """How many participants an effect needs.
+    """Number of participants that an effect needs.
 
     Attributes:
-        d_z: the effect, mean over standard deviation of the differences within participants.
-        least: the least number of participants by the power that is wanted.
-        participants: how many there are to be; None: it is not asked.
-        power: with so many, by the noncentral t.
-        simulated: the same by drawn experiments, with its 95 % interval.
+        d_z: the effect: mean over standard deviation of the differences within participants.
+        least: the smallest number of participants for each desired power.
+        participants: planned number of participants; None without a plan.
+        power: power with the planned number, by the noncentral t distribution.
+        simulated: power with the planned number from simulated experiments, with its 95 %
+            interval.
     """
 
     def __init__(self, d_z: float, participants: int | None, seed: int) -> None:
@@ -682,8 +721,8 @@ class PowerOfExperiment(Result):
             )
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns it as `trilat experiment power --json`."""
-        drawn = None if self.simulated is None else self.simulated._asdict()
+        """Returns the numbers as `trilat experiment power --json` prints them."""
+        simulated = None if self.simulated is None else self.simulated._asdict()
         least = [
             {"power": wanted, "participants": number} for wanted, number in self.least.items()
         ]
@@ -692,29 +731,32 @@ class PowerOfExperiment(Result):
             "least": least,
             "participants": self.participants,
             "power": self.power,
-            "simulated": drawn,
+            "simulated": simulated,
         }
 
     def blocks(self) -> Iterator[Block]:
-        """Yields its text."""
-        yield f"paired comparison of two conditions, two-sided, alpha 0.05, effect d_z {self.d_z:g}"
-        yield TextTable(
-            ("power", "participants"),
-            [(f"{p:g}", str(n)) for p, n in self.least.items()],
-            align="rr",
+        """Yields the text."""
+        yield (
+            "paired comparison of two conditions, two-sided, alpha 0.05, "
+            f"effect d_z {self.d_z:g}"
         )
+        rows = [(f"{wanted:g}", str(number)) for wanted, number in self.least.items()]
+        yield TextTable(("power", "participants"), rows, align="rr")
         if self.power is not None and self.simulated is not None:
-            drawn = f"{self.simulated.found:.3f} {_span(self.simulated.interval)} of 500 drawn experiments"
+            interval = _format_interval(self.simulated.interval)
+            simulated = f"{self.simulated.found:.3f} {interval} of 500 drawn experiments"
             yield (
                 f"with {count_nouns(self.participants, 'participant')}: power "
-                f"{self.power:.3f}; found in {drawn}"
+                f"{self.power:.3f}; found in {simulated}"
             )
 
 
 def compute_experiment_power(
     effect: float, participants: int | None = None, *, seed: int = 1
 ) -> PowerOfExperiment:
-    """Returns how many participants an effect needs; the command is `trilat experiment power`.
+    """Returns the number of participants that an effect needs.
+
+    The command is `trilat experiment power`.
 
     >>> tn.compute_experiment_power(0.5).least[0.8]
     34
@@ -722,33 +764,40 @@ def compute_experiment_power(
     Args:
         effect: mean over standard deviation of the differences within participants, Cohen's
             d_z.
-        participants: how many there are to be, of whom the power is told and simulated.
-        seed: of the experiments that are drawn.
+        participants: planned number of participants, whose power is computed and simulated.
+        seed: seed of the simulated experiments.
 
     Raises:
-        UsageError: the effect is too small to be found.
+        UsageError: the effect needs more participants than `find_least_number` tries.
     """
     return PowerOfExperiment(effect, participants, seed)
 
 
 def _describe_mean(mean: ConditionMean) -> str:
-    """Returns a mean, with how many numbers are missing if any are."""
+    """Returns a mean as text, with the number of missing values if there are any."""
     return f"{mean.mean:.4g}" + (f" ({mean.missing} missing)" if mean.missing else "")
 
 
-def _span(interval: tuple[float, float | None] | None) -> str:
-    """Returns an interval, whose upper end may not have been reached."""
+def _list_points(rows: Sequence[Row], name: str) -> Array:
+    """Returns the points `name` of trials in m: a row for each trial, with columns x and y."""
+    return np.array([[row[f"{name}_{axis}_m"] for axis in "xy"] for row in rows])
+
+
+def _format_interval(interval: tuple[float, float | None] | None) -> str:
+    """Returns an interval as text; an upper end of None was not reached."""
     if interval is None:
         return "-"
     low, high = interval
-    return f"[{low:.4g}, {NOT_REACHED if high is None else format(high, '.4g')}]"
+    upper = NOT_REACHED if high is None else f"{high:.4g}"
+    return f"[{low:.4g}, {upper}]"
 
 
 def _flatten(row: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Yields the cells of a row; an interval has one for each end."""
-    for key, one in row.items():
+    """Yields the cells of a row; an interval has a cell for each end."""
+    for key, value in row.items():
         if key in ("interval", "bootstrap"):
-            low, high = one or (None, None)
-            yield from ((f"{key}_low", low), (f"{key}_high", high))
+            low, high = value or (None, None)
+            yield f"{key}_low", low
+            yield f"{key}_high", high
         else:
-            yield key, one
+            yield key, value
