@@ -1,10 +1,10 @@
-"""The protocol of an experiment with people, from one TOML file, and the trials that follow
-from it.
+"""Protocol of an experiment with people, read from a TOML file, and the plan of its trials.
 
-Invariant: the plan is a function of the protocol. Its digest, over the protocol and the text of
-the scenario of every condition, stands in the log of every trial: what was planned before
-anybody sat down can be shown afterwards. A protocol that cannot be carried out is refused as a
-whole, with everything that is wrong.
+Invariant:
+    - The plan is a function of the protocol and of the scenarios of its conditions.
+    - The digest of the plan covers the protocol and the text of the scenario of each condition.
+      The log of each trial contains the digest, which proves that the trial follows the plan.
+    - A protocol that cannot be carried out is refused as a whole, with a list of all problems.
 """
 
 import hashlib
@@ -32,7 +32,7 @@ from .tasks import AnyTask, ReachTrial
 
 Wait = Annotated[float, Meta(ge=0.0, le=60.0)]
 Pseudonym = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_]{1,20}\Z")]
-"""It becomes part of file names."""
+"""Name of a participant; the name becomes part of file names."""
 Count = Annotated[int, Meta(ge=1, le=1000)]
 Counted = Annotated[int, Meta(ge=0, le=1000)]
 Feedback = Literal[
@@ -47,12 +47,12 @@ Feedback = Literal[
 
 
 class CatchTrials(Frozen, frozen=True):
-    """Trials of another condition among those of a block, so that nobody learns what to expect
-    of it.
+    """Trials of another condition within a block, which keep participants from anticipating.
 
     Attributes:
-        condition: which.
-        share: of the trials of a block that count, rounded; blocks of that condition have none.
+        condition: condition of the catch trials.
+        share: share of the counted trials of a block, rounded. Blocks of the condition itself
+            have no catch trials.
     """
 
     condition: Name
@@ -60,15 +60,17 @@ class CatchTrials(Frozen, frozen=True):
 
 
 class Training(Frozen, frozen=True):
-    """Authority that moves from the first user, an expert, to the second one, who learns.
+    """Training in which authority moves from an expert to a learner.
+
+    The first user is the expert, the second user the learner.
 
     Attributes:
-        lead: by condition the expert's part of what both share at the slave, in the first and
-            last trial.
-        before: trials of a block before that, which the second user makes alone.
-        after: trials alone right afterwards: what was learned.
-        retention: trials alone later, after a rest: what is left of it.
-        rest_s: that rest, s.
+        lead: for each condition, the expert's part of the users' total share at the slave, in
+            the first and in the last trial of the training.
+        before: number of trials of the learner alone before the training.
+        after: number of trials of the learner alone right after the training (transfer).
+        retention: number of trials of the learner alone after a rest (retention).
+        rest_s: rest before the retention trials, s.
     """
 
     lead: dict[Name, tuple[Share, Share]]
@@ -78,47 +80,49 @@ class Training(Frozen, frozen=True):
     rest_s: Annotated[float, Meta(ge=0.0, le=1e6)] = 600.0
 
     def describe(self) -> str:
-        """Returns it in a sentence of a methods paragraph."""
+        """Returns the sentence on the training for a methods paragraph."""
         parts = ", ".join(
             f"{first:g} to {last:g} ({name})" for name, (first, last) in self.lead.items()
         )
-        later = f", and {self.retention} more after {self.rest_s:g} s" if self.retention else ""
+        retention = ""
+        if self.retention:
+            retention = f", and {self.retention} more after {self.rest_s:g} s"
         return (
             f"In these the expert's part of the authority went from {parts}; "
             f"{count_nouns(self.before, 'trial')} before and "
-            f"{self.after} after them{later} were made without it and are compared"
+            f"{self.after} after them{retention} were made without it and are compared"
         )
 
 
 class Protocol(Frozen, frozen=True):
-    """An experiment, as its file has it.
+    """Protocol of an experiment, with the keys of its TOML file.
 
     Attributes:
-        name: of the experiment.
-        title: in words.
-        scenario: name or path of the scenario that all conditions are made of.
-        users: the sites that participants hold; two of them are held by a pair.
-        participants: how many, or their pseudonyms.
+        name: name of the experiment.
+        title: title of the experiment for people.
+        scenario: name or path of the scenario on which all conditions are based.
+        users: the sites that participants hold; two sites are held by a pair.
+        participants: number of participants, or their pseudonyms.
         design: how the order of conditions is balanced over participants, see
             docs/experiments.md.
-        trials: trials of a block that count; a block is all trials of one condition.
-        practice: trials before those, which do not.
-        foreperiod_s: range of the time from the begin of a trial until its target appears, s;
-            drawn evenly.
-        seed: of orders, targets and synthetic participants.
-        set: keys of the scenario that are alike in all conditions.
-        conditions: the keys of the scenario that each sets, by name.
-        task: what a participant does.
-        model: the numbers of synthetic participants.
-        consent: what people agree to before their first trial; "" asks for nothing.
-        questionnaires: what people answer, and when.
-        rest_s: how long people rest at least between two blocks, s.
-        feedback: the measures that people are told after a trial.
-        force_limit_n: largest force of the live hands of participants who bear less, N, by
-            pseudonym.
-        catch: trials of another condition among those of a block; they do not count.
-        training: trials in which authority moves from an expert to somebody who learns.
-        staircase: pairs of trials by which a key is adapted to what a participant can tell.
+        trials: number of counted trials of a block; a block has all trials of a condition.
+        practice: number of practice trials before the counted trials of a block.
+        foreperiod_s: range of the time from the start of a trial until its target appears, s;
+            the time is drawn uniformly.
+        seed: seed of orders, targets and synthetic participants.
+        set: scenario keys with the same value in all conditions.
+        conditions: for each condition by name, the scenario keys that it sets.
+        task: task of the participants.
+        model: parameters of synthetic participants.
+        consent: text that people agree to before their first trial; "" requests no consent.
+        questionnaires: the questionnaires, and when people answer them.
+        rest_s: shortest rest between two blocks, s.
+        feedback: the measures that are shown to people after a trial.
+        force_limit_n: largest force of the live hand, N, for the pseudonyms of participants who
+            need a lower limit.
+        catch: trials of another condition within a block; they do not count.
+        training: trials in which authority moves from an expert to a learner.
+        staircase: pairs of trials that adapt a scenario key to a participant's threshold.
     """
 
     name: Name
@@ -147,8 +151,10 @@ class Protocol(Frozen, frozen=True):
     def list_phases(
         self, condition: str, random: np.random.Generator
     ) -> list[tuple[str, float | None]]:
-        """Returns phase and first user's part of what two share, of every trial of a block
-        after practice.
+        """Returns phase and `lead` of each trial of a block after practice.
+
+        The lead is the first user's part of the two users' total share at the slave; None keeps
+        the scenario's shares. `random` draws the order in the pairs of a staircase.
         """
         if self.staircase is not None:
             pairs = [
@@ -156,47 +162,57 @@ class Protocol(Frozen, frozen=True):
                 for _ in range(self.trials // 2)
             ]
             return [(phase, None) for phase in itertools.chain(*pairs)]
-        if (how := self.training) is None:
+        training = self.training
+        if training is None:
             return [("", None)] * self.trials
-        parts = np.linspace(*how.lead[condition], self.trials).tolist()
-        alone = {"before": how.before, "after": how.after, "retention": how.retention}
-        before, after, later = ([(phase, 0.0)] * count for phase, count in alone.items())
-        return [*before, *(("training", part) for part in parts), *after, *later]
+        first_lead, last_lead = training.lead[condition]
+        phases: list[tuple[str, float | None]] = [("before", 0.0)] * training.before
+        leads = np.linspace(first_lead, last_lead, self.trials).tolist()
+        phases += [("training", lead) for lead in leads]
+        phases += [("after", 0.0)] * training.after
+        phases += [("retention", 0.0)] * training.retention
+        return phases
 
     @property
     def forms(self) -> list[Questionnaire]:
-        """What is answered: questionnaires, and the choices of a staircase."""
-        return [*self.questionnaires, *([self.staircase.form] if self.staircase else [])]
+        """The forms that people fill in: questionnaires, and the choices of a staircase."""
+        forms = list(self.questionnaires)
+        if self.staircase:
+            forms.append(self.staircase.form)
+        return forms
 
     @property
     def groups(self) -> list[tuple[str, ...]]:
-        """Who takes part together: one participant, or a pair."""
+        """The participants who take part together: single participants, or pairs."""
         names = self.participants
         if isinstance(names, int):
-            names = tuple(f"P{n:0{len(str(self.participants))}d}" for n in range(1, names + 1))
+            digits = len(str(names))
+            names = tuple(f"P{number:0{digits}d}" for number in range(1, names + 1))
         size = len(self.users)
-        return [names[n : n + size] for n in range(0, len(names), size)]
+        return [names[first : first + size] for first in range(0, len(names), size)]
 
 
 class PlannedTrial(NamedTuple):
-    """One trial of the plan.
+    """A trial of the plan.
 
     Attributes:
-        number: its place in the experiment, from 1.
-        group: who takes part, by the users of the protocol.
-        condition: by name.
-        block: the how manyth condition of this group it is, from 1.
-        trial: its place in the block, from 1; practice comes first.
-        practice: whether it does not count.
-        before: how many trials the group has made before.
-        target: the number of its target; each block begins at another, which is drawn, so that
-            what the direction of a target does is no learning. Both trials of a pair have one.
-        seed: of what is drawn in it.
-        catch: whether its condition is another than the block's, and it does not count.
-        phase: of a training: "before", "training", "after" or "retention"; of a staircase which
-            trial of its pair it is: "standard" or "comparison".
-        lead: the first user's part of what two users share at the slave; None: as the scenario
-            has it.
+        number: number of the trial in the experiment, from 1.
+        group: the participants, in the order of the protocol's users.
+        condition: name of the condition.
+        block: number of the block within the group, from 1.
+        trial: number of the trial within the block, from 1; practice trials are first.
+        practice: whether the trial is a practice trial, which does not count.
+        before: number of earlier trials of the group.
+        target: number of the target. The first target of each block is drawn, so that effects
+            of target direction are not mistaken for learning. Both trials of a staircase pair
+            have the same target.
+        seed: seed of the random numbers of the trial.
+        catch: whether the trial is a catch trial: of another condition than its block, and not
+            counted.
+        phase: phase of a training: "before", "training", "after" or "retention"; or the trial
+            of a staircase pair: "standard" or "comparison".
+        lead: the first user's part of the two users' total share at the slave; None keeps the
+            scenario's shares.
     """
 
     number: int
@@ -214,24 +230,24 @@ class PlannedTrial(NamedTuple):
 
     @property
     def file(self) -> str:
-        """The name of its log."""
-        who = "-".join(self.group)
-        return f"{self.number:05d}-{who}-b{self.block}-t{self.trial:02d}-{self.condition}.mcap"
+        """The file name of the trial's log."""
+        group = "-".join(self.group)
+        position = f"b{self.block}-t{self.trial:02d}"
+        return f"{self.number:05d}-{group}-{position}-{self.condition}.mcap"
 
 
 Choices = Mapping[int, float]
-"""Which trial, 1 or 2, was chosen of each pair of a staircase so far, by the number of its
-second trial.
-"""
+"""The chosen trial, 1 or 2, of each staircase pair, by the number of its second trial."""
 
 
 class Step(NamedTuple):
-    """Something that people do in an experiment.
+    """A step of an experiment: a consent, a trial or a questionnaire.
 
     Attributes:
         kind: "consent", "trial" or "questionnaire".
-        planned: the trial that it is, comes before, or comes after.
-        form: what is answered, of a questionnaire.
+        planned: the trial itself, the trial after the consent, or the trial before the
+            questionnaire.
+        form: the questionnaire; None for other kinds.
     """
 
     kind: Literal["consent", "trial", "questionnaire"]
@@ -240,15 +256,14 @@ class Step(NamedTuple):
 
     @property
     def key(self) -> str:
-        """What it is called in notes and messages."""
-        return f"{self.kind} {self.planned.number}" + (
-            f" {self.form.name}" if self.form else ""
-        )
+        """The identifier of the step in notes and messages."""
+        key = f"{self.kind} {self.planned.number}"
+        return f"{key} {self.form.name}" if self.form else key
 
 
 @dataclass(frozen=True, repr=False)
 class ExperimentPlan(Result):
-    """A protocol, the scenario of every condition, and all trials in their order.
+    """A protocol, the scenario of each condition, and all trials in their order.
 
     Attributes:
         digest: SHA-256 of protocol and scenarios, in hexadecimal digits.
@@ -260,110 +275,122 @@ class ExperimentPlan(Result):
     digest: str
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns it as `trilat experiment check --json`."""
+        """Returns the plan as `trilat experiment check --json` prints it."""
         protocol = self.protocol
-        facts = {"name": protocol.name, "digest": self.digest, "groups": len(protocol.groups)}
-        counted = sum(not (one.practice or one.catch) for one in self.trials)
-        counts = {"trials": len(self.trials), "counted": counted}
         return {
-            **facts,
-            **counts,
+            "name": protocol.name,
+            "digest": self.digest,
+            "groups": len(protocol.groups),
+            "trials": len(self.trials),
+            "counted": sum(not (trial.practice or trial.catch) for trial in self.trials),
             "conditions": list(protocol.conditions),
             "orders": self.list_orders(),
         }
 
     def list_steps(self) -> Iterator[Step]:
-        """Yields what people do, in order."""
+        """Yields the steps of the experiment in their order."""
         protocol = self.protocol
         for planned in self.trials:
             if protocol.consent and planned.block == planned.trial == 1:
                 yield Step("consent", planned)
             yield Step("trial", planned)
             counted = planned.trial - protocol.practice
-            if (stairs := protocol.staircase) is not None and counted > 0 and counted % 2 == 0:
-                yield Step("questionnaire", planned, stairs.form)
+            ends_pair = counted > 0 and counted % 2 == 0
+            if protocol.staircase is not None and ends_pair:
+                yield Step("questionnaire", planned, protocol.staircase.form)
             if planned.trial == self.trials[-1].trial:
-                left = planned.block == len(protocol.conditions)
-                asked = [
-                    form for form in protocol.questionnaires if left or form.after == "block"
-                ]
-                yield from (Step("questionnaire", planned, find_form(form)) for form in asked)
+                is_last_block = planned.block == len(protocol.conditions)
+                for form in protocol.questionnaires:
+                    if is_last_block or form.after == "block":
+                        yield Step("questionnaire", planned, find_form(form))
 
     def judge_choices(self, planned: PlannedTrial, choices: Choices) -> list[bool]:
-        """Returns whether each choice of a trial's block is the trial that had more."""
-        block = self.trials[planned.number - planned.trial :][: self.trials[-1].trial]
-        seconds = [one for one in block if one.number in choices]
-        return [
-            choices[second.number] == 1 + (second.phase == COMPARISON) for second in seconds
-        ]
+        """Returns for each choice in a trial's block whether it is the comparison trial.
+
+        The comparison trial is the trial of its pair with the larger value.
+        """
+        first = planned.number - planned.trial
+        block = self.trials[first:][: self.trials[-1].trial]
+        judgements = []
+        for second in block:
+            if second.number in choices:
+                right_choice = 1 + (second.phase == COMPARISON)
+                judgements.append(choices[second.number] == right_choice)
+        return judgements
 
     def find_pair(self, planned: PlannedTrial, choices: Choices) -> tuple[float, bool | None]:
-        """Returns the difference in a trial's pair, and whether the choice was right; None: it
-        is to come.
+        """Returns the difference within a trial's pair, and whether the choice was right.
+
+        The second is None before the choice.
         """
-        stairs = self.protocol.staircase
-        number = (planned.trial - self.protocol.practice - 1) // 2
-        assert stairs is not None
-        right = self.judge_choices(planned, choices)
-        return stairs.list_differences(right)[number], right[number] if number < len(
-            right
-        ) else None
+        staircase = self.protocol.staircase
+        assert staircase is not None
+        pair = (planned.trial - self.protocol.practice - 1) // 2
+        judgements = self.judge_choices(planned, choices)
+        difference = staircase.list_differences(judgements)[pair]
+        is_right = judgements[pair] if pair < len(judgements) else None
+        return difference, is_right
 
     def find_scenario(self, planned: PlannedTrial, choices: Choices) -> Scenario:
-        """Returns the scenario of a trial, after the choices of its block before it."""
+        """Returns the scenario of a trial, given the earlier choices of its block."""
         scenario = self.scenarios[planned.condition]
-        stairs = self.protocol.staircase
-        if stairs is None or planned.practice:
+        staircase = self.protocol.staircase
+        if staircase is None or planned.practice:
             return scenario
-        more = self.find_pair(planned, choices)[0] if planned.phase == COMPARISON else 0.0
-        return load_scenario(scenario, {stairs.key: stairs.standard + more})
+        difference = 0.0
+        if planned.phase == COMPARISON:
+            difference, _ = self.find_pair(planned, choices)
+        return load_scenario(scenario, {staircase.key: staircase.standard + difference})
 
     def rest_before_s(self, planned: PlannedTrial) -> float:
-        """Returns how long people rest at least before a trial, s."""
+        """Returns the shortest rest before a trial, s."""
         training = self.protocol.training
-        before = self.trials[max(planned.number - 2, 0)]
-        if training is not None and planned.phase == "retention" != before.phase:
+        previous = self.trials[max(planned.number - 2, 0)]
+        starts_retention = planned.phase == "retention" and previous.phase != "retention"
+        if training is not None and starts_retention:
             return training.rest_s
-        return self.protocol.rest_s if planned.trial == 1 and planned.block > 1 else 0.0
+        starts_later_block = planned.trial == 1 and planned.block > 1
+        return self.protocol.rest_s if starts_later_block else 0.0
 
     def list_orders(self) -> dict[str, list[str]]:
-        """Returns the order of conditions of each group, by its name."""
-        found: dict[str, list[str]] = {}
-        for trial in (one for one in self.trials if not one.catch):
-            order = found.setdefault("-".join(trial.group), [])
+        """Returns the order of conditions for each group by its name."""
+        orders: dict[str, list[str]] = {}
+        for trial in self.trials:
+            if trial.catch:
+                continue
+            order = orders.setdefault("-".join(trial.group), [])
             if trial.condition not in order:
                 order.append(trial.condition)
-        return found
+        return orders
 
     def blocks(self) -> Iterator[Block]:
-        """Yields its text."""
+        """Yields the text of the plan."""
         protocol = self.protocol
         facts = self.to_dict()
-        whose = "pairs" if len(protocol.users) > 1 else "participants"
+        units = "pairs" if len(protocol.users) > 1 else "participants"
+        users = ", ".join(protocol.users)
         yield f"{protocol.name}: {protocol.title or protocol.task.description}"
-        yield f"{facts['groups']} {whose} at {', '.join(protocol.users)}, {protocol.task.description}"
+        yield f"{facts['groups']} {units} at {users}, {protocol.task.description}"
         trials = self.trials[-1].trial - protocol.practice
-        each = (
+        blocks = (
             f"{count_nouns(len(protocol.conditions), 'condition')} of "
             f"{protocol.practice} + {count_nouns(trials, 'trial')}"
         )
         longest_s = protocol.foreperiod_s[1] + protocol.task.longest_s
         yield (
-            f"{each}: {count_nouns(len(self.trials), 'trial')} of at most {longest_s:g} "
-            f"s; design {protocol.design}"
+            f"{blocks}: {count_nouns(len(self.trials), 'trial')} of at most {longest_s:g} s; "
+            f"design {protocol.design}"
         )
-        yield TextTable(
-            ("", "order of conditions"),
-            [(name, ", ".join(one)) for name, one in facts["orders"].items()],
-        )
+        rows = [(name, ", ".join(order)) for name, order in facts["orders"].items()]
+        yield TextTable(("", "order of conditions"), rows)
         yield f"sha256 of the plan {self.digest}"
 
 
 def read_protocol(file: str | Path) -> Protocol:
-    """Returns the protocol of a file.
+    """Returns the protocol of a TOML file.
 
     Raises:
-        UsageError: it cannot be read, or a key or value of it is not valid.
+        UsageError: the file cannot be read, or a key or value in it is not valid.
     """
     path = Path(file)
     try:
@@ -374,7 +401,7 @@ def read_protocol(file: str | Path) -> Protocol:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise UsageError(f"{path}: is no TOML: {error}") from None
     except msgspec.ValidationError as error:
-        valid = ", ".join(one.encode_name for one in msgspec.structs.fields(Protocol))
+        valid = ", ".join(key.encode_name for key in msgspec.structs.fields(Protocol))
         raise UsageError(f"{path}: {error}; the keys of a protocol are {valid}") from None
 
 
@@ -383,71 +410,79 @@ def plan_experiment(
     folder: Path | None = None,
     scenarios: Mapping[str, Scenario] | None = None,
 ) -> ExperimentPlan:
-    """Returns the plan of a protocol; a path of its scenario is from `folder`, or all
-    `scenarios` are given.
+    """Returns the plan of a protocol.
+
+    Args:
+        protocol: the protocol.
+        folder: folder to which the path of the protocol's scenario is relative.
+        scenarios: the scenario of each condition; None loads them from the protocol's scenario.
 
     Raises:
-        UsageError: it cannot be carried out; the error names everything that is wrong.
+        UsageError: the protocol cannot be carried out; the error lists all problems.
     """
     problems = list(_find_problems(protocol))
-    found = dict(scenarios or {})
+    condition_scenarios = dict(scenarios or {})
     source: str | Path = protocol.scenario
     if folder is not None and (folder / protocol.scenario).is_file():
         source = folder / protocol.scenario
     for name, keys in protocol.conditions.items() if scenarios is None else ():
         try:
-            every = _list_keys(protocol.set) | _list_keys(keys)
-            found[name] = _prepare(load_scenario(source, every), protocol)
+            settings = _list_keys(protocol.set) | _list_keys(keys)
+            scenario = load_scenario(source, settings)
+            condition_scenarios[name] = _check_scenario(scenario, protocol)
         except TrilatError as error:
             problems.append(f"condition {name}: {error}")
     if problems:
         raise UsageError(f"{protocol.name}: " + "; ".join(problems))
-    texts = {name: scenario.text for name, scenario in found.items()}
-    whole = msgspec.json.encode([msgspec.to_builtins(protocol), texts], order="sorted")
+    texts = {name: scenario.text for name, scenario in condition_scenarios.items()}
+    content = msgspec.json.encode([msgspec.to_builtins(protocol), texts], order="sorted")
     return ExperimentPlan(
-        protocol, found, list(_list_trials(protocol)), hashlib.sha256(whole).hexdigest()
+        protocol=protocol,
+        scenarios=condition_scenarios,
+        trials=list(_list_trials(protocol)),
+        digest=hashlib.sha256(content).hexdigest(),
     )
 
 
 def _list_keys(table: Mapping[str, Any], path: str = "") -> dict[str, Any]:
-    """Returns keys of a scenario, each written out that is of a site, a link or a row of
-    dominance.
+    """Returns the dotted keys of a table of scenario settings with their values.
+
+    Tables of sites, links and rows of dominance are expanded; other tables stay values.
     """
-    found = dict[str, Any]()
+    keys = dict[str, Any]()
     for name, value in table.items():
         key = f"{path}.{name}" if path else name
-        inside = key in ("sites", "links", "dominance") or path in ("sites", "links")
-        found |= (
-            _list_keys(value, key) if inside and isinstance(value, Mapping) else {key: value}
-        )
-    return found
+        is_expanded = key in ("sites", "links", "dominance") or path in ("sites", "links")
+        if is_expanded and isinstance(value, Mapping):
+            keys |= _list_keys(value, key)
+        else:
+            keys[key] = value
+    return keys
 
 
 def _find_problems(protocol: Protocol) -> Iterator[str]:
-    """Yields what no scenario is needed to see."""
+    """Yields the problems of a protocol that are visible without its scenario."""
     size = len(protocol.users)
     names = [name for group in protocol.groups for name in group]
     if protocol.foreperiod_s[0] > protocol.foreperiod_s[1]:
-        yield f"foreperiod_s is from the shorter to the longer time, not {list(protocol.foreperiod_s)}"
+        foreperiod_s = list(protocol.foreperiod_s)
+        yield f"foreperiod_s is from the shorter to the longer time, not {foreperiod_s}"
     if len(set(names)) < len(names):
         yield "two participants have one pseudonym"
     if unknown := protocol.force_limit_n.keys() - set(names):
         yield f"force_limit_n: there is no participant {', '.join(sorted(unknown))}"
     if protocol.catch is not None and protocol.catch.condition not in protocol.conditions:
         yield f"catch.condition: there is no condition {protocol.catch.condition}"
-    if (
-        protocol.training is not None
-        and protocol.training.lead.keys() != protocol.conditions.keys()
-    ):
-        yield f"training.lead: is a pair of numbers for each of {', '.join(protocol.conditions)}"
-    if (
-        sum(one is not None for one in (protocol.training, protocol.catch, protocol.staircase))
-        > 1
-    ):
+    training = protocol.training
+    if training is not None and training.lead.keys() != protocol.conditions.keys():
+        conditions = ", ".join(protocol.conditions)
+        yield f"training.lead: is a pair of numbers for each of {conditions}"
+    exclusive_tables = (training, protocol.catch, protocol.staircase)
+    if sum(table is not None for table in exclusive_tables) > 1:
         yield "an experiment has one of catch trials, a training and a staircase"
     if protocol.staircase is not None:
         yield from _find_staircase_problems(protocol, protocol.staircase)
-    if size != 2 and (protocol.training is not None or protocol.task.needs_pair):
+    if size != 2 and (training is not None or protocol.task.needs_pair):
         yield "a training, a handover and users who are shown different targets need two users"
     forms = [form.name for form in protocol.forms]
     if len(set(forms)) < len(forms):
@@ -460,31 +495,40 @@ def _find_problems(protocol: Protocol) -> Iterator[str]:
     if not 1 <= size <= 2 or len(set(protocol.users)) < size:
         yield f"users are one or two sites, not {', '.join(protocol.users)}"
     elif len(names) % size:
-        lone = count_nouns(len(names), "participant makes", "participants make")
-        yield f"{lone} no pairs: their number must be even"
+        participants = count_nouns(len(names), "participant makes", "participants make")
+        yield f"{participants} no pairs: their number must be even"
     rows = len(list_orders(protocol.design, list(protocol.conditions), protocol.seed))
     if protocol.design in ("williams", "latin") and len(protocol.groups) % rows:
-        whose = "pairs" if size == 2 else "participants"
+        units = "pairs" if size == 2 else "participants"
         yield (
             f"a {protocol.design} design of "
-            f"{count_nouns(len(protocol.conditions), 'condition')} has {count_nouns(rows, 'order')}: the "
-            f"number of {whose} must be a multiple of {rows}, is {len(protocol.groups)}"
+            f"{count_nouns(len(protocol.conditions), 'condition')} "
+            f"has {count_nouns(rows, 'order')}: the "
+            f"number of {units} must be a multiple of {rows}, is {len(protocol.groups)}"
         )
 
 
-def _find_staircase_problems(protocol: Protocol, stairs: Staircase) -> Iterator[str]:
+def _find_staircase_problems(protocol: Protocol, staircase: Staircase) -> Iterator[str]:
+    """Yields the problems of a protocol with a staircase."""
     if len(protocol.users) != 1:
         yield "staircase: is of one user, who answers"
     if protocol.trials % 2:
-        yield f"trials: a staircase is of pairs, their number must be even, is {protocol.trials}"
-    if setting := [
-        name for name, keys in protocol.conditions.items() if stairs.key in _list_keys(keys)
-    ]:
-        yield f"staircase.key: {stairs.key} is set by condition {', '.join(setting)} too"
+        yield (
+            f"trials: a staircase is of pairs, their number must be even, is {protocol.trials}"
+        )
+    key = staircase.key
+    conditions = [name for name, keys in protocol.conditions.items() if key in _list_keys(keys)]
+    if conditions:
+        yield f"staircase.key: {key} is set by condition {', '.join(conditions)} too"
 
 
-def _prepare(scenario: Scenario, protocol: Protocol) -> Scenario:
-    """Returns the scenario of a condition, if participants can hold its masters."""
+def _check_scenario(scenario: Scenario, protocol: Protocol) -> Scenario:
+    """Returns the scenario of a condition if the experiment can be run with it.
+
+    Raises:
+        ScenarioError: a user's site is missing or has no live hand, or a wall, a share, a
+            force limit or a key of the staircase does not fit.
+    """
     for user in protocol.users:
         if user not in scenario.names:
             raise ScenarioError(
@@ -499,105 +543,125 @@ def _prepare(scenario: Scenario, protocol: Protocol) -> Scenario:
     if protocol.task.needs_wall and not scenario.sites[slave].environment:
         raise ScenarioError("there is no wall to press", path=f"sites.{slave}.environment")
     shares = [scenario.dominance[slave].get(user, 0.0) for user in protocol.users]
-    if (protocol.training is not None or protocol.task.needs_pair) and min(shares) <= 0.0:
+    needs_shares = protocol.training is not None or protocol.task.needs_pair
+    if needs_shares and min(shares) <= 0.0:
         raise ScenarioError("both users are to have a share", path=f"dominance.{slave}")
     for group in protocol.groups:
         limit_forces(scenario, protocol, group)
-    if (stairs := protocol.staircase) is not None:
-        for value in (stairs.standard, stairs.standard + stairs.start):
-            load_scenario(scenario, {stairs.key: value})
+    staircase = protocol.staircase
+    if staircase is not None:
+        for value in (staircase.standard, staircase.standard + staircase.start):
+            load_scenario(scenario, {staircase.key: value})
     return scenario
 
 
 def limit_forces(
     scenario: Scenario, protocol: Protocol, group: Sequence[str]
 ) -> dict[str, Any]:
-    """Returns the users' sites whose live hand is to be weaker than the scenario's, by
-    `force_limit_n`.
+    """Returns the specifications of sites whose live hand gets a lower force limit.
+
+    The limits are those of `force_limit_n` for the participants of a group.
 
     Raises:
-        ScenarioError: a hand has no such limit, or a lower one already.
+        ScenarioError: a live hand has no force limit, or a lower limit already.
     """
-    found = {}
-    # an odd one out is refused by itself
+    limited_sites = {}
+    # not strict: `_find_problems` reports a group that is too small
     for user, name in zip(protocol.users, group, strict=False):
         spec = scenario.sites[user]
-        most = protocol.force_limit_n.get(name)
-        hand = spec.find_live_hand(is_open=True)
-        if most is None or hand is None:
+        limit_n = protocol.force_limit_n.get(name)
+        live_hand = spec.find_live_hand(is_open=True)
+        if limit_n is None or live_hand is None:
             continue
-        if hand.mode == "joint" or hand.force_limit_n < most:
-            has = "none, N" if hand.mode == "joint" else f"{hand.force_limit_n:g} N"
+        has_no_limit = live_hand.mode == "joint"
+        if has_no_limit or live_hand.force_limit_n < limit_n:
+            scenario_limit = "none, N" if has_no_limit else f"{live_hand.force_limit_n:g} N"
             raise ScenarioError(
-                f"{most:g} N: the live hand at {user} has a limit of {has}",
+                f"{limit_n:g} N: the live hand at {user} has a limit of {scenario_limit}",
                 path=f"force_limit_n.{name}",
             )
-        limited = tuple(
-            replace(one, force_limit_n=most) if one is hand else one for one in spec.hands
-        )
-        found[user] = replace(spec, hands=limited)
-    return found
+        limited_hand = replace(live_hand, force_limit_n=limit_n)
+        hands = tuple(limited_hand if hand is live_hand else hand for hand in spec.hands)
+        limited_sites[user] = replace(spec, hands=hands)
+    return limited_sites
 
 
 def list_orders(design: str, conditions: Sequence[str], seed: int) -> list[tuple[str, ...]]:
-    """Returns the orders of conditions that participants get in turn.
+    """Returns the orders of conditions, which are assigned to participants in turn.
 
-    Williams (1949): each condition is equally often at each place, and equally often right
-    after each other one; of an odd number of conditions there are twice as many orders. A
-    cyclic Latin square balances places alone. "random": every permutation, shuffled; "fixed":
-    as written.
+    Args:
+        design: "williams": each condition is equally often at each position, and equally often
+            right after each other condition (Williams 1949); an odd number of conditions needs
+            twice as many orders. "latin": a cyclic Latin square, which balances the positions
+            alone. "random": 1000 random permutations. "fixed": the order of `conditions`.
+        conditions: names of the conditions.
+        seed: seed of random permutations.
     """
-    n = len(conditions)
+    count = len(conditions)
     if design == "fixed":
         return [tuple(conditions)]
     if design == "random":
         random = np.random.default_rng(seed)
-        return [
-            tuple(np.array(conditions)[random.permutation(n)].tolist()) for _ in range(1000)
-        ]
-    first = list(range(n))
-    if design == "williams":  # 0, 1, n - 1, 2, n - 2, ...
-        first = [
-            0,
-            *(place for k in range(1, n // 2 + 1) for place in dict.fromkeys((k, n - k))),
-        ][:n]
-    rows = [[(place + shift) % n for place in first] for shift in range(n)]
-    if design == "williams" and n % 2:
+        names = np.array(conditions)
+        return [tuple(names[random.permutation(count)].tolist()) for _ in range(1000)]
+    first_row = list(range(count))
+    if design == "williams":
+        # the first row is 0, 1, n - 1, 2, n - 2, ...
+        first_row = [0]
+        for step in range(1, count // 2 + 1):
+            first_row += [step, count - step]
+        first_row = first_row[:count]
+    rows = [[(index + shift) % count for index in first_row] for shift in range(count)]
+    if design == "williams" and count % 2:
         rows += [row[::-1] for row in rows]
-    return [tuple(conditions[place] for place in row) for row in rows]
+    return [tuple(conditions[index] for index in row) for row in rows]
 
 
 def _list_trials(protocol: Protocol) -> Iterator[PlannedTrial]:
+    """Yields all trials of an experiment in their order."""
     orders = list_orders(protocol.design, list(protocol.conditions), protocol.seed)
+    blocks = range(len(protocol.conditions))
     number = 0
-    for (n, group), block in itertools.product(
-        enumerate(protocol.groups), range(len(protocol.conditions))
-    ):
-        condition = orders[n % len(orders)][block]
-        random = np.random.default_rng([protocol.seed, n, block, 2])
-        phases = [*[("", None)] * protocol.practice, *protocol.list_phases(condition, random)]
-        for trial, phase in enumerate(phases):
+    for (index, group), block in itertools.product(enumerate(protocol.groups), blocks):
+        condition = orders[index % len(orders)][block]
+        random = np.random.default_rng([protocol.seed, index, block, 2])
+        phases: list[tuple[str, float | None]] = [("", None)] * protocol.practice
+        phases += protocol.list_phases(condition, random)
+        catches = _draw_catches(protocol, condition, index, block)
+        first_target = np.random.default_rng([protocol.seed, index, block]).integers(1000)
+        for trial, (phase, lead) in enumerate(phases):
             number += 1
-            caught = trial in _draw_catches(protocol, condition, (n, block))
-            drawn = np.random.SeedSequence([protocol.seed, number]).generate_state(1)
-            seed = int(drawn[0]) >> 1
-            practice = trial < protocol.practice
-            first = np.random.default_rng([protocol.seed, n, block]).integers(1000)
-            target = int(first) + (
-                (trial - protocol.practice) // 2 if protocol.staircase else trial
+            is_catch = trial in catches
+            trial_condition = condition
+            if protocol.catch is not None and is_catch:
+                trial_condition = protocol.catch.condition
+            state = np.random.SeedSequence([protocol.seed, number]).generate_state(1)
+            target_step = trial
+            if protocol.staircase:
+                target_step = (trial - protocol.practice) // 2
+            yield PlannedTrial(
+                number=number,
+                group=group,
+                condition=trial_condition,
+                block=block + 1,
+                trial=trial + 1,
+                practice=trial < protocol.practice,
+                before=block * len(phases) + trial,
+                target=int(first_target) + target_step,
+                # 31 bits, so that the seed is a positive 32-bit integer
+                seed=int(state[0]) >> 1,
+                catch=is_catch,
+                phase=phase,
+                lead=lead,
             )
-            counts = block + 1, trial + 1, practice, block * len(phases) + trial, target
-            shown = (
-                protocol.catch.condition if protocol.catch is not None and caught else condition
-            )
-            yield PlannedTrial(number, group, shown, *counts, seed, caught, *phase)
 
 
-def _draw_catches(protocol: Protocol, condition: str, block: tuple[int, int]) -> set[int]:
-    """Returns which trials of a block, from 0, are catch trials."""
+def _draw_catches(protocol: Protocol, condition: str, group: int, block: int) -> set[int]:
+    """Returns the indices of the catch trials in a block, from 0 with practice included."""
     catch = protocol.catch
     if catch is None or catch.condition == condition:
         return set()
-    random = np.random.default_rng([protocol.seed, *block, 1])
+    random = np.random.default_rng([protocol.seed, group, block, 1])
     count = round(catch.share * protocol.trials)
-    return set((protocol.practice + random.permutation(protocol.trials)[:count]).tolist())
+    indices = protocol.practice + random.permutation(protocol.trials)[:count]
+    return set(indices.tolist())
