@@ -1,7 +1,10 @@
 """Figures of the suite: a panel per task, a row per law, a column per link.
 
-Invariant: a cell is coloured by its mean alone; a white cross says that a run there is not
-stable, a dot that one is open. Equal results give equal bytes.
+Invariant:
+    - The colour of a cell depends on its mean alone.
+    - A white cross marks a cell with a run that is not stable. A white dot marks a cell without
+      such a run but with a run whose stability is open.
+    - Equal results give equal bytes.
 """
 
 from pathlib import Path
@@ -27,46 +30,48 @@ FIGURES_OF_BENCH = {
     "effort": ("effort, N m", "effort_nm"),
     "stiffness": ("stiffness at the hand, N/m", "stiffness_n_m"),
 }
-"""Per figure its label, and the number that it shows; "" for the share of stable runs."""
+"""For each figure its label and its quantity; "" stands for the share of stable runs."""
 _WIDTH_IN = 7.0
 _ROW_IN = 0.14
 _HEAD_IN = 0.65
 _TEXT_PT = 5.5
 _PALETTE = "cividis"
 _NONE = "#a23b53"
-"""Where there is no number: no contact, no rest, or a run that diverged."""
+"""Colour of cells without a number: no contact, no rest, or a run that diverged."""
 
 
 def list_figures_with_values(results: BenchResults) -> list[str]:
-    """Returns the names of those figures for which the results have a number."""
-    return [
-        name
-        for name in FIGURES_OF_BENCH
-        if any(np.isfinite(field).any() for field in _collect_fields(results, name).values())
-    ]
+    """Returns the names of the figures for which the results have a number."""
+    names = []
+    for name in FIGURES_OF_BENCH:
+        fields = _collect_fields(results, name).values()
+        if any(np.isfinite(field).any() for field in fields):
+            names.append(name)
+    return names
 
 
 def _collect_fields(results: BenchResults, name: str) -> dict[str, Array]:
-    """Returns the numbers of a figure: by task an array of shape (laws, links)."""
+    """Returns the numbers of a figure: for each task an array of shape (laws, links)."""
     _, quantity = FIGURES_OF_BENCH[name]
-    tasks = [
-        task for task in results.plan.tasks if quantity != "stiffness_n_m" or task == "contact"
-    ]
+    tasks = list(results.plan.tasks)
+    if quantity == "stiffness_n_m":
+        # only the task contact has a stiffness
+        tasks = [task for task in tasks if task == "contact"]
     return {task: _collect(results, task, quantity) for task in tasks}
 
 
 def draw_bench(results: BenchResults, name: str) -> Figure:
-    """Returns a figure by its name in `FIGURES_OF_BENCH`; `list_figures_with_values` has the
-    names.
-    """
+    """Returns the figure with a name from `list_figures_with_values`."""
     label, quantity = FIGURES_OF_BENCH[name]
     links = results.plan.links
     fields = _collect_fields(results, name)
     known = np.concatenate([field[np.isfinite(field)].ravel() for field in fields.values()])
     scale: Any = Normalize(0.0, 1.0)
     if quantity:
-        least, most = (float(known.min()), float(known.max())) if known.size else (0.1, 1.0)
-        scale = LogNorm(max(least, 1e-6), max(most, 2e-6))
+        smallest = float(known.min()) if known.size else 0.1
+        largest = float(known.max()) if known.size else 1.0
+        # a logarithmic scale needs limits above 0
+        scale = LogNorm(max(smallest, 1e-6), max(largest, 2e-6))
     height = sum(_HEAD_IN / 2 + _ROW_IN * len(field) for field in fields.values()) + _HEAD_IN
     form = make_print_size(_WIDTH_IN)
     with style.styled_figure(form, height) as figure:
@@ -83,35 +88,40 @@ def draw_bench(results: BenchResults, name: str) -> Figure:
     return figure
 
 
-def _rows(results: BenchResults, task: str) -> list[tuple[str, str]]:
-    return [one for one in results.plan.laws if any(results.of(task, one[0]))]
+def _list_laws(results: BenchResults, task: str) -> list[tuple[str, str]]:
+    """Returns law and form of each row of a task's panel: the laws with results."""
+    return [(law, form) for law, form in results.plan.laws if any(results.of(task, law))]
 
 
 def _collect(results: BenchResults, task: str, quantity: str) -> Array:
-    """Returns the numbers of a panel, shape (laws, links); NaN where there is none."""
-    rows = _rows(results, task)
+    """Returns the numbers of a panel, shape (laws, links); NaN for a missing number."""
+    laws = _list_laws(results, task)
     links = results.plan.links
-    field = np.full((len(rows), len(links)), np.nan)
-    for place in results.of(task):
-        value = place.mean(quantity) if quantity else place.stable / len(place.runs)
+    field = np.full((len(laws), len(links)), np.nan)
+    for result in results.of(task):
+        value = result.mean(quantity) if quantity else result.stable / len(result.runs)
         if value is not None:
-            at = rows.index((place.cell.law, place.cell.form)), links.index(place.cell.link)
-            field[at] = value.mean if isinstance(value, MeanInterval) else value
+            row = laws.index((result.cell.law, result.cell.form))
+            column = links.index(result.cell.link)
+            field[row, column] = value.mean if isinstance(value, MeanInterval) else value
     return field
 
 
 def _mark(axes: Axes, results: BenchResults, task: str) -> None:
-    rows = _rows(results, task)
+    """Labels the rows of a panel and marks its cells with runs that are not stable."""
+    laws = _list_laws(results, task)
     links = results.plan.links
-    axes.set_yticks(range(len(rows)), [name_law(*one) for one in rows], fontsize=_TEXT_PT)
+    labels = [name_law(law, form) for law, form in laws]
+    axes.set_yticks(range(len(laws)), labels, fontsize=_TEXT_PT)
     axes.grid(visible=False)
     axes.set_facecolor(_NONE)
-    for place in results.of(task):
-        at = [links.index(place.cell.link)], [rows.index((place.cell.law, place.cell.form))]
-        if place.count(Stability.NOT_STABLE):
-            axes.plot(*at, marker="x", color="#ffffff", markersize=3.0, markeredgewidth=0.8)
-        elif place.stable < len(place.runs):
-            axes.plot(*at, marker=".", color="#ffffff", markersize=2.0)
+    for result in results.of(task):
+        x = [links.index(result.cell.link)]
+        y = [laws.index((result.cell.law, result.cell.form))]
+        if result.count(Stability.NOT_STABLE):
+            axes.plot(x, y, marker="x", color="#ffffff", markersize=3.0, markeredgewidth=0.8)
+        elif result.stable < len(result.runs):
+            axes.plot(x, y, marker=".", color="#ffffff", markersize=2.0)
 
 
 def write_bench(results: BenchResults, folder: Path, command: str) -> list[Path]:
