@@ -1,21 +1,24 @@
-"""Recovery: makes a finished MCAP file of one that is cut off or damaged.
+"""Recovery of a torn or damaged MCAP file into a new, finished file.
+
+Any MCAP file is accepted. The accounts of a trilat-net log are rebuilt from its messages.
 
 Invariant:
-- What can be read is copied byte for byte: messages with their times and numbers, metadata,
-  attachments.
-- What cannot be read is left out and reported. Nothing is invented: of a trilat-net log a
-  message is copied only if a valid checksum covers it or if its content proves it
-  (`content_check`), and only from a chunk that stands where it was written (`recovery_survey`).
-- No file is made that holds nothing. A log that no command opens in the end is reported as
-  such: the new file is read once more.
-- The source file is not modified. Any MCAP file is accepted; for a trilat-net log the accounts
-  are rebuilt.
+    - Everything readable is copied byte for byte: messages with their times and numbers,
+      metadata and attachments.
+    - Everything unreadable is left out and reported.
+    - Nothing is invented: a message of a trilat-net log is copied only if a valid checksum
+      covers the message or if its content proves the message (`content_check`), and only from
+      a chunk at the position where the chunk was written (`recovery_survey`).
+    - An output file is never empty: if nothing can be saved, no file is created.
+    - The output is read once more, and an output that no trilat-net command can open is
+      reported as such.
+    - The source file is not modified.
 """
 
 import hashlib
 import json
 from collections import Counter, deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -53,19 +56,19 @@ from .torn_chunk import TornChunk
 _UNOPENED = "other MCAP programs open the new file, commands of trilat-net do not"
 _UNPROVEN = "without a checksum, and without the scenario no message can be checked"
 _MAX_REASONS = 3
-"""Losses that the error names where they leave nothing to save."""
+"""Number of losses that the error message names if nothing can be saved."""
 MAX_LISTED_LOSSES = 20
-"""Losses that are listed there one by one."""
+"""Number of losses that the metadata of the new file list one by one."""
 DAMAGED_SUFFIX = ".damaged"
-"""What is added to the name of an attachment whose checksum does not agree."""
+"""Suffix of the name of an attachment whose checksum does not agree."""
 _MAX_SCENARIO_BYTES = 64 << 20
 _MAX_NUMBERS = 65_535
-"""Channels, and schemas, that a file can have."""
-_MADE_AGAIN = frozenset(
+"""Largest number of channels in a file, and of schemas: their numbers have 16 bits."""
+_REGENERATED = frozenset(
     {Opcode.MESSAGE_INDEX, Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.STATISTICS}
     | {Opcode.METADATA_INDEX, Opcode.SUMMARY_OFFSET, Opcode.DATA_END, Opcode.FOOTER}
 )
-"""What a finished file has besides its content: nothing is lost with it."""
+"""Records that the writer generates from the content: losing them loses no data."""
 
 
 @dataclass(repr=False)
@@ -73,18 +76,20 @@ class Recovery(Result):
     """Result of a recovery.
 
     Attributes:
-        path, output: the source file, and the file that was made.
-        finished: True if the source had been finished.
-        messages: number of messages.
-        duration_s: from the first message to the last, by the times at which they were logged,
-            s.
-        salvaged: messages out of a last chunk that was cut off.
-        lost, lost_bytes: what was lost, a sentence each, and how many bytes could not be read.
-        missing: per site which records are not in the file, be they lost here or never
-            recorded.
-        coverage: the records in the file and the ticks of the run; of no site if it is no
+        path: the source file.
+        output: the new file.
+        finished: True if the source file had been finished.
+        messages: number of messages in the new file.
+        duration_s: time from the first message to the last, by their log times, in s.
+        salvaged: number of messages that were saved from a last chunk that was cut off.
+        lost: a sentence for each loss.
+        lost_bytes: number of bytes that could not be read.
+        missing: for each site, the records that the new file lacks, whether they were lost in
+            the source file or never recorded.
+        coverage: records in the new file and ticks of the run, per site; empty if the source
+            is not a trilat-net log.
+        chain: agreement of the source with its digest chain; "" if the source is not a
             trilat-net log.
-        chain: agreement of the source with its digest chain; "" if it is no trilat-net log.
     """
 
     path: Path
@@ -101,7 +106,7 @@ class Recovery(Result):
 
     @property
     def lossless(self) -> bool:
-        """True if all that was in the file is in the new one."""
+        """True if the new file holds all the content of the source file."""
         return not self.lost
 
     def to_dict(self) -> dict[str, Any]:
@@ -119,27 +124,27 @@ class Recovery(Result):
             "lost": self.lost,
             "missing": self.missing,
             "coverage": {
-                site: {"records": there, "ticks": ticks}
-                for site, (there, ticks) in self.coverage.to_json().items()
+                site: {"records": records, "ticks": ticks}
+                for site, (records, ticks) in self.coverage.to_json().items()
             },
             "digest_chain": str(self.chain) or None,
         }
 
-    def add_loss(self, what: str, size: int = 0) -> None:
-        """Adds a loss of so many bytes."""
-        self.lost.append(what)
+    def add_loss(self, text: str, size: int = 0) -> None:
+        """Adds a loss of `size` bytes, described by `text`."""
+        self.lost.append(text)
         self.lost_bytes += size
 
     def facts(self) -> dict[str, str]:
         """Returns the metadata of the new file that describe the recovery."""
-        listed = self.lost[:MAX_LISTED_LOSSES]
-        more = (
-            [f"and {len(self.lost) - len(listed)} more"] if len(self.lost) > len(listed) else []
-        )
+        losses = self.lost[:MAX_LISTED_LOSSES]
+        unlisted = len(self.lost) - len(losses)
+        if unlisted:
+            losses.append(f"and {unlisted} more")
         return {
             "from": self.path.name,
             "finished": str(self.finished).lower(),
-            "lost": "; ".join(listed + more) or "nothing",
+            "lost": "; ".join(losses) or "nothing",
             "lost_bytes": str(self.lost_bytes),
             "salvaged_messages": str(self.salvaged),
             "missing": "; ".join(self.missing) or "nothing",
@@ -149,7 +154,7 @@ class Recovery(Result):
 
 
 def recovered_path(path: Path) -> Path:
-    """Returns the default name of the file that is made of another one."""
+    """Returns the default name of the new file for the source file at `path`."""
     if path.name.endswith(ACTIVE_SUFFIX) and path.name != ACTIVE_SUFFIX:
         return path.with_name(path.name.removesuffix(ACTIVE_SUFFIX))
     return path.with_name(f"{path.stem}.recovered{path.suffix or '.mcap'}")
@@ -162,37 +167,37 @@ def recover(
     force: bool = False,
     progress: Progress | None = None,
 ) -> Recovery:
-    """Makes a whole file of a torn or damaged one; the command is `trilat log recover`.
+    """Recovers a torn or damaged file into a new file, like `trilat log recover`.
 
     >>> path = tn.simulate("two_sites", duration_s=0.1).save("torn.mcap")
     >>> tn.recover(path, "whole.mcap").lossless
     True
 
     Args:
-        file: the torn one.
-        out: the file to be made; by default `recovered_path`.
-        force: True if it may replace one.
-        progress: called after every record of the file.
+        file: the source file.
+        out: the new file; by default `recovered_path`.
+        force: True if the new file may replace an existing file.
+        progress: called after every record of the source file.
 
     Raises:
-        LogError: the file cannot be read.
+        LogError: the source file cannot be read.
         NothingSaved: nothing could be recovered.
-        UsageError: the output exists, or cannot be made.
-        LogRefused: the disk refused; nothing was made.
+        UsageError: the new file exists already or cannot be created.
+        LogRefused: the disk refused a write; no file was created.
     """
     path = Path(file)
     if not path.name:
         raise LogError(f"{path}: cannot be read: Is a directory")
-    made = recovered_path(path) if out is None else Path(out)
-    if not made.name:
-        raise UsageError(f"{made}: is a directory; name a file with -o")
-    if made.exists() and path.exists() and made.samefile(path):
+    output = recovered_path(path) if out is None else Path(out)
+    if not output.name:
+        raise UsageError(f"{output}: is a directory; name a file with -o")
+    if output.exists() and path.exists() and output.samefile(path):
         raise UsageError(
-            f"{made}: is the file itself, which is not touched; choose another name with -o"
+            f"{output}: is the file itself, which is not touched; choose another name with -o"
         )
     try:
         with open_regular(path) as stream:
-            return _recover(stream, Recovery(path, made), force, progress)
+            return _recover(stream, Recovery(path, output), force, progress)
     except OSError as error:
         if error.filename not in (None, str(path)):
             raise describe_write_error(Path(error.filename), error) from None
@@ -229,7 +234,7 @@ def _recover(
 
 
 def _check_output(working: Path, result: Recovery) -> None:
-    """Adds a loss if no command opens the file that was made."""
+    """Adds a loss to `result` if no trilat-net command can open the new file."""
     with working.open("rb") as stream:
         try:
             check_log(stream, str(result.output))
@@ -238,12 +243,15 @@ def _check_output(working: Path, result: Recovery) -> None:
 
 
 def _restore_scenario(survey: RecoverySurvey, path: Path) -> bytes:
-    """Returns the scenario of a log that lost it, if the file that was run is beside it; else
-    b"".
+    """Restores a lost scenario from the scenario file next to the log.
+
+    Returns:
+        The text of the scenario file if its hash is the one in the session's metadata; b"" if
+        the log still has its scenario or the file does not match.
     """
     digest = survey.metadata.get(SESSION, {}).get("scenario_sha256", "")
-    kept = survey.attachments.get(SCENARIO)
-    if not digest or kept is not None:
+    attached = survey.attachments.get(SCENARIO)
+    if not digest or attached is not None:
         return b""
     with suppress(OSError, LogError), open_regular(path.with_name(SCENARIO)) as stream:
         text: bytes = stream.read(_MAX_SCENARIO_BYTES)
@@ -254,60 +262,74 @@ def _restore_scenario(survey: RecoverySurvey, path: Path) -> bytes:
 
 
 class _FileCopy:
-    """Copy of one file into another; of a number's definitions the first one holds.
+    """Copy of the source file into the new file.
+
+    If the source defines a schema or channel number twice, the first definition holds.
 
     Attributes:
-        is_session_log: True if anything says that it is a log of a session.
+        is_session_log: True if any evidence says that the source is a log of a session.
     """
 
     def __init__(
         self, reader: McapReader, file: LogFile, survey: RecoverySurvey, result: Recovery
     ) -> None:
-        reader.watch = self._copy
+        reader.watch = self._on_record
         self._reader = reader
         self._scanner = reader.scanner
         self._survey = survey
         self._result = result
-        by = f"recovered by trilat-net {collect_provenance()['version_trilat-net']}"
-        self._out = McapWriter(file, f"{survey.library or 'unknown'}, {by}", survey.profile)
+        version = collect_provenance()["version_trilat-net"]
+        library = f"{survey.library or 'unknown'}, recovered by trilat-net {version}"
+        self._out = McapWriter(file, library, survey.profile)
         self._accounts = open_session_accounts(survey.metadata, survey.attachments)
-        self._content = _make_content_check(survey, self._accounts)
+        self._content = _create_content_check(survey, self._accounts)
         self._data_end = reader.size + 1
         self.is_session_log = survey.is_session_log
-        self._is_empty = True  # neither a message nor metadata nor an attachment was copied
-        self._reported = 0  # damaged parts that are among the losses
-        self._defined: dict[
-            tuple[int, int], Any
-        ] = {}  # schemas and channels, by opcode and number
-        self._contradicted: set[int] = set()  # numbers that have two definitions
+        # True until a message, a metadata record or an attachment is copied.
+        self._is_empty = True
+        # Number of damaged parts that are among the losses already.
+        self._reported = 0
+        # Schemas and channels of the source, by opcode and number.
+        self._definitions: dict[tuple[int, int], Any] = {}
+        # Numbers that the source defines in two ways.
+        self._contradicted: set[int] = set()
+        # Schema number in the new file, by the number in the source.
         self._new_schemas: dict[int, int] = {}
-        self._released_schemas: dict[
-            str, int
-        ] = {}  # written anew, by the kind of their messages
-        self._new_channels: dict[int, tuple[int, str]] = {}  # number in the new file, and topic
-        self._new_topics: dict[
-            str, tuple[int, str]
-        ] = {}  # the same by topic, of the session's own channels
-        self._bare: list[str] = []  # topics of channels whose schema no record names
-        self._misnamed: list[
-            str
-        ] = []  # topics of channels whose messages prove another or no definition
-        self._unnamed: Counter[int] = Counter()  # messages of channels that no record names
-        self._identified: set[int] = set()  # channels whose first message was looked at
+        # Schemas that recovery defines itself, by schema name.
+        self._session_schemas: dict[str, int] = {}
+        # Channel number in the new file and topic, by the number in the source.
+        self._new_channels: dict[int, tuple[int, str]] = {}
+        # The same by topic, for the channels of the session's members.
+        self._new_topics: dict[str, tuple[int, str]] = {}
+        # Topics of channels whose schema is missing.
+        self._topics_without_schema: list[str] = []
+        # Topics whose messages contradict the definition of their channel, or lack one.
+        self._misnamed: list[str] = []
+        # Number of messages of undefined channels, by channel number in the source.
+        self._unnamed: Counter[int] = Counter()
+        # Channels whose first message has been identified by its content.
+        self._identified: set[int] = set()
         for opcode, content in survey.definitions:
             try:
                 self._define(opcode, content)
             except UnreadableRecord as error:
                 result.add_loss(f"a definition: {error}", len(content))
-        for kind, number in sorted(self._defined):
-            if kind == Opcode.CHANNEL and self._is_plausible(self._defined[kind, number].topic):
-                self._open_channel(number)  # with or without messages
+        for opcode, number in sorted(self._definitions):
+            if opcode != Opcode.CHANNEL:
+                continue
+            # A channel is copied even if it has no messages.
+            if self._is_plausible(self._definitions[opcode, number].topic):
+                self._open_channel(number)
 
     def run(self, restored: bytes) -> None:
-        """Copies everything; a scenario that was `restored` from elsewhere comes first.
+        """Copies all readable content of the source and finishes the new file.
+
+        Args:
+            restored: the scenario from the file next to the log, written first; b"" if the log
+                has its scenario.
 
         Raises:
-            NothingSaved: all that the file holds is lost.
+            NothingSaved: all content of the source is lost.
         """
         if restored:
             self._out.add_attachment(
@@ -318,25 +340,27 @@ class _FileCopy:
                 data=restored,
             )
             self._is_empty = False
-        deque(self._reader.messages(), maxlen=0)  # every record passes through `_copy`
+        # Reading the messages passes every record to `_on_record`.
+        deque(self._reader.messages(), maxlen=0)
         self._report_damaged()
         if self._scanner.torn is not None:
-            self._take_torn(self._scanner.torn)
+            self._copy_torn_chunk(self._scanner.torn)
         self._out.flush()
-        self._report_unnamed()
-        # before the end mark, which would make it a file
+        self._report_final_losses()
+        # This check precedes the end mark, which would turn an empty output into a valid file.
         if self._is_empty and self._result.lost:
-            reasons = [text for text in self._result.lost if _UNOPENED not in text][
-                :_MAX_REASONS
-            ]
-            why = f"there is nothing in it that could be saved: {'; '.join(reasons)}"
-            raise NothingSaved(f"{self._result.path}: {why}")
+            losses = [text for text in self._result.lost if _UNOPENED not in text]
+            reasons = "; ".join(losses[:_MAX_REASONS])
+            raise NothingSaved(
+                f"{self._result.path}: there is nothing in it that could be saved: {reasons}"
+            )
         self._finish()
 
-    def _copy(self, frame: mcap_records.RecordFrame, content: bytes, data: bytes) -> None:
+    def _on_record(self, frame: mcap_records.RecordFrame, content: bytes, data: bytes) -> None:
+        """Copies one record of the source, or adds it to the losses if it is unreadable."""
         self._report_damaged()
         try:
-            self._take(frame, content, data)
+            self._copy_record(frame, content, data)
         except UnreadableRecord as error:
             self._result.add_loss(
                 f"{count_nouns(frame.size, 'byte')} at byte {frame.offset}: {error}", frame.size
@@ -348,39 +372,50 @@ class _FileCopy:
                 self._result.add_loss(str(damage), damage.length)
         self._reported = len(self._scanner.damaged)
 
-    def _take(self, frame: mcap_records.RecordFrame, content: bytes, data: bytes) -> None:
-        """Copies one record of the file; `data` is what a chunk holds, empty if it cannot be
-        unpacked.
+    def _copy_record(
+        self, frame: mcap_records.RecordFrame, content: bytes, data: bytes
+    ) -> None:
+        """Copies one record of the source.
+
+        Args:
+            frame: position and opcode of the record.
+            content: bytes of the record.
+            data: unpacked records of a chunk; empty for other records and for a chunk that
+                cannot be unpacked.
+
+        Raises:
+            UnreadableRecord: the record cannot be trusted; it was not copied.
         """
         opcode = frame.opcode
         if opcode == Opcode.HEADER or opcode in mcap_records.DEFINITIONS:
             return
-        if opcode in _MADE_AGAIN:
-            self._pass_over(frame, content)
+        if opcode in _REGENERATED:
+            self._check_regenerated(frame, content)
         elif opcode == Opcode.CHUNK:
-            self._take_chunk(frame, data or mcap_records.unpack_chunk(content))
+            self._copy_chunk(frame, data or mcap_records.unpack_chunk(content))
         elif opcode == mcap_records.OP_MESSAGE:
-            self._take_single(content)
+            self._copy_single_message(content)
         elif opcode == Opcode.METADATA:
-            self._take_metadata(content)
+            self._copy_metadata(content)
         elif opcode == Opcode.ATTACHMENT:
-            self._take_attachment(content)
+            self._copy_attachment(content)
         else:
             raise UnreadableRecord(f"a record of kind {opcode} is unknown here")
 
-    def _take_metadata(self, content: bytes) -> None:
+    def _copy_metadata(self, content: bytes) -> None:
         entry = mcap_records.parse_record(Opcode.METADATA, content)
-        is_made_again = self._accounts is not None and entry.name in (ACCOUNTS, DIGESTS)
-        if entry.name == RECOVERED or is_made_again:
+        is_regenerated = self._accounts is not None and entry.name in (ACCOUNTS, DIGESTS)
+        if entry.name == RECOVERED or is_regenerated:
             return
         if entry.name == SESSION and entry.metadata != self._survey.metadata.get(SESSION):
             raise UnreadableRecord("metadata of another session")
         self._out.add_metadata(entry.name, entry.metadata)
         self._is_empty = False
 
-    def _take_attachment(self, content: bytes) -> None:
-        """Copies an attachment; one that is damaged must not get a valid checksum under its own
-        name.
+    def _copy_attachment(self, content: bytes) -> None:
+        """Copies an attachment; a damaged attachment gets the suffix `DAMAGED_SUFFIX`.
+
+        Under its own name, the damaged attachment would get a valid checksum in the new file.
         """
         entry = mcap_records.parse_record(Opcode.ATTACHMENT, content)
         name = entry.name
@@ -399,8 +434,12 @@ class _FileCopy:
         )
         self._is_empty = False
 
-    def _pass_over(self, frame: mcap_records.RecordFrame, content: bytes) -> None:
-        """Leaves out what is made again; raises if it is something else whose kind was damaged."""
+    def _check_regenerated(self, frame: mcap_records.RecordFrame, content: bytes) -> None:
+        """Raises unless a record whose opcode is in `_REGENERATED` is plausible as such.
+
+        A damaged opcode can turn a record with data into an apparent index record, which would
+        be left out without being reported.
+        """
         if frame.opcode == Opcode.DATA_END and len(content) == 4:
             self._data_end = frame.offset
         elif frame.opcode == Opcode.MESSAGE_INDEX:
@@ -410,48 +449,50 @@ class _FileCopy:
         elif frame.offset < self._data_end:
             raise UnreadableRecord(f"a record of kind {frame.opcode} stands among the data")
 
-    def _take_chunk(self, frame: mcap_records.RecordFrame, data: bytes) -> None:
-        """Copies a chunk that was unpacked, and agrees with its checksum if it has one."""
+    def _copy_chunk(self, frame: mcap_records.RecordFrame, data: bytes) -> None:
+        """Copies the records of an unpacked chunk whose checksum, if any, is right."""
         if problem := self._survey.misplaced.get(frame.offset):
             raise UnreadableRecord(problem)
         head = self._scanner.head(frame)
-        inner = [
+        records = [
             (opcode, data[begin:end])
             for opcode, begin, end in mcap_records.iterate_records(data)
         ]
         if not head.crc and self._content is None and self.is_session_log:
             raise UnreadableRecord(f"a chunk {_UNPROVEN}")
         if not head.crc and self._content is not None:
-            self._take_unproven(inner, (head.start_ns, head.end_ns))
+            self._copy_unproven(records, (head.start_ns, head.end_ns))
             return
         if self._content is not None:
             self._content.check_origin(data)
-        for opcode, content in inner:
-            self._take_inner(opcode, content)
+        for opcode, content in records:
+            self._copy_chunk_record(opcode, content)
 
-    def _take_single(self, content: bytes) -> None:
-        """Copies a message outside of chunks, which has no checksum."""
+    def _copy_single_message(self, content: bytes) -> None:
+        """Copies a message outside of chunks, which no checksum covers."""
         if self._content is not None:
-            self._take_unproven([(mcap_records.OP_MESSAGE, content)], (0, _LAST_NS))
+            self._copy_unproven([(mcap_records.OP_MESSAGE, content)], (0, _LAST_NS))
         elif self.is_session_log:
             raise UnreadableRecord(f"a message {_UNPROVEN}")
         elif self._survey.is_chunked:
             raise UnreadableRecord("a message stands outside of the chunks")
         else:
-            self._take_inner(mcap_records.OP_MESSAGE, content)
+            self._copy_chunk_record(mcap_records.OP_MESSAGE, content)
 
-    def _take_inner(self, opcode: int, content: bytes) -> None:
+    def _copy_chunk_record(self, opcode: int, content: bytes) -> None:
+        """Copies a message or takes over a definition; other records of a chunk are ignored."""
         if opcode in mcap_records.DEFINITIONS:
             self._define(opcode, content)
         elif opcode == mcap_records.OP_MESSAGE:
-            number, sequence, log_ns, publish_ns = _split_head(content)
+            number, sequence, log_ns, publish_ns = _parse_message_head(content)
             payload = content[mcap_records.MESSAGE_HEAD.size :]
-            new = self._find_channel(number, payload)
-            if new is None:
+            channel = self._find_channel(number, payload)
+            if channel is None:
                 self._unnamed[number] += 1
                 return
+            new_number, topic = channel
             self._out.add_message(
-                channel_id=new[0],
+                channel_id=new_number,
                 log_time=log_ns,
                 data=payload,
                 publish_time=publish_ns,
@@ -459,34 +500,36 @@ class _FileCopy:
             )
             self._is_empty = False
             if self._content is not None:
-                self._content.accept(new[1], sequence, log_ns, payload)
+                self._content.accept(topic, sequence, log_ns, payload)
             if self._accounts is not None:
-                self._accounts.receive(new[1], sequence, payload)
+                self._accounts.receive(topic, sequence, payload)
 
-    def _take_unproven(
-        self, inner: Iterable[tuple[int, bytes]], span_ns: tuple[int, int]
+    def _copy_unproven(
+        self, records: Iterable[tuple[int, bytes]], span_ns: tuple[int, int]
     ) -> None:
-        """Copies the messages of which no checksum proves anything, if all of them prove
-        themselves.
+        """Copies records without a checksum, if the content of every record proves it.
 
         Args:
-            inner: records of a chunk.
+            records: opcode and content of the records of a chunk.
             span_ns: first and last log time of the chunk, Unix ns.
 
         Raises:
             UnreadableRecord: a record fails; nothing was copied.
         """
-        inner = list(inner)
-        for opcode, content in inner:
+        records = list(records)
+        for opcode, content in records:
             self._check_unproven(opcode, content, span_ns)
-        for opcode, content in inner:
-            self._take_inner(opcode, content)
+        for opcode, content in records:
+            self._copy_chunk_record(opcode, content)
 
     def _check_unproven(self, opcode: int, content: bytes, span_ns: tuple[int, int]) -> None:
+        """Raises UnreadableRecord unless the content of a record proves the record."""
         if opcode in mcap_records.DEFINITIONS:
             entry = mcap_records.parse_record(opcode, content)
-            is_own = opcode == Opcode.CHANNEL and entry.topic.startswith(f"/{topics.ROOT}/")
-            if is_own and self._content is None:
+            is_session_topic = opcode == Opcode.CHANNEL and entry.topic.startswith(
+                f"/{topics.ROOT}/"
+            )
+            if is_session_topic and self._content is None:
                 self.is_session_log = True
                 raise UnreadableRecord("its scenario, without which no message can be checked")
             if opcode == Opcode.CHANNEL and not self._is_plausible(entry.topic):
@@ -495,34 +538,52 @@ class _FileCopy:
             return
         if opcode != mcap_records.OP_MESSAGE:
             raise UnreadableRecord(f"a chunk holds a record of kind {opcode}")
-        number, sequence, log_ns, publish_ns = _split_head(content)
+        number, sequence, log_ns, publish_ns = _parse_message_head(content)
         payload = content[mcap_records.MESSAGE_HEAD.size :]
         channel = self._find_channel(number, payload)
         if channel is None:
             raise UnreadableRecord(f"a message is of channel {number}, which no record names")
         if self._content is not None:
-            self._content.check(channel[1], sequence, log_ns, publish_ns, payload, span_ns)
+            self._content.check(
+                topic=channel[1],
+                sequence=sequence,
+                log_ns=log_ns,
+                publish_ns=publish_ns,
+                payload=payload,
+                span_ns=span_ns,
+            )
         elif not span_ns[0] <= log_ns <= span_ns[1]:
             raise UnreadableRecord("a message was logged outside of its chunk")
 
     def _define(self, opcode: int, content: bytes) -> None:
         entry = mcap_records.parse_record(opcode, content)
-        if self._defined.setdefault((opcode, entry.id), entry) != entry:
+        known = self._definitions.setdefault((opcode, entry.id), entry)
+        if known != entry:
             self._contradicted.add(entry.id)
 
     def _is_plausible(self, topic: str) -> bool:
-        """True for a topic that the file can have: of a session's log none of another session's
-        members.
+        """Returns True for a topic that can occur in the source.
+
+        A session's log has no topics of another session's members.
         """
-        is_own = topic.startswith(f"/{topics.ROOT}/")
-        return self._content is None or not is_own or self._content.owns_channel(topic)
+        if self._content is None or not topic.startswith(f"/{topics.ROOT}/"):
+            return True
+        return self._content.owns_channel(topic)
 
     def _find_channel(self, number: int, payload: bytes) -> tuple[int, str] | None:
-        """Returns the number of a channel in the new file, and its topic; None if nothing tells
-        what it is.
+        """Finds the channel of the new file for a message of the source.
 
-        The first message of a channel of the session decides: it names its member and its kind,
-        where the definition of a channel has no checksum in a file that was not finished.
+        In a session's log, the first message of a channel decides: the message names its sender
+        and its kind. The definition of the channel is less reliable, because definitions have
+        no checksum in a file that was not finished.
+
+        Args:
+            number: channel number in the source.
+            payload: the message.
+
+        Returns:
+            Channel number in the new file and topic; None if neither the message nor a
+            definition names the channel.
         """
         known = self._new_channels.get(number)
         if known is not None and (self._content is None or number in self._identified):
@@ -532,97 +593,115 @@ class _FileCopy:
         if not topic or (known is not None and known[1] == topic):
             return known or self._open_channel(number)
         self._misnamed.append(topic)
-        self._new_channels[number] = self._new_topics.get(topic) or self._open_again(topic)
-        return self._new_channels[number]
+        channel = self._new_topics.get(topic) or self._open_session_channel(topic)
+        self._new_channels[number] = channel
+        return channel
 
     def _open_channel(self, number: int) -> tuple[int, str] | None:
-        """Returns the number of a channel in the new file, and its topic; None if no record
-        names it.
-        """
-        known = self._defined.get((Opcode.CHANNEL, number))
-        if (
-            known is None
-            or len(self._new_channels) >= _MAX_NUMBERS
-            or not self._is_plausible(known.topic)
-        ):
-            return None
-        schema = self._defined.get((Opcode.SCHEMA, known.schema_id))
-        if schema is not None and schema.id not in self._new_schemas:
-            new = self._out.register_schema(schema.name, schema.encoding, schema.data)
-            self._new_schemas[schema.id] = new
-        if schema is None and known.schema_id:
-            self._bare.append(known.topic)
-        new_schema = self._new_schemas.get(known.schema_id, 0)
-        channel = self._out.register_channel(
-            known.topic, known.message_encoding, new_schema, known.metadata
-        )
-        return self._keep_channel(number, channel, known.topic)
+        """Registers a channel that the source defines.
 
-    def _open_again(self, topic: str) -> tuple[int, str]:
-        """Returns a channel of the session that is defined anew, as the log's writer defines
-        it.
+        Args:
+            number: channel number in the source.
+
+        Returns:
+            Channel number in the new file and topic; None if the source has no plausible
+            definition of the channel.
+        """
+        definition = self._definitions.get((Opcode.CHANNEL, number))
+        if definition is None or len(self._new_channels) >= _MAX_NUMBERS:
+            return None
+        if not self._is_plausible(definition.topic):
+            return None
+        schema = self._definitions.get((Opcode.SCHEMA, definition.schema_id))
+        if schema is not None and schema.id not in self._new_schemas:
+            self._new_schemas[schema.id] = self._out.register_schema(
+                schema.name, schema.encoding, schema.data
+            )
+        if schema is None and definition.schema_id:
+            self._topics_without_schema.append(definition.topic)
+        new_number = self._out.register_channel(
+            definition.topic,
+            definition.message_encoding,
+            self._new_schemas.get(definition.schema_id, 0),
+            definition.metadata,
+        )
+        return self._register_copy(number, new_number, definition.topic)
+
+    def _open_session_channel(self, topic: str) -> tuple[int, str]:
+        """Registers a channel of the session with the definition that `LogWriter` gives it.
+
+        Returns:
+            Channel number in the new file and topic.
         """
         assert self._content is not None
         kind = CHANNEL_TYPES[topic.rpartition("/")[2]]
         name = f"trilat.{kind.__name__}.v{VERSION}"
-        if name not in self._released_schemas:
+        if name not in self._session_schemas:
             data = json.dumps(json_schema(kind)).encode()
-            self._released_schemas[name] = self._out.register_schema(name, "jsonschema", data)
+            self._session_schemas[name] = self._out.register_schema(name, "jsonschema", data)
         about = self._content.describe_channel(topic)
-        channel = self._out.register_channel(
-            topic, "msgpack", self._released_schemas[name], about
+        new_number = self._out.register_channel(
+            topic, "msgpack", self._session_schemas[name], about
         )
-        return self._keep_channel(None, channel, topic)
+        return self._register_copy(None, new_number, topic)
 
-    def _keep_channel(self, number: int | None, channel: int, topic: str) -> tuple[int, str]:
+    def _register_copy(
+        self, number: int | None, new_number: int, topic: str
+    ) -> tuple[int, str]:
+        """Records the channel number in the new file; returns that number and the topic."""
+        channel = new_number, topic
         if number is not None:
-            self._new_channels[number] = channel, topic
+            self._new_channels[number] = channel
         if self._content is not None and self._content.owns_channel(topic):
-            self._new_topics.setdefault(topic, (channel, topic))
+            self._new_topics.setdefault(topic, channel)
         if self._accounts is not None:
             self._accounts.open_channel(topic)
-        return channel, topic
+        return channel
 
-    def _take_torn(self, torn: mcap_records.Damage) -> None:
+    def _copy_torn_chunk(self, torn: mcap_records.Damage) -> None:
+        """Copies the readable messages of the record at which the source is cut off."""
         opcode = int.from_bytes(self._scanner.read(torn.offset, 1), "little")
-        if not torn.length or opcode in _MADE_AGAIN or torn.offset > self._data_end:
+        if not torn.length or opcode in _REGENERATED or torn.offset > self._data_end:
             return
         if opcode != Opcode.CHUNK:
             self._result.add_loss(str(torn), torn.length)
             return
-        before = self._out.messages
+        messages_before = self._out.messages
         problem = self._salvage(torn.offset)
-        self._result.salvaged = self._out.messages - before
-        why = f" before {problem}" if problem else ""
+        self._result.salvaged = self._out.messages - messages_before
+        size = count_nouns(torn.length, "byte")
+        salvaged = count_nouns(self._result.salvaged, "message")
+        reason = f" before {problem}" if problem else ""
         self._result.add_loss(
-            f"the end of a chunk that was cut off at byte {torn.offset}; of its "
-            f"{count_nouns(torn.length, 'byte')} "
-            f"{count_nouns(self._result.salvaged, 'message')} could be saved{why}",
+            f"the end of a chunk that was cut off at byte {torn.offset}; of its {size} "
+            f"{salvaged} could be saved{reason}",
             torn.length,
         )
 
     def _salvage(self, offset: int) -> str:
-        """Copies the records of a chunk that was cut off, block by block; returns what ended
-        that, or "".
+        """Copies the records of a chunk that was cut off, block by block.
+
+        Returns:
+            The problem that ended the copy; "" if all blocks were copied.
         """
         if self._content is None and self.is_session_log:
             return "its scenario, without which no message can be checked"
         try:
             torn = TornChunk.read(self._scanner, offset)
             for records in torn.iterate_blocks():
-                self._take_unproven(records, (torn.head.start_ns, torn.head.end_ns))
+                self._copy_unproven(records, (torn.head.start_ns, torn.head.end_ns))
         except UnreadableRecord as error:
             return str(error)
         return ""
 
-    def _report_unnamed(self) -> None:
+    def _report_final_losses(self) -> None:
+        """Adds the losses that show only after all records were read."""
         result = self._result
-        stated = self._survey.count
         for number, count in self._unnamed.items():
             result.add_loss(
                 f"{count_nouns(count, 'message')} of channel {number}, which no record names"
             )
-        for topic in self._bare:
+        for topic in self._topics_without_schema:
             result.add_loss(f"the schema of {topic}")
         for topic in self._misnamed:
             result.add_loss(
@@ -630,80 +709,112 @@ class _FileCopy:
             )
         for number in self._contradicted:
             result.add_loss(f"what channel or schema {number} is: the file says it in two ways")
-        survey = self._survey
-        has_head = SESSION in survey.metadata and SCENARIO in survey.attachments
-        if self.is_session_log and not has_head:
-            lacks = "the scenario" if SESSION in survey.metadata else "the session's metadata"
-            if survey.is_foreign_session:
-                lacks += ", in whose place are those of another session"
-            advice = ""
-            if SESSION in survey.metadata:  # which names the hash that the scenario must have
-                advice = f". If the file that was run stands beside the log as {SCENARIO}, recover puts it in"
-            # lists show the first losses
-            result.lost.insert(0, f"{lacks}; {_UNOPENED}{advice}")
+        self._report_missing_head()
+        stated = self._survey.count
         if stated is not None and self._out.messages < stated and result.lossless:
+            missing = stated - self._out.messages
             result.add_loss(
-                f"{stated - self._out.messages} of the {count_nouns(stated, 'message')} that it says it has"
+                f"{missing} of the {count_nouns(stated, 'message')} that it says it has"
             )
 
+    def _report_missing_head(self) -> None:
+        """Adds a loss if a session's log lacks its metadata or its scenario."""
+        survey = self._survey
+        has_metadata = SESSION in survey.metadata
+        if not self.is_session_log or (has_metadata and SCENARIO in survey.attachments):
+            return
+        loss = "the scenario" if has_metadata else "the session's metadata"
+        if survey.is_foreign_session:
+            loss += ", in whose place are those of another session"
+        advice = ""
+        # Only the metadata name the hash by which a scenario file can be recognized.
+        if has_metadata:
+            advice = (
+                f". If the file that was run stands beside the log as {SCENARIO}, recover "
+                "puts it in"
+            )
+        # The most important loss comes first, because lists show only the first losses.
+        self._result.lost.insert(0, f"{loss}; {_UNOPENED}{advice}")
+
     def _finish(self) -> None:
+        """Completes the result; writes accounts, recovery metadata and the end mark."""
         result = self._result
         accounts = self._accounts
         result.finished = self._scanner.finished
         result.messages = self._out.messages
         result.duration_s = self._out.duration_s
         if SESSION in self._survey.metadata:
-            result.chain = self._judge_source()
+            result.chain = self._judge_source_chain()
         if accounts is not None:
             result.missing = list(accounts.describe_missing())
-            # else the end is in a later part
+            # The end of a finished part may be in a later part of the log.
             if not (result.finished and PART in self._survey.metadata):
                 result.missing += accounts.describe_unfinished_sites()
             result.coverage = accounts.coverage()
-            before = self._survey.metadata.get(ACCOUNTS, {})
-            alone = (
-                self._scanner.finished and result.lossless and PART not in self._survey.metadata
-            )
-            if alone and any(
-                parse_counts(before.get(topic, "")) not in ({}, parse_counts(text))
-                for topic, text in accounts.format_accounts().items()
-                if topic.endswith(f"/{topics.STATE}")
-            ):
+            source_accounts = self._survey.metadata.get(ACCOUNTS, {})
+            if self._contradicts_accounts(accounts, source_accounts):
                 result.chain = DigestState.CHANGED
-            counts = {name: text for name, text in before.items() if not name.startswith("/")}
+            counts = {
+                name: text for name, text in source_accounts.items() if not name.startswith("/")
+            }
             self._out.add_metadata(ACCOUNTS, {**accounts.format_accounts(), **counts})
         self._out.add_metadata(RECOVERED, result.facts())
         if accounts is not None:
             self._out.close_digest()
         self._out.finish()
 
-    def _judge_source(self) -> DigestState:
+    def _contradicts_accounts(
+        self, accounts: SessionAccounts, source_accounts: Mapping[str, str]
+    ) -> bool:
+        """Returns True if the source's accounts of records differ from the rebuilt accounts.
+
+        Only a finished, lossless log in one file can be compared: elsewhere the accounts may
+        cover records that the new file lacks.
+        """
+        is_complete = self._scanner.finished and self._result.lossless
+        if not is_complete or PART in self._survey.metadata:
+            return False
+        for topic, text in accounts.format_accounts().items():
+            if not topic.endswith(f"/{topics.STATE}"):
+                continue
+            source_counts = parse_counts(source_accounts.get(topic, ""))
+            if source_counts not in ({}, parse_counts(text)):
+                return True
+        return False
+
+    def _judge_source_chain(self) -> DigestState:
         """Returns the agreement of the source with its digest chain.
 
-        A definition that is damaged among the data, and stands in the index with a checksum,
+        A definition that is damaged among the data, but present in the index with a checksum,
         changes no message.
         """
-        state = self._reader.judge_digest().state if self._scanner.begins else DigestState.OPEN
+        if not self._scanner.begins:
+            return DigestState.OPEN
+        state = self._reader.judge_digest().state
         is_repaired = self._survey.is_redefined and self._reader.agrees_on_messages
-        return DigestState.OPEN if state is DigestState.CHANGED and is_repaired else state
+        if state is DigestState.CHANGED and is_repaired:
+            return DigestState.OPEN
+        return state
 
 
 _LAST_NS = (1 << 64) - 1
+"""Latest time that a message can have, in ns: times have 64 bits."""
 
 
-def _split_head(content: bytes) -> tuple[int, int, int, int]:
-    """Returns channel, sequence, log time and publish time of a message."""
+def _parse_message_head(content: bytes) -> tuple[int, int, int, int]:
+    """Returns channel number, sequence number, log time and publish time of a message."""
     if len(content) < mcap_records.MESSAGE_HEAD.size:
         raise UnreadableRecord("a message is too short")
     number, sequence, log_ns, publish_ns = mcap_records.MESSAGE_HEAD.unpack_from(content)
     return number, sequence, log_ns, publish_ns
 
 
-def _make_content_check(
+def _create_content_check(
     survey: RecoverySurvey, accounts: SessionAccounts | None
 ) -> ContentCheck | None:
-    """Returns the check of a log's messages; None of a file of another program, and without a
-    scenario.
+    """Returns the content check of a session's log.
+
+    Returns None for a file of another program and for a log without a scenario.
     """
     if accounts is None:
         return None
