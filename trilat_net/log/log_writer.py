@@ -1,10 +1,15 @@
-"""Writer of a session's log into one MCAP file or into parts: `run-001.mcap`, `run-002.mcap`,
-...
+"""Writer of a session's log into one MCAP file or into several parts.
 
-Invariant (L5): a file explains itself from its first bytes on: session, scenario and schemas
-precede the first message, payloads are stored byte for byte as published, and the accounts
-stand at the end. Each part repeats session, scenario and schemas and names the part before it;
-a message is in exactly one part. The file changes between two messages, on the writing thread.
+Parts have numbered names: `run-001.mcap`, `run-002.mcap` and so on.
+
+Invariant (L5):
+    - A file explains itself from its first bytes on: session, scenario and schemas precede the
+      first message.
+    - Payloads are stored byte for byte as published.
+    - The accounts are at the end of the file.
+    - Each part repeats session, scenario and schemas, and names the part before it.
+    - Each message is in exactly one part: a new part begins between two messages, on the
+      writing thread.
 """
 
 import json
@@ -27,11 +32,11 @@ from .ros2.viz_channels import TakeMessage, VizChannels
 from .running_digest import ALGORITHM, DIGESTS_KEY, PREVIOUS_DIGEST_KEY
 
 Decoded = State | TickRecord | LinkStats | Event | None
-"""A message as the channels for viewers take it; None where there are none."""
+"""A decoded message for the channels for viewers; None if the log has no such channels."""
 
 
 class LogWriter:
-    """One log, from its header to its last account.
+    """Writer of one log file, from its header to its accounts.
 
     Args:
         stream: receives the bytes.
@@ -40,15 +45,16 @@ class LogWriter:
         driver: "live" or "virtual".
         epoch_unix_ns: Unix time of tick 0; 0 in virtual time.
         facts: further metadata of the session.
-        part: metadata of a part of a log.
-        choice: the channels that it takes.
-        views_hz: messages a second of the channels for viewers, see `VizChannels`; 0 for none.
+        part: metadata of the part, for a log in parts.
+        choice: the channels that the log stores.
+        views_hz: rate of the channels for viewers, in messages per second, see `VizChannels`; 0
+            for a log without such channels.
 
     Attributes:
-        records_digest: the digest of its messages, once it is finished; else "".
+        records_digest: digest of the messages of a finished log; "" before the end.
 
     Raises:
-        LogRefused: the disk refused.
+        LogRefused: the disk refused a write.
     """
 
     def __init__(
@@ -66,7 +72,8 @@ class LogWriter:
     ) -> None:
         self._epoch_unix_ns = epoch_unix_ns
         self.records_digest = ""
-        self._ended = ""  # why nothing more can be added
+        # Why no message can be added any more; "" while the log is open.
+        self._end_reason = ""
         self._views = None
         if views_hz:
             self._views = VizChannels(
@@ -74,14 +81,14 @@ class LogWriter:
                 session=session,
                 epoch_unix_ns=epoch_unix_ns,
                 views_hz=views_hz,
-                put=self._put_view,
+                put=self._add_view_message,
             )
-        self._takers: dict[str, TakeMessage] = self._views.takers if self._views else {}
+        self._view_receivers: dict[str, TakeMessage] = self._views.takers if self._views else {}
         self._last_log_ns = 0
         self._file = McapWriter(
             stream, f"trilat-net {log_layout.collect_provenance()['version_trilat-net']}"
         )
-        self._standard = StandardChannels(
+        self._view_channels = StandardChannels(
             self._file, self._views.channels if self._views else {}
         )
         about = {
@@ -96,7 +103,7 @@ class LogWriter:
             DIGESTS_KEY: ALGORITHM,
         }
         about |= {**log_layout.collect_provenance(), **choice.facts(), **(facts or {})}
-        with self._refusing():
+        with self._translate_disk_errors():
             self._file.add_metadata(log_layout.SESSION, about)
             if part:
                 self._file.add_metadata(log_layout.PART, part)
@@ -107,14 +114,16 @@ class LogWriter:
                 media_type="application/toml",
                 data=scenario.text.encode(),
             )
-            self._channels = self._register(scenario, session, choice)
+            self._channels = self._register_channels(scenario, session, choice)
             self._file.flush()
 
-    def _register(
+    def _register_channels(
         self, scenario: Scenario, session: str, choice: log_layout.ChannelFilter
     ) -> dict[str, int | None]:
-        """Registers the channels of the session; returns them by key, None for those that are
-        excluded.
+        """Registers schemas and channels of the session.
+
+        Returns:
+            Channel numbers by key; None for the channels that `choice` excludes.
         """
         schemas = {
             name: self._file.register_schema(
@@ -127,7 +136,8 @@ class LogWriter:
         channels: dict[str, int | None] = {}
         for member in (*scenario.names, topics.RECORDER):
             is_site = member != topics.RECORDER
-            for name in log_layout.SITE_CHANNELS if is_site else log_layout.RECORDER_CHANNELS:
+            names = log_layout.SITE_CHANNELS if is_site else log_layout.RECORDER_CHANNELS
+            for name in names:
                 key = topics.key(session, member, name)
                 about = {"member": member}
                 if name == topics.STATE:
@@ -141,12 +151,12 @@ class LogWriter:
 
     @property
     def ended(self) -> bool:
-        """True once nothing more can be added: it is finished, or the disk refused."""
-        return bool(self._ended)
+        """True if no message can be added: the log is finished, or the disk refused a write."""
+        return bool(self._end_reason)
 
     @property
     def messages(self) -> int:
-        """Number of messages."""
+        """Number of messages in the file."""
         return self._file.messages
 
     @property
@@ -156,7 +166,7 @@ class LogWriter:
 
     @property
     def most_bytes(self) -> int:
-        """Largest length of the file without its accounts, if it were finished now."""
+        """Upper bound of the file's length without accounts, if the log were finished now."""
         views = self._views.most_bytes if self._views is not None else 0
         return self._file.position + self._file.open_chunk_bytes + self._file.end_bytes + views
 
@@ -169,21 +179,21 @@ class LogWriter:
         number: int,
         message: Decoded = None,
     ) -> None:
-        """Writes one message, if the log takes its channel.
+        """Writes one message, unless the log excludes its channel.
 
         Args:
-            key: key of its channel.
-            payload: its bytes.
-            t_ns: when it was sent, ns since the epoch.
-            log_time_ns: when it arrived, Unix ns.
-            number: its sequence number.
-            message: the same, decoded, for the channels for viewers.
+            key: key of the channel.
+            payload: bytes of the message.
+            t_ns: time of sending, in ns since the epoch.
+            log_time_ns: time of arrival, in Unix ns.
+            number: sequence number.
+            message: the decoded message, for the channels for viewers.
 
         Raises:
-            LogRefused: the disk refused, now (then this message is the last one) or before.
+            LogRefused: the disk refused this write or an earlier write, or the log is finished.
         """
-        if self._ended:
-            raise LogRefused(self._ended)
+        if self._end_reason:
+            raise LogRefused(self._end_reason)
         channel = self._channels[key]
         if channel is None:
             return
@@ -197,83 +207,93 @@ class LogWriter:
                 publish_time=sent_ns,
                 sequence=max(0, number) & 0xFFFFFFFF,
             )
-            if message is not None and (take := self._takers.get(key)) is not None:
-                take(message, log_time_ns)
+            receive_view = self._view_receivers.get(key)
+            if message is not None and receive_view is not None:
+                receive_view(message, log_time_ns)
         except OSError as error:
-            raise self._refused(error) from None
+            raise self._end_with_error(error) from None
 
-    def _put_view(self, topic: str, data: bytes, publish_ns: int, log_ns: int) -> None:
+    def _add_view_message(self, topic: str, data: bytes, publish_ns: int, log_ns: int) -> None:
         publish_ns = min(publish_ns, log_layout.MAX_TIME_NS)
-        self._file.add_message(self._standard[topic], log_ns, data, publish_ns)
+        self._file.add_message(self._view_channels[topic], log_ns, data, publish_ns)
 
     def flush(self) -> None:
-        """Closes the open chunk and hands it to the operating system: a crash loses nothing
-        before it.
+        """Closes the open chunk and hands its bytes to the operating system.
+
+        A later crash of the process loses none of these messages.
 
         Raises:
-            LogRefused: the disk refused.
+            LogRefused: the disk refused a write.
         """
-        with self._refusing():
+        with self._translate_disk_errors():
             self._file.flush()
 
     def finish(self, accounts: Mapping[str, str]) -> None:
-        """Writes the accounts, the index and the end mark, once; the stream stays open.
+        """Writes the accounts, the index and the end mark; the stream stays open.
+
+        Further calls have no effect.
 
         Args:
-            accounts: the accounts by topic, and other counts by name. Those of channels that
-                the log does not take are left out.
+            accounts: accounts by topic, and other counts by name. Accounts of excluded channels
+                are left out.
 
         Raises:
-            LogRefused: the disk refused.
+            LogRefused: the disk refused a write.
         """
-        if self._ended == _FINISHED:
+        if self._end_reason == _FINISHED:
             return
-        whole = not self._ended
-        self._ended = _FINISHED
-        left_out = {f"/{key}" for key, channel in self._channels.items() if channel is None}
-        taken = {name: text for name, text in accounts.items() if name not in left_out}
-        with self._refusing():
+        is_intact = not self._end_reason
+        self._end_reason = _FINISHED
+        excluded = {f"/{key}" for key, channel in self._channels.items() if channel is None}
+        included = {name: text for name, text in accounts.items() if name not in excluded}
+        with self._translate_disk_errors():
             try:
-                if self._views is not None and whole:
+                if self._views is not None and is_intact:
                     self._views.finish(self._last_log_ns)
             finally:
-                self._file.add_metadata(log_layout.ACCOUNTS, taken)
+                self._file.add_metadata(log_layout.ACCOUNTS, included)
                 self.records_digest = self._file.close_digest()["records"]
                 self._file.finish()
 
     @contextmanager
-    def _refusing(self) -> Iterator[None]:
+    def _translate_disk_errors(self) -> Iterator[None]:
+        """Turns an OSError of the `with` block into LogRefused and ends the log."""
         try:
             yield
         except OSError as error:
-            raise self._refused(error) from None
+            raise self._end_with_error(error) from None
 
-    def _refused(self, error: OSError) -> LogRefused:
+    def _end_with_error(self, error: OSError) -> LogRefused:
+        """Ends the log after a failed write; returns the error to raise."""
         text = f"the log cannot be written: {error.strerror}; what was flushed before is intact"
-        self._ended = self._ended or text
+        self._end_reason = self._end_reason or text
         return LogRefused(text)
 
 
 _FINISHED = "the log is finished"
 
 ACCOUNTS_BYTES = 16 << 10
-"""Space for the accounts of a part, and for the messages for viewers that one message causes.
+"""Space that a part keeps free, in bytes.
+
+The space is for the accounts and for the messages for viewers that one message causes.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class LogStorage:
-    """Place and form of a log.
+    """Path and division into parts of a log.
 
     Attributes:
-        path: its name; parts add their number to it.
-        force: True if it may replace a file.
-        durable: True if every flush syncs it.
-        split_bytes: largest length of a part.
-        split_ns: longest time of a part.
-        carry_on: True to write the part after a log of that name, finished or not.
-        choice: the channels that it takes.
-        views_hz: messages a second of the channels for viewers, see `VizChannels`; 0 for none.
+        path: path of the log; parts add their number to this name.
+        force: True if the log may replace an existing file.
+        durable: True if every flush also syncs the file to the disk.
+        split_bytes: largest length of a part, in bytes; None for no limit.
+        split_ns: longest duration of a part, in ns; None for no limit.
+        carry_on: True to continue an existing log of this name, finished or not, with a new
+            part.
+        choice: the channels that the log stores.
+        views_hz: rate of the channels for viewers, in messages per second, see `VizChannels`; 0
+            for a log without such channels.
     """
 
     path: Path
@@ -287,39 +307,50 @@ class LogStorage:
 
     @property
     def splits(self) -> bool:
-        """True if it has parts from the start."""
+        """True if the log has parts from the start."""
         return self.split_bytes is not None or self.split_ns is not None
 
     def first(self) -> tuple[int, str]:
-        """Returns the number of the part to begin with, 0 for a log without parts, and the part
-        before it.
+        """Finds the first part to write.
+
+        Returns:
+            Number of the part, 0 for a log without parts, and name of the part before it, "" if
+            there is no such part.
 
         Raises:
-            UsageError: the name is taken, and not just one of `force` and `carry_on` is given.
+            UsageError: a log of this name exists and neither `force` nor `carry_on` is set, or
+                both are set.
         """
         if self.carry_on and self.force:
             raise UsageError(
                 "--continue keeps what exists, --force replaces it; give one of them"
             )
-        there = log_layout.find_parts(self.path)
-        if self.carry_on and there:
-            last = max(there)
-            return last + 1, there[last].name.removesuffix(log_layout.ACTIVE_SUFFIX)
+        parts = log_layout.find_parts(self.path)
+        if self.carry_on and parts:
+            last = max(parts)
+            return last + 1, parts[last].name.removesuffix(log_layout.ACTIVE_SUFFIX)
         refuse_existing(
             self.path, force=self.force, unfinished=log_layout.active_path(self.path)
         )
-        if self.splits and there and not self.force:
-            ways = "choose another name, carry on behind it with --continue, or replace it with --force"
-            raise UsageError(f"{there[max(there)]}: exists; {ways}")
+        if self.splits and parts and not self.force:
+            raise UsageError(
+                f"{parts[max(parts)]}: exists; choose another name, carry on behind it with "
+                "--continue, or replace it with --force"
+            )
         return int(self.splits), ""
 
 
 def parse_split(option: str, unit: str, number: float | None, scale: int) -> int | None:
-    """Returns the limit of a part, as an option of a command states it in units of `scale`;
-    None for none.
+    """Returns the limit of a part that an option of a command sets, in ns or bytes.
+
+    Args:
+        option: name of the option, for the error text.
+        unit: name of the option's unit, for the error text.
+        number: value of the option; None, and thus no limit, if the option is absent.
+        scale: ns or bytes per unit.
 
     Raises:
-        UsageError: a part cannot be that small or that large.
+        UsageError: the number is not from 1 to 1e6.
     """
     if number is None:
         return None
@@ -329,20 +360,20 @@ def parse_split(option: str, unit: str, number: float | None, scale: int) -> int
 
 
 class LogParts:
-    """A `LogWriter` over as many files as it takes; for use in a `with` statement.
+    """Writer of a log in as many files as its limits require; for use in a `with` statement.
 
     Args:
-        storage: place and form of the log.
-        begin: begins the log in a file, with the metadata of the part ({} for a log without
-            parts).
-        opened: opens a file by name; by default `LogFile`.
+        storage: path of the log and its division into parts.
+        begin: creates the `LogWriter` of a file, with the metadata of the part ({} for a log
+            without parts).
+        opened: opens a file by path; by default `LogFile`.
 
     Attributes:
-        current_accounts: returns the accounts for a part that is full.
+        current_accounts: returns the accounts to write at the end of a full part.
 
     Raises:
-        UsageError: the name is taken, or the file cannot be made.
-        LogRefused: the disk refused.
+        UsageError: the name is in use, or the file cannot be created.
+        LogRefused: the disk refused a write.
     """
 
     def __init__(
@@ -351,72 +382,77 @@ class LogParts:
         begin: Callable[[Sink, Mapping[str, str]], LogWriter],
         opened: Callable[[Path], LogFile] | None = None,
     ) -> None:
-        self._opened = opened or (
+        self._open_file = opened or (
             lambda path: LogFile(path, force=storage.force, durable=storage.durable)
         )
         self.current_accounts: Callable[[], Mapping[str, str]] = dict
         self._storage = storage
-        self._begin_log = begin
+        self._begin_writer = begin
         self._number, self._previous = storage.first()
         self._previous_digest = ""
-        # what was left of a log would seem to belong to the new one
+        # Remaining parts of a replaced log would seem to belong to the new log.
         if storage.force and storage.splits:
             for number in (0, *log_layout.find_parts(storage.path)):
-                name = log_layout.part_path(storage.path, number)
-                name.unlink(missing_ok=True)
-                log_layout.active_path(name).unlink(missing_ok=True)
-        self._since_ns: int | None = None
-        self._before_bytes = 0
-        self._begin()
+                path = log_layout.part_path(storage.path, number)
+                path.unlink(missing_ok=True)
+                log_layout.active_path(path).unlink(missing_ok=True)
+        self._part_start_ns: int | None = None
+        self._previous_bytes = 0
+        self._begin_part()
 
-    def _begin(self) -> None:
+    def _begin_part(self) -> None:
+        """Opens the file of the current part and writes its header."""
         path = log_layout.part_path(self._storage.path, self._number)
-        part = {"index": str(self._number), "previous": self._previous} if self._number else {}
+        part: dict[str, str] = {}
+        if self._number:
+            part = {"index": str(self._number), "previous": self._previous}
         if self._previous_digest:
             part[PREVIOUS_DIGEST_KEY] = self._previous_digest
-        self._file = file = self._opened(path)
+        self._file = file = self._open_file(path)
         try:
-            self._writer = self._begin_log(file, part)
-        except LogRefused as error:
+            self._writer = self._begin_writer(file, part)
+        except LogRefused:
             file.discard()
-            raise (
-                error if file.disk_error is None else file.refused(file.disk_error)
-            ) from None
-        self._since_ns = None
+            if file.disk_error is None:
+                raise
+            raise file.refused(file.disk_error) from None
+        self._part_start_ns = None
         self._previous = path.name
 
-    def _roll(self) -> None:
+    def _begin_next_part(self) -> None:
+        """Finishes the current part and begins the next part."""
         self._writer.finish(self.current_accounts())
         self._previous_digest = self._writer.records_digest
-        self._before_bytes += self._writer.written_bytes
+        self._previous_bytes += self._writer.written_bytes
         self._file.end()
         self._number += 1
         try:
-            self._begin()
-        except UsageError as error:  # the caller's no more: the disk took the parts before
+            self._begin_part()
+        except UsageError as error:
+            # After a first part this is no longer an error of the caller.
             raise LogRefused(f"{error}; the log ends with {self._previous}") from None
 
-    def _full(self, payload: bytes, log_time_ns: int) -> bool:
-        limit = self._storage
+    def _is_part_full(self, payload_bytes: int, duration_ns: int) -> bool:
+        """Returns True if the next message exceeds a limit of the current part."""
+        limits = self._storage
         writer = self._writer
-        if self._since_ns is None:
-            self._since_ns = log_time_ns
-        if limit.split_ns is not None and log_time_ns - self._since_ns >= limit.split_ns:
+        if limits.split_ns is not None and duration_ns >= limits.split_ns:
             return True
-        size = writer.most_bytes + len(payload) + ACCOUNTS_BYTES
-        return (
-            limit.split_bytes is not None and writer.messages > 0 and size > limit.split_bytes
-        )
+        # A part holds at least one message, however small the limit is.
+        if limits.split_bytes is None or not writer.messages:
+            return False
+        size = writer.most_bytes + payload_bytes + ACCOUNTS_BYTES
+        return size > limits.split_bytes
 
     @property
     def path(self) -> Path:
-        """Name of the file that is being written, once it is whole."""
+        """Final path of the file that is being written."""
         return self._file.path
 
     @property
     def written_bytes(self) -> int:
-        """How many bytes all parts have so far."""
-        return self._before_bytes + self._writer.written_bytes
+        """Number of bytes in all parts so far."""
+        return self._previous_bytes + self._writer.written_bytes
 
     def add(
         self,
@@ -428,13 +464,17 @@ class LogParts:
         message: Decoded = None,
     ) -> None:
         """Writes one message; see `LogWriter.add`."""
-        if self._storage.splits and not self._writer.ended and self._full(payload, log_time_ns):
-            self._roll()
-            self._since_ns = log_time_ns
+        if self._storage.splits and not self._writer.ended:
+            if self._part_start_ns is None:
+                self._part_start_ns = log_time_ns
+            duration_ns = log_time_ns - self._part_start_ns
+            if self._is_part_full(len(payload), duration_ns):
+                self._begin_next_part()
+                self._part_start_ns = log_time_ns
         self._writer.add(key, payload, t_ns, log_time_ns, number, message)
 
     def flush(self) -> None:
-        """Hands everything so far to the operating system; see `LogWriter.flush`."""
+        """Hands all bytes so far to the operating system; see `LogWriter.flush`."""
         self._writer.flush()
 
     def finish(self, accounts: Mapping[str, str]) -> None:
