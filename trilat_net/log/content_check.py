@@ -1,18 +1,18 @@
-"""Check of messages that no checksum covers, by their content: of a chunk that was cut off, or
-has no CRC.
+"""Check of messages by their content, for messages that no checksum covers.
+
+No checksum covers the messages of a chunk that was cut off or has no CRC. Instead, a log
+identifies each message in four ways: by its position in the file, by its channel, by its
+sequence number and by its content. Damage that keeps all four consistent can only change
+numbers inside a single message, and is shorter than that message.
 
 Invariant:
-- A message is believed only if it decodes by its channel's schema, comes from its channel's
-  member and from the same start of it as the message before, has the next number of its
-  channel, is stored under that number and with its own time of sending, and was logged within
-  its chunk and not before the message that precedes it.
-- Nothing is believed after the first message that fails.
-- Of a session in virtual time every message names the scenario by its boot: a chunk of a run of
-  another scenario, which includes the seed, is refused even where a checksum covers it.
-
-A log names each message four times over: by its place in the file, by its channel, by its
-sequence number and by its content. Damage that keeps all four consistent changes numbers inside
-a message alone, and is shorter than a message.
+    - A message is accepted only if the message decodes by the schema of its channel, comes from
+      the member of its channel and from the same boot as the message before, has the next
+      number of its channel, is stored with that number and with its time of sending, and was
+      logged within its chunk and not before the preceding message.
+    - No message is accepted after the first message that fails.
+    - In virtual time, the boot of every message identifies the scenario, including its seed. A
+      chunk from a run of another scenario is refused even if a checksum covers the chunk.
 """
 
 import re
@@ -39,20 +39,20 @@ from .message_identity import (
 CDR_HEAD = b"\x00\x01"
 """First bytes of a message of a channel for viewers."""
 
-
 VIRTUAL_DRIVER = "virtual"
 """Driver of a session in virtual time."""
 _SAMPLED_MESSAGES = 200
+"""Number of messages of a chunk that are decoded to find their origins."""
 _CHECKED_MESSAGES = 20
-"""Messages of a chunk that are compared with the boots of a session in virtual time."""
+"""Number of messages of a chunk whose boots are compared with those of the scenario."""
 
 
 class MessageOrigins(NamedTuple):
-    """The origins that messages state.
+    """Sessions and senders of a set of messages.
 
     Attributes:
-        epochs_ns: the epochs of their sessions, Unix ns.
-        boots: their senders, and the boots of those.
+        epochs_ns: epochs of the sessions, in Unix ns.
+        boots: pairs of sender and boot number of that sender.
     """
 
     epochs_ns: set[int]
@@ -60,15 +60,15 @@ class MessageOrigins(NamedTuple):
 
 
 def find_origins(data: bytes, most: int = _SAMPLED_MESSAGES) -> MessageOrigins:
-    """Returns the origins that the first messages of an unpacked chunk imply or state.
+    """Returns the origins of the first messages of an unpacked chunk.
 
-    An event states the epoch that it announces. Records and statistics state when they were
-    sent since the epoch, and are stored with the Unix time of that; a session in virtual time
-    has the epoch 0.
+    An event that announces an epoch contains the epoch itself. Records and statistics contain
+    their time of sending since the epoch and are stored with the Unix time of sending, so the
+    difference is the epoch. The epoch of a session in virtual time is 0.
 
     Args:
-        data: the records of the chunk.
-        most: the number of messages that are decoded.
+        data: records of the chunk.
+        most: largest number of messages to decode.
     """
     epochs_ns: set[int] = set()
     boots: set[tuple[str, int]] = set()
@@ -89,18 +89,22 @@ def find_origins(data: bytes, most: int = _SAMPLED_MESSAGES) -> MessageOrigins:
                 sent_ns = identity.sent_ns
                 boots.add((identity.sender, message.boot))
                 if isinstance(message, messages.Event):
-                    epochs_ns |= {message.epoch_unix_ns} if message.epoch_unix_ns else set()
+                    if message.epoch_unix_ns:
+                        epochs_ns.add(message.epoch_unix_ns)
                 elif sent_ns is not None and publish_ns:
                     epochs_ns.add(publish_ns - sent_ns)
     return MessageOrigins(epochs_ns, boots)
 
 
 def has_foreign_boots(about: Mapping[str, str], boots: set[tuple[str, int]]) -> bool:
-    """True if no message is of a session in virtual time, whose boots follow from its scenario.
+    """Returns True if all messages are from another session than the given one.
+
+    This can be told only in virtual time, where the boots follow from the scenario. In real
+    time, and without messages, the result is False.
 
     Args:
-        about: metadata of the session; of a session in real time nothing is foreign.
-        boots: the senders of the messages, and their boots.
+        about: metadata of the session.
+        boots: pairs of sender and boot number of that sender.
     """
     if about.get("driver") != VIRTUAL_DRIVER:
         return False
@@ -111,13 +115,13 @@ def has_foreign_boots(about: Mapping[str, str], boots: set[tuple[str, int]]) -> 
 
 
 class ContentCheck:
-    """What is known of a session, to compare messages with.
+    """Check of a session's messages against its scenario, metadata and earlier messages.
 
     Args:
-        scenario: the session's scenario.
+        scenario: scenario of the session.
         about: metadata of the session.
-        is_continued: True for a later part of a log, whose channels do not begin with their
-            first message.
+        is_continued: True for a later part of a log, where the channels continue with numbers
+            greater than 0.
     """
 
     def __init__(
@@ -129,16 +133,18 @@ class ContentCheck:
         epoch_text = about.get("epoch_unix_ns", "")
         self._epoch_ns = int(epoch_text) if re.fullmatch(r"\d{1,19}", epoch_text) else 0
         self._is_continued = is_continued
-        self._newest: dict[str, tuple[int, bytes]] = {}  # by topic: sequence number and payload
+        # Sequence number and payload of the latest accepted message, by topic.
+        self._latest: dict[str, tuple[int, bytes]] = {}
+        # Latest log time of an accepted message, in Unix ns.
         self._log_ns = 0
 
     def accept(self, topic: str, sequence: int, log_ns: int, payload: bytes) -> None:
-        """Takes note of a message that a checksum covers; those after it must continue it."""
-        self._newest[topic] = sequence, payload
+        """Accepts a message that a checksum covers; the channel must continue from there."""
+        self._latest[topic] = sequence, payload
         self._log_ns = max(self._log_ns, log_ns)
 
     def owns_channel(self, topic: str) -> bool:
-        """True for a channel of the session's members."""
+        """Returns True for a channel of a member of the session."""
         key = topics.parse_key(topic.removeprefix("/"))
         if key is None or key.session != self._session or key.boot:
             return False
@@ -147,8 +153,9 @@ class ContentCheck:
         return key.member in self._scenario.sites and key.channel in SITE_CHANNELS
 
     def identify(self, payload: bytes) -> str:
-        """Returns the topic that a message belongs to by its own content; "" if it is none of
-        the session.
+        """Returns the topic of a message as its content states.
+
+        Returns "" if the message is not from a member of the session.
         """
         kinds: tuple[Any, ...] = tuple(CHANNEL_TYPES.values())
         for kind in kinds:
@@ -162,7 +169,7 @@ class ContentCheck:
         return ""
 
     def describe_channel(self, topic: str) -> dict[str, str]:
-        """Returns the metadata of a channel of the session, as the log's writer gives them."""
+        """Returns the metadata that `LogWriter` gives to a channel of the session."""
         member, channel = topic.split("/")[-2:]
         about = {"member": member}
         if channel == topics.STATE:
@@ -178,19 +185,19 @@ class ContentCheck:
         payload: bytes,
         span_ns: tuple[int, int],
     ) -> None:
-        """Takes note of a message that no checksum covers, if its content proves that it is the
-        next one.
+        """Accepts a message without a checksum if the message continues its channel.
 
         Args:
-            topic: the topic of its channel.
-            sequence: its number in the file.
-            log_ns: when it was logged, Unix ns.
-            publish_ns: when it was sent, Unix ns.
-            payload: its bytes.
-            span_ns: first and last log time of its chunk, Unix ns.
+            topic: topic of the channel.
+            sequence: sequence number that the file stores with the message.
+            log_ns: log time, in Unix ns.
+            publish_ns: time of sending, in Unix ns.
+            payload: bytes of the message.
+            span_ns: first and last log time of the chunk, in Unix ns.
 
         Raises:
-            UnreadableRecord: it is not.
+            UnreadableRecord: the content does not prove that the message is the next of its
+                channel.
         """
         first_ns, last_ns = span_ns
         if not max(first_ns, self._log_ns) <= log_ns <= last_ns:
@@ -199,12 +206,13 @@ class ContentCheck:
             if payload[:2] != CDR_HEAD:
                 raise UnreadableRecord(f"a message of {topic} is not CDR")
         elif self.owns_channel(topic):
-            self._check_own(topic, sequence, publish_ns, payload)
+            self._check_session_message(topic, sequence, publish_ns, payload)
         else:
             raise UnreadableRecord(f"a message of {topic[:80]!r} is none of this session")
         self.accept(topic, sequence, log_ns, payload)
 
     def _decode(self, topic: str, payload: bytes) -> tuple[AnyMessage, MessageIdentity]:
+        """Returns the decoded message of a topic, and the identity that its content states."""
         member, channel = topic.split("/")[-2:]
         kind: Any = CHANNEL_TYPES[channel]
         layout = None
@@ -218,7 +226,10 @@ class ContentCheck:
             raise UnreadableRecord(f"a message of {topic} cannot be read: {error}") from None
         return message, identify_message(message, rate_hz)
 
-    def _check_own(self, topic: str, sequence: int, publish_ns: int, payload: bytes) -> None:
+    def _check_session_message(
+        self, topic: str, sequence: int, publish_ns: int, payload: bytes
+    ) -> None:
+        """Raises UnreadableRecord unless a member's message is the next of its channel."""
         message, identity = self._decode(topic, payload)
         member = topic.split("/")[-2]
         if identity.sender != member:
@@ -242,46 +253,55 @@ class ContentCheck:
                 raise UnreadableRecord(f"number {number} of {topic} was sent at another time")
 
     def check_origin(self, data: bytes) -> None:
-        """Raises if the messages of an unpacked chunk are of another run in virtual time."""
+        """Raises UnreadableRecord if a chunk is from another run in virtual time.
+
+        Args:
+            data: records of the unpacked chunk.
+        """
+        # Decoding messages is slow, and in real time the boots prove nothing.
         if self._about.get("driver") != VIRTUAL_DRIVER:
             return
-        if has_foreign_boots(self._about, find_origins(data, _CHECKED_MESSAGES).boots):
+        origins = find_origins(data, _CHECKED_MESSAGES)
+        if has_foreign_boots(self._about, origins.boots):
             raise UnreadableRecord("a chunk of another run")
 
     def _find_boot(self, member: str) -> int | None:
-        """Returns the boot with which a member sends its messages; None if nothing tells it
-        yet.
-        """
+        """Returns the boot number of a member; None in real time before its first message."""
         if self._about.get("driver") == VIRTUAL_DRIVER:
             return compute_virtual_boot(self._about.get("scenario_sha256", ""), member)
         channels = RECORDER_CHANNELS if member == topics.RECORDER else SITE_CHANNELS
         for channel in channels:
             topic = "/" + topics.key(self._session, member, channel)
-            if topic in self._newest:
-                return self._decode(topic, self._newest[topic][1])[0].boot
+            if topic in self._latest:
+                _, payload = self._latest[topic]
+                message, _ = self._decode(topic, payload)
+                return message.boot
         return None
 
     def _check_number(self, topic: str, message: AnyMessage, number: int) -> None:
-        """Raises unless a message has the next number of its channel; old events have none."""
+        """Raises UnreadableRecord unless a message has the next number of its channel."""
         member, channel = topic.split("/")[-2:]
+        # Events of old logs have no number.
         if isinstance(message, messages.Event) and message.n < 0:
             return
-        before = self._newest.get(topic)
-        if before is None:
-            is_first = number == 0 or self._is_continued or self._scenario.sites_may_return
-            if not is_first:
+        if topic not in self._latest:
+            may_continue = self._is_continued or self._scenario.sites_may_return
+            if number and not may_continue:
                 raise UnreadableRecord(f"the first message of {topic} has number {number}")
             return
+        sequence_before, _ = self._latest[topic]
         rate_hz = self._scenario.sites[member].rate_hz if member in self._scenario.sites else 1
-        expected = number_message(channel, before[0], rate_hz) + 1
+        expected = number_message(channel, sequence_before, rate_hz) + 1
         if isinstance(message, messages.State):
             expected += count_skipped_ticks(message.cmd)
         if number != expected:
             raise UnreadableRecord(f"number {number} of {topic} follows number {expected - 1}")
 
     def _check_tick(self, topic: str, record: messages.State) -> None:
-        """Raises unless a record is of a tick of the run, at its nominal time, and names
-        existing peers.
+        """Raises UnreadableRecord unless the content of a record is possible in the run.
+
+        The tick must exist in the run and have its nominal time, the peers must exist, and the
+        mode must be known.
         """
         site = record.site
         if not 0 <= record.tick < self._scenario.ticks(site):
@@ -289,9 +309,9 @@ class ContentCheck:
         if record.t_ns != tick_ns(record.tick, self._scenario.sites[site].rate_hz):
             raise UnreadableRecord(f"tick {record.tick} of {topic} has another nominal time")
         peers = self._scenario.peers(site)
-        if not record.used.keys() <= set(peers) or not all(
-            0 <= peer < len(peers) for peer, *_ in record.rx
-        ):
+        uses_known_peers = record.used.keys() <= set(peers)
+        receives_from_known_peers = all(0 <= peer < len(peers) for peer, *_ in record.rx)
+        if not uses_known_peers or not receives_from_known_peers:
             raise UnreadableRecord(
                 f"tick {record.tick} of {topic} names a peer that does not exist"
             )
