@@ -1,25 +1,25 @@
-"""The Zenoh configuration of a session member, what each may send and hear, and checks of a
-user's own file.
+"""The Zenoh configuration of a session member, its access rules, and checks of a user's file.
 
 Invariant:
     - Explicit endpoints only, no multicast, gossip or shared memory, so two sessions on one
       host never meet by accident.
-    - No setting of a user's file is overruled silently: it is taken, or refused with its key,
-      its value and the value required. A setting that a session makes itself is taken if it has
-      the session's value.
-    - A file is refused once, with all its settings that contradict a session.
+    - No setting of a user's file is overruled silently: a setting is accepted, or refused with
+      its key, its value and the required value. A setting that the session sets itself is
+      accepted if its value is the session's.
+    - A refusal of a file lists all settings that contradict a session.
+    - Access is denied by default, at every member and at routers.
+    - A member publishes under its own name only: its links show a certificate, and the name in
+      the certificate is the name in its keys.
 
 Three defaults of Zenoh do not suit a 1 kHz loop: a transmission queue of 2 batches (16 here,
 for bursts of catch-up ticks), a publisher that waits 1 ms for room (0 here: the loop never
-waits and the receiver counts drops), and `express`, which sends each message by itself; it
-stays off because batching makes bursts of thousands of small messages fit.
+waits and the receiver counts drops), and `express`, which sends each message separately.
+`express` stays off because only with batching do bursts of thousands of small messages fit.
 
-What a member may send, hear, ask and answer are rules of Zenoh's access control: everything
-that is not named is denied, at every member and at routers. A member speaks under its own name
-alone: its links show a certificate, and the name in it is the one that stands in its keys. A
-router carries what others said; it is trusted with all of it. Sizes are limited here, rates are
-not: Zenoh would thin out bursts, in which samples of ticks that are made up for arrive, and
-events of one tick.
+The rules of Zenoh's access control say which messages a member may publish, receive, query and
+reply to. A router forwards the messages of others and is trusted with all of them. The rules
+limit sizes but not rates: a rate limit of Zenoh would thin out bursts, and bursts carry the
+samples of catch-up ticks and the events of a single tick.
 """
 
 import difflib
@@ -35,19 +35,24 @@ from ..files import open_regular
 from . import topics
 
 LEASE_MS = 5_000
-"""A stall shorter than this loses no connection, hence no message. A killed peer is seen at
-once by its closed connection; a silent one by the age of its samples.
+"""Lease of a connection, in ms: a shorter stall loses no connection and thus no message.
+
+A killed peer is noticed at once by its closed connection, a silent peer by the age of its
+samples.
 """
 
 BATCHES = 16
 BATCH_BYTES = 65_535
 MOST_PUT_BYTES = 262_144
 MOST_QUERY_BYTES = 65_536
-"""The largest messages that a link takes: ten records of the longest arms; an order."""
+"""Largest messages that a link accepts, in bytes.
+
+A put holds ten records of the longest arms, a query holds a command.
+"""
 
 ZenohMode = Literal["peer", "client", "router"]
 Endpoint = str | Mapping[str, Any]
-"""As in "tcp/127.0.0.1:7447", or one of Zenoh's groups of locators."""
+"""A locator, as in "tcp/127.0.0.1:7447", or a group of locators in the form of Zenoh."""
 
 QUEUES = [
     "control",
@@ -59,21 +64,21 @@ QUEUES = [
     "data_low",
     "background",
 ]
-"""Zenoh's queues of a link, by priority."""
-
+"""Zenoh's transmission queues of a link, by priority."""
 
 CONNECT_TIMEOUT_MS = {"router": -1, "peer": -1, "client": 0}
-"""A client's session opens with its router; where that is not there yet, `open_bus` tries
-again.
+"""Zenoh's `connect/timeout_ms` by mode: -1 retries without limit, 0 does not retry.
+
+A client cannot open its session without its router; `open_bus` retries until the router runs.
 """
 CONNECT_EXIT_ON_FAILURE = {"router": False, "peer": False, "client": True}
 LISTEN_TIMEOUT_MS = {"router": 0, "peer": 0, "client": 0}
-"""Zenoh's default, which a session leaves as it is."""
+"""Zenoh's `listen/timeout_ms` by mode: the defaults, which a session does not change."""
 LISTEN_EXIT_ON_FAILURE = {"router": True, "peer": True, "client": True}
 
 
 def limit_sizes(name: str, messages: list[str], size: int) -> dict[str, Any]:
-    """Returns the setting of Zenoh by which a member drops longer messages of others."""
+    """Returns the Zenoh filter by which a member drops incoming messages over `size` bytes."""
     return {
         "id": name,
         "flows": ["ingress"],
@@ -93,20 +98,25 @@ def make_zenoh_config(
     listen: Sequence[Endpoint],
     connect: Sequence[Endpoint],
     mode: ZenohMode = "peer",
-    own: Mapping[str, Any] | None = None,
+    user_settings: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Returns the Zenoh configuration of a session member, with the `settings` of a
-    `ZenohFile`.
+    """Returns the Zenoh configuration of a session member.
+
+    Args:
+        listen: endpoints at which the member listens.
+        connect: endpoints to which the member connects.
+        mode: the member's mode in Zenoh.
+        user_settings: the `settings` of a `ZenohFile`, which take precedence.
     """
-    tries = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5}
-    needed: dict[str, Any] = {
+    retry = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5}
+    session_settings: dict[str, Any] = {
         "mode": mode,
         "listen": {"endpoints": list(listen), "exit_on_failure": LISTEN_EXIT_ON_FAILURE[mode]},
         "connect": {
             "endpoints": list(connect),
             "timeout_ms": CONNECT_TIMEOUT_MS[mode],
             "exit_on_failure": CONNECT_EXIT_ON_FAILURE[mode],
-            "retry": tries,
+            "retry": retry,
         },
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "transport": {
@@ -127,88 +137,95 @@ def make_zenoh_config(
         },
         "low_pass_filter": SIZE_LIMITS,
     }
-    return merge_settings(needed, own or {})
+    return merge_settings(session_settings, user_settings or {})
 
 
-def merge_settings(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns settings with those of `own` in place of what they name."""
-    both = dict(base)
-    for key, value in own.items():
-        under = both.get(key)
-        both[key] = (
-            merge_settings(under, value)
-            if isinstance(under, dict) and isinstance(value, dict)
-            else value
-        )
-    return both
+def merge_settings(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the nested settings of `base`, replaced by `overrides` key by key."""
+    merged = dict(base)
+    for key, value in overrides.items():
+        base_value = merged.get(key)
+        if isinstance(base_value, dict) and isinstance(value, dict):
+            merged[key] = merge_settings(base_value, value)
+        else:
+            merged[key] = value
+    return merged
 
 
 _Requirement = tuple[Callable[[Any], bool], str]
-"""Whether the value of a key in a user's file will do, and what it must be."""
+"""A requirement of a key in a user's file: a predicate of the value, and a text for errors."""
 
 
-def _exactly(value: object, must: str) -> _Requirement:
-    return (lambda stated: stated == value and isinstance(stated, type(value)), must)
+def _require_value(required: object, text: str) -> _Requirement:
+    """Returns the requirement of a fixed value, including its type: 0 is not False."""
+    return (lambda value: value == required and isinstance(value, type(required)), text)
 
 
-def _at_least(least: int, must: str) -> _Requirement:
-    return (lambda stated: isinstance(stated, int) and stated >= least, must)
+def _require_minimum(minimum: int, text: str) -> _Requirement:
+    """Returns the requirement of an integer that is `minimum` or more."""
+    return (lambda value: isinstance(value, int) and value >= minimum, text)
 
 
-def _as_used(used: Mapping[str, Any]) -> _Requirement:
+def _require_session_value(session_values: Mapping[str, Any]) -> _Requirement:
     """Returns the requirement of a key that a session sets itself, by the mode of the member.
 
-    A file states it for a mode each, or once for the file's own mode (`_expand_mode`).
+    The predicate takes the values of a file by mode, see `_expand_mode`.
     """
 
-    def is_used(stated: Any) -> bool:
-        return isinstance(stated, dict) and all(
-            mode in used and value == used[mode] and type(value) is type(used[mode])
-            for mode, value in stated.items()
-        )
+    def equals_session_value(mode: str, value: Any) -> bool:
+        if mode not in session_values:
+            return False
+        session_value = session_values[mode]
+        is_equal: bool = value == session_value
+        return is_equal and type(value) is type(session_value)
 
-    values = ", ".join(f"{mode} {json.dumps(value)}" for mode, value in used.items())
-    return is_used, f"left out, or as a session sets it itself: {values}"
+    def are_session_values(values: Any) -> bool:
+        if not isinstance(values, dict):
+            return False
+        return all(equals_session_value(mode, value) for mode, value in values.items())
+
+    listed = ", ".join(f"{mode} {json.dumps(value)}" for mode, value in session_values.items())
+    return are_session_values, f"left out, or as a session sets it itself: {listed}"
 
 
-_NAMED = _exactly(False, "false: members meet at named endpoints and nowhere else")
-_UNTOUCHED = _exactly([], "empty: it would change or thin out a session's messages")
+_MUST_BE_OFF = _require_value(False, "false: members meet at named endpoints and nowhere else")
+_MUST_BE_EMPTY = _require_value([], "empty: it would change or thin out a session's messages")
 _TX = "transport/link/tx"
 
 REQUIREMENTS: Mapping[str, _Requirement] = {
-    "connect/timeout_ms": _as_used(CONNECT_TIMEOUT_MS),
-    "connect/exit_on_failure": _as_used(CONNECT_EXIT_ON_FAILURE),
-    "listen/timeout_ms": _as_used(LISTEN_TIMEOUT_MS),
-    "listen/exit_on_failure": _as_used(LISTEN_EXIT_ON_FAILURE),
-    "scouting/multicast/enabled": _NAMED,
-    "scouting/gossip/enabled": _NAMED,
+    "connect/timeout_ms": _require_session_value(CONNECT_TIMEOUT_MS),
+    "connect/exit_on_failure": _require_session_value(CONNECT_EXIT_ON_FAILURE),
+    "listen/timeout_ms": _require_session_value(LISTEN_TIMEOUT_MS),
+    "listen/exit_on_failure": _require_session_value(LISTEN_EXIT_ON_FAILURE),
+    "scouting/multicast/enabled": _MUST_BE_OFF,
+    "scouting/gossip/enabled": _MUST_BE_OFF,
     **{
-        f"{_TX}/queue/size/{queue}": _at_least(
+        f"{_TX}/queue/size/{queue}": _require_minimum(
             BATCHES, f"{BATCHES}: a burst of catch-up ticks must fit into the queue"
         )
         for queue in QUEUES
     },
-    f"{_TX}/queue/congestion_control/drop/wait_before_drop": _exactly(
+    f"{_TX}/queue/congestion_control/drop/wait_before_drop": _require_value(
         0, "0: a loop never waits for room"
     ),
-    f"{_TX}/queue/batching/enabled": _exactly(
+    f"{_TX}/queue/batching/enabled": _require_value(
         True, "true: without batches a burst of catch-up ticks does not fit into the queue"
     ),
-    f"{_TX}/batch_size": _at_least(
+    f"{_TX}/batch_size": _require_minimum(
         BATCH_BYTES, f"{BATCH_BYTES}: a burst of catch-up ticks must fit"
     ),
-    f"{_TX}/lease": _at_least(
+    f"{_TX}/lease": _require_minimum(
         LEASE_MS, f"{LEASE_MS} or more: a stall shorter than that loses no message"
     ),
-    "transport/unicast/lowlatency": _exactly(
+    "transport/unicast/lowlatency": _require_value(
         False, "false: it sends in the loop, without a queue"
     ),
-    "transport/shared_memory/enabled": _exactly(
+    "transport/shared_memory/enabled": _require_value(
         False, "false: a receiver that stalls would lose messages"
     ),
-    "qos/publication": _UNTOUCHED,
-    "qos/network": _UNTOUCHED,
-    "downsampling": _UNTOUCHED,
+    "qos/publication": _MUST_BE_EMPTY,
+    "qos/network": _MUST_BE_EMPTY,
+    "downsampling": _MUST_BE_EMPTY,
     "low_pass_filter": (
         lambda stated: stated in ([], SIZE_LIMITS),
         "left out: a session sets it",
@@ -216,15 +233,21 @@ REQUIREMENTS: Mapping[str, _Requirement] = {
 }
 """Requirements of a session by the path of the key in Zenoh's configuration."""
 
-_FILES = r"transport/(link/tls/\w+_(certificate|private_key)|auth/usrpwd/dictionary_file)"
-"""Keys that name files. Zenoh opens those of a connecting side late, and then retries for ever.
+_FILE_KEYS = r"transport/(link/tls/\w+_(certificate|private_key)|auth/usrpwd/dictionary_file)"
+"""Keys that name files, which are opened here once to report unreadable files early.
+
+Zenoh opens the files of a connecting member late, and then retries for ever.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class ZenohFile:
-    """A user's Zenoh configuration, checked: its mode, or "", its endpoints, and its other
-    settings.
+    """A user's Zenoh configuration after its check.
+
+    Attributes:
+        source: name of the file, for error texts.
+        mode: mode in Zenoh; "" if the file has no mode.
+        settings: all settings except mode and endpoints.
     """
 
     source: str
@@ -235,28 +258,33 @@ class ZenohFile:
     def endpoints(
         self, side: Literal["listen", "connect"], mode: ZenohMode
     ) -> list[Endpoint] | None:
-        """Returns its endpoints for a mode, or None without any."""
-        stated = self._endpoints.get(side)
-        if isinstance(stated, dict) and "locators" not in stated:
-            stated = stated.get(mode)
-        if stated is None:
+        """Returns the endpoints of one side for a mode; None if the file has no endpoints."""
+        endpoints = self._endpoints.get(side)
+        # A dictionary is either a group of locators or a table by mode.
+        if isinstance(endpoints, dict) and "locators" not in endpoints:
+            endpoints = endpoints.get(mode)
+        if endpoints is None:
             return None
-        return list(stated) if isinstance(stated, list) else [stated]
+        return list(endpoints) if isinstance(endpoints, list) else [endpoints]
 
 
 def check_zenoh_file(
     source: str, stated: object, refusal: Callable[[Mapping[str, Any]], str]
 ) -> ZenohFile:
-    """Checks the content of a user's file; `refusal` returns Zenoh's reason for refusing
-    settings, or "".
+    """Checks the content of a user's Zenoh configuration file.
+
+    Args:
+        source: name of the file, for error texts.
+        stated: parsed content of the file.
+        refusal: returns Zenoh's reason for refusing some settings; "" if Zenoh accepts them.
 
     Raises:
-        UsageError: it is no Zenoh configuration, or contradicts requirements of a session; the
-            message has every key that does so.
+        UsageError: the file is not a Zenoh configuration, or contradicts requirements of a
+            session; the message lists all keys that do so.
     """
     if not isinstance(stated, dict):
         raise UsageError(f"{source}: a Zenoh configuration is one object in braces")
-    settings = _without_nulls(stated)
+    settings = _remove_nulls(stated)
     if reason := refusal(settings):
         refused = list(_find_refused_keys(settings, refusal, ()))
         problems = [f"{'/'.join(path)}: {_suggest_key(path, why)}" for path, why in refused]
@@ -264,7 +292,8 @@ def check_zenoh_file(
     if problems := list(_find_problems(settings)):
         raise UsageError(_list_problems(source, problems))
     for path in (*_SET_BY_MODE, "low_pass_filter"):
-        _drop_key(settings, path)  # it says what a session does by itself
+        # The check has shown that the session's own value is the same.
+        _drop_key(settings, path)
     mode = settings.pop("mode", "")
     endpoints = {
         side: settings[side].pop("endpoints")
@@ -278,19 +307,21 @@ def _list_problems(source: str, problems: Sequence[str]) -> str:
     """Returns the problems of a file in one line."""
     if len(problems) == 1:
         return f"{source}: {problems[0]}"
-    return f"{source}: {count_nouns(len(problems), 'setting')} cannot be taken: {'; '.join(problems)}"
+    count = count_nouns(len(problems), "setting")
+    return f"{source}: {count} cannot be taken: {'; '.join(problems)}"
 
 
 def _find_problems(settings: Mapping[str, Any]) -> Iterator[str]:
-    """Yields what contradicts a requirement of a session, each with its key."""
-    for key, value in _leaves(settings, ()):
+    """Yields a text for each setting that contradicts a requirement, beginning with its key."""
+    for key, value in _iterate_leaves(settings, ()):
         compared = _expand_mode(settings, value) if key in _SET_BY_MODE else value
-        need = REQUIREMENTS.get(key)
-        if need is not None and not need[0](compared):
-            text = json.dumps(value)
-            shown = text if len(text) <= 60 else f"{text[:57]}..."
-            yield f"{key}: {shown} must be {need[1]}"
-        if re.fullmatch(_FILES, key):
+        if key in REQUIREMENTS:
+            is_met, requirement_text = REQUIREMENTS[key]
+            if not is_met(compared):
+                text = json.dumps(value)
+                shortened = text if len(text) <= 60 else f"{text[:57]}..."
+                yield f"{key}: {shortened} must be {requirement_text}"
+        if re.fullmatch(_FILE_KEYS, key):
             try:
                 open_regular(Path(str(value))).close()
             except OSError as error:
@@ -309,34 +340,46 @@ _SET_BY_MODE = (
 
 
 def _expand_mode(settings: Mapping[str, Any], value: Any) -> Any:
-    """Returns the value of a key by mode: one that is stated once is that of the file's mode,
-    or of peers.
+    """Returns the value of a key as a dictionary by mode.
+
+    A single value applies to the file's mode, or to peers if the file has no mode.
     """
     return value if isinstance(value, dict) else {settings.get("mode", "peer"): value}
 
 
 def _drop_key(settings: dict[str, Any], path: str) -> None:
+    """Removes a key from nested settings, if present; `path` separates the levels by "/"."""
     *folders, last = path.split("/")
     for folder in folders:
         settings = settings.get(folder, {})
     settings.pop(last, None)
 
 
-def _without_nulls(stated: Mapping[str, Any]) -> dict[str, Any]:
+def _remove_nulls(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns a copy of nested settings without the keys whose value is null."""
     return {
-        key: _without_nulls(value) if isinstance(value, dict) else value
-        for key, value in stated.items()
+        key: _remove_nulls(value) if isinstance(value, dict) else value
+        for key, value in settings.items()
         if value is not None
     }
 
 
-def _leaves(settings: Mapping[str, Any], path: tuple[str, ...]) -> Iterator[tuple[str, Any]]:
+def _iterate_leaves(
+    settings: Mapping[str, Any], path: tuple[str, ...]
+) -> Iterator[tuple[str, Any]]:
+    """Yields path and value of each leaf of nested settings, and of each required key.
+
+    Args:
+        settings: the settings below `path`.
+        path: keys of the levels above.
+    """
     for key, value in settings.items():
-        here = (*path, key)
-        if isinstance(value, dict) and "/".join(here) not in REQUIREMENTS:
-            yield from _leaves(value, here)
+        key_path = (*path, key)
+        joined = "/".join(key_path)
+        if isinstance(value, dict) and joined not in REQUIREMENTS:
+            yield from _iterate_leaves(value, key_path)
         else:
-            yield "/".join(here), value
+            yield joined, value
 
 
 def _find_refused_keys(
@@ -344,28 +387,35 @@ def _find_refused_keys(
     refusal: Callable[[Mapping[str, Any]], str],
     path: tuple[str, ...],
 ) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Yields every key that Zenoh refuses by itself, as deep as it goes, with Zenoh's reason."""
+    """Yields path and reason of each setting that Zenoh refuses, even without the others.
+
+    If Zenoh refuses a group of settings, the deepest refused keys are yielded.
+    """
     for key, value in settings.items():
-        here = (*path, key)
-        alone: Any = value
-        for part in reversed(here):
-            alone = {part: alone}
-        if reason := refusal(alone):
-            deeper = (
-                list(_find_refused_keys(value, refusal, here))
-                if isinstance(value, dict)
-                else []
-            )
-            yield from deeper or [(here, reason)]
+        key_path = (*path, key)
+        single_setting: Any = value
+        for level in reversed(key_path):
+            single_setting = {level: single_setting}
+        reason = refusal(single_setting)
+        if not reason:
+            continue
+        deeper: list[tuple[tuple[str, ...], str]] = []
+        if isinstance(value, dict):
+            deeper = list(_find_refused_keys(value, refusal, key_path))
+        yield from deeper or [(key_path, reason)]
 
 
 def _suggest_key(path: Sequence[str], reason: str) -> str:
-    unknown = re.match(r"unknown field `([^`]*)`, expected (?:one of )?(.*)", reason)
-    if unknown is None or not path or unknown[1] != path[-1]:
+    """Returns Zenoh's reason, or for an unknown key a suggestion of similar keys."""
+    match = re.match(r"unknown field `([^`]*)`, expected (?:one of )?(.*)", reason)
+    if match is None or not path or match[1] != path[-1]:
         return reason
-    near = difflib.get_close_matches(unknown[1], re.findall(r"`([^`]*)`", unknown[2]), 1)
-    choice = f"did you mean {near[0]}?" if near else f"there are {unknown[2].replace('`', '')}"
-    return f"no key of Zenoh's; {choice}"
+    unknown_key, valid_text = match.groups()
+    valid_keys = re.findall(r"`([^`]*)`", valid_text)
+    similar = difflib.get_close_matches(unknown_key, valid_keys, 1)
+    if similar:
+        return f"no key of Zenoh's; did you mean {similar[0]}?"
+    return f"no key of Zenoh's; there are {valid_text.replace('`', '')}"
 
 
 RECORDER = topics.RECORDER
@@ -375,25 +425,27 @@ BRIDGE = "bridge"
 PROTOCOLS = ("tls", "quic")
 
 MOST_REPLY_BYTES = 8_388_608
-"""The largest answer that a link takes: records sent again."""
+"""Largest reply that a link accepts, in bytes: a reply with records that are sent again."""
 MOST_SESSIONS = 64
 
 
 class _Role(NamedTuple):
-    """The channels of a kind of member.
+    """The channels that a kind of member may use.
 
     Attributes:
-        hears, asks: of everybody.
-        publishes, answers: under its own name.
-        hears_own: what is addressed to its own name.
-        addresses: publishes under everybody's name: what is addressed to them.
+        hears: channels that the member receives from all members.
+        asks: channels that the member queries at all members.
+        publishes: channels that the member publishes under its own name.
+        answers: channels whose queries the member answers under its own name.
+        hears_addressed: channels that the member receives under its own name.
+        addresses: channels that the member publishes under the name of the addressed member.
     """
 
     hears: tuple[str, ...]
     asks: tuple[str, ...]
     publishes: tuple[str, ...] = ()
     answers: tuple[str, ...] = ()
-    hears_own: tuple[str, ...] = ()
+    hears_addressed: tuple[str, ...] = ()
     addresses: tuple[str, ...] = ()
 
 
@@ -409,7 +461,7 @@ SITE_ROLE = _Role(
     answers=(topics.INFO, topics.PING, topics.PAST, topics.SET, topics.STOP),
     hears=(topics.SAMPLE, topics.LINK, topics.EVENT),
     asks=(topics.INFO, topics.PING, topics.STOP),
-    hears_own=(topics.STATE, topics.MEASURED, topics.HAND, topics.ENABLE),
+    hears_addressed=(topics.STATE, topics.MEASURED, topics.HAND, topics.ENABLE),
 )
 ROLES = {
     RECORDER: _Role(
@@ -436,23 +488,32 @@ ROLES = {
         addresses=(topics.HAND, topics.MEASURED),
     ),
 }
-"""Of members that are no sites."""
+"""Roles of the members that are not sites, by name of the member."""
 
 
 def make_access_rules(members: Sequence[str]) -> dict[str, Any]:
-    """Returns Zenoh's settings that hold members, a router among them or not, to their roles."""
+    """Returns the Zenoh settings that restrict members to their roles.
+
+    Args:
+        members: names of all members, with or without `ROUTER`.
+    """
     rules: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []
     for member in members:
-        relayed = [_rule(["ingress", "egress"], _EVERY, [f"{topics.ROOT}/**"])]
-        own = relayed if member == ROUTER else _hold(member, ROLES.get(member, SITE_ROLE))
-        kept = (rule for rule in own if rule["key_exprs"])
-        named = [
-            {"id": f"{member} {n}", "permission": "allow", **rule}
-            for n, rule in enumerate(kept)
+        if member == ROUTER:
+            keys = [f"{topics.ROOT}/**"]
+            member_rules = [_make_rule(["ingress", "egress"], _ALL_MESSAGES, keys)]
+        else:
+            member_rules = list(_derive_rules(member, ROLES.get(member, SITE_ROLE)))
+        # A role without channels of some kind gives a rule without keys.
+        member_rules = [rule for rule in member_rules if rule["key_exprs"]]
+        named_rules = [
+            {"id": f"{member} {index}", "permission": "allow", **rule}
+            for index, rule in enumerate(member_rules)
         ]
-        rules += named
-        policies.append({"rules": [rule["id"] for rule in named], "subjects": [member]})
+        rules += named_rules
+        rule_ids = [rule["id"] for rule in named_rules]
+        policies.append({"rules": rule_ids, "subjects": [member]})
     subjects = [
         {"id": member, "cert_common_names": [member], "link_protocols": list(PROTOCOLS)}
         for member in members
@@ -467,34 +528,44 @@ def make_access_rules(members: Sequence[str]) -> dict[str, Any]:
     }
 
 
-_ALIVE = "liveliness_token", "declare_liveliness_subscriber", "liveliness_query"
-_EVERY = "put", "delete", "query", "reply", "declare_subscriber", "declare_queryable", *_ALIVE
+_LIVELINESS = "liveliness_token", "declare_liveliness_subscriber", "liveliness_query"
+_ALL_MESSAGES = (
+    "put",
+    "delete",
+    "query",
+    "reply",
+    "declare_subscriber",
+    "declare_queryable",
+    *_LIVELINESS,
+)
 
 
-def _hold(member: str, role: _Role) -> Iterator[dict[str, Any]]:
-    """Yields what comes from a member (ingress) and what goes to it (egress)."""
+def _derive_rules(member: str, role: _Role) -> Iterator[dict[str, Any]]:
+    """Yields the rules of a role: messages from the member (ingress) and to it (egress)."""
 
-    def keys(whose: str, channels: Sequence[str]) -> list[str]:
-        """Returns the keys of some channels of a member, or of every one, in any session."""
-        return [topics.key("*", whose, channel) for channel in channels]
+    def keys(owner: str, channels: Sequence[str]) -> list[str]:
+        """Returns the keys of a member's channels in any session; "*" is any member."""
+        return [topics.key("*", owner, channel) for channel in channels]
 
-    says = keys(member, role.publishes) + keys("*", role.addresses)
-    hears = keys("*", role.hears) + keys(member, role.hears_own)
-    everyone = [topics.presence_key("*", "*")]
-    yield _rule(["ingress"], ["put"], says)
-    yield _rule(["ingress"], ["declare_subscriber"], hears)
-    yield _rule(["ingress"], ["declare_queryable", "reply"], keys(member, role.answers))
-    yield _rule(["ingress"], ["query"], keys("*", role.asks))
-    yield _rule(["ingress"], ["liveliness_token"], [topics.presence_key("*", member)])
-    yield _rule(["ingress"], ["declare_liveliness_subscriber", "liveliness_query"], everyone)
-    yield _rule(["egress"], ["put"], hears)
-    yield _rule(
+    published = keys(member, role.publishes) + keys("*", role.addresses)
+    received = keys("*", role.hears) + keys(member, role.hears_addressed)
+    all_presences = [topics.presence_key("*", "*")]
+    yield _make_rule(["ingress"], ["put"], published)
+    yield _make_rule(["ingress"], ["declare_subscriber"], received)
+    yield _make_rule(["ingress"], ["declare_queryable", "reply"], keys(member, role.answers))
+    yield _make_rule(["ingress"], ["query"], keys("*", role.asks))
+    yield _make_rule(["ingress"], ["liveliness_token"], [topics.presence_key("*", member)])
+    yield _make_rule(
+        ["ingress"], ["declare_liveliness_subscriber", "liveliness_query"], all_presences
+    )
+    yield _make_rule(["egress"], ["put"], received)
+    yield _make_rule(
         ["egress"], ["declare_subscriber"], keys("*", (*role.publishes, *role.addresses))
     )
-    yield _rule(["egress"], ["query"], keys("*", role.answers))
-    yield _rule(["egress"], ["declare_queryable", "reply"], keys("*", role.asks))
-    yield _rule(["egress"], _ALIVE, everyone)
+    yield _make_rule(["egress"], ["query"], keys("*", role.answers))
+    yield _make_rule(["egress"], ["declare_queryable", "reply"], keys("*", role.asks))
+    yield _make_rule(["egress"], _LIVELINESS, all_presences)
 
 
-def _rule(flows: list[str], messages: Sequence[str], keys: list[str]) -> dict[str, Any]:
+def _make_rule(flows: list[str], messages: Sequence[str], keys: list[str]) -> dict[str, Any]:
     return {"flows": flows, "messages": list(messages), "key_exprs": keys}
