@@ -1,8 +1,11 @@
-"""Packer and reader of standard ROS 2 messages: CDR, little-endian; no ROS installation needed.
+"""Packer and reader of standard ROS 2 messages, which needs no ROS installation.
 
-Invariant: the bytes equal those of any other serializer. Fields are aligned to their size,
-counted from the end of the four-byte header; padding is zero. The constant layout is computed
-once, so that a message is one `struct` call.
+The encoding is little-endian CDR: fields are aligned to their size, counted from the end of the
+four-byte header. Padding is zero.
+
+Invariant:
+    - The bytes equal those of any other serializer.
+    - The constant layout of a message is computed once, so that packing is one `struct` call.
 """
 
 import math
@@ -26,13 +29,13 @@ TWIST = "geometry_msgs/msg/TwistStamped"
 WRENCH = "geometry_msgs/msg/WrenchStamped"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 
-_HEAD = b"\x00\x01\x00\x00"  # plain CDR, little-endian, no options
-_LAST_S = (1 << 31) - 1  # of the stamps of ROS 2
+_HEAD = b"\x00\x01\x00\x00"
+"""Header of a message: plain CDR, little-endian, no options."""
+_LAST_S = (1 << 31) - 1
+"""Latest stamp of ROS 2, in s: seconds are signed numbers of 32 bits."""
 
 DEFINITIONS = resources.files("trilat_net.log.ros2") / "definitions"
-"""Texts of ROS: types with the types of their fields, the quality of service of a bag, the
-planar arm.
-"""
+"""Text files of ROS: message types, the quality of service of a bag, and the planar arm."""
 ROS2_SCHEMAS = {
     name: (DEFINITIONS / f"{name.rpartition('/')[2]}.msg").read_bytes()
     for name in (
@@ -47,46 +50,59 @@ ROS2_SCHEMAS = {
         DIAGNOSTICS,
     )
 }
-"""Complete definitions of the types that are packed here, by name."""
+"""Complete definitions of the packed message types, by name."""
 
 
 def _pack_fields(offset: int, *values: int | str) -> bytes:
+    """Returns uint32 numbers and strings, packed for a position `offset` bytes after the head.
+
+    A string is packed as its length with the terminating zero, then its bytes.
+    """
     data = b""
     for value in values:
         text = value.encode() + b"\0" if isinstance(value, str) else b""
         number = value if isinstance(value, int) else len(text)
-        data += b"\0" * (-(offset + len(data)) % 4) + struct.pack("<I", number) + text
+        padding = b"\0" * (-(offset + len(data)) % 4)
+        data += padding + struct.pack("<I", number) + text
     return data
 
 
 def _split_stamp(stamp_ns: int) -> tuple[int, int]:
+    """Returns the seconds and nanoseconds of a ROS 2 stamp."""
     seconds, rest_ns = divmod(stamp_ns, NS_PER_S)
     return min(seconds, _LAST_S), rest_ns
 
 
 def _format_floats(offset: int, count: int) -> tuple[str, int]:
-    before = -offset % 4
-    start = offset + before + 4
-    gap = -start % 8 if count else 0  # an empty list has nothing to align
-    return f"{before}xI{gap}x{count}d", start + gap + 8 * count
+    """Returns the `struct` format of a list of floats that begins at `offset`, and its end."""
+    padding = -offset % 4
+    start = offset + padding + 4
+    # An empty list has no float to align.
+    gap = -start % 8 if count else 0
+    return f"{padding}xI{gap}x{count}d", start + gap + 8 * count
 
 
 class JointStatePacker:
-    """Packer of `sensor_msgs/msg/JointState` with these joints, with or without velocities and
-    efforts.
+    """Packer of `sensor_msgs/msg/JointState`.
+
+    Args:
+        names: names of the joints.
+        velocity: True if the messages contain velocities.
+        effort: True if the messages contain efforts.
     """
 
     def __init__(
         self, names: Sequence[str], *, velocity: bool = True, effort: bool = True
     ) -> None:
-        self._names = _pack_fields(8, "", len(names), *names)  # after the stamp; of no frame
+        # The names follow the stamp of 8 bytes and an empty frame.
+        self._names = _pack_fields(8, "", len(names), *names)
         self._counts = [len(names) * present for present in (True, velocity, effort)]
-        form = f"<4siI{len(self._names)}s"
+        struct_format = f"<4siI{len(self._names)}s"
         offset = 8 + len(self._names)
         for count in self._counts:
-            part, offset = _format_floats(offset, count)
-            form += part
-        self._pack = struct.Struct(form).pack
+            list_format, offset = _format_floats(offset, count)
+            struct_format += list_format
+        self._pack = struct.Struct(struct_format).pack
 
     def pack(
         self,
@@ -95,49 +111,75 @@ class JointStatePacker:
         velocity: Sequence[float] = (),
         effort: Sequence[float] = (),
     ) -> bytes:
-        """Returns one message of a time (Unix ns, not below 0): rad, rad/s and N m per joint."""
-        p, v, e = self._counts
+        """Returns one message.
+
+        Args:
+            stamp_ns: Unix time of the message, in ns, 0 or more.
+            position: joint angles, in rad.
+            velocity: joint speeds, in rad/s.
+            effort: joint torques, in N m.
+        """
+        position_count, velocity_count, effort_count = self._counts
         return self._pack(
-            _HEAD, *_split_stamp(stamp_ns), self._names, p, *position, v, *velocity, e, *effort
+            _HEAD,
+            *_split_stamp(stamp_ns),
+            self._names,
+            position_count,
+            *position,
+            velocity_count,
+            *velocity,
+            effort_count,
+            *effort,
         )
 
 
 class TransformPacker:
-    """Packer of `tf2_msgs/msg/TFMessage` with these frames: pairs of parent and child."""
+    """Packer of `tf2_msgs/msg/TFMessage` for frames given as pairs of parent and child."""
 
     def __init__(self, frames: Sequence[tuple[str, str]]) -> None:
         self._names = []
-        form = "<4sI"
+        struct_format = "<4sI"
         offset = 4
         for parent, child in frames:
             names = _pack_fields(offset + 8, parent, child)
             gap = -(offset + 8 + len(names)) % 8
-            form += f"iI{len(names)}s{gap}x7d"
+            struct_format += f"iI{len(names)}s{gap}x7d"
             offset += 8 + len(names) + gap + 56
             self._names.append(names)
-        self._pack = struct.Struct(form).pack
+        self._pack = struct.Struct(struct_format).pack
 
     def pack(self, stamp_ns: int, numbers: Sequence[float]) -> bytes:
-        """Returns one message of a time (Unix ns, not below 0): x, y, z, m, and a quaternion."""
+        """Returns one message.
+
+        Args:
+            stamp_ns: Unix time of the message, in ns, 0 or more.
+            numbers: for each frame, x, y, z in m and a quaternion x, y, z, w.
+        """
         fields: list[object] = []
-        for n, names in enumerate(self._names):
-            fields += (*_split_stamp(stamp_ns), names, *numbers[7 * n : 7 * n + 7])
+        for frame_index, names in enumerate(self._names):
+            pose = numbers[7 * frame_index : 7 * frame_index + 7]
+            fields += (*_split_stamp(stamp_ns), names, *pose)
         return self._pack(_HEAD, len(self._names), *fields)
 
 
 def make_float_array_packer(*dimensions: tuple[str, int]) -> Callable[..., bytes]:
-    """Returns a packer of `std_msgs/msg/Float64MultiArray` of one shape; it takes the numbers
-    row by row.
+    """Returns a packer of `std_msgs/msg/Float64MultiArray` of a fixed shape.
 
-    Each dimension is a label and a size.
+    The packer takes the numbers row by row.
+
+    Args:
+        dimensions: label and size of each dimension.
     """
     sizes = [size for _, size in dimensions]
+    count = math.prod(sizes)
     layout: list[int | str] = []
-    for n, (label, size) in enumerate(dimensions):
-        layout += label, size, math.prod(sizes[n:])
-    shape = _pack_fields(0, len(dimensions), *layout, 0)  # the last is data_offset
-    form, _ = _format_floats(len(shape), count := math.prod(sizes))
-    pack = struct.Struct(f"<4s{len(shape)}s{form}").pack
+    for index, (label, size) in enumerate(dimensions):
+        stride = math.prod(sizes[index:])
+        layout += label, size, stride
+    data_offset = 0
+    shape = _pack_fields(0, len(dimensions), *layout, data_offset)
+    list_format, _ = _format_floats(len(shape), count)
+    pack = struct.Struct(f"<4s{len(shape)}s{list_format}").pack
     return lambda *numbers: pack(_HEAD, shape, count, *numbers)
 
 
@@ -147,7 +189,7 @@ def pack_string(text: str) -> bytes:
 
 
 class RosLogLevel(IntEnum):
-    """Severity of a line of a log, by the numbers of ROS 2."""
+    """Severity of a log line, with the numbers of ROS 2."""
 
     INFO = 20
     WARN = 30
@@ -155,20 +197,32 @@ class RosLogLevel(IntEnum):
 
 
 def pack_log(stamp_ns: int, level: RosLogLevel, name: str, text: str) -> bytes:
-    """Returns an `rcl_interfaces/msg/Log` of a member at a time (Unix ns, not below 0)."""
-    # after stamp and level; of no file, function and line
+    """Returns an `rcl_interfaces/msg/Log`.
+
+    Args:
+        stamp_ns: Unix time of the line, in ns, 0 or more.
+        level: severity of the line.
+        name: name of the member that logs.
+        text: content of the line.
+    """
+    # The fields follow stamp and level, 9 bytes; file, function and line number are empty.
     fields = _pack_fields(9, name, text, "", "", 0)
     return _HEAD + struct.pack("<iIB", *_split_stamp(stamp_ns), level) + fields
 
 
 def pack_frame_vectors(stamp_ns: int, frame: str, *numbers: float) -> bytes:
-    """Returns a message of vectors in a frame.
+    """Returns a `PoseStamped`, `TwistStamped` or `WrenchStamped`, depending on the numbers.
 
-    It is a `PoseStamped` (x, y, z, m, and the quaternion x, y, z, w), a `TwistStamped` (m/s,
-    rad/s) or a `WrenchStamped` (N, N m).
+    Args:
+        stamp_ns: Unix time of the message, in ns, 0 or more.
+        frame: frame of the vectors.
+        numbers: of a pose x, y, z in m and the quaternion x, y, z, w; of a twist the velocity
+            in m/s and the angular velocity in rad/s; of a wrench the force in N and the torque
+            in N m.
     """
     head = struct.pack("<iI", *_split_stamp(stamp_ns)) + _pack_fields(8, frame)
-    return _HEAD + head + b"\0" * (-len(head) % 8) + struct.pack(f"<{len(numbers)}d", *numbers)
+    padding = b"\0" * (-len(head) % 8)
+    return _HEAD + head + padding + struct.pack(f"<{len(numbers)}d", *numbers)
 
 
 def pack_trigger_response(*, success: bool, text: str) -> bytes:
@@ -177,8 +231,13 @@ def pack_trigger_response(*, success: bool, text: str) -> bytes:
 
 
 class Diagnosis(NamedTuple):
-    """A part of `/diagnostics`: its level (0 ok, 1 warning, 2 error, 3 stale), name, text and
-    values.
+    """One status in a message of `/diagnostics`.
+
+    Attributes:
+        level: 0 ok, 1 warning, 2 error, 3 stale.
+        name: name of the diagnosed component.
+        text: description of the status.
+        values: further values, by key.
     """
 
     level: int
@@ -192,13 +251,13 @@ def pack_diagnostics(stamp_ns: int, parts: Sequence[Diagnosis]) -> bytes:
     data = struct.pack("<iI", *_split_stamp(stamp_ns)) + _pack_fields(8, "", len(parts))
     for part in parts:
         data += bytes([part.level])
-        fields = [one for pair in part.values.items() for one in pair]
+        fields = [text for pair in part.values.items() for text in pair]
         data += _pack_fields(len(data), part.name, part.text, "", len(part.values), *fields)
     return _HEAD + data
 
 
 class CdrReader:
-    """Reads the fields of a message one after another.
+    """Reader of the fields of a message, one after another.
 
     Raises:
         ValueError: the message is not plain CDR, little-endian, or ends before a field does.
@@ -208,44 +267,51 @@ class CdrReader:
         if payload[:2] != _HEAD[:2] or len(payload) < len(_HEAD):
             raise ValueError("is not plain CDR, little-endian")
         self._data = payload[len(_HEAD) :]
-        self._at = 0
+        self._position = 0
 
     def numbers(self, code: str, count: int = 1) -> tuple[Any, ...]:
-        """Returns numbers of a format of `struct`."""
+        """Returns the next `count` numbers of the `struct` format `code`."""
         size = struct.calcsize(f"<{code}")
-        start = self._at + (-self._at % size if count else 0)
-        self._at = start + count * size
-        if self._at > len(self._data):
+        padding = -self._position % size if count else 0
+        start = self._position + padding
+        self._position = start + count * size
+        if self._position > len(self._data):
             raise ValueError("ends in the middle of a field")
         return struct.unpack_from(f"<{count}{code}", self._data, start)
 
     def count(self) -> int:
-        """Returns how many entries a list has, each of one byte at least."""
+        """Returns the length of the next list, whose entries have one byte at least."""
         (count,) = self.numbers("I")
-        if count > len(self._data) - self._at:
+        if count > len(self._data) - self._position:
             raise ValueError("ends in the middle of a field")
         return int(count)
 
     def text(self) -> str:
-        """Returns a string."""
+        """Returns the next string."""
         length = self.count()
         (data,) = self.numbers("s", length) if length else (b"",)
         return bytes(data).removesuffix(b"\0").decode()
 
     def floats(self) -> tuple[float, ...]:
-        """Returns a list of numbers."""
+        """Returns the next list of floats."""
         return self.numbers("d", self.count())
 
     def header(self) -> tuple[int, str]:
-        """Returns the stamp of a header, ns, on whatever clock, and its frame."""
+        """Returns the stamp of the next header, in ns of the sender's clock, and its frame."""
         (whole_s,) = self.numbers("i")
         (rest_ns,) = self.numbers("I")
         return whole_s * NS_PER_S + rest_ns, self.text()
 
 
 class RosJoints(NamedTuple):
-    """A `JointState`: stamp, ns, names, and positions, velocities, efforts, as many as they, or
-    none.
+    """Content of a `JointState`.
+
+    Attributes:
+        stamp_ns: time of the message, in ns of the sender's clock.
+        names: names of the joints.
+        position: joint angles, in rad; empty if unknown.
+        velocity: joint speeds, in rad/s; empty if unknown.
+        effort: joint torques, in N m; empty if unknown.
     """
 
     stamp_ns: int
@@ -256,10 +322,10 @@ class RosJoints(NamedTuple):
 
 
 def read_joint_state(payload: bytes) -> RosJoints:
-    """Returns what a `sensor_msgs/msg/JointState` says.
+    """Returns the content of a `sensor_msgs/msg/JointState`.
 
     Raises:
-        ValueError: it cannot be read.
+        ValueError: the message cannot be read.
     """
     reader = CdrReader(payload)
     stamp_ns, _ = reader.header()
@@ -274,10 +340,10 @@ def read_joint_state(payload: bytes) -> RosJoints:
 
 
 def read_float_array(payload: bytes) -> tuple[float, ...]:
-    """Returns the numbers of a `std_msgs/msg/Float64MultiArray`, whatever its shape.
+    """Returns the numbers of a `std_msgs/msg/Float64MultiArray` of any shape.
 
     Raises:
-        ValueError: it cannot be read.
+        ValueError: the message cannot be read.
     """
     reader = CdrReader(payload)
     for _ in range(reader.count()):
@@ -288,11 +354,15 @@ def read_float_array(payload: bytes) -> tuple[float, ...]:
 
 
 def read_frame_vectors(payload: bytes, count: int) -> tuple[str, tuple[float, ...]]:
-    """Returns the frame of a `PoseStamped` (7 numbers) or a `WrenchStamped` (6), and its
-    numbers.
+    """Returns frame and numbers of a `PoseStamped` or `WrenchStamped`.
+
+    Args:
+        payload: bytes of the message.
+        count: 7 numbers for a pose, 6 for a wrench.
 
     Raises:
-        ValueError: it cannot be read.
+        ValueError: the message cannot be read.
     """
     reader = CdrReader(payload)
-    return reader.header()[1], reader.numbers("d", count)
+    _, frame = reader.header()
+    return frame, reader.numbers("d", count)

@@ -1,8 +1,9 @@
-"""Names of the topics of a session in ROS 2: one table for the live bridge and for bags.
+"""Names of a session's topics in ROS 2, in one table for the live bridge and for bags.
 
 Invariant:
-- A name that begins with / stands for itself, and no two topics have one name.
-- What a bag has of a session stands there under the name that the live bridge gives it.
+    - A name that begins with / is a full name; other names are below `/<session>/<site>`.
+    - No two topics have the same name.
+    - A topic has the same name in a bag as in the live bridge.
 """
 
 import re
@@ -45,23 +46,27 @@ TOPICS = {
     "robot_states": ("robot/joint_states", "robot/measured_js"),
     "robot_commands": ("robot/commands", "robot/commands"),
 }
-"""By our name of a topic the one that it has under `/<session>/<site>` in each of `NAMINGS`: as
-CRISP, and as the Collaborative Robotics Toolkit of the da Vinci Research Kit call it. What a
-law sends is "sent_" and the name of the vector, in every naming.
+"""Name of each topic below `/<session>/<site>`, in each of `NAMINGS`, by trilat-net's own name.
+
+The two namings are those of CRISP and of the Collaborative Robotics Toolkit (CRTK) of the da
+Vinci Research Kit. A vector that a law sends is named "sent_" and the name of the vector in
+both.
 """
 FRAMES = "tf"
 DIAGNOSTICS = "diagnostics"
-"""Topics of all sessions together, where tools of ROS look for them."""
+"""Topics that all sessions share, with the names at which tools of ROS expect them."""
 
 
 class RobotTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a file says of the robot that is the arm of a site.
+    """Description of the robot that is the arm of a site, as a names file gives it.
 
     Attributes:
-        joints: its names of the arm's joints, in the scenario's order; empty: as the scenario
-            calls them.
-        controller: the same in the order of its controller; empty: in that of the scenario.
-        safe: what this controller gets while the arm is to brake, in its order; empty: zeros.
+        joints: the robot's names of the joints, in the scenario's order; if empty, the names of
+            the scenario.
+        controller: the same names in the order of the robot's controller; if empty, in the
+            scenario's order.
+        safe: command to the controller while the arm brakes, in the controller's order; if
+            empty, zeros.
     """
 
     joints: list[str] = []
@@ -70,8 +75,12 @@ class RobotTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class TopicTable(NamedTuple):
-    """By our names of topics those that they have at every site, and where a site has others;
-    the robots.
+    """Names of the topics in ROS 2, and the robots.
+
+    Attributes:
+        names: names in ROS 2 at every site, by trilat-net's own names.
+        of_site: names that differ at a site, by site and trilat-net's own name.
+        robots: the robots, by site.
     """
 
     names: Mapping[str, str]
@@ -79,59 +88,76 @@ class TopicTable(NamedTuple):
     robots: Mapping[str, RobotTable] = {}
 
     def find(self, session: str, site: str, topic: str) -> str:
-        """Returns the full name of a topic of a site; one that begins with / stands for itself."""
-        called = self.of_site.get(site, {}).get(topic, self.names.get(topic, topic))
-        return called[1:] if called.startswith("/") else f"{session}/{site}/{called}"
+        """Returns the full name, without the first /, of a site's topic."""
+        common_name = self.names.get(topic, topic)
+        name = self.of_site.get(site, {}).get(topic, common_name)
+        return name[1:] if name.startswith("/") else f"{session}/{site}/{name}"
 
 
 def make_session_name(text: str) -> str:
-    """Returns the name of a session as a name of ROS 2: other characters become _."""
-    bare = re.sub(r"[^A-Za-z0-9_]", "_", text)
-    return bare if bare[:1].isalpha() else f"_{bare}"
+    """Returns a session's name as a valid name in ROS 2: other characters become _."""
+    name = re.sub(r"[^A-Za-z0-9_]", "_", text)
+    return name if name[:1].isalpha() else f"_{name}"
 
 
-def read_topic_table(asked: str) -> TopicTable:
-    """Returns the names of "crisp" or "crtk", or those of a file, which is TOML upon those of
-    CRISP.
+def read_topic_table(source: str) -> TopicTable:
+    """Returns the table of a naming, or of a TOML file that changes names of CRISP.
 
-    As in `joint_states = "arm/joint_states"`; a table `[sites.s]` is for one site, and says of
-    its robot what a `RobotTable` has.
+    A line of the file is, for example, `joint_states = "arm/joint_states"`. A table `[sites.s]`
+    is for the site `s` alone, and also holds the fields of a `RobotTable`.
+
+    Args:
+        source: "crisp", "crtk" or the path of a file.
 
     Raises:
-        UsageError: it cannot be read, or a name in it cannot be right.
+        UsageError: the file cannot be read, or a name in it is not valid.
     """
-    plain = {
-        topic: row[NAMINGS.index(asked) if asked in NAMINGS else 0]
-        for topic, row in TOPICS.items()
-    }
-    if asked in NAMINGS:
-        return TopicTable(plain)
+    naming_index = NAMINGS.index(source) if source in NAMINGS else 0
+    default_names = {topic: names[naming_index] for topic, names in TOPICS.items()}
+    if source in NAMINGS:
+        return TopicTable(default_names)
+    names, site_names, robots = _read_names_file(source)
+    for table in (names, *site_names.values()):
+        for topic, name in table.items():
+            if topic not in TOPICS:
+                suggestion = suggest_nearest(topic, list(TOPICS))
+                raise UsageError(f"{source}: no topic {topic!r}{suggestion}")
+            check_ros_name(str(name), f"{source}: {topic}")
+    topic_table = TopicTable(default_names | names, site_names, robots)
+    _check_unique_names(source, topic_table)
+    return topic_table
+
+
+def _read_names_file(
+    source: str,
+) -> tuple[dict[str, Any], dict[str, dict[str, Any]], dict[str, RobotTable]]:
+    """Returns the common names, the names by site, and the robots by site of a names file."""
     try:
-        with open_regular(Path(asked)) as stream:
-            found = tomllib.loads(stream.read().decode())
-        tables = msgspec.convert(found.pop("sites", {}), dict[str, dict[str, Any]])
-        of_robot = RobotTable.__struct_fields__
-        own = {
-            site: {key: of.pop(key) for key in of_robot if key in of}
-            for site, of in tables.items()
+        with open_regular(Path(source)) as stream:
+            names = tomllib.loads(stream.read().decode())
+        site_names = msgspec.convert(names.pop("sites", {}), dict[str, dict[str, Any]])
+        robot_fields = {
+            site: {key: table.pop(key) for key in RobotTable.__struct_fields__ if key in table}
+            for site, table in site_names.items()
         }
-        robots = msgspec.convert(own, dict[str, RobotTable])
+        robots = msgspec.convert(robot_fields, dict[str, RobotTable])
     except OSError as error:
         raise UsageError(
-            f"--names is crisp, crtk or a file, and {asked} cannot be read: {error.strerror}"
+            f"--names is crisp, crtk or a file, and {source} cannot be read: {error.strerror}"
         ) from None
     except (ValueError, msgspec.ValidationError) as error:
-        raise UsageError(f"{asked}: is no TOML of names: {error}") from None
-    for key, name in [pair for table in (found, *tables.values()) for pair in table.items()]:
-        if key not in TOPICS:
-            raise UsageError(f"{asked}: no topic {key!r}{suggest_nearest(key, list(TOPICS))}")
-        check_ros_name(str(name), f"{asked}: {key}")
-    table = TopicTable(plain | found, tables, robots)
-    # several arms may stand in one message
-    shown = [topic for topic in TOPICS if topic != "robot_states"]
-    places = [table.find("", site, topic) for site in (*tables, "*", "**") for topic in shown]
-    if len(set(places)) < len(places):
+        raise UsageError(f"{source}: is no TOML of names: {error}") from None
+    return names, site_names, robots
+
+
+def _check_unique_names(source: str, table: TopicTable) -> None:
+    """Raises UsageError if two topics have the same full name."""
+    # The states of several arms may be in one message, so `robot_states` may repeat.
+    topics = [topic for topic in TOPICS if topic != "robot_states"]
+    # Two sites without names of their own show whether a full name is common to all sites.
+    sites = (*table.of_site, "*", "**")
+    full_names = [table.find("", site, topic) for site in sites for topic in topics]
+    if len(set(full_names)) < len(full_names):
         raise UsageError(
-            f"{asked}: two topics have one name; one that begins with / is for one site"
+            f"{source}: two topics have one name; one that begins with / is for one site"
         )
-    return table
