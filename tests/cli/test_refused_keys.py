@@ -40,7 +40,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     create_keys(folder / "others", MEMBERS_MADE)
     create_keys(folder / "old", MEMBERS_MADE, days=0)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(member_keys, "_BEFORE", -timedelta(days=2))
+        patch.setattr(member_keys, "_CLOCK_TOLERANCE", -timedelta(days=2))
         create_keys(folder / "early", MEMBERS_MADE)
     return folder
 
@@ -249,7 +249,7 @@ def test_files_of_another_user_are_refused(made: Path, monkeypatch: pytest.Monke
     theirs = os.stat_result((own.st_mode, *own[1:4], 65533, *own[5:10]))
     monkeypatch.setattr(os, "geteuid", lambda: 65534)
     with pytest.raises(UsageError, match="belongs to another user, who can change it"):
-        member_keys._refuse_of_others(made / MEMBERS, theirs)
+        member_keys._check_permissions(made / MEMBERS, theirs)
 
 
 NEW = [
@@ -296,7 +296,7 @@ def test_keys_are_made_whole_or_not_at_all(
     failing: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The disk refuses the n-th file, or Ctrl-C comes there: what was made before goes too."""
-    put, written = member_keys._put, list[Path]()
+    put, written = member_keys._write_new_file, list[Path]()
 
     def refuse(error: BaseException) -> Callable[[Path, bytes], None]:
         def act(path: Path, content: bytes) -> None:
@@ -312,7 +312,7 @@ def test_keys_are_made_whole_or_not_at_all(
         (KeyboardInterrupt(),) * 2,
     ):
         written.clear()
-        monkeypatch.setattr(member_keys, "_put", refuse(error))
+        monkeypatch.setattr(member_keys, "_write_new_file", refuse(error))
         caught: Any = kind if isinstance(kind, type) else KeyboardInterrupt
         with pytest.raises(caught) as raised:
             create_keys(tmp_path / "k", ["m1", "m2"])

@@ -1,14 +1,18 @@
-"""The keys of a session's members: made by `trilat keys new`, used by every member that is
-given its folder.
+"""The keys of a session's members, which `trilat keys new` creates.
 
-Invariant: a private authority signs one certificate per member, which ends after some days, and
-is kept apart. A member's folder holds its own key, which nobody else may read, its certificate,
-that of the authority, and the list of members, from which its access rules follow; nobody else
-may write any of it. Keys are made whole or not at all.
+A private authority signs one certificate per member. Every member loads the keys in its own
+folder; the authority has a separate folder.
 
-Keys end a day before their certificate does: no member begins with them any more, but `trilat
-stop` still connects. Every connection of Zenoh, also one that is made again, needs a
-certificate that holds.
+Keys end a day before their certificate: afterwards no member can start with the keys, but
+`trilat stop` can still connect. Every connection of Zenoh, and every reconnection, needs a
+valid certificate.
+
+Invariant:
+    - A certificate ends after some days.
+    - A member's folder holds its private key, its certificate, the certificate of the
+      authority, and the list of members, from which the access rules follow.
+    - No other user can read the private key, or write any file of the folder.
+    - Either all keys of a session are created, or no key.
 """
 
 import datetime
@@ -43,26 +47,29 @@ PRIVATE_KEY = "private.key"
 MEMBERS = "members.json"
 _AUTHORITY_FOLDER = "authority"
 HERE = ("localhost", "127.0.0.1", "::1")
-"""Names of the own machine, which every certificate holds."""
+"""Names of the local machine, which every certificate contains."""
 STOPPING_TIME = datetime.timedelta(days=1)
-"""Time after the end of keys during which they still stop arms."""
-_BEFORE = datetime.timedelta(hours=1)
-"""Clocks of machines may differ by so much."""
+"""Time after the end of the keys during which they can still stop arms."""
+_CLOCK_TOLERANCE = datetime.timedelta(hours=1)
+"""Tolerated difference between the clocks of two machines."""
 MOST_KEY_BYTES = 65_536
-"""Of a file of keys; the rest of a longer one is not read."""
+"""Largest number of bytes that are read from a key file."""
 _RENEWAL = "renew it with trilat keys renew, or make new keys for all with trilat keys new"
 _DATE = "%Y-%m-%d %H:%M UTC"
 MOST_DAYS = 3_650
+"""Longest validity of keys, in days."""
 MOST_LETTERS = 64
-"""For which certificates may hold, and of a name in one."""
+"""Longest name of a member: X.509 limits common names to 64 characters."""
 
 
 class MemberKeys(NamedTuple):
-    """A member's keys.
+    """The keys of one member.
 
     Attributes:
-        ends: when the keys end, in UTC; their certificate holds for `STOPPING_TIME` longer.
-        settings: of Zenoh, see `make_zenoh_config`.
+        member: name of the member.
+        members: names of all members.
+        ends: end of the keys, in UTC; the certificate is valid for `STOPPING_TIME` longer.
+        settings: Zenoh settings that use the keys, see `make_zenoh_config`.
     """
 
     member: str
@@ -74,21 +81,23 @@ class MemberKeys(NamedTuple):
 def create_keys(
     folder: str | Path, members: Sequence[str], hosts: Sequence[str] = (), days: int = 30
 ) -> list[Path]:
-    """Makes an authority and a folder of keys for each member; returns the folders, as `trilat
-    keys new`.
+    """Creates an authority and a folder of keys for each member, like `trilat keys new`.
 
-    >>> [one.name for one in tn.create_keys("keys", ["m", "s", "recorder"])]
+    >>> [folder.name for folder in tn.create_keys("keys", ["m", "s", "recorder"])]
     ['m', 's', 'recorder']
 
     Args:
-        folder: where they are made; it must not exist, or be empty.
-        members: sites, and of `recorder`, `operator`, `router` those that there are.
-        hosts: names and addresses at which members listen, besides this machine's own.
-        days: how long the certificates hold.
+        folder: the folder to create; it must be empty if it exists.
+        members: the sites, and those of `recorder`, `operator` and `router` that take part.
+        hosts: names and addresses at which members listen, in addition to `HERE`.
+        days: validity of the keys, in days.
+
+    Returns:
+        The folders of the members.
 
     Raises:
-        UsageError: a name cannot be one, or the folder is not empty, or cannot be made.
-        LogRefused: the disk refused it; nothing is left of it.
+        UsageError: a name is not valid, or the folder is not empty or cannot be created.
+        LogRefused: the disk refused a write; no files are left.
     """
     folder = Path(folder)
     faults = [_find_name_fault(members), *map(_find_host_fault, hosts)]
@@ -96,49 +105,53 @@ def create_keys(
         faults.append(f"keys hold for 0 to {MOST_DAYS} days, not {days}")
     if fault := next(filter(None, faults), ""):
         raise UsageError(fault)
-    if not folder.name or (folder.exists() and (not folder.is_dir() or any(folder.iterdir()))):
+    is_occupied = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
+    if not folder.name or is_occupied:
         raise UsageError(
             f"{folder}: there is something already; keys are never replaced, name a new folder"
         )
     make_folder(folder.parent)
     with stage_output(folder, force=False, manifest=MEMBERS) as staged:
         staged.chmod(0o700)
-        _make_all(staged, members, hosts, days)
+        _write_all_keys(staged, members, hosts, days)
     return [folder / member for member in members]
 
 
 def _find_name_fault(members: Sequence[Any]) -> str:
+    """Returns why members cannot have these names; "" if they can."""
     for name in members:
-        of_letters = isinstance(name, str) and re.fullmatch("[A-Za-z0-9_-]+", name)
-        if not of_letters or len(name) > MOST_LETTERS or name == _AUTHORITY_FOLDER:
-            most = f"at most {MOST_LETTERS} letters, digits, _ and -"
-            letters = "" if str(name).isascii() else "; its letters are a to z and A to Z"
-            return f"a member's name is {most}, and not {_AUTHORITY_FOLDER}, not {ascii(name)[:80]}{letters}"
-    return (
-        ""
-        if 0 < len(members) == len(set(members))
-        else "every member is named once, and there is one"
-    )
+        has_valid_letters = isinstance(name, str) and re.fullmatch("[A-Za-z0-9_-]+", name)
+        if not has_valid_letters or len(name) > MOST_LETTERS or name == _AUTHORITY_FOLDER:
+            hint = "" if str(name).isascii() else "; its letters are a to z and A to Z"
+            return (
+                f"a member's name is at most {MOST_LETTERS} letters, digits, _ and -, and not "
+                f"{_AUTHORITY_FOLDER}, not {ascii(name)[:80]}{hint}"
+            )
+    if not members or len(members) > len(set(members)):
+        return "every member is named once, and there is one"
+    return ""
 
 
 def _find_host_fault(host: str) -> str:
-    """Returns why a certificate cannot be made for a host, "" if it can: no certificate is good
-    for many.
+    """Returns why a certificate cannot name a host; "" if it can.
+
+    Addresses and patterns that stand for several hosts are refused.
     """
     label = "(?!-)[A-Za-z0-9_-]{1,63}(?<!-)"
     try:
-        one = not ipaddress.ip_address(host).is_unspecified
+        is_valid = not ipaddress.ip_address(host).is_unspecified
     except ValueError:
-        one = bool(re.fullmatch(rf"({label}\.)*(?!\d+$){label}", host)) and len(host) <= 253
+        is_host_name = bool(re.fullmatch(rf"({label}\.)*(?!\d+$){label}", host))
+        is_valid = is_host_name and len(host) <= 253
+    if is_valid:
+        return ""
     return (
-        ""
-        if one
-        else f"--host: a certificate is for one host name or address, without a port, not {host!r}"
+        f"--host: a certificate is for one host name or address, without a port, not {host!r}"
     )
 
 
 def renew_keys(folder: str | Path, members: Sequence[str] = (), days: int = 30) -> list[Path]:
-    """Renews the certificates of members in place; the command is `trilat keys renew`.
+    """Renews the certificates of members in place, like `trilat keys renew`.
 
     Private keys, hosts and the lists of members stay as they are.
 
@@ -147,35 +160,36 @@ def renew_keys(folder: str | Path, members: Sequence[str] = (), days: int = 30) 
     ['m', 's']
 
     Args:
-        folder: the folder that `create_keys` made, with its folder `authority`.
-        members: whose certificates are renewed; none: those of all members whose folders are
-            there.
-        days: how long the keys hold from now on.
+        folder: the folder that `create_keys` created, with its folder `authority`.
+        members: members whose certificates are renewed; if empty, all members that have a
+            folder.
+        days: validity of the keys from now on, in days.
 
     Returns:
         The renewed folders.
 
     Raises:
         UsageError: the authority, a member's folder or a file in it is missing or damaged.
-        LogRefused: the disk refused it.
+        LogRefused: the disk refused a write.
     """
     folder = Path(folder)
     if not 0 <= days <= MOST_DAYS:
         raise UsageError(f"keys hold for 0 to {MOST_DAYS} days, not {days}")
+    authority_folder = folder / _AUTHORITY_FOLDER
     try:
-        before = x509.load_pem_x509_certificate(_read(folder / _AUTHORITY_FOLDER / AUTHORITY))
-        key: Any = serialization.load_pem_private_key(
-            _read(folder / _AUTHORITY_FOLDER / PRIVATE_KEY), password=None
+        old_authority = x509.load_pem_x509_certificate(
+            _read_trusted(authority_folder / AUTHORITY)
+        )
+        authority_key: Any = serialization.load_pem_private_key(
+            _read_trusted(authority_folder / PRIVATE_KEY), password=None
         )
     except (OSError, ValueError, TypeError) as error:
         raise UsageError(
-            f"{folder / _AUTHORITY_FOLDER}: no authority ({error}): without it, make new keys for all with "
-            "trilat keys new"
+            f"{authority_folder}: no authority ({error}): without it, make new keys for all "
+            "with trilat keys new"
         ) from None
-    if key.public_key() != before.public_key():
-        raise UsageError(
-            f"{folder / _AUTHORITY_FOLDER}: the private key is not that of the certificate"
-        )
+    if authority_key.public_key() != old_authority.public_key():
+        raise UsageError(f"{authority_folder}: the private key is not that of the certificate")
     present = [path.name for path in sorted(folder.iterdir()) if (path / MEMBERS).is_file()]
     chosen = list(members) or present
     if missing := [name for name in chosen if name not in present]:
@@ -183,100 +197,118 @@ def renew_keys(folder: str | Path, members: Sequence[str] = (), days: int = 30) 
             f"{folder}: holds no keys of {', '.join(missing)}; it has {', '.join(present)}"
         )
     ends = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=days)
-    authority = _sign_authority(key, ends)
-    # all of them, or none
-    renewed = {name: _renew(folder / name, before, key, ends) for name in chosen}
-    for name, (certificate, listed) in renewed.items():
+    authority = _sign_authority(authority_key, ends)
+    # All certificates are signed before the first write, so that a fault changes no file.
+    renewed = {
+        name: _renew_member(folder / name, old_authority, authority_key, ends)
+        for name in chosen
+    }
+    for name, (certificate, member_list) in renewed.items():
         write_whole(folder / name / AUTHORITY, _encode(authority), mode=0o600)
         write_whole(folder / name / CERTIFICATE, _encode(certificate), mode=0o600)
-        # last: it says when the keys end
-        write_whole(folder / name / MEMBERS, listed, mode=0o600)
-    write_whole(folder / _AUTHORITY_FOLDER / AUTHORITY, _encode(authority), mode=0o600)
+        # The list comes last, because it states the new end of the keys.
+        write_whole(folder / name / MEMBERS, member_list, mode=0o600)
+    write_whole(authority_folder / AUTHORITY, _encode(authority), mode=0o600)
     return [folder / name for name in chosen]
 
 
-def _renew(
-    folder: Path, authority: x509.Certificate, key: Any, ends: datetime.datetime
+def _renew_member(
+    folder: Path, authority: x509.Certificate, authority_key: Any, ends: datetime.datetime
 ) -> tuple[x509.Certificate, str]:
-    """Returns the new certificate of a member, and its list of members with the new end."""
+    """Returns a member's new certificate and the new content of its list of members."""
     try:
-        before = x509.load_pem_x509_certificate(_read(folder / CERTIFICATE))
-        before.verify_directly_issued_by(authority)
-        listed = json.loads(_read(folder / MEMBERS))
-        names = before.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+        old = x509.load_pem_x509_certificate(_read_trusted(folder / CERTIFICATE))
+        old.verify_directly_issued_by(authority)
+        member_list = json.loads(_read_trusted(folder / MEMBERS))
+        names = old.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
         certificate = _sign_member(
-            subject=before.subject, own=before.public_key(), names=names, key=key, ends=ends
+            subject=old.subject,
+            public_key=old.public_key(),
+            names=names,
+            authority_key=authority_key,
+            ends=ends,
         )
-        return certificate, _list_members(listed["member"], listed["members"], ends)
+        return certificate, _format_member_list(
+            member_list["member"], member_list["members"], ends
+        )
     except UsageError:
         raise
-    except Exception as error:  # cryptography's errors have no common base
+    except Exception as error:  # the errors of cryptography have no common base class
         raise UsageError(f"{folder}: damaged, or not of this authority ({error!r})") from None
 
 
-def _make_all(folder: Path, members: Sequence[str], hosts: Sequence[str], days: int) -> None:
+def _write_all_keys(
+    folder: Path, members: Sequence[str], hosts: Sequence[str], days: int
+) -> None:
+    """Creates the folders of the authority and of all members inside `folder`."""
     ends = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=days)
-    key = ec.generate_private_key(ec.SECP256R1())
-    authority = _sign_authority(key, ends)
-    _write(folder / _AUTHORITY_FOLDER, authority, authority, key)
+    authority_key = ec.generate_private_key(ec.SECP256R1())
+    authority = _sign_authority(authority_key, ends)
+    _write_folder(folder / _AUTHORITY_FOLDER, authority, authority, authority_key)
     for member in members:
-        own = ec.generate_private_key(ec.SECP256R1())
+        member_key = ec.generate_private_key(ec.SECP256R1())
         certificate = _sign_member(
-            subject=_name(member),
-            own=own.public_key(),
-            names=_alternatives(hosts),
-            key=key,
+            subject=_make_subject(member),
+            public_key=member_key.public_key(),
+            names=_make_alternative_names(hosts),
+            authority_key=authority_key,
             ends=ends,
         )
-        _write(folder / member, authority, certificate, own)
-        _put(folder / member / MEMBERS, _list_members(member, members, ends).encode())
+        _write_folder(folder / member, authority, certificate, member_key)
+        member_list = _format_member_list(member, members, ends)
+        _write_new_file(folder / member / MEMBERS, member_list.encode())
 
 
-def _list_members(member: str, members: Sequence[str], ends: datetime.datetime) -> str:
-    listed = {"member": member, "members": list(members), "ends": ends.isoformat()}
-    return f"{json.dumps(listed)}\n"
+def _format_member_list(member: str, members: Sequence[str], ends: datetime.datetime) -> str:
+    """Returns the content of a member's file `MEMBERS`."""
+    content = {"member": member, "members": list(members), "ends": ends.isoformat()}
+    return f"{json.dumps(content)}\n"
 
 
 def _sign_authority(
     key: ec.EllipticCurvePrivateKey, ends: datetime.datetime
 ) -> x509.Certificate:
+    """Returns the self-signed certificate of the authority."""
     constraints = x509.BasicConstraints(ca=True, path_length=0)
-    builder = _certificate(_ISSUER, key.public_key(), ends)
+    builder = _start_certificate(_ISSUER, key.public_key(), ends)
     return builder.add_extension(constraints, critical=True).sign(key, hashes.SHA256())
 
 
 def _sign_member(
     subject: x509.Name,
-    own: Any,
+    public_key: Any,
     names: x509.SubjectAlternativeName,
-    key: ec.EllipticCurvePrivateKey,
+    authority_key: ec.EllipticCurvePrivateKey,
     ends: datetime.datetime,
 ) -> x509.Certificate:
     """Returns the certificate for a member's public key, signed by the key of the authority."""
     uses = x509.ExtendedKeyUsage(
         [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
     )
-    builder = _certificate(subject, own, ends).add_extension(names, critical=False)
-    return builder.add_extension(uses, critical=False).sign(key, hashes.SHA256())
+    builder = _start_certificate(subject, public_key, ends)
+    builder = builder.add_extension(names, critical=False)
+    builder = builder.add_extension(uses, critical=False)
+    return builder.sign(authority_key, hashes.SHA256())
 
 
-def _name(common: str) -> x509.Name:
-    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common)])
+def _make_subject(common_name: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common_name)])
 
 
-_ISSUER = _name("trilat-net authority")
+_ISSUER = _make_subject("trilat-net authority")
 
 
-def _certificate(
-    subject: x509.Name, own: Any, ends: datetime.datetime
+def _start_certificate(
+    subject: x509.Name, public_key: Any, ends: datetime.datetime
 ) -> x509.CertificateBuilder:
+    """Returns a certificate of the authority that is not signed yet."""
     return (
         x509.CertificateBuilder()
         .subject_name(subject)
         .issuer_name(_ISSUER)
-        .public_key(own)
+        .public_key(public_key)
         .serial_number(x509.random_serial_number())
-        .not_valid_before(datetime.datetime.now(datetime.UTC) - _BEFORE)
+        .not_valid_before(datetime.datetime.now(datetime.UTC) - _CLOCK_TOLERANCE)
         .not_valid_after(ends + STOPPING_TIME)
     )
 
@@ -285,7 +317,8 @@ def _encode(certificate: x509.Certificate) -> bytes:
     return certificate.public_bytes(serialization.Encoding.PEM)
 
 
-def _alternatives(hosts: Sequence[str]) -> x509.SubjectAlternativeName:
+def _make_alternative_names(hosts: Sequence[str]) -> x509.SubjectAlternativeName:
+    """Returns the hosts of a certificate: `HERE` and `hosts`, each as address or as name."""
     names: list[x509.GeneralName] = []
     for host in dict.fromkeys((*HERE, *hosts)):
         try:
@@ -295,68 +328,75 @@ def _alternatives(hosts: Sequence[str]) -> x509.SubjectAlternativeName:
     return x509.SubjectAlternativeName(names)
 
 
-def _write(
+def _write_folder(
     folder: Path,
     authority: x509.Certificate,
     certificate: x509.Certificate,
     key: ec.EllipticCurvePrivateKey,
 ) -> None:
+    """Creates the folder of a member, or of the authority if both certificates are the same."""
     folder.mkdir(mode=0o700, parents=True)
-    _put(folder / AUTHORITY, authority.public_bytes(serialization.Encoding.PEM))
+    _write_new_file(folder / AUTHORITY, authority.public_bytes(serialization.Encoding.PEM))
     if certificate is not authority:
-        _put(folder / CERTIFICATE, certificate.public_bytes(serialization.Encoding.PEM))
+        _write_new_file(
+            folder / CERTIFICATE, certificate.public_bytes(serialization.Encoding.PEM)
+        )
     private = key.private_bytes(
         serialization.Encoding.PEM,
         serialization.PrivateFormat.PKCS8,
         serialization.NoEncryption(),
     )
-    _put(folder / PRIVATE_KEY, private)
+    _write_new_file(folder / PRIVATE_KEY, private)
 
 
-def _put(path: Path, content: bytes) -> None:
-    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+def _write_new_file(path: Path, content: bytes) -> None:
+    """Writes a file that only its owner can read; the file must not exist."""
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    with os.fdopen(descriptor, "wb") as file:
         file.write(content)
 
 
-def _read(path: Path) -> bytes:
+def _read_trusted(path: Path) -> bytes:
+    """Returns the content of a key file; raises UsageError if other users can change it."""
     with open_regular(path) as stream:
-        _refuse_of_others(path, os.fstat(stream.fileno()))
+        _check_permissions(path, os.fstat(stream.fileno()))
         content: bytes = stream.read(MOST_KEY_BYTES)
     return content
 
 
-def _refuse_of_others(path: Path, facts: os.stat_result) -> None:
-    """Refuses what another user can change; in a folder of many (sticky) nobody changes files
-    of others.
+def _check_permissions(path: Path, status: os.stat_result) -> None:
+    """Raises UsageError if another user can change a file or folder.
 
-    On Windows these bits do not tell who may: nothing is refused.
+    In a shared folder with the sticky bit, users cannot change the files of others. On Windows
+    the permission bits do not tell who can write, so there is no check.
     """
     if sys.platform == "win32":
         return
-    if os.geteuid() and facts.st_uid not in (0, os.geteuid()):
+    if os.geteuid() and status.st_uid not in (0, os.geteuid()):
         raise UsageError(
             f"{path}: belongs to another user, who can change it: take keys of your own"
         )
-    shared = stat.S_ISDIR(facts.st_mode) and facts.st_mode & stat.S_ISVTX
-    if facts.st_mode & 0o022 and not shared:
+    is_sticky_folder = stat.S_ISDIR(status.st_mode) and status.st_mode & stat.S_ISVTX
+    if status.st_mode & 0o022 and not is_sticky_folder:
         raise UsageError(
             f"{path}: others may write it, and so say who takes part: chmod go-w {path}"
         )
 
 
 def read_member_keys(folder: str | Path, *, stops: bool = False) -> MemberKeys:
-    """Returns the keys in a member's folder; the command is `trilat keys info`.
+    """Reads and checks the keys in a member's folder, like `trilat keys info`.
 
     >>> tn.read_member_keys(tn.create_keys("lab-keys", ["m", "s"])[0]).member
     'm'
 
     Args:
         folder: the folder of one member.
-        stops: true if the keys serve to stop arms alone: they may have ended, while their
-            certificate holds.
+        stops: True if the keys only serve to stop arms: then keys that have ended are accepted
+            while their certificate is valid.
 
     Raises:
-        UsageError: something is missing, has ended, or does not belong together.
+        UsageError: a file is missing or damaged, the keys have ended, or the files do not
+            belong together.
     """
     folder = Path(folder)
     if (folder / _AUTHORITY_FOLDER).is_dir():
@@ -364,44 +404,47 @@ def read_member_keys(folder: str | Path, *, stops: bool = False) -> MemberKeys:
             f"{folder}: holds the keys of all; name the folder of one member, as in {folder}/m1"
         )
     try:
-        _refuse_of_others(folder, folder.stat())
-        listed, *pems, private = map(
-            _read, (folder / one for one in (MEMBERS, AUTHORITY, CERTIFICATE, PRIVATE_KEY))
-        )
+        _check_permissions(folder, folder.stat())
+        members_text = _read_trusted(folder / MEMBERS)
+        authority_pem = _read_trusted(folder / AUTHORITY)
+        certificate_pem = _read_trusted(folder / CERTIFICATE)
+        private_pem = _read_trusted(folder / PRIVATE_KEY)
     except OSError as error:
         raise UsageError(
             f"{error.filename}: {error.strerror}: no keys of `trilat keys new`"
         ) from None
     try:
-        named = json.loads(listed)
-        member = named["member"]
-        members = tuple(named["members"])
-        authority, certificate = map(x509.load_pem_x509_certificate, pems)
-        key = serialization.load_pem_private_key(private, password=None)
+        member_list = json.loads(members_text)
+        member = member_list["member"]
+        members = tuple(member_list["members"])
+        authority = x509.load_pem_x509_certificate(authority_pem)
+        certificate = x509.load_pem_x509_certificate(certificate_pem)
+        key = serialization.load_pem_private_key(private_pem, password=None)
         ends = certificate.not_valid_after_utc
-        if "ends" in named:  # keys of earlier versions end with their certificate
-            ends = min(ends, datetime.datetime.fromisoformat(named["ends"]))
+        # Keys of earlier versions end with their certificate.
+        if "ends" in member_list:
+            ends = min(ends, datetime.datetime.fromisoformat(member_list["ends"]))
         certificate.verify_directly_issued_by(authority)
     except (ValueError, TypeError, KeyError, RecursionError) as error:
         raise UsageError(f"{folder}: damaged, no keys of `trilat keys new` ({error})") from None
-    except Exception as error:  # cryptography's errors have no common base
+    except Exception as error:  # the errors of cryptography have no common base class
         raise UsageError(
             f"{folder}: the authority has not signed this certificate ({error!r})"
         ) from None
-    last = certificate.not_valid_after_utc if stops else ends
-    if fault := _find_name_fault(members) or _find_fault(
+    fault = _find_name_fault(members) or _find_key_fault(
         folder=folder,
         member=member,
         members=members,
         certificate=certificate,
         key=key,
-        ends=last,
-    ):
+        ends=certificate.not_valid_after_utc if stops else ends,
+    )
+    if fault:
         raise UsageError(f"{folder}: {fault}")
     return MemberKeys(member, members, ends, _make_settings(folder.resolve(), members))
 
 
-def _find_fault(
+def _find_key_fault(
     folder: Path,
     member: str,
     members: Sequence[str],
@@ -409,20 +452,21 @@ def _find_fault(
     key: Any,
     ends: datetime.datetime,
 ) -> str:
-    common = ", ".join(
+    """Returns the first fault of a member's keys; "" if the keys are valid."""
+    common_name = ", ".join(
         name.rfc4514_string().removeprefix("CN=") for name in certificate.subject.rdns
     )
     begins = certificate.not_valid_before_utc
     private = folder / PRIVATE_KEY
     now = datetime.datetime.now(datetime.UTC)
-    for fault, text in (
+    faults = (
         (
             read_foreign_permissions(private),
             f"{PRIVATE_KEY} can be read by others: chmod 600 {private}",
         ),
         (
-            common != member,
-            f"the certificate is that of {common}, and {MEMBERS} names {member}",
+            common_name != member,
+            f"the certificate is that of {common_name}, and {MEMBERS} names {member}",
         ),
         (member not in members, f"{MEMBERS} does not list {member}"),
         (
@@ -437,23 +481,25 @@ def _find_fault(
             ends <= now,
             f"the certificate ended on {ends:{_DATE}}: {_RENEWAL}",
         ),
-    ):
-        if fault:
+    )
+    for is_present, text in faults:
+        if is_present:
             return text
     return ""
 
 
 def _make_settings(folder: Path, members: Sequence[str]) -> dict[str, Any]:
-    files = {
-        **{f"{side}_certificate": str(folder / CERTIFICATE) for side in ("listen", "connect")},
-        **{f"{side}_private_key": str(folder / PRIVATE_KEY) for side in ("listen", "connect")},
-    }
+    """Returns the Zenoh settings of a member whose keys are in `folder`."""
     tls = {
         "root_ca_certificate": str(folder / AUTHORITY),
         "enable_mtls": True,
         "verify_name_on_connect": True,
-        "close_link_on_expiration": False,  # no date ends a session; see `Connection.require_keys_until`
-        **files,
+        # The end of a certificate ends no session; see `Connection.require_keys_until`.
+        "close_link_on_expiration": False,
+        "listen_certificate": str(folder / CERTIFICATE),
+        "connect_certificate": str(folder / CERTIFICATE),
+        "listen_private_key": str(folder / PRIVATE_KEY),
+        "connect_private_key": str(folder / PRIVATE_KEY),
     }
     return {
         "transport": {
