@@ -1,9 +1,12 @@
-"""A master of a session of trilat-net as a robot of LeRobot: a policy is one of two users of
-the slave.
+"""A LeRobot robot that lets a policy drive one master of a trilat-net session.
 
-Invariant: an action moves the hand that the scenario allows at the master, within its force and
-speed limits; the slave follows all of its users by their dominance factors. The features follow
-from the scenario alone.
+The policy is one of two users of the slave.
+
+Invariant:
+    - An action moves the live hand that the scenario allows at the master, within the hand's
+      limits of force and speed.
+    - The slave follows all of its users by their dominance factors.
+    - The features follow from the scenario alone.
 """
 
 import time
@@ -16,23 +19,23 @@ from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnected
 
 import trilat_net as tn
 
-_ACTS = {"tip": ("move", "pos"), "joint": ("turn", "pos"), "force": ("push", "force")}
-"""By the mode of a live hand what it does, and what its numbers are."""
+_HAND_COMMANDS = {"tip": ("move", "pos"), "joint": ("turn", "pos"), "force": ("push", "force")}
+"""Method of `tn.hand` that commands a live hand, and kind of its numbers, by hand mode."""
 
 
 @RobotConfig.register_subclass("trilat")
 @dataclass(kw_only=True)
 class TrilatRobotConfig(RobotConfig):
-    """Where the policy takes part.
+    """The session and the site of the policy.
 
     Attributes:
         session: name of the session.
-        scenario: name or path of its scenario; "": as the session.
-        site: the master that the policy holds.
-        slave: the site that it observes besides.
-        connect: endpoints of the session; by default those on this machine.
-        keys: folder of the operator's keys; "": none.
-        timeout_s: longest wait for the session.
+        scenario: name or path of the session's scenario; "": the session's name.
+        site: the master that the policy drives.
+        slave: the site that the policy also observes.
+        connect: endpoints of the session; by default the endpoints on this machine.
+        keys: folder of the operator's keys; "" for a session without keys.
+        timeout_s: longest wait for the session, in s.
     """
 
     session: str = "play"
@@ -45,7 +48,7 @@ class TrilatRobotConfig(RobotConfig):
 
 
 class TrilatRobot(Robot):
-    """The slave and one master of a session, of which the policy holds the master."""
+    """The slave and one master of a session; the policy observes both and drives the master."""
 
     config_class = TrilatRobotConfig
     name = "trilat"
@@ -54,46 +57,51 @@ class TrilatRobot(Robot):
         super().__init__(config)
         self.config = config
         scenario = tn.load_scenario(config.scenario or config.session)
-        live = [
-            hand
-            for hand in scenario.sites[config.site].hands
-            if getattr(hand, "mode", "") in _ACTS
+        site = scenario.sites[config.site]
+        live_hands = [
+            hand for hand in site.hands if getattr(hand, "mode", "") in _HAND_COMMANDS
         ]
-        if not live:
+        if not live_hands:
             raise ValueError(f"the scenario has no operator of kind 'live' at {config.site}")
-        self._act, what = _ACTS[live[0].mode]
-        arms = scenario.arms
-        q0 = scenario.sites[config.site].q0_rad
-        axes = ["x", "y", "z"][: len(arms[config.site].end_effector(q0))]
-        axes = list(arms[config.site].joint_names) if live[0].mode == "joint" else axes
-        self._actions = [f"{axis}.{what}" for axis in axes]
-        self._places = [f"{axis}.pos" for axis in axes]
-        self._felt = [f"{axis}.felt" for axis in axes]
+        mode = live_hands[0].mode
+        self._command, quantity = _HAND_COMMANDS[mode]
+        arm = scenario.arms[config.site]
+        axes = ["x", "y", "z"][: len(arm.end_effector(site.q0_rad))]
+        if mode == "joint":
+            axes = list(arm.joint_names)
+        self._action_keys = [f"{axis}.{quantity}" for axis in axes]
+        self._position_keys = [f"{axis}.pos" for axis in axes]
+        self._felt_keys = [f"{axis}.felt" for axis in axes]
         self._sites = (config.slave, config.site)
-        whats = ("pos", "vel", "tau_x")
-        names = {site: arms[site].joint_names for site in self._sites}
-        self._joints = [
-            f"{site}.{one}.{what}" for site in names for what in whats for one in names[site]
-        ]
+        self._joint_keys: list[str] = []
+        for site_name in dict.fromkeys(self._sites):
+            joint_names = scenario.arms[site_name].joint_names
+            for joint_quantity in ("pos", "vel", "tau_x"):
+                self._joint_keys += [
+                    f"{site_name}.{joint}.{joint_quantity}" for joint in joint_names
+                ]
         self._hand: Any = None
         self._records: dict[str, Any] = {}
         self._stack = ExitStack()
 
     @property
     def observation_features(self) -> dict[str, type]:
-        """Per joint of the slave and of the own arm its angle, rad, speed, rad/s, external
-        torque, N m.
+        """Joint states of the slave and the master, and position and force of the hand.
 
-        Of the own hand its place, m (or angles, rad), and what it feels, N (or N m).
+        A joint has angle in rad, speed in rad/s and external torque in N m. The hand has its
+        position in m and the force that it feels in N; a hand in mode `joint` has angles in rad
+        and torques in N m.
         """
-        return dict.fromkeys([*self._joints, *self._places, *self._felt], float)
+        return dict.fromkeys([*self._joint_keys, *self._position_keys, *self._felt_keys], float)
 
     @property
     def action_features(self) -> dict[str, type]:
-        """Where the hand goes, m (angles, rad), or what it pushes with, N, by its mode in the
-        scenario.
+        """Command of the hand, by its mode in the scenario.
+
+        The command is a position in m (mode `tip`), angles in rad (`joint`) or a force in N
+        (`force`).
         """
-        return dict.fromkeys(self._actions, float)
+        return dict.fromkeys(self._action_keys, float)
 
     @property
     def is_connected(self) -> bool:
@@ -110,60 +118,65 @@ class TrilatRobot(Robot):
         pass
 
     def connect(self, calibrate: bool = True) -> None:  # noqa: ARG002 - there is nothing to calibrate
-        """Joins the session, and waits for the first record of both sites."""
+        """Joins the session and waits for the first record of both sites."""
         if self._hand is not None:
             raise DeviceAlreadyConnectedError(f"{self} is already connected.")
-        own = self.config
-        reach = {"connect": self.config.connect or None, "keys": self.config.keys or None}
+        config = self.config
+        connection = {"connect": config.connect or None, "keys": config.keys or None}
         with ExitStack() as stack:
-            hand = tn.hand(
-                own.session, own.site, source="policy", timeout_s=own.timeout_s, **reach
+            hand_context = tn.hand(
+                config.session,
+                config.site,
+                source="policy",
+                timeout_s=config.timeout_s,
+                **connection,
             )
-            entered = stack.enter_context(hand)
-            self._take = stack.enter_context(
-                tn.session(own.session, **reach).records(*self._sites)
-            )
-            give_up_s = time.monotonic() + own.timeout_s
+            hand = stack.enter_context(hand_context)
+            session = tn.session(config.session, **connection)
+            self._receive_records = stack.enter_context(session.records(*self._sites))
+            deadline_s = time.monotonic() + config.timeout_s
             while set(self._sites) - self._records.keys():
-                if time.monotonic() > give_up_s:
+                if time.monotonic() > deadline_s:
                     raise DeviceNotConnectedError(
                         f"no records of both {' and '.join(self._sites)}"
                     )
                 time.sleep(0.002)
                 self._update()
-            self._hand = entered
+            self._hand = hand
             self._stack = stack.pop_all()
 
     def _update(self) -> None:
-        self._records.update({record.site: record for record in self._take()})
+        """Receives new records and keeps the newest record of each site."""
+        self._records.update({record.site: record for record in self._receive_records()})
 
     def get_observation(self) -> dict[str, float]:
-        """Returns the newest record of the slave and of the own arm."""
-        hand = self._held()
+        """Returns the newest records of slave and master, and the state of the hand."""
+        hand = self._require_hand()
         self._update()
-        records = [self._records[site] for site in self._sites]
-        found = [
-            value
-            for one in records
-            for vector in (one.q, one.qd, one.tau_x)
-            for value in vector
-        ]
-        felt = [-one for one in hand.force]
-        return dict(zip(self.observation_features, [*found, *hand.pose, *felt], strict=True))
+        values: list[float] = []
+        for site in self._sites:
+            record = self._records[site]
+            values += [*record.q, *record.qd, *record.tau_x]
+        values += hand.pose
+        # The hand feels the reaction of the force that it applies to the arm.
+        values += [-force for force in hand.force]
+        return dict(zip(self.observation_features, values, strict=True))
 
     def send_action(self, action: dict[str, Any]) -> dict[str, float]:
-        """Moves the hand; the site keeps its limits of force and speed."""
-        goal = {key: float(action[key]) for key in self._actions}
-        getattr(self._held(), self._act)(*goal.values())
+        """Commands the hand; the site enforces the limits of force and speed."""
+        goal = {key: float(action[key]) for key in self._action_keys}
+        command = getattr(self._require_hand(), self._command)
+        command(*goal.values())
         return goal
 
     def disconnect(self) -> None:
-        """Lets go of the arm and leaves the session, which goes on."""
-        self._held()
+        """Releases the arm and leaves the session, which continues."""
+        self._require_hand()
         self._hand = None
         self._stack.close()
 
-    def _held(self) -> Any:
+    def _require_hand(self) -> Any:
+        """Returns the hand; raises DeviceNotConnectedError before `connect`."""
         if self._hand is None:
             raise DeviceNotConnectedError(f"{self} is not connected.")
         return self._hand

@@ -1,10 +1,12 @@
-"""A master of a session of trilat-net as a teleoperator of LeRobot: the person's arm, beside a
-policy's.
+"""A LeRobot teleoperator for a person's master in a trilat-net session.
 
-Invariant: nothing is replaced when a person intervenes: the slave follows both users by their
-dominance factors, and an intervention is that the person's factor is above the program's.
-Feedback pulls the arm with the spring and the limits of its live hand, while torque is enabled
-and nobody else holds it.
+The person shares the slave with a policy, which has a master of its own.
+
+Invariant:
+    - The slave follows both users by their dominance factors, also while the person intervenes.
+    - The person intervenes if the person's dominance factor is greater than the policy's.
+    - Feedback pulls the arm with the spring and the limits of its live hand, while torque is
+      enabled and no other user holds the arm.
 """
 
 from contextlib import ExitStack
@@ -17,24 +19,24 @@ from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnected
 
 import trilat_net as tn
 
-_ACTS = {"tip": ("move", "pos"), "joint": ("turn", "pos"), "force": ("push", "force")}
-"""By the mode of a live hand what it does, and what its numbers are."""
+_HAND_COMMANDS = {"tip": ("move", "pos"), "joint": ("turn", "pos"), "force": ("push", "force")}
+"""Method of `tn.hand` that commands a live hand, and kind of its numbers, by hand mode."""
 
 
 @TeleoperatorConfig.register_subclass("trilat")
 @dataclass(kw_only=True)
 class TrilatTeleoperatorConfig(TeleoperatorConfig):
-    """Whose arm it is.
+    """The session and the sites of the person and the policy.
 
     Attributes:
         session: name of the session.
-        scenario: name or path of its scenario; "": as the session.
+        scenario: name or path of the session's scenario; "": the session's name.
         site: the person's master.
         program: the policy's master.
-        slave: the site that both lead.
-        connect: endpoints of the session; by default those on this machine.
-        keys: folder of the operator's keys; "": none.
-        timeout_s: longest wait for the session.
+        slave: the site that both masters lead.
+        connect: endpoints of the session; by default the endpoints on this machine.
+        keys: folder of the operator's keys; "" for a session without keys.
+        timeout_s: longest wait for the session, in s.
     """
 
     session: str = "play"
@@ -57,36 +59,40 @@ class TrilatTeleoperator(Teleoperator):
         super().__init__(config)
         self.config = config
         scenario = tn.load_scenario(config.scenario or config.session)
-        live = [
-            hand
-            for hand in scenario.sites[config.site].hands
-            if getattr(hand, "mode", "") in _ACTS
+        site = scenario.sites[config.site]
+        live_hands = [
+            hand for hand in site.hands if getattr(hand, "mode", "") in _HAND_COMMANDS
         ]
-        if not live:
+        if not live_hands:
             raise ValueError(f"the scenario has no operator of kind 'live' at {config.site}")
-        self._act, what = _ACTS[live[0].mode]
+        mode = live_hands[0].mode
+        self._command, quantity = _HAND_COMMANDS[mode]
         arm = scenario.arms[config.site]
-        axes = ["x", "y", "z"][: len(arm.end_effector(scenario.sites[config.site].q0_rad))]
-        axes = list(arm.joint_names) if live[0].mode == "joint" else axes
-        self._places = [f"{axis}.pos" for axis in axes]
-        self._feedback = [f"{axis}.{what}" for axis in axes]
-        self._pulls = False
+        axes = ["x", "y", "z"][: len(arm.end_effector(site.q0_rad))]
+        if mode == "joint":
+            axes = list(arm.joint_names)
+        self._position_keys = [f"{axis}.pos" for axis in axes]
+        self._feedback_keys = [f"{axis}.{quantity}" for axis in axes]
+        self._torque_enabled = False
         self._hand: Any = None
         self._stack = ExitStack()
 
     @property
     def action_features(self) -> dict[str, type]:
-        """Where the arm is, m (of a hand at the joints: angles, rad): the keys of the policy's
-        robot.
+        """Position of the arm in m, or angles in rad for a hand in mode `joint`.
+
+        The keys are those of the actions of `TrilatRobot`.
         """
-        return dict.fromkeys(self._places, float)
+        return dict.fromkeys(self._position_keys, float)
 
     @property
     def feedback_features(self) -> dict[str, type]:
-        """Where the arm is pulled, or what pushes it, N, by the mode of its hand in the
-        scenario.
+        """Command of the hand at the arm, by the hand's mode in the scenario.
+
+        The command is a position in m (mode `tip`), angles in rad (`joint`) or a force in N
+        (`force`).
         """
-        return dict.fromkeys(self._feedback, float)
+        return dict.fromkeys(self._feedback_keys, float)
 
     @property
     def is_connected(self) -> bool:
@@ -103,70 +109,75 @@ class TrilatTeleoperator(Teleoperator):
         pass
 
     def connect(self, calibrate: bool = True) -> None:  # noqa: ARG002 - there is nothing to calibrate
-        """Joins the session; nobody holds the arm by that."""
+        """Joins the session without holding the arm."""
         if self._hand is not None:
             raise DeviceAlreadyConnectedError(f"{self} is already connected.")
-        own = self.config
-        reach = {"connect": self.config.connect or None, "keys": self.config.keys or None}
+        config = self.config
+        connection = {"connect": config.connect or None, "keys": config.keys or None}
         with ExitStack() as stack:
-            hand = tn.hand(
-                own.session, own.site, source="teleoperator", timeout_s=own.timeout_s, **reach
+            hand_context = tn.hand(
+                config.session,
+                config.site,
+                source="teleoperator",
+                timeout_s=config.timeout_s,
+                **connection,
             )
-            entered = stack.enter_context(hand)
-            self._find_shares = stack.enter_context(
-                tn.session(own.session, **reach).shares(own.slave)
-            )
-            self._hand = entered
+            hand = stack.enter_context(hand_context)
+            session = tn.session(config.session, **connection)
+            self._get_shares = stack.enter_context(session.shares(config.slave))
+            self._hand = hand
             self._stack = stack.pop_all()
 
     def get_action(self) -> dict[str, float]:
-        """Returns where the arm is."""
-        return dict(zip(self._places, self._held().pose, strict=True))
+        """Returns the position of the arm, with the keys of `action_features`."""
+        return dict(zip(self._position_keys, self._require_hand().pose, strict=True))
 
     def get_felt(self) -> dict[str, float]:
-        """Returns the force of the arm on whoever holds it, N (of a hand at the joints:
-        torques, N m).
+        """Returns the force of the arm on the hand that holds it, in N.
+
+        A hand in mode `joint` feels torques in N m.
         """
-        felt = (-one for one in self._held().force)
-        return {
-            key.replace(".pos", ".felt"): one
-            for key, one in zip(self._places, felt, strict=True)
-        }
+        # The hand feels the reaction of the force that it applies to the arm.
+        felt_forces = [-force for force in self._require_hand().force]
+        felt_keys = [key.replace(".pos", ".felt") for key in self._position_keys]
+        return dict(zip(felt_keys, felt_forces, strict=True))
 
     def send_feedback(self, feedback: dict[str, Any]) -> None:
-        """Pulls or pushes the arm, if torque is enabled; other keys mean nothing."""
-        hand = self._held()
-        if self._pulls and all(key in feedback for key in self._feedback):
-            getattr(hand, self._act)(*(float(feedback[key]) for key in self._feedback))
+        """Pulls or pushes the arm if torque is enabled; unknown keys are ignored."""
+        hand = self._require_hand()
+        if self._torque_enabled and all(key in feedback for key in self._feedback_keys):
+            command = getattr(hand, self._command)
+            command(*(float(feedback[key]) for key in self._feedback_keys))
 
     def enable_torque(self) -> None:
-        """Lets feedback act on the arm."""
-        self._pulls = True
+        """Allows feedback to move the arm."""
+        self._torque_enabled = True
 
     def disable_torque(self) -> None:
-        """Lets go of the arm: it is the person's alone."""
-        self._pulls = False
-        self._held().release()
+        """Releases the arm, which the person then moves alone."""
+        self._torque_enabled = False
+        self._require_hand().release()
 
     def get_teleop_events(self) -> dict[TeleopEvents, bool]:
-        """Says whether the person leads the slave, and whether the session is over."""
-        hand = self._held()
-        shares = self._find_shares()
+        """Returns whether the person intervenes and whether the session is over."""
+        hand = self._require_hand()
+        shares = self._get_shares()
+        person_leads = shares[self.config.site] > shares[self.config.program]
         return {
-            TeleopEvents.IS_INTERVENTION: shares[self.config.site]
-            > shares[self.config.program],
+            TeleopEvents.IS_INTERVENTION: person_leads,
             TeleopEvents.TERMINATE_EPISODE: bool(hand.over),
             TeleopEvents.SUCCESS: False,
             TeleopEvents.RERECORD_EPISODE: False,
         }
 
     def disconnect(self) -> None:
-        """Lets go of the arm and leaves the session, which goes on."""
-        self._held()
+        """Releases the arm and leaves the session, which continues."""
+        self._require_hand()
         self._hand = None
         self._stack.close()
 
-    def _held(self) -> Any:
+    def _require_hand(self) -> Any:
+        """Returns the hand; raises DeviceNotConnectedError before `connect`."""
         if self._hand is None:
             raise DeviceNotConnectedError(f"{self} is not connected.")
         return self._hand
