@@ -1,8 +1,10 @@
 """Mapping of a session's messages to standard ROS 2 messages: channels, units, names.
 
-Invariant: only units are converted, as the channel's metadata states; an unmeasured value is
-NaN. A curve's name stands where viewers look for it: with the joints in the message, else in
-the label of its dimension.
+Invariant:
+    - Only units are converted, as the metadata of the channel state.
+    - A value that was not measured is NaN.
+    - The name of a curve is where viewers look for it: a joint's name is in the message, other
+      names are in the label of the dimension.
 """
 
 import math
@@ -29,19 +31,22 @@ from .robot_model import RobotModel
 
 EVENTS = "events"
 LINES = "log"
-"""Channels of a whole session: events as plain text, and as lines with a time and a level."""
+"""Channels of a whole session: events as plain text, and as log lines with time and level."""
 SENT_PREFIX = "sent_"
-"""Of the names of arrays that hold what a law sends: "sent_E", "sent_u_to_m2"."""
-
+"""Prefix of the arrays with the vectors that a law sends: "sent_E", "sent_u_to_m2"."""
 
 ROBOT = "robot_description"
 FRAMES = "tf"
-"""Channels of an arm that a URDF describes: that file, and where its links are."""
+"""Channels of an arm with a URDF: the URDF text, and the frames of the links."""
 
 
 class Ros2Channel(NamedTuple):
-    """A standard channel: type of its messages, metadata, and whether late subscribers get the
-    last one.
+    """A channel of standard ROS 2 messages.
+
+    Attributes:
+        kind: type of the messages.
+        about: metadata of the channel.
+        latched: True if late subscribers receive the last message.
     """
 
     kind: str
@@ -50,30 +55,32 @@ class Ros2Channel(NamedTuple):
 
 
 class StandardChannels:
-    """The channels of a file, of all that are known by topic; each is registered with its first
-    message.
+    """Numbers of the standard channels of a file, by topic.
+
+    A channel is registered in the file when its number is first looked up.
+
+    Args:
+        file: the file.
+        known: the channels that can be registered, by topic.
     """
 
     def __init__(self, file: McapWriter, known: Mapping[str, Ros2Channel]) -> None:
         self._file = file
         self._known = known
-        self._numbers: dict[
-            str, int
-        ] = {}  # of schemas by their kind, and of channels by their topic
+        self._schema_numbers: dict[str, int] = {}
+        self._channel_numbers: dict[str, int] = {}
 
     def __getitem__(self, topic: str) -> int:
-        if topic not in self._numbers:
+        if topic not in self._channel_numbers:
             kind, about, _ = self._known[topic]
-            if kind not in self._numbers:
-                schema = self._file.register_schema(
+            if kind not in self._schema_numbers:
+                self._schema_numbers[kind] = self._file.register_schema(
                     kind, cdr.SCHEMA_ENCODING, cdr.ROS2_SCHEMAS[kind]
                 )
-                self._numbers[kind] = schema
-            schema = self._numbers[kind]
-            self._numbers[topic] = self._file.register_channel(
-                topic, cdr.ENCODING, schema, about
+            self._channel_numbers[topic] = self._file.register_channel(
+                topic, cdr.ENCODING, self._schema_numbers[kind], about
             )
-        return self._numbers[topic]
+        return self._channel_numbers[topic]
 
 
 SESSION_CHANNELS = {
@@ -94,8 +101,11 @@ _MODES = {name: float(mode) for mode, word in MODE_WORDS.items() for name in (mo
 
 
 def pack_event(event: Event, stamp_ns: int) -> Iterator[tuple[str, bytes]]:
-    """Yields an event for the channels of the session; `stamp_ns` is its Unix time, not below
-    0.
+    """Yields channel and message of an event, for each channel of the session.
+
+    Args:
+        event: the event.
+        stamp_ns: Unix time of the event, in ns, 0 or more.
     """
     text = describe_event(event.kind, event.text, event.command)
     level = _LEVELS.get(event.kind, cdr.RosLogLevel.INFO)
@@ -104,8 +114,12 @@ def pack_event(event: Event, stamp_ns: int) -> Iterator[tuple[str, bytes]]:
 
 
 class ArrayChannel:
-    """A channel of `std_msgs/msg/Float64MultiArray`: content and unit of its numbers, names on
-    its axes.
+    """A channel of `std_msgs/msg/Float64MultiArray`.
+
+    Args:
+        content: description of the numbers.
+        unit: unit of the numbers.
+        axes: names of the entries along each axis.
     """
 
     def __init__(self, content: str, unit: str, *axes: Sequence[str]) -> None:
@@ -117,26 +131,26 @@ class ArrayChannel:
                 "names": "; ".join(" ".join(axis) for axis in axes),
             },
         )
-        labels = [
-            f"{content}: {' '.join(axis)}" if not n else " ".join(axis)
-            for n, axis in enumerate(axes)
-        ]
+        labels = [" ".join(axis) for axis in axes]
+        labels[0] = f"{content}: {labels[0]}"
         labels[-1] += f" ({unit})"
-        self.size = math.prod(map(len, axes))
-        self.pack = cdr.make_float_array_packer(*zip(labels, map(len, axes), strict=True))
+        lengths = [len(axis) for axis in axes]
+        self.size = math.prod(lengths)
+        self.pack = cdr.make_float_array_packer(*zip(labels, lengths, strict=True))
 
 
 class Ros2SiteChannels:
     """The standard channels of one site with its peers in scenario order.
 
     Attributes:
-        joints: names of its joints: those of its file, or numbered ones of a planar arm.
-        arrays: the channels that are arrays, by the last part of their topic.
-        record_arrays: the names of those that a record has; the others are of statistics.
-        error_row: of a row of `stack_signals`, behind the joints, the error e = q - q_des, Eq.
-            (9).
-        slow_row: the rest: tau_x, theta_hat, what the law sends, mode.
-        robot: the arm for viewers, or None where arms are planar ones alone.
+        joints: names of the joints, from the URDF; numbered names for a planar arm.
+        arrays: the array channels, by the last part of their topic.
+        record_arrays: names of the arrays that are made from records; the others are made from
+            statistics.
+        error_row: slice of the error e = q - q_des, Eq. (9), in a row of `stack_signals`.
+        slow_row: slice of the remaining numbers of the row: tau_x, theta_hat, the vectors that
+            the law sends, and the mode.
+        robot: the arm for viewers; None for a planar arm.
     """
 
     def __init__(self, scenario: Scenario, site: str) -> None:
@@ -184,25 +198,24 @@ class Ros2SiteChannels:
 
     @property
     def channels(self) -> dict[str, Ros2Channel]:
-        """Its channels by the last part of their topic: those of arrays, and of an arm for
-        viewers.
-        """
+        """Array channels and channels of the robot, by the last part of their topic."""
         arrays = {name: array.channel for name, array in self.arrays.items()}
         return arrays if self.robot is None else arrays | ROBOT_CHANNELS
 
     def joint_states(self, names: Sequence[str], *, effort: bool = True) -> Ros2Channel:
-        """Returns a channel of joint states with these names."""
-        units = ", ".join(map(self._unit, ("rad", "rad/s", "N m")[: 2 + effort]))
-        return Ros2Channel(
-            cdr.JOINT_STATE,
-            {"unit": units, "names": " ".join("_".join(n.split()) for n in names)},
-        )
+        """Returns a channel of joint states for joints with these names."""
+        revolute_units = ["rad", "rad/s", "N m"] if effort else ["rad", "rad/s"]
+        units = ", ".join(self._unit(unit) for unit in revolute_units)
+        # The names are separated by spaces and cannot contain any.
+        joined_names = " ".join("_".join(name.split()) for name in names)
+        return Ros2Channel(cdr.JOINT_STATE, {"unit": units, "names": joined_names})
 
     def _unit(self, unit: str) -> str:
+        """Returns the units of all joints, where `unit` is that of a revolute joint."""
         return " or ".join(dict.fromkeys(self._arm.joint_units(unit)))
 
     def slow(self, row: Sequence[float]) -> Iterator[tuple[str, bytes]]:
-        """Yields the arrays of one record, from the numbers of its `slow_row`."""
+        """Yields name and message of a record's arrays, from the numbers of its `slow_row`."""
         start = 0
         for name in self._slow:
             array = self.arrays[name]
@@ -210,54 +223,56 @@ class Ros2SiteChannels:
             start += array.size
 
     def statistics(self, stats: LinkStats) -> Iterator[tuple[str, bytes]]:
-        """Yields the arrays of one statistics; those of clocks and networks only in a live
-        session.
+        """Yields name and message of the arrays of link statistics.
+
+        The arrays of delays, clock offsets and timing exist in a live session only.
         """
         arrays = self.arrays
         peers = self._peers
         if not peers:
             return
-        yield (
-            "link_age",
-            arrays["link_age"].pack(*(_ms(stats.age_us.get(peer, -1)) for peer in peers)),
-        )
-        if not stats.delay_us:  # virtual time has neither
+        ages_ms = [_convert_to_ms(stats.age_us.get(peer, -1)) for peer in peers]
+        yield "link_age", arrays["link_age"].pack(*ages_ms)
+        # Virtual time has no measured delays and no clock offsets.
+        if not stats.delay_us:
             return
-        delays = [
-            _ms(by.get(peer, -1))
-            for peer in peers
-            for by in (stats.delay_us, stats.delay_max_us)
-        ]
-        yield "link_delay", arrays["link_delay"].pack(*delays)
-        offsets = [
-            by.get(peer, math.nan) / 1e3
-            for peer in peers
-            for by in (stats.offset_us, stats.bound_us)
-        ]
-        yield "link_offset", arrays["link_offset"].pack(*offsets)
+        delays_ms: list[float] = []
+        offsets_ms: list[float] = []
+        for peer in peers:
+            delays_ms.append(_convert_to_ms(stats.delay_us.get(peer, -1)))
+            delays_ms.append(_convert_to_ms(stats.delay_max_us.get(peer, -1)))
+            offsets_ms.append(stats.offset_us.get(peer, math.nan) / 1e3)
+            offsets_ms.append(stats.bound_us.get(peer, math.nan) / 1e3)
+        yield "link_delay", arrays["link_delay"].pack(*delays_ms)
+        yield "link_offset", arrays["link_offset"].pack(*offsets_ms)
         yield "timing", arrays["timing"].pack(stats.late_max_us, stats.busy_max_us)
 
 
 def _make_sent_channels(scenario: Scenario, site: str) -> dict[str, ArrayChannel]:
     """Returns a channel for each vector that a site's law sends, in the order of its record."""
-    return {
-        f"{SENT_PREFIX}{vector.name}" + f"_to_{peer}" * bool(peer): ArrayChannel(
+    channels: dict[str, ArrayChannel] = {}
+    for vector, peer, index in scenario.channel(site).entries(scenario.peers(site)):
+        # A vector has several entries; the first entry stands for the whole vector.
+        if index:
+            continue
+        suffix = f"_to_{peer}" if peer else ""
+        channels[f"{SENT_PREFIX}{vector.name}{suffix}"] = ArrayChannel(
             f"{vector.name} that the law sends to {peer or 'all'}",
             vector.unit or "-",
-            [f"{vector.name}{n + 1}" for n in range(vector.length)],
+            [f"{vector.name}{number}" for number in range(1, vector.length + 1)],
         )
-        for vector, peer, place in scenario.channel(site).entries(scenario.peers(site))
-        if not place
-    }
+    return channels
 
 
-def _ms(us: int) -> float:
+def _convert_to_ms(us: int) -> float:
+    """Returns a time in ms; NaN for -1, which stands for a time that was not measured."""
     return us / 1e3 if us != -1 else math.nan
 
 
 def read_ros2_channels(path: Path) -> dict[str, Ros2Channel]:
-    """Returns the standard channels of a finished file by topic, {} if it has no readable
-    index.
+    """Returns the standard channels of a finished file by topic.
+
+    Returns {} for a file without a readable index.
 
     Raises:
         LogError: the file cannot be opened.
@@ -283,28 +298,35 @@ SignalRow = Sequence[float]
 
 
 def stack_signals(records: Sequence[Record]) -> list[SignalRow]:
-    """Returns the numbers of records, a column per curve: q, q_des, qd, tau, e, tau_x,
-    theta_hat, ch, mode.
+    """Returns the numbers of records, a column per curve.
 
-    A column may be shorter where all of its numbers are the same. In task space no joint has a
-    reference: its own angle stands there, and e is x - x_des.
+    The columns are q, q_des, qd, tau, e, tau_x, theta_hat, ch and mode. The column of the mode
+    has a single number if all records have the same mode. In task space the joints have no
+    reference: the columns of q_des hold q, and e is x - x_des.
     """
-    task = bool(records[0].x)
-    rows = [
-        (*m.q, *(m.q if task else m.q_des), *m.qd, *m.tau, *m.tau_x, *m.theta_hat, *m.ch)
-        for m in records
-    ]
+    is_task_space = bool(records[0].x)
+    rows: list[tuple[float, ...]] = []
+    for record in records:
+        joint_reference = record.q if is_task_space else record.q_des
+        kinematics = (*record.q, *joint_reference, *record.qd)
+        torques = (*record.tau, *record.tau_x)
+        rows.append((*kinematics, *torques, *record.theta_hat, *record.ch))
     columns: list[SignalRow] = [*zip(*rows, strict=True)]
     n = len(records[0].q)
-    here = [*zip(*(m.x for m in records), strict=True)] if task else columns[:n]
-    there = [*zip(*(m.q_des for m in records), strict=True)]
+    actual = columns[:n]
+    if is_task_space:
+        actual = [*zip(*(record.x for record in records), strict=True)]
+    desired = [*zip(*(record.q_des for record in records), strict=True)]
     error = [
-        [a - b for a, b in zip(*pair, strict=True)] for pair in zip(here, there, strict=True)
+        [value - reference for value, reference in zip(*curves, strict=True)]
+        for curves in zip(actual, desired, strict=True)
     ]
-    if len(error) > POSITION and task:
-        x, x_des = (np.array(columns).T for columns in (here, there))
+    # A pose has an orientation, whose error is not a difference of numbers.
+    if len(error) > POSITION and is_task_space:
+        x = np.array(actual).T
+        x_des = np.array(desired).T
         error = compute_task_errors(x, x_des, [1.0] * len(error)).T.tolist()
-    modes = [m.mode for m in records]
+    modes = [record.mode for record in records]
     if modes.count(modes[0]) == len(modes):
         del modes[1:]
     return [
