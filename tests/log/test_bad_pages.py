@@ -67,7 +67,11 @@ def test_a_torn_chunk_with_a_zeroed_page_adds_nothing(tmp_path: Path) -> None:
         torn = bytearray(data[: draw.randrange(PAGE_BYTES, len(data))])
         offset = draw.randrange(len(torn) // PAGE_BYTES) * PAGE_BYTES
         torn[offset : offset + PAGE_BYTES] = bytes(PAGE_BYTES)
-        result, saved = recovered(bytes(torn), tmp_path)
+        try:
+            result, saved = recovered(bytes(torn), tmp_path)
+        except NothingSaved:
+            assert not offset  # the first page names the channels of all messages
+            continue
         assert not Counter(messages(saved)) - truth
         salvaged += result.salvaged
         if offset:

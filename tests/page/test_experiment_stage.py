@@ -215,7 +215,7 @@ def test_log_that_ends_too_early_does_not_count(experiment: Experiment) -> None:
         experiment.plan.trials[0],
         experiment.plan.digest,
     )
-    assert TrialJudge(trial).take(0.0, [-0.6, 1.2], [0.0, 0.0]) is None
+    assert TrialJudge(trial).accept(0.0, [-0.6, 1.2], [0.0, 0.0]) is None
     people = People(experiment)
     left: list[int] = [1]
 
@@ -298,7 +298,7 @@ def watched(experiment: Experiment, tmp_path: Path) -> tuple[Any, Any, Any]:
 def view_of(trial: ExperimentTrial, log: Any, last: int, mode: str = "run") -> Any:
     window = RecordWindow(trial.scenario, "s", kept_s=60.0)
     for record in log["s"].states[: last + 1]:
-        window.take(record)
+        window.receive(record)
     site = SimpleNamespace(window=window, complete=last, record=SimpleNamespace(mode=mode))
     return SimpleNamespace(running=True, sites={"s": site})
 

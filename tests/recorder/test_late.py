@@ -104,7 +104,7 @@ def test_a_recorder_takes_over_from_one_that_ended(tmp_path: Path, ahead_ns: int
         )
         epoch = recorder.join(30.0)
         assert epoch is not None
-        return recorder.record(epoch).problem()
+        return recorder.record(epoch).describe_problem()
 
     session.relay.add("second", second, begun_ns + 3 * S // 2)
     session.play()

@@ -50,7 +50,8 @@ class ChainEquations(DelayEquations):
 
 def chain_equations(scenario: Scenario) -> ChainEquations:
     """The equations of a scenario whose arms are one file, with gravity down along -z."""
-    (arm,) = {spec.arm for spec in scenario.sites.values()}
+    arm, *others = [spec.arm for spec in scenario.sites.values()]
+    assert all(other == arm for other in others)
     chain = read_urdf(scenario.urdf[arm.urdf], arm.base, arm.tip)
     model = build_model(chain)
     model.gravity.linear = np.array([0.0, 0.0, -arm.g_m_s2])

@@ -178,6 +178,7 @@ def plot_spread(axes: Axes, t_s: Array, values: Array, **options: Any) -> None:
         if not len(bucket):
             continue
         part = values[bucket]
+        spread: tuple[float, float, float]
         # numpy warns of buckets without a number
         if np.isfinite(part).any():
             spread = (np.nanmin(part), np.nanmedian(part), np.nanmax(part))

@@ -553,8 +553,8 @@ def _compose_statics(metrics: LogMetrics) -> Iterator[Block]:
         rad = metrics.unit("rad", 1)
         ratio = metrics.unit("N m/rad", 1)
         joint = "axis" if metrics.axes else "joint"
-        heads = ("stiffness felt", joint, "by", f"{nm} more", f"{rad} further", ratio)
-        yield from _tabulate(heads, rows, text_columns=1)
+        felt_heads = ("stiffness felt", joint, "by", f"{nm} more", f"{rad} further", ratio)
+        yield from _tabulate(felt_heads, rows, text_columns=1)
 
 
 def _compose_impedance(metrics: LogMetrics) -> Iterator[Block]:
