@@ -81,25 +81,16 @@ def make_arrival(
         sample: the record of that tick, or an arrival of the sample.
         latency_us: time from the stamp to the arrival, us.
     """
-    if isinstance(sample, Arrival) or not sample.x:
-        return Arrival(
-            peer=peer,
-            tick=tick,
-            q=sample.q,
-            qd=sample.qd,
-            latency_us=latency_us,
-            tau_x=sample.tau_x,
-            ch=sample.ch,
-        )
-    # in task space the sites share the motion of the end effector
+    q = sample.q
+    qd = sample.qd
+    tau_x = sample.tau_x
+    if not isinstance(sample, Arrival) and sample.x:
+        # in task space the sites share the motion of the end effector
+        q = sample.x
+        qd = sample.xd
+        tau_x = sample.wrench
     return Arrival(
-        peer=peer,
-        tick=tick,
-        q=sample.x,
-        qd=sample.xd,
-        latency_us=latency_us,
-        tau_x=sample.wrench,
-        ch=sample.ch,
+        peer=peer, tick=tick, q=q, qd=qd, latency_us=latency_us, tau_x=tau_x, ch=sample.ch
     )
 
 
