@@ -462,7 +462,7 @@ class RunningSite:
             self._parts.say(text)
 
     def _watch_members(self, t_ns: int) -> None:
-        """Follows who leaves and who joins, and admits the peers that join."""
+        """Tracks the members that join and leave, and admits the peers that join."""
         parts = self._parts
         monitor = parts.monitor
         monitor.watch(self._publisher, t_ns)
