@@ -195,7 +195,7 @@ class RemoteHand(HandPlayer):
             self._decide(k, message)
         return super().track(site, k)
 
-    def ask(self, k: int, arrays: SiteArrays) -> None:
+    def request_action(self, k: int, arrays: SiteArrays) -> None:
         """Sends the hand the view of tick `k`."""
         view = self.view(k, arrays)
         fields = _list_numbers(view)

@@ -1,6 +1,7 @@
 """The program's own sources: files, rooms, definitions, and which room imports which."""
 
 import ast
+import re
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -78,3 +79,39 @@ def definitions(path: Path) -> set[str]:
                 if isinstance(below, ast.FunctionDef)
             }
     return found
+
+
+def unused_methods() -> set[str]:
+    """Returns the methods that nothing refers to, as "Class.method".
+
+    An override whose method of the base class was renamed shows here: nobody calls its old name. Methods that
+    a library calls, and those that only the documentation names, count as referred to if their name stands in
+    the documentation.
+    """
+    references = set(
+        re.findall(
+            r"\w+", "".join(path.read_text("utf-8") for path in (ROOT / "docs").glob("*.md"))
+        )
+    )
+    methods = set()
+    folders = (*TOPS, "containers", "plugins", "tests", "benchmarks", "examples", "docs")
+    for path in sorted(path for folder in folders for path in (ROOT / folder).rglob("*.py")):
+        for node in ast.walk(tree(path)):
+            match node:
+                case ast.Attribute(attr=name) | ast.Name(id=name) | ast.alias(name=name):
+                    references.add(name)
+                case ast.keyword(arg=str(name)):
+                    references.add(name)
+                case ast.Constant(value=str(name)):
+                    references.add(name)
+                case ast.ClassDef() if path.is_relative_to(ROOT / "tests") is False:
+                    methods |= {
+                        (node.name, method.name)
+                        for method in node.body
+                        if isinstance(method, ast.FunctionDef)
+                    }
+    return {
+        f"{owner}.{name}"
+        for owner, name in methods
+        if name not in references and not name.startswith("__")
+    }
