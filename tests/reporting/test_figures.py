@@ -55,7 +55,7 @@ def test_a_site_has_one_colour_in_every_figure():
 
 def test_histograms_count_every_tick():
     log = logs.timed(logs.simulated("four"))
-    edges = age_and_lateness.loop_time_bin_edges(log)
+    edges = age_and_lateness.choose_bin_edges_us(log)
     for site in log.sites:
         assert age_and_lateness.bin_loop_times(log[site].late_us, edges).sum() == len(log[site])
         assert (
@@ -126,7 +126,7 @@ def test_estimates_have_a_line_per_site_and_the_truth():
 def test_distributions_reach_longest_age_and_rare_one_by_logarithm():
     for few, even in ((20.0, True), (1.0, False)):
         ages_ms = np.where(np.arange(1000) < 10.0 * few, 3200.0, 200.0)
-        x_ms = age_and_lateness.delay_axis_ms(
+        x_ms = age_and_lateness.choose_delay_axis_ms(
             [age_and_lateness.DelayDistribution("a", "b", np.full(9, 200.0), ages_ms)]
         )
         assert x_ms[-1] >= 3200.0
@@ -159,11 +159,11 @@ def test_the_axis_of_ages_is_logarithmic_after_an_outage():
 
 
 def test_shares_are_of_all_that_there_is():
-    percent = age_and_lateness.cumulative_percent(
+    percent = age_and_lateness.compute_cumulative_percent(
         np.array([1.0, 2.0, 2.0, 4.0]), np.array([0.0, 2.0, 9.0])
     )
     assert percent.tolist() == [0, 75, 100]
-    assert np.isnan(age_and_lateness.cumulative_percent(np.zeros(0), np.zeros(2))).all()
+    assert np.isnan(age_and_lateness.compute_cumulative_percent(np.zeros(0), np.zeros(2))).all()
 
 
 def test_arms_stand_at_their_angles_in_panels_with_equal_axes():
@@ -241,7 +241,7 @@ RAMPS = [
 
 def test_shares_are_drawn_as_they_change():
     log = trilat_net.simulate("paper", {"duration_s": 2.0, "rate_hz": 100, "timeline": RAMPS})
-    assert joint_motion.sites_with_changing_dominance(log) == ["s"]
+    assert joint_motion.list_sites_with_changing_dominance(log) == ["s"]
     figure = joint_motion.draw_authority(log)
     assert len(figure.axes) == 3
     m1, m2 = (line.get_data() for line in lines(figure.axes[0])[:2])
@@ -249,7 +249,7 @@ def test_shares_are_drawn_as_they_change():
         [0.5, 0.625, 0.75, 0.375, 0.0]
     )
     assert m1[1] + m2[1] == pytest.approx(np.ones(len(m1[0])))
-    assert joint_motion.sites_with_changing_dominance(logs.simulated("paper")) == []
+    assert joint_motion.list_sites_with_changing_dominance(logs.simulated("paper")) == []
 
 
 def test_overview_has_extremes_of_every_site_and_verdict():

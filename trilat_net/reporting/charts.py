@@ -85,8 +85,8 @@ class Charts:
         self._log = log
         self._twin = twin
         times = np.linspace(0.0, recorded_end_s(log), 60)
-        poses = [arm_poses.pose_at(log, site, t) for site in log.sites for t in times]
-        self.bounds_m = left, right, bottom, top = arm_poses.pose_box_m(poses)
+        poses = [arm_poses.find_pose(log, site, t) for site in log.sites for t in times]
+        self.bounds_m = left, right, bottom, top = arm_poses.compute_pose_box_m(poses)
         planar = all(arm.chain is None for arm in log.scenario.arms.values())
         self.factor = 1.0 if planar else PICTURE_SIDE / max(right - left, top - bottom)
         self._changes = list_changes(log)
@@ -296,7 +296,7 @@ class Charts:
         lines: list[StatedLine] = []
         for peer in log[site].peers:
             states = list_stated_models(log, f"{peer}->{site}", self._changes)
-            t_s, mean_ms = age_and_lateness.stated_delay_line(log, states)
+            t_s, mean_ms = age_and_lateness.trace_stated_delay(log, states)
             for start, end, value in zip(t_s[::3], t_s[1::3], mean_ms[::3], strict=True):
                 if np.isfinite(value):
                     colour = log.sites.index(peer)
@@ -307,7 +307,7 @@ class Charts:
 
     def _distributions(self) -> Iterator[DistributionChart]:
         measured = age_and_lateness.measure_delay_distributions(self._log)
-        x_ms = age_and_lateness.delay_axis_ms(measured)
+        x_ms = age_and_lateness.choose_delay_axis_ms(measured)
         for site in self._log.sites:
             series = []
             for link in (link for link in measured if link.site == site):
@@ -316,7 +316,7 @@ class Charts:
                     ("age", link.age_ms, False),
                     ("delay", link.delay_ms, True),
                 ):
-                    percent = age_and_lateness.cumulative_percent(values, x_ms)
+                    percent = age_and_lateness.compute_cumulative_percent(values, x_ms)
                     if np.isfinite(percent).any():
                         label = f"{name}, {link.peer}"
                         series.append(
@@ -333,7 +333,7 @@ class Charts:
 
     def _histograms(self) -> Iterator[HistogramChart]:
         log = self._log
-        edges = age_and_lateness.loop_time_bin_edges(log)
+        edges = age_and_lateness.choose_bin_edges_us(log)
         periods = sorted({1e6 / log.scenario.sites[site].rate_hz for site in log.sites})
         titles = {
             "late_us": "wake-up after the deadline",

@@ -95,6 +95,6 @@ class EpisodePicture:
         return pixels
 
 
-def is_place(goal: Sequence[float] | Array, end_effector_m: Array) -> bool:
+def is_position(goal: Sequence[float] | Array, end_effector_m: Array) -> bool:
     """Returns whether a goal has the numbers of a place of this end effector."""
     return np.shape(goal) == np.shape(end_effector_m)

@@ -498,14 +498,14 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         # imported here, because the import of Matplotlib takes a second
         from ..reporting.episode_picture import (
             EpisodePicture,
-            is_place,
+            is_position,
         )
 
         if self._picture is None:
             self._picture = EpisodePicture(self.scenario, self._leads)
         scene = self._build_scene()
         goal = None
-        if is_place(self.task.goal, scene.end_effector_m[self._leads]):
+        if is_position(self.task.goal, scene.end_effector_m[self._leads]):
             goal = self.task.goal
         return self._picture.draw(scene.q, scene.bodies, goal, f"t = {scene.t_s:.2f} s")
 

@@ -51,7 +51,7 @@ class DelayDistribution(NamedTuple):
 def draw_sample_age(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns the age of the sample in use on every link over time, ms: a row per receiver."""
     lines = {
-        link: stated_delay_line(log, states) for link, states in _stated_models(log).items()
+        link: trace_stated_delay(log, states) for link, states in _stated_models(log).items()
     }
     with style.time_figure(log, form, 0.6 + 1.05 * len(log.sites)) as plot:
         grid = style.add_panels(
@@ -107,16 +107,18 @@ def draw_delay_distributions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure
         grid = style.add_panels(
             figure, len(log.sites), len(log.sites) - 1, sharex=True, sharey=True
         )
-        x_ms = delay_axis_ms(list(found.values()))
+        x_ms = choose_delay_axis_ms(list(found.values()))
         for site, row in zip(log.sites, grid, strict=True):
             for peer, axes in zip(log[site].peers, row, strict=True):
                 link = found[peer, site]
                 axes.plot(
                     x_ms,
-                    cumulative_percent(link.age_ms, x_ms),
+                    compute_cumulative_percent(link.age_ms, x_ms),
                     **style.site_line(log, peer, 1.8),
                 )
-                axes.plot(x_ms, cumulative_percent(link.delay_ms, x_ms), **style.LIMIT_LINE)
+                axes.plot(
+                    x_ms, compute_cumulative_percent(link.delay_ms, x_ms), **style.LIMIT_LINE
+                )
                 _title_link(axes, peer, site)
         for axes in grid[:, 0]:
             axes.set_ylabel("cumulative (%)")
@@ -153,7 +155,7 @@ def measure_delay_distributions(log: Log) -> list[DelayDistribution]:
     return found
 
 
-def delay_axis_ms(found: list[DelayDistribution]) -> Array:
+def choose_delay_axis_ms(found: list[DelayDistribution]) -> Array:
     """Returns the delays at which distributions are drawn, ms, to the longest; by logarithm if
     it is rare.
     """
@@ -167,7 +169,7 @@ def delay_axis_ms(found: list[DelayDistribution]) -> Array:
     return np.geomspace(max(0.5 * float(np.percentile(known, 1.0)), 0.1), end_ms, _POINTS)
 
 
-def cumulative_percent(values: Array, limits: Array) -> Array:
+def compute_cumulative_percent(values: Array, limits: Array) -> Array:
     """Returns the percentage of values that are at most as large as each limit; NaN without
     values.
     """
@@ -176,7 +178,7 @@ def cumulative_percent(values: Array, limits: Array) -> Array:
     return 100.0 * np.searchsorted(np.sort(values), limits, side="right") / len(values)
 
 
-def stated_delay_line(log: Log, states: list[StatedModel]) -> tuple[Array, Array]:
+def trace_stated_delay(log: Log, states: list[StatedModel]) -> tuple[Array, Array]:
     """Returns the stated mean delay over time as a line: times, s, and delays, ms; NaN between
     states.
     """
@@ -232,7 +234,7 @@ def explain_missing_loop_times(log: Log) -> str:
     return NO_LOOP_CLOCK if log.driver == "virtual" else NO_LOOP_TIMES
 
 
-def loop_time_bin_edges(log: Log) -> Array:
+def choose_bin_edges_us(log: Log) -> Array:
     """Returns the edges of the histograms of a log, shape (B + 1,), us, equal steps of the
     logarithm.
 
@@ -268,7 +270,7 @@ def bin_loop_times(times_us: Ints, edges: Array) -> Ints:
 )
 def draw_loop_timing(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns histograms of each site's lateness and computing time, us."""
-    edges = loop_time_bin_edges(log)
+    edges = choose_bin_edges_us(log)
     labels = ("lateness", "computing time")
     if not form.narrow:
         labels = ("wake-up after the deadline", "computing time of a tick")

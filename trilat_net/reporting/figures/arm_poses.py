@@ -137,7 +137,7 @@ def choose_instants_s(log: Log, count: int = INSTANTS) -> list[float]:
     return sorted({0.0, *(round(t, 6) for t in inner if t < end_s), end_s})
 
 
-def pose_at(log: Log, site: str, t_s: float) -> ArmPose | None:
+def find_pose(log: Log, site: str, t_s: float) -> ArmPose | None:
     """Returns the pose of a site at an instant: that of its last record until then; None
     without one.
     """
@@ -168,7 +168,7 @@ def pose_at(log: Log, site: str, t_s: float) -> ArmPose | None:
     )
 
 
-def pose_box_m(poses: Sequence[ArmPose | None]) -> PictureBox:
+def compute_pose_box_m(poses: Sequence[ArmPose | None]) -> PictureBox:
     """Returns left, right, bottom and top of a box around poses with a margin, m; the base is
     inside.
     """
@@ -190,9 +190,9 @@ def draw_arms(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     axes in m.
     """
     times = choose_instants_s(log, _NARROW_INSTANTS if form.narrow else INSTANTS)
-    drawn = {site: [pose_at(log, site, t) for t in times] for site in log.sites}
+    drawn = {site: [find_pose(log, site, t) for t in times] for site in log.sites}
     planar = all(arm.chain is None for arm in log.scenario.arms.values())
-    left, right, bottom, top = pose_box_m([p for row in drawn.values() for p in row])
+    left, right, bottom, top = compute_pose_box_m([p for row in drawn.values() for p in row])
     side_in = (form.width_in - 0.6) / len(times)
     height_in = 0.75 + len(log.sites) * (side_in * (top - bottom) / (right - left) + 0.08)
     with style.styled_figure(form, height_in) as figure:
@@ -253,7 +253,7 @@ def render_arms_svg(log: Log, bounds_m: PictureBox, factor: float) -> str:
             continue
         cells.append(f'<span class="head">{escape(site)}</span>')
         for t in times:
-            drawn = pose_at(log, site, t)
+            drawn = find_pose(log, site, t)
             scaled = None
             if drawn is not None:
                 bodies = [factor * path for path in drawn.bodies]

@@ -500,7 +500,7 @@ def thin_path(path: Array) -> Array:
     return kept
 
 
-def sites_with_changing_dominance(log: Log) -> list[str]:
+def list_sites_with_changing_dominance(log: Log) -> list[str]:
     """Returns the sites whose shares change during the run, in scenario order."""
     changing = {changed.change.dominance for changed in list_changes(log)}
     return [site for site in log.sites if site in changing]
@@ -509,11 +509,11 @@ def sites_with_changing_dominance(log: Log) -> list[str]:
 @draws(
     "authority",
     "shares that change, and the motion of the arms",
-    unless(sites_with_changing_dominance, "the shares of all sites are constant"),
+    unless(list_sites_with_changing_dominance, "the shares of all sites are constant"),
 )
 def draw_authority(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns the shares that change, and how far every arm is from where it started, rad."""
-    owners = sites_with_changing_dominance(log)
+    owners = list_sites_with_changing_dominance(log)
     titles = style.name_joints(log)
     rows = len(owners) + len(titles)
     low = len(titles) > 2
@@ -540,7 +540,7 @@ def draw_authority(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     return plot.figure
 
 
-def sites_with_walls(log: Log) -> list[str]:
+def list_sites_with_walls(log: Log) -> list[str]:
     """Returns the sites that have a wall in their way, in scenario order."""
     return [site for site in log.sites if list_walls(log.scenario.sites[site])]
 
@@ -548,13 +548,13 @@ def sites_with_walls(log: Log) -> list[str]:
 @draws(
     "contact",
     "force of the walls, and depth in them",
-    unless(sites_with_walls, "no site has a wall in this run"),
+    unless(list_sites_with_walls, "no site has a wall in this run"),
 )
 def draw_contact(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns the normal force of every wall over time, N, above the depth of the end effector
     in it, mm.
     """
-    sites = sites_with_walls(log)
+    sites = list_sites_with_walls(log)
     with style.time_figure(log, form, 2.9) as plot:
         column = style.add_panels(plot.figure, 2, 1, sharex=True)[:, 0]
         for site in sites:
