@@ -1,12 +1,13 @@
 """A LeRobot robot that lets a policy drive one master of a trilat-net session.
 
-The policy is one of two users of the slave.
+The policy shares the slave with another user, who drives another master. Each action of the
+policy commands the live hand that the scenario allows at the policy's master. Each observation
+holds the newest records of the slave and of that master, and the state of the hand.
 
 Invariant:
-    - An action moves the live hand that the scenario allows at the master, within the hand's
-      limits of force and speed.
+    - An action moves the arm within the hand's limits of force and speed.
     - The slave follows all of its users by their dominance factors.
-    - The features follow from the scenario alone.
+    - The features of actions and observations follow from the scenario alone.
 """
 
 import time
@@ -20,7 +21,7 @@ from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnected
 import trilat_net as tn
 
 _HAND_COMMANDS = {"tip": ("move", "pos"), "joint": ("turn", "pos"), "force": ("push", "force")}
-"""Method of `tn.hand` that commands a live hand, and kind of its numbers, by hand mode."""
+"""How a hand of each mode is commanded: the method of `tn.hand`, and the suffix of the keys."""
 
 
 @RobotConfig.register_subclass("trilat")
@@ -57,29 +58,20 @@ class TrilatRobot(Robot):
         super().__init__(config)
         self.config = config
         scenario = tn.load_scenario(config.scenario or config.session)
-        site = scenario.sites[config.site]
-        live_hands = [
-            hand for hand in site.hands if getattr(hand, "mode", "") in _HAND_COMMANDS
-        ]
-        if not live_hands:
-            raise ValueError(f"the scenario has no operator of kind 'live' at {config.site}")
-        mode = live_hands[0].mode
+        mode = _find_hand_mode(scenario, config.site)
         self._command, quantity = _HAND_COMMANDS[mode]
-        arm = scenario.arms[config.site]
-        axes = ["x", "y", "z"][: len(arm.end_effector(site.q0_rad))]
-        if mode == "joint":
-            axes = list(arm.joint_names)
+        axes = _list_hand_axes(scenario, config.site, mode)
         self._action_keys = [f"{axis}.{quantity}" for axis in axes]
         self._position_keys = [f"{axis}.pos" for axis in axes]
         self._felt_keys = [f"{axis}.felt" for axis in axes]
         self._sites = (config.slave, config.site)
         self._joint_keys: list[str] = []
-        for site_name in dict.fromkeys(self._sites):
-            joint_names = scenario.arms[site_name].joint_names
+        for site in dict.fromkeys(self._sites):
+            joint_names = scenario.arms[site].joint_names
             for joint_quantity in ("pos", "vel", "tau_x"):
-                self._joint_keys += [
-                    f"{site_name}.{joint}.{joint_quantity}" for joint in joint_names
-                ]
+                keys = [f"{site}.{joint}.{joint_quantity}" for joint in joint_names]
+                self._joint_keys += keys
+        # The hand exists while the robot is connected.
         self._hand: Any = None
         self._records: dict[str, Any] = {}
         self._stack = ExitStack()
@@ -134,25 +126,33 @@ class TrilatRobot(Robot):
             hand = stack.enter_context(hand_context)
             session = tn.session(config.session, **connection)
             self._receive_records = stack.enter_context(session.records(*self._sites))
-            deadline_s = time.monotonic() + config.timeout_s
-            while set(self._sites) - self._records.keys():
-                if time.monotonic() > deadline_s:
-                    raise DeviceNotConnectedError(
-                        f"no records of both {' and '.join(self._sites)}"
-                    )
-                time.sleep(0.002)
-                self._update()
+            self._await_records(config.timeout_s)
             self._hand = hand
             self._stack = stack.pop_all()
 
-    def _update(self) -> None:
-        """Receives new records and keeps the newest record of each site."""
-        self._records.update({record.site: record for record in self._receive_records()})
+    def _await_records(self, timeout_s: float) -> None:
+        """Waits until both sites have published a record.
+
+        Raises:
+            DeviceNotConnectedError: a site has published none for `timeout_s` seconds.
+        """
+        deadline_s = time.monotonic() + timeout_s
+        while set(self._sites) - self._records.keys():
+            if time.monotonic() > deadline_s:
+                sites = " and ".join(self._sites)
+                raise DeviceNotConnectedError(f"no records of both {sites}")
+            time.sleep(0.002)
+            self._receive_newest()
+
+    def _receive_newest(self) -> None:
+        """Receives the new records and keeps the newest record of each site."""
+        for record in self._receive_records():
+            self._records[record.site] = record
 
     def get_observation(self) -> dict[str, float]:
-        """Returns the newest records of slave and master, and the state of the hand."""
+        """Returns the joint states of slave and master, and the state of the hand."""
         hand = self._require_hand()
-        self._update()
+        self._receive_newest()
         values: list[float] = []
         for site in self._sites:
             record = self._records[site]
@@ -180,3 +180,28 @@ class TrilatRobot(Robot):
         if self._hand is None:
             raise DeviceNotConnectedError(f"{self} is not connected.")
         return self._hand
+
+
+def _find_hand_mode(scenario: Any, site: str) -> str:
+    """Returns the mode of the live hand at a site.
+
+    Raises:
+        ValueError: the scenario allows no live hand at the site.
+    """
+    for hand in scenario.sites[site].hands:
+        mode: str = getattr(hand, "mode", "")
+        if mode in _HAND_COMMANDS:
+            return mode
+    raise ValueError(f"the scenario has no operator of kind 'live' at {site}")
+
+
+def _list_hand_axes(scenario: Any, site: str, mode: str) -> list[str]:
+    """Returns the names of the axes along which a hand of this mode moves the arm.
+
+    A hand in mode `joint` turns the joints; a hand in another mode moves the end effector.
+    """
+    arm = scenario.arms[site]
+    if mode == "joint":
+        return list(arm.joint_names)
+    end_effector = arm.end_effector(scenario.sites[site].q0_rad)
+    return ["x", "y", "z"][: len(end_effector)]

@@ -1,12 +1,14 @@
 """A LeRobot teleoperator for a person's master in a trilat-net session.
 
-The person shares the slave with a policy, which has a master of its own.
+The person shares the slave with a policy, which drives another master. An action of the person
+is the position of the person's arm. Feedback lets LeRobot move that arm, for example to the
+policy's position before the person intervenes.
 
 Invariant:
     - The slave follows both users by their dominance factors, also while the person intervenes.
     - The person intervenes if the person's dominance factor is greater than the policy's.
-    - Feedback pulls the arm with the spring and the limits of its live hand, while torque is
-      enabled and no other user holds the arm.
+    - Feedback moves the arm only while torque is enabled and no other user holds the arm.
+    - Feedback pulls the arm with the spring and the limits of the arm's live hand.
 """
 
 from contextlib import ExitStack
@@ -20,7 +22,7 @@ from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnected
 import trilat_net as tn
 
 _HAND_COMMANDS = {"tip": ("move", "pos"), "joint": ("turn", "pos"), "force": ("push", "force")}
-"""Method of `tn.hand` that commands a live hand, and kind of its numbers, by hand mode."""
+"""How a hand of each mode is commanded: the method of `tn.hand`, and the suffix of the keys."""
 
 
 @TeleoperatorConfig.register_subclass("trilat")
@@ -59,21 +61,13 @@ class TrilatTeleoperator(Teleoperator):
         super().__init__(config)
         self.config = config
         scenario = tn.load_scenario(config.scenario or config.session)
-        site = scenario.sites[config.site]
-        live_hands = [
-            hand for hand in site.hands if getattr(hand, "mode", "") in _HAND_COMMANDS
-        ]
-        if not live_hands:
-            raise ValueError(f"the scenario has no operator of kind 'live' at {config.site}")
-        mode = live_hands[0].mode
+        mode = _find_hand_mode(scenario, config.site)
         self._command, quantity = _HAND_COMMANDS[mode]
-        arm = scenario.arms[config.site]
-        axes = ["x", "y", "z"][: len(arm.end_effector(site.q0_rad))]
-        if mode == "joint":
-            axes = list(arm.joint_names)
+        axes = _list_hand_axes(scenario, config.site, mode)
         self._position_keys = [f"{axis}.pos" for axis in axes]
         self._feedback_keys = [f"{axis}.{quantity}" for axis in axes]
         self._torque_enabled = False
+        # The hand exists while the teleoperator is connected.
         self._hand: Any = None
         self._stack = ExitStack()
 
@@ -130,7 +124,8 @@ class TrilatTeleoperator(Teleoperator):
 
     def get_action(self) -> dict[str, float]:
         """Returns the position of the arm, with the keys of `action_features`."""
-        return dict(zip(self._position_keys, self._require_hand().pose, strict=True))
+        position = self._require_hand().pose
+        return dict(zip(self._position_keys, position, strict=True))
 
     def get_felt(self) -> dict[str, float]:
         """Returns the force of the arm on the hand that holds it, in N.
@@ -143,11 +138,16 @@ class TrilatTeleoperator(Teleoperator):
         return dict(zip(felt_keys, felt_forces, strict=True))
 
     def send_feedback(self, feedback: dict[str, Any]) -> None:
-        """Pulls or pushes the arm if torque is enabled; unknown keys are ignored."""
+        """Pulls or pushes the arm if torque is enabled.
+
+        Unknown keys are ignored. Feedback that lacks a key moves nothing.
+        """
         hand = self._require_hand()
-        if self._torque_enabled and all(key in feedback for key in self._feedback_keys):
+        is_complete = all(key in feedback for key in self._feedback_keys)
+        if self._torque_enabled and is_complete:
+            goal = [float(feedback[key]) for key in self._feedback_keys]
             command = getattr(hand, self._command)
-            command(*(float(feedback[key]) for key in self._feedback_keys))
+            command(*goal)
 
     def enable_torque(self) -> None:
         """Allows feedback to move the arm."""
@@ -181,3 +181,28 @@ class TrilatTeleoperator(Teleoperator):
         if self._hand is None:
             raise DeviceNotConnectedError(f"{self} is not connected.")
         return self._hand
+
+
+def _find_hand_mode(scenario: Any, site: str) -> str:
+    """Returns the mode of the live hand at a site.
+
+    Raises:
+        ValueError: the scenario allows no live hand at the site.
+    """
+    for hand in scenario.sites[site].hands:
+        mode: str = getattr(hand, "mode", "")
+        if mode in _HAND_COMMANDS:
+            return mode
+    raise ValueError(f"the scenario has no operator of kind 'live' at {site}")
+
+
+def _list_hand_axes(scenario: Any, site: str, mode: str) -> list[str]:
+    """Returns the names of the axes along which a hand of this mode moves the arm.
+
+    A hand in mode `joint` turns the joints; a hand in another mode moves the end effector.
+    """
+    arm = scenario.arms[site]
+    if mode == "joint":
+        return list(arm.joint_names)
+    end_effector = arm.end_effector(scenario.sites[site].q0_rad)
+    return ["x", "y", "z"][: len(end_effector)]
