@@ -11,7 +11,7 @@ from trilat_net.errors import UsageError
 from trilat_net.studies.sweep import plan_sweep
 from trilat_net.studies.tuning.search_space import (
     build_model_information,
-    build_own_search_space,
+    build_user_search_space,
     select_search_spaces,
 )
 from trilat_net.studies.tuning.tuning_plan import plan_tuning
@@ -71,8 +71,8 @@ def test_ranges_come_from_the_class() -> None:
 def test_ranges_that_are_none_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     for entry in ((3.0, 1.0), (0.0, 1.0), "wide", (1.0, 2.0, 3.0), (1.0,)):
         monkeypatch.setattr(PD, "tune", {"K": entry})
-        with pytest.raises(UsageError, match=r"tune\['K'\] is as in"):
-            build_own_search_space("tests.own_laws:PD")
+        with pytest.raises(UsageError, match=r"tune\['K'\] must be"):
+            build_user_search_space("tests.own_laws:PD")
 
 
 @pytest.mark.long

@@ -94,7 +94,7 @@ def test_whole_numbers_stay_whole() -> None:
 def test_uneven_values_are_drawn_one_apart(values: tuple[float, ...], even: bool) -> None:
     side = PlaneAxis("k", values, "k")
     assert side.even is even
-    assert side.places.tolist() == list(values if even else range(len(values)))
+    assert side.positions.tolist() == list(values if even else range(len(values)))
 
 
 def test_no_runs_no_numbers_and_too_many_panels_are_refused() -> None:

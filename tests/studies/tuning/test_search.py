@@ -36,8 +36,8 @@ def lost(_: dict[str, float]) -> CandidateScore:
 def searched(law: str, budget: int, seed: int, score: object = bowl) -> CandidateSearch:
     search = CandidateSearch(SEARCH_SPACES[law], budget, seed, Objective.ERROR)
     for number in range(len(search.rounds)):
-        asked = search.ask(number)
-        search.tell(asked, [score(gains) for gains in asked])  # type: ignore[operator]
+        asked = search.propose_candidates(number)
+        search.record_scores(asked, [score(gains) for gains in asked])  # type: ignore[operator]
     return search
 
 
@@ -68,7 +68,7 @@ def test_the_first_half_samples_every_slice_of_every_range(
     law: str, budget: int, seed: int
 ) -> None:
     """What makes a Latin hypercube of it (McKay, Beckman and Conover 1979)."""
-    first = CandidateSearch(SEARCH_SPACES[law], budget, seed, Objective.ERROR).ask(0)
+    first = CandidateSearch(SEARCH_SPACES[law], budget, seed, Objective.ERROR).propose_candidates(0)
     for knob in SEARCH_SPACES[law].knobs:
         share = np.log([gains[knob.name] / knob.low for gains in first]) / math.log(
             knob.high / knob.low
@@ -79,7 +79,7 @@ def test_the_first_half_samples_every_slice_of_every_range(
 
 def test_laws_with_as_many_gains_begin_at_the_same_places() -> None:
     firsts = [
-        CandidateSearch(SEARCH_SPACES[law], 16, 3, Objective.ERROR).ask(0)
+        CandidateSearch(SEARCH_SPACES[law], 16, 3, Objective.ERROR).propose_candidates(0)
         for law in ("adaptive", "adaptive_box")
     ]
     assert firsts[0] == firsts[1]
@@ -94,7 +94,7 @@ def test_refinement_comes_nearer_than_the_hypercube_of_all(law: str) -> None:
     spread = [
         min(
             bowl(gains).error_rad or 0.0
-            for gains in CandidateSearch(SEARCH_SPACES[law], 128, seed, Objective.ERROR).ask(0)
+            for gains in CandidateSearch(SEARCH_SPACES[law], 128, seed, Objective.ERROR).propose_candidates(0)
         )
         for seed in range(10)
     ]

@@ -71,7 +71,7 @@ def test_a_front_is_dominated_by_no_law(found: TuningResult) -> None:
     for one in found.found:
         own = points[one.space.law]
         assert one.front == find_pareto_front(own)
-        shared = found.shared(one)
+        shared = found.list_overall_front(one)
         assert set(shared) <= set(one.front)
         for place in one.front:
             point = own[place]
@@ -110,7 +110,7 @@ def test_runs_that_failed_are_in_the_facts_and_counted(tmp_path: Path) -> None:
     }
     assert law["front"] == []
     assert [one["outcome"] for one in law["candidates"]] == ["diverged"] * 4
-    assert found.at_edge(found.found[0]) == []
+    assert found.list_edge_gains(found.found[0]) == []
 
 
 def test_hanging_arms_are_on_no_front_of_a_real_search(tmp_path: Path) -> None:
@@ -169,13 +169,13 @@ def with_front(law: str, gains: dict[str, float], points: int) -> CandidateSearc
         CandidateScore(one, 1.0 / n, 0.1, 0.1, float(n), None, 0.0)
         for n, one in enumerate(outcomes, 1)
     ]
-    search.tell([gains] * 6, scores)
+    search.record_scores([gains] * 6, scores)
     return search
 
 
 def test_tables_name_the_edge_of_what_was_searched(found: TuningResult) -> None:
     knob = SEARCH_SPACES["p_d"].knobs[0]
-    assert found.at_edge(with_front("p_d", {"K": knob.high, "d": 10.0}, 1)) == ["K"]
+    assert found.list_edge_gains(with_front("p_d", {"K": knob.high, "d": 10.0}, 1)) == ["K"]
 
 
 @pytest.fixture(scope="module")
@@ -217,7 +217,7 @@ def test_the_page_tells_procedure_search_and_commands(
     found: TuningResult, written: Path
 ) -> None:
     text = (written / "front.md").read_text()
-    assert "every law is told gravity exactly" in text
+    assert "every law gets the exact gravity parameters" in text
     assert "torques clamped at 60 N m" in text
     assert "| p_d | K | N m/rad | 1 | 1000 | gravity |" in text
     assert "AND inertia exactly: more than the others" in text

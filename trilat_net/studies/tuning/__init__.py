@@ -1,11 +1,13 @@
 """Fair comparison of control laws.
 
-Each law is tuned by one written procedure, and shown as a front of error against effort.
+The gains of each law are tuned by the same procedure. Each law is then shown as a Pareto front
+of error against effort. docs/fair-comparison.md has the procedure, the formulas and the search
+ranges.
 
-Invariant: every law gets the same number of candidates, torque clamp, horizon, seeds, gravity
-information and classification. e alone ranks no law: arms that hang together have e = 0.
-
-docs/fair-comparison.md holds the procedure, the formulas and the table of search ranges.
+Invariant:
+    - Every law gets the same number of candidates, torque clamp, horizon, seeds, gravity
+      information and classification.
+    - The error e alone does not rank laws: arms that hang together have e = 0.
 """
 
 from .tuning_plan import TuningPlan, TuningResult, plan_tuning

@@ -1,20 +1,29 @@
-"""One candidate of a tuning: its scenario and command, its run in virtual time, its score, and
-where it ends.
+"""One candidate of a tuning: its scenario and command, its run in virtual time, and its score.
 
-Where the arms of a comparison ought to end is the consensus of weightless arms: before any
-operator acts q* = sum_i beta_i q_i(0), beta the left Perron vector of the dominance matrix: the
-limit of x_i' = sum_j alpha_ij x_j - x_i. Spring operators move it to q* = sum_i beta_i K_i x_i
-/ sum_i beta_i K_i, per joint, with target x_i and stiffness K_i of the operator at site i,
-since sum_i beta_i tau_i = 0 in statics. After they let go it stays. Torques without a target
-and walls ask for no pose: such a scenario is judged on its twin, the same without them.
+A candidate is a control law with a choice of gains. The error of its run is measured against
+the pose q* at which weightless arms would agree:
 
-Invariant: a candidate's scenario is loaded through the same settings that its command names,
-and its score is a function of the scenario alone: None for the errors of a run that does not
-reach its end. No gain and no control law enters the pose. A run has exactly one class, and only
-a settled one may stand on a front: one that is stable by the judgement of every run
-(`analysis.run_end`), at the pose. Arms that hang, however well together, have strayed. An arm
-hangs if both links point down at the end and did not at the start; arms fell if their mean ends
-more than 0.2 rad from the pose in a log without a push that could explain it.
+- Before any operator acts, q* = sum_i beta_i q_i(0). Here beta is the left Perron vector of the
+  dominance matrix alpha: the limit of x_i' = sum_j alpha_ij x_j - x_i.
+- While spring operators act, q* = sum_i beta_i K_i x_i / sum_i beta_i K_i per joint. The
+  operator at site i has the target x_i and the stiffness K_i; the equation follows from
+  sum_i beta_i tau_i = 0 in statics.
+- After the operators have released the arms, q* stays.
+
+Torques without a target and walls ask for no pose. A scenario with such torques or walls is
+judged on its twin: the same scenario without them.
+
+Invariant:
+    - A candidate's scenario is loaded with the same settings that its command names.
+    - A score is a function of the scenario alone. The errors of a run that does not reach its
+      end are None.
+    - No gain and no control law enters the pose q*.
+    - A run has exactly one class, and only a settled run may stand on a front: a run that is
+      stable by the judgement of every run (`analysis.run_end`) and ends at the pose.
+    - Arms that hang have strayed, however close to each other they are. An arm hangs if both
+      links point down at the end and did not at the start.
+    - Arms fell if their mean ends more than 0.2 rad from the pose, in a log without a push that
+      could explain the distance.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -46,113 +55,146 @@ from ..study_folder import format_command, format_toml_value, set_options
 from .search_space import GainValues, ModelInformation, SearchSpace, SiteControls
 
 CONFLICT_RAD = 0.02
-"""Operators whose targets are further from the consensus than this hold the arms apart."""
-_LOOK_HZ = 100.0
+"""Operators whose targets are further than this from the consensus keep the arms separate."""
+_POSE_SAMPLES_HZ = 100.0
+"""Rate at which the targets of operators are compared with the consensus."""
 
 
 def check_comparable(scenario: Scenario) -> None:
     """Refuses a scenario in which laws cannot be compared fairly.
 
     Raises:
-        ScenarioError: says why, and what would be right.
+        ScenarioError: states the reason and a remedy.
     """
     refuse_live_only(scenario)
     if any(spec.task.shared for spec in scenario.sites.values()):
         raise ScenarioError(
-            "laws are compared by the distance of joint angles, and here end effectors agree: take a "
-            "scenario in joint space",
+            "laws are compared by the distance of joint angles, but here the end effectors "
+            "agree: take a scenario in joint space",
             path="task.space",
             source=scenario.name,
         )
     groups = find_closed_groups(scenario.alpha)
     if len(groups) > 1:
-        words = " and ".join(
-            ", ".join(scenario.names[site] for site in group) for group in groups
-        )
+        group_names = [", ".join(scenario.names[site] for site in group) for group in groups]
         raise ScenarioError(
-            f"these groups follow no other site: {words}; there is no pose that all would reach",
+            f"these groups follow no other site: {' and '.join(group_names)}; there is no pose "
+            "that all would reach",
             path="dominance",
             source=scenario.name,
         )
-    t_s = np.arange(0.0, scenario.duration_s, 1.0 / _LOOK_HZ)
-    pose = compute_consensus_pose(scenario, t_s)
-    for name, stiffness, on, target in _follow_springs(scenario, t_s):
-        apart = np.abs(target - pose) * on * (stiffness > 0.0)
-        if apart.max(initial=0.0) > CONFLICT_RAD:
-            at_s = t_s[apart.max(axis=1).argmax()]
+    t_s = np.arange(0.0, scenario.duration_s, 1.0 / _POSE_SAMPLES_HZ)
+    pose_rad = compute_consensus_pose(scenario, t_s)
+    for spring in _list_springs(scenario, t_s):
+        pulls = spring.acts * (spring.stiffness_nm_rad > 0.0)
+        conflict_rad = np.abs(spring.target_rad - pose_rad) * pulls
+        if conflict_rad.max(initial=0.0) > CONFLICT_RAD:
+            worst_s = t_s[conflict_rad.max(axis=1).argmax()]
             raise ScenarioError(
-                f"at {at_s:g} s this hand wants another pose than others do: no law can bring the arms "
-                "together, and their distance says nothing of the law; keep one of the operators",
-                path=f"sites.{name}.hands",
+                f"at {worst_s:g} s this hand wants another pose than the others: no law can "
+                "bring the arms together, and their distance says nothing about the law; keep "
+                "one of the operators",
+                path=f"sites.{spring.site}.hands",
                 source=scenario.name,
             )
 
 
 def build_twin(scenario: Scenario) -> Scenario | None:
-    """Returns the same without torques that have no target, and without walls; None where it
-    has neither.
+    """Returns the scenario without walls and without torques that have no target.
+
+    None if the scenario has neither.
     """
     sites = {}
     for name, spec in scenario.sites.items():
         hands = tuple(hand for hand in spec.hands if isinstance(hand, JointSpring))
-        environment = tuple(one for one in spec.environment if not isinstance(one, Wall))
+        environment = tuple(part for part in spec.environment if not isinstance(part, Wall))
         sites[name] = msgspec.structs.replace(spec, hands=hands, environment=environment)
-    return None if sites == scenario.sites else msgspec.structs.replace(scenario, sites=sites)
+    if sites == scenario.sites:
+        return None
+    return msgspec.structs.replace(scenario, sites=sites)
 
 
 def compute_consensus_pose(scenario: Scenario, t_s: Array) -> Array:
-    """Returns q*, the pose of a weightless consensus, shape (K, n), rad, at times of shape
-    (K,), s.
+    """Returns q*, the pose of a weightless consensus (see the head of this module).
+
+    Args:
+        scenario: the scenario.
+        t_s: times, shape (K,), s.
+
+    Returns:
+        The pose at these times, shape (K, n), rad.
     """
     beta = left_perron_vector(scenario.alpha)
     weights = dict(zip(scenario.names, beta, strict=True))
-    start = np.sum(
-        [weights[name] * np.array(spec.q0_rad) for name, spec in scenario.sites.items()], axis=0
-    )
-    stiffness = np.zeros((len(t_s), len(start)))
-    torque = np.zeros((len(t_s), len(start)))
-    for name, spring, on, target in _follow_springs(scenario, t_s):
-        pull = weights[name] * spring * on
-        stiffness += pull
-        torque += pull * target
+    weighted_starts = [
+        weights[name] * np.array(spec.q0_rad) for name, spec in scenario.sites.items()
+    ]
+    start_rad = np.sum(weighted_starts, axis=0)
+
+    stiffness = np.zeros((len(t_s), len(start_rad)))
+    torque = np.zeros((len(t_s), len(start_rad)))
+    for spring in _list_springs(scenario, t_s):
+        weighted_stiffness = weights[spring.site] * spring.stiffness_nm_rad * spring.acts
+        stiffness += weighted_stiffness
+        torque += weighted_stiffness * spring.target_rad
     held = stiffness > 0.0
-    rows = np.vstack(
-        [start, np.divide(torque, stiffness, where=held, out=np.zeros_like(torque))]
-    )
-    last = np.maximum.accumulate(
-        np.where(held, np.arange(1, len(t_s) + 1)[:, np.newaxis], 0), axis=0
-    )
-    return np.take_along_axis(rows, last, axis=0)
+    held_pose_rad = np.divide(torque, stiffness, where=held, out=np.zeros_like(torque))
+
+    # row 0 is the start pose; each joint has the last row at which a spring held it
+    poses_rad = np.vstack([start_rad, held_pose_rad])
+    row_numbers = np.arange(1, len(t_s) + 1)[:, np.newaxis]
+    last_held = np.maximum.accumulate(np.where(held, row_numbers, 0), axis=0)
+    return np.take_along_axis(poses_rad, last_held, axis=0)
 
 
-def _follow_springs(
-    scenario: Scenario, t_s: Array
-) -> Iterator[tuple[str, Array, Array, Array]]:
-    """Yields each spring's site, stiffness, where it is at work, 0 or 1, shape (K, 1), and
-    target, rad.
+class _SpringHistory(NamedTuple):
+    """A spring operator at given times.
+
+    Attributes:
+        site: the site of the operator.
+        stiffness_nm_rad: stiffness per joint, shape (n,), N m/rad.
+        acts: 1 at times at which the spring acts, else 0; shape (K, 1).
+        target_rad: target of the spring, shape (K, n), rad.
+    """
+
+    site: str
+    stiffness_nm_rad: Array
+    acts: Array
+    target_rad: Array
+
+
+def _list_springs(scenario: Scenario, t_s: Array) -> Iterator[_SpringHistory]:
+    """Yields the spring operators of all sites.
+
+    Args:
+        scenario: the scenario.
+        t_s: times, shape (K,), s.
     """
     for name, spec in scenario.sites.items():
-        for hand in (hand for hand in spec.hands if isinstance(hand, JointSpring)):
-            on = ((t_s >= hand.start_s) & (t_s < hand.end_s))[:, np.newaxis].astype(np.float64)
-            yield (
-                name,
-                np.array(hand.stiffness_nm_rad),
-                on,
-                compute_target_motion(hand.actor, t_s)[0],
+        for hand in spec.hands:
+            if not isinstance(hand, JointSpring):
+                continue
+            acts = (t_s >= hand.start_s) & (t_s < hand.end_s)
+            target_rad, _ = compute_target_motion(hand.actor, t_s)
+            yield _SpringHistory(
+                site=name,
+                stiffness_nm_rad=np.array(hand.stiffness_nm_rad),
+                acts=acts[:, np.newaxis].astype(np.float64),
+                target_rad=target_rad,
             )
 
 
 STRAYED_RAD = 0.2
-"""Arms whose mean is further than this from where they ought to be fell, hang, or were thrown
-there.
+"""Arms have strayed if their mean is further than this from q*: they fell, hang or were thrown.
 """
 TOGETHER_RAD = 0.02
-"""Arms no further than this from their mean are together."""
+"""Arms agree if each joint is no further than this from the mean of the arms."""
 
 
 class CandidateClass(StrEnum):
-    """Class of a candidate, from the worst to the best, in the order in which it is asked; as
-    in JSON.
+    """Class of a candidate, from the worst to the best; the values are those in JSON.
+
+    The first class that applies counts.
     """
 
     DIVERGED = "diverged"
@@ -164,26 +206,26 @@ class CandidateClass(StrEnum):
 
     @property
     def word(self) -> str:
-        """The word for people: that of the judgement, where the judgement decides."""
-        words = {
-            CandidateClass.OSCILLATED: Stability.NOT_STABLE,
-            CandidateClass.SETTLED: Stability.STABLE,
-        }
-        return words.get(self, self).value
+        """The word for people; for the judgement of a run it is the word of the certificate."""
+        if self is CandidateClass.OSCILLATED:
+            return Stability.NOT_STABLE.value
+        if self is CandidateClass.SETTLED:
+            return Stability.STABLE.value
+        return self.value
 
 
 CLASS_MEANINGS = {
-    CandidateClass.DIVERGED: "not stable: a joint left the speed limit",
-    CandidateClass.OSCILLATED: "it swings on, drifts or grows",
-    CandidateClass.STRAYED: f"the mean pose ends more than {STRAYED_RAD} rad from where a weightless "
-    "consensus stands, or would after as long again: the arms fell, hang, sink, or were thrown there",
-    CandidateClass.APART: f"an arm ends more than {TOGETHER_RAD} rad from the mean of all",
-    CandidateClass.OPEN: "it hardly decays, or is undecided: a longer run may tell",
-    CandidateClass.SETTLED: "it converged or decays, and none of these holds",
+    CandidateClass.DIVERGED: "not stable: a joint exceeded the speed limit",
+    CandidateClass.OSCILLATED: "it keeps oscillating, drifts or grows",
+    CandidateClass.STRAYED: (
+        f"the mean pose ends more than {STRAYED_RAD} rad from the pose of a weightless "
+        "consensus, or would after as long again: the arms fell, hang, sink, or were thrown"
+    ),
+    CandidateClass.APART: f"an arm ends more than {TOGETHER_RAD} rad from the mean of all arms",
+    CandidateClass.OPEN: "it hardly decays, or is undecided: a longer run may decide",
+    CandidateClass.SETTLED: "it converged or decays, and no other class applies",
 }
-"""What the classes mean, as far as the judgement of a run (docs/definitions.md) does not say
-it.
-"""
+"""The meanings of the classes; docs/definitions.md defines the judgement of a run."""
 
 
 def classify_candidate(
@@ -192,97 +234,111 @@ def classify_candidate(
     """Returns the class of a candidate.
 
     Args:
-        ends: the judgements of its run and of its twin; where it has none, the same twice.
-        fall_rad: largest distance, over joints, of the twin's mean pose from q*, after as long
-            again at the pace at which it grew in the second half.
-        apart_rad: largest distance of a joint from the mean of the sites in that second.
+        ends: the judgements of the candidate's run and of its twin; without a twin, the same
+            judgement twice.
+        fall_rad: predicted distance of the twin's mean pose from q*, the largest over joints:
+            the distance at the end of a run twice as long, if the distance keeps growing at the
+            pace of the second half.
+        apart_rad: largest distance of a joint from the mean of the sites, in the last second.
     """
-    found = {end.stability for end in ends}
+    stabilities = {end.stability for end in ends}
     if any(end.behaviour is EndBehaviour.DIVERGED for end in ends):
         return CandidateClass.DIVERGED
-    if Stability.NOT_STABLE in found:
+    if Stability.NOT_STABLE in stabilities:
         return CandidateClass.OSCILLATED
     if fall_rad > STRAYED_RAD:
         return CandidateClass.STRAYED
     if apart_rad > TOGETHER_RAD:
         return CandidateClass.APART
-    return CandidateClass.OPEN if Stability.OPEN in found else CandidateClass.SETTLED
+    return CandidateClass.OPEN if Stability.OPEN in stabilities else CandidateClass.SETTLED
 
 
 _SHORT_S = 0.5
-_LOOKS = 2000
+"""A log that ends this much before the planned duration is reported as short, s."""
+_POSE_SAMPLES = 2000
+"""Number of times at which the consensus pose of a log is computed."""
 
 
 def check_final_posture(log: Log) -> list[str]:
-    """Returns what to say of how a log ended, a sentence each; nothing where its arms stand at
-    its end.
+    """Returns warnings about the end of a log, a sentence each.
+
+    There are no warnings if the log is complete and its arms stand at the end.
 
     Raises:
         LogError: a record cannot be read.
     """
-    diverged = [s for s in log.sites if len(log[s]) and log[s].record(-1).mode == "diverged"]
+    parts = {site: log[site] for site in log.sites if len(log[site])}
+    diverged = [site for site, part in parts.items() if part.record(-1).mode == "diverged"]
     if diverged:
         return [f"{', '.join(diverged)} diverged: its figures end there"]
-    parts = {site: log[site] for site in log.sites if len(log[site])}
-    ends = {
-        site: part.q[part.t_s > part.t_s[-1] - END_WINDOW_S].mean(axis=0)
-        for site, part in parts.items()
-    }
+
     warnings = []
-    last_s = min((float(part.t_s[-1]) for part in parts.values()), default=0.0)
-    wanted_s = log.scenario.duration_s
-    if last_s <= wanted_s - _SHORT_S:
+    end_s = min((float(part.t_s[-1]) for part in parts.values()), default=0.0)
+    planned_s = log.scenario.duration_s
+    if end_s <= planned_s - _SHORT_S:
         warnings.append(
-            f"ends at {last_s:.4g} s of {wanted_s:g} s: its figures are of a shorter run"
+            f"ends at {end_s:.4g} s of {planned_s:g} s: its figures are of a shorter run"
         )
-    hanging = find_hanging_sites(log.scenario, ends)
-    if not hanging:
-        return [*warnings, *_warn_fallen(log, ends)]
-    verb = "hangs" if len(hanging) == 1 else "hang"
-    why = "small errors and torques of arms that hang say nothing of a law"
-    return [*warnings, f"{', '.join(hanging)} {verb} at the end: {why}"]
+
+    end_poses_rad = {}
+    for site, part in parts.items():
+        in_last_second = part.t_s > part.t_s[-1] - END_WINDOW_S
+        end_poses_rad[site] = part.q[in_last_second].mean(axis=0)
+    hanging = find_hanging_sites(log.scenario, end_poses_rad)
+    if hanging:
+        verb = "hangs" if len(hanging) == 1 else "hang"
+        warnings.append(
+            f"{', '.join(hanging)} {verb} at the end: small errors and torques of arms that "
+            "hang say nothing about a law"
+        )
+        return warnings
+    return [*warnings, *_warn_fallen(log, end_poses_rad)]
 
 
-def _warn_fallen(log: Log, ends: dict[str, Array]) -> list[str]:
-    """Warns if the mean pose left the consensus, and no operator or environment can be the
-    cause.
+def _warn_fallen(log: Log, end_poses_rad: dict[str, Array]) -> list[str]:
+    """Returns a warning if the mean pose of a log ends far from the consensus, else nothing.
+
+    An operator or an environment that could be the cause excludes a warning.
     """
     scenario = log.scenario
     try:
         check_comparable(scenario)
-    except ScenarioError:  # there is no one pose to speak of
+    except ScenarioError:  # the scenario has no common pose
         return []
-    if build_twin(scenario) is not None or len(ends) < len(scenario.names):
+    if build_twin(scenario) is not None or len(end_poses_rad) < len(scenario.names):
         return []
-    t_s = np.linspace(0.0, min(float(log[site].t_s[-1]) for site in ends), _LOOKS)
-    away = np.mean(list(ends.values()), axis=0) - compute_consensus_pose(scenario, t_s)[-1]
-    joint = int(np.abs(away).argmax())
-    if abs(away[joint]) <= STRAYED_RAD:
+    end_s = min(float(log[site].t_s[-1]) for site in end_poses_rad)
+    t_s = np.linspace(0.0, end_s, _POSE_SAMPLES)
+    mean_rad = np.mean(list(end_poses_rad.values()), axis=0)
+    distance_rad = np.abs(mean_rad - compute_consensus_pose(scenario, t_s)[-1])
+    joint = int(distance_rad.argmax())
+    if distance_rad[joint] <= STRAYED_RAD:
         return []
     return [
-        f"the arms end {abs(away[joint]):.2g} rad (joint {joint + 1}) from where a weightless consensus "
-        "would stand: they sank, or drifted"
+        f"the arms end {distance_rad[joint]:.2g} rad (joint {joint + 1}) from where a "
+        "weightless consensus would stand: they sank, or drifted"
     ]
 
 
 class CandidateScore(msgspec.Struct, frozen=True):
-    """One candidate, measured; the formulas stand in docs/fair-comparison.md.
+    """The measured score of a candidate; docs/fair-comparison.md has the formulas.
 
     Attributes:
-        outcome: its class.
-        error_rad: RMS distance of the arms from where they ought to be; None where the run
-            diverged.
-        spread_rad: the part of it that is the arms' distance from each other, at one instant,
-            undelayed.
-        pose_rad: the part of it that is the distance of their mean from the pose.
-        effort_nm: RMS torque beyond what gravity asks at the pose where the arm is.
-        settled_s: since when the largest |e| is below 0.01 rad; None where it is not at the
-            end.
+        outcome: the class of the candidate.
+        error_rad: RMS distance of the arms from q*, in rad; None if the run diverged.
+        spread_rad: the part of the error that is the distance between the arms at the same
+            time, without delays.
+        pose_rad: the part of the error that is the distance of the arms' mean from q*.
+        effort_nm: RMS of the torque minus the gravity torque at the arm's own pose, in N m.
+        settled_s: time from which the largest |e| stays below 0.01 rad, in s; None if the
+            largest |e| is not below 0.01 rad at the end.
         saturated: share of all joint torques that were at the clamp.
-        diverged_s: when the first site left its limits, or None.
-        seeds: how many runs it is the mean of; its outcome is the worst of theirs.
-        error_half_rad, effort_half_nm: half the width of the 95 % interval of that mean; None
-        of one run.
+        diverged_s: time at which the first site left its limits, in s, or None.
+        seeds: number of runs over which the score is averaged; the outcome is the worst of
+            them.
+        error_half_rad: half the width of the 95 % interval of the mean error; None for a single
+            run.
+        effort_half_nm: the same for the mean effort.
     """
 
     outcome: CandidateClass
@@ -298,21 +354,27 @@ class CandidateScore(msgspec.Struct, frozen=True):
     effort_half_nm: float | None = None
 
 
+_AVERAGED = ("error_rad", "spread_rad", "pose_rad", "effort_nm", "settled_s", "saturated")
+"""Fields of a score that are averaged over the seeds."""
+
+
 def average_scores(scores: Sequence[CandidateScore]) -> CandidateScore:
-    """Returns the score of a candidate from those of its seeds; a number that one of them lacks
-    is None.
+    """Returns the score of a candidate from the scores of its seeds.
+
+    A number that is missing for one of the seeds is None.
     """
     if len(scores) == 1:
         return scores[0]
     rank = list(CandidateClass)
     worst = min(scores, key=lambda score: rank.index(score.outcome))
-    named = ("error_rad", "spread_rad", "pose_rad", "effort_nm", "settled_s", "saturated")
-    means = {name: mean_interval([getattr(score, name) for score in scores]) for name in named}
+    means = {}
+    for field in _AVERAGED:
+        means[field] = mean_interval([getattr(score, field) for score in scores])
     error = means["error_rad"]
     effort = means["effort_nm"]
     return msgspec.structs.replace(
         worst,
-        **{name: mean and mean.mean for name, mean in means.items()},
+        **{field: mean and mean.mean for field, mean in means.items()},
         seeds=len(scores),
         error_half_rad=error and error.half,
         effort_half_nm=effort and effort.half,
@@ -320,32 +382,52 @@ def average_scores(scores: Sequence[CandidateScore]) -> CandidateScore:
 
 
 def measure_candidate(text: str, twin_text: str | None) -> CandidateScore:
-    """Runs a candidate and its twin, and returns its score."""
-    run = _run(parse_scenario(text))
-    alone = run if twin_text is None else _run(parse_scenario(twin_text))
-    outcome = classify_candidate((run.end, alone.end), alone.fall_rad, alone.apart_rad)
-    diverged_s = [
-        end.diverged_at_s for end in (run.end, alone.end) if end.diverged_at_s is not None
-    ]
+    """Runs a candidate and its twin, and returns the candidate's score.
+
+    Args:
+        text: the canonical text of the candidate's scenario.
+        twin_text: the canonical text of the twin's scenario; None if the candidate has no twin
+            and is judged itself.
+    """
+    run = _measure_run(parse_scenario(text))
+    twin = run if twin_text is None else _measure_run(parse_scenario(twin_text))
+    ends = (run.end, twin.end)
+    outcome = classify_candidate(ends, twin.fall_rad, twin.apart_rad)
+    diverged_s = [end.diverged_at_s for end in ends if end.diverged_at_s is not None]
     if diverged_s:
         return CandidateScore(
-            outcome, None, None, None, None, None, run.saturated, diverged_s[0]
+            outcome=outcome,
+            error_rad=None,
+            spread_rad=None,
+            pose_rad=None,
+            effort_nm=None,
+            settled_s=None,
+            saturated=run.saturated,
+            diverged_s=diverged_s[0],
         )
-    error_rad = float(np.hypot(run.spread_rad, alone.pose_rad))
     return CandidateScore(
-        outcome,
-        error_rad,
-        run.spread_rad,
-        alone.pose_rad,
-        run.effort_nm,
-        run.settled_s,
-        run.saturated,
+        outcome=outcome,
+        error_rad=float(np.hypot(run.spread_rad, twin.pose_rad)),
+        spread_rad=run.spread_rad,
+        pose_rad=twin.pose_rad,
+        effort_nm=run.effort_nm,
+        settled_s=run.settled_s,
+        saturated=run.saturated,
     )
 
 
-class _Run(NamedTuple):
-    """What is measured of one run; `fall_rad` and `apart_rad` as `classify_candidate` takes
-    them.
+class _RunMeasures(NamedTuple):
+    """The measures of one run.
+
+    Attributes:
+        end: the judgement of the run.
+        fall_rad: see `classify_candidate`.
+        apart_rad: see `classify_candidate`.
+        spread_rad: RMS distance of the arms from their mean, in rad.
+        pose_rad: RMS distance of the arms' mean from q*, in rad.
+        effort_nm: see `CandidateScore`.
+        settled_s: see `CandidateScore`.
+        saturated: see `CandidateScore`.
     """
 
     end: RunEnd
@@ -358,50 +440,96 @@ class _Run(NamedTuple):
     saturated: float
 
 
-def _run(scenario: Scenario) -> _Run:
-    of_site, end = run_whole(scenario)
-    records = list(of_site.values())
-    t_s, q, e = _aligned(records)
-    mean = q.mean(axis=0)
-    apart = q - mean
-    off = mean - compute_consensus_pose(scenario, t_s)
-    last = t_s > t_s[-1] - END_WINDOW_S
-    half_s = 0.5 * t_s[-1]
-    middle = (t_s > half_s - END_WINDOW_S) & (t_s <= half_s + 1e-9)
-    end_rad, before_rad = (np.abs(off[part].mean(axis=0)) for part in (last, middle))
-    largest = np.abs(e).max(axis=(0, 2))
-    apart_at_s = t_s[largest >= SETTLED_ERROR_RAD].max(initial=0.0)
-    efforts = []
-    saturated = []
-    for record, site in zip(records, scenario.names, strict=True):
-        beyond_nm = record.tau - build_arm_rows(scenario, site).gravity_torque(record.q)
-        efforts.append(np.mean(beyond_nm**2))
-        saturated.append(
-            np.mean(np.abs(record.tau) >= scenario.sites[site].limits.tau_limit_nm)
-        )
-    return _Run(
+def _measure_run(scenario: Scenario) -> _RunMeasures:
+    """Runs a scenario in virtual time and returns the measures of the run."""
+    records_by_site, end = run_whole(scenario)
+    records = list(records_by_site.values())
+    t_s, q, e = _sample_at_common_times(records)
+    mean_rad = q.mean(axis=0)
+    from_mean_rad = q - mean_rad
+    from_pose_rad = mean_rad - compute_consensus_pose(scenario, t_s)
+    in_last_second = t_s > t_s[-1] - END_WINDOW_S
+    effort_nm, saturated = _measure_torques(scenario, records)
+    return _RunMeasures(
         end=end,
-        fall_rad=float((end_rad + 2.0 * np.maximum(end_rad - before_rad, 0.0)).max()),
-        apart_rad=float(np.abs(apart[:, last]).max()),
-        spread_rad=_rms(apart),
-        pose_rad=_rms(off),
-        effort_nm=float(np.sqrt(np.mean(efforts))),
-        settled_s=float(apart_at_s) if largest[-1] < SETTLED_ERROR_RAD else None,
-        saturated=float(np.mean(saturated)),
+        fall_rad=_predict_fall_rad(t_s, from_pose_rad),
+        apart_rad=float(np.abs(from_mean_rad[:, in_last_second]).max()),
+        spread_rad=_rms(from_mean_rad),
+        pose_rad=_rms(from_pose_rad),
+        effort_nm=effort_nm,
+        settled_s=_find_settling_time(t_s, e),
+        saturated=saturated,
     )
 
 
-def _aligned(records: list[RecordBatch]) -> tuple[Array, Array, Array]:
-    """Returns the ticks of the slowest site, s, and every site's latest q and e at them, shape
-    (N, K, n).
+def _predict_fall_rad(t_s: Array, from_pose_rad: Array) -> float:
+    """Returns the predicted distance from q* in a run twice as long, the largest over joints.
+
+    The distance is taken from means over the second before the middle and over the last second.
+    A growth in the second half goes on for the length of two halves.
+
+    Args:
+        t_s: times, shape (K,), s.
+        from_pose_rad: distance of the mean pose from q*, shape (K, n), rad.
+    """
+    half_s = 0.5 * t_s[-1]
+    at_end = t_s > t_s[-1] - END_WINDOW_S
+    at_half = (t_s > half_s - END_WINDOW_S) & (t_s <= half_s + 1e-9)
+    end_rad = np.abs(from_pose_rad[at_end].mean(axis=0))
+    half_rad = np.abs(from_pose_rad[at_half].mean(axis=0))
+    growth_rad = np.maximum(end_rad - half_rad, 0.0)
+    return float((end_rad + 2.0 * growth_rad).max())
+
+
+def _find_settling_time(t_s: Array, e: Array) -> float | None:
+    """Returns the last time at which |e| is not below 0.01 rad, in s; 0 if there is none.
+
+    None if the largest |e| is not below 0.01 rad at the end.
+
+    Args:
+        t_s: times, shape (K,), s.
+        e: errors, shape (N, K, n), rad.
+    """
+    largest_rad = np.abs(e).max(axis=(0, 2))
+    is_settled = largest_rad[-1] < SETTLED_ERROR_RAD
+    if not is_settled:
+        return None
+    unsettled_s = t_s[largest_rad >= SETTLED_ERROR_RAD]
+    return float(unsettled_s.max(initial=0.0))
+
+
+def _measure_torques(scenario: Scenario, records: Sequence[RecordBatch]) -> tuple[float, float]:
+    """Returns the effort in N m, and the share of the joint torques that were at the clamp."""
+    mean_squares = []
+    saturated_shares = []
+    for record, site in zip(records, scenario.names, strict=True):
+        gravity_nm = build_arm_rows(scenario, site).gravity_torque(record.q)
+        mean_squares.append(np.mean((record.tau - gravity_nm) ** 2))
+        limit_nm = scenario.sites[site].limits.tau_limit_nm
+        saturated_shares.append(np.mean(np.abs(record.tau) >= limit_nm))
+    return float(np.sqrt(np.mean(mean_squares))), float(np.mean(saturated_shares))
+
+
+def _sample_at_common_times(records: Sequence[RecordBatch]) -> tuple[Array, Array, Array]:
+    """Returns the times of the slowest site's ticks, and the latest q and e of all sites.
+
+    Args:
+        records: the records of each site.
+
+    Returns:
+        The times, shape (K,), s; the joint angles, shape (N, K, n), rad; and the errors, shape
+        (N, K, n), rad.
     """
     end_ns = min(record.t_ns[-1] for record in records)
-    slowest = min((record.t_ns for record in records), key=len)
-    at_ns = slowest[slowest <= end_ns]
-    latest = [np.searchsorted(record.t_ns, at_ns, side="right") - 1 for record in records]
-    q = np.array([record.q[rows] for record, rows in zip(records, latest, strict=True)])
-    e = np.array([record.e[rows] for record, rows in zip(records, latest, strict=True)])
-    return at_ns / NS_PER_S, q, e
+    slowest_ns = min((record.t_ns for record in records), key=len)
+    times_ns = slowest_ns[slowest_ns <= end_ns]
+    q = []
+    e = []
+    for record in records:
+        latest = np.searchsorted(record.t_ns, times_ns, side="right") - 1
+        q.append(record.q[latest])
+        e.append(record.e[latest])
+    return times_ns / NS_PER_S, np.array(q), np.array(e)
 
 
 def _rms(values: Array) -> float:
@@ -409,62 +537,75 @@ def _rms(values: Array) -> float:
 
 
 class TuningScenario(NamedTuple):
-    """The experiment in which laws are compared; a command calls it by source and overrides
-    KEY=VALUE.
+    """The experiment in which laws are compared, with its overrides.
+
+    Attributes:
+        experiment: the experiment as its author wrote it.
+        overrides: the overrides, as texts KEY=VALUE.
+        scenario: the experiment with the overrides.
     """
 
-    written: ExperimentText
+    experiment: ExperimentText
     overrides: tuple[str, ...]
     scenario: Scenario
 
     @property
     def source(self) -> str:
-        """What a command calls it."""
-        return self.written.label
+        """The name of the experiment in a command."""
+        return self.experiment.label
 
     def with_controls(self, controls: SiteControls) -> "TuningScenario":
-        """Returns the same with the control of every site replaced, in as few settings as say
-        it.
+        """Returns the experiment with the control of every site replaced.
+
+        If all sites have the same control, a single override sets it, unless a site of the
+        experiment has gains of its own. Otherwise there is an override per site.
         """
-        single = [
+        site_overrides = [
             f"sites.{name}.control={format_toml_value(table)}"
             for name, table in controls.items()
         ]
-        wanted = self.written.load([*self.overrides, *single])
+        overrides = (*self.overrides, *site_overrides)
+        scenario = self.experiment.load(overrides)
         first = next(iter(controls.values()))
         if all(table == first for table in controls.values()):
-            texts = (*self.overrides, f"control={format_toml_value(first)}")
-            # a site has gains of its own, which are none of this law
+            common_overrides = (*self.overrides, f"control={format_toml_value(first)}")
+            # gains that a site of the experiment has may not belong to this law
             with suppress(ScenarioError):
-                scenario = self.written.load(texts)
-                if scenario.sites == wanted.sites:
-                    return TuningScenario(self.written, texts, scenario)
-        return TuningScenario(self.written, (*self.overrides, *single), wanted)
+                common_scenario = self.experiment.load(common_overrides)
+                if common_scenario.sites == scenario.sites:
+                    return self._replace(overrides=common_overrides, scenario=common_scenario)
+        return self._replace(overrides=overrides, scenario=scenario)
 
     def with_gains(
         self, space: SearchSpace, knowledge: ModelInformation, gains: GainValues
     ) -> "TuningScenario":
-        """Returns the same under a law with a choice of gains."""
+        """Returns the experiment under a law with a choice of gains.
+
+        Args:
+            space: the law and its gains.
+            knowledge: the model information that the law gets.
+            gains: the values of the gains.
+        """
         return self.with_controls(space.controls(self.scenario, knowledge, gains))
 
     @property
     def texts(self) -> tuple[str, str | None]:
-        """The canonical texts of its scenario and of its twin."""
-        alone = build_twin(self.scenario)
-        return self.scenario.text, None if alone is None else alone.text
+        """The canonical texts of the scenario and of its twin; None without a twin."""
+        twin = build_twin(self.scenario)
+        return self.scenario.text, None if twin is None else twin.text
 
     @property
     def command(self) -> str:
-        """The command that makes a log of it."""
+        """The command that makes a log of the experiment."""
         return format_command("sim", self.source, *set_options(self.overrides))
 
 
 class CandidateItem(NamedTuple):
-    """One candidate to be run.
+    """Task of a worker: the runs of one candidate.
 
     Attributes:
-        runs: of each seed the canonical texts of its scenario and of its twin.
-        name: what it is called.
+        runs: for each seed the canonical texts of the scenario and of its twin.
+        name: the name of the candidate, for messages.
     """
 
     runs: tuple[tuple[str, str | None], ...]
@@ -475,24 +616,32 @@ class CandidateItem(NamedTuple):
 
 
 def build_candidate_item(seeds: Sequence[TuningScenario]) -> CandidateItem:
-    """Returns what has to be run to measure one candidate, given with every seed."""
+    """Returns the task that measures a candidate.
+
+    Args:
+        seeds: the candidate's experiment with each seed.
+    """
     name = ", ".join(seeds[0].overrides) or seeds[0].source
-    return CandidateItem(tuple(one.texts for one in seeds), name)
+    return CandidateItem(tuple(seed.texts for seed in seeds), name)
 
 
 def measure_candidate_task(task: CandidateItem) -> CandidateScore:
-    """Runs one task, in whatever process."""
-    return average_scores([measure_candidate(*run) for run in task.runs])
+    """Runs a candidate with all of its seeds and returns its score; any worker can do it."""
+    scores = [measure_candidate(text, twin_text) for text, twin_text in task.runs]
+    return average_scores(scores)
 
 
 def load_tuning_scenario(
     source: str | Path | Mapping[str, Any] | Scenario, overrides: Sequence[str] = ()
 ) -> TuningScenario:
-    """Returns the experiment that a name, a path, a text, tables or a scenario mean with
-    overrides.
+    """Returns an experiment with overrides.
+
+    Args:
+        source: the experiment: a shipped name, a path, a TOML text, tables or a scenario.
+        overrides: the overrides, as texts KEY=VALUE.
 
     Raises:
-        ScenarioError: there is none.
+        ScenarioError: the experiment does not exist, or is not valid with the overrides.
     """
-    written = read_experiment(source)
-    return TuningScenario(written, tuple(overrides), written.load(overrides))
+    experiment = read_experiment(source)
+    return TuningScenario(experiment, tuple(overrides), experiment.load(overrides))

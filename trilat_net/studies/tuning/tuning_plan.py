@@ -1,15 +1,20 @@
-"""The tuning procedure: the plan, its cost, the search that every control law gets, and the
-Pareto front.
+"""The tuning procedure: the plan of a comparison, the search of each law, and the Pareto front.
 
-Invariant: the result is a function of the plan alone; neither the number of processes nor their
-speed enters. The gains tried are a function of the seed, the search space and the scores of
-earlier rounds; their number is the budget. Half is a Latin hypercube in the logarithm of the
-gains (McKay, Beckman and Conover, Technometrics 21, 1979), half refinement of its front. Both
-objectives, error and effort, are minimised, only stable runs at the pose compete, and of equal
-ones the first stays. The gains that the paper prints are measured, never searched, and stand on
-no front.
+Every law gets the same number of candidates. The first half is a Latin hypercube in the
+logarithms of the gains (McKay, Beckman and Conover, Technometrics 21, 1979). The second half
+refines the law's own front, in four rounds with shrinking steps.
+
+Invariant:
+    - The result is a function of the plan alone: neither the number of processes nor their
+      speed enters.
+    - The candidates are a function of the seed, the search space and the scores of earlier
+      rounds. Their number is the budget.
+    - Both objectives, error and effort, are minimised.
+    - Only stable runs that end at the pose compete. Of equal runs the first stays.
+    - The gains that the paper prints are measured, never searched, and stand on no front.
 """
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -29,10 +34,10 @@ from ...results import Result
 from ...scenario import Scenario
 from ...scenario.imported_code import name_law_classes
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
-from . import search_space
 from .candidate import (
     CLASS_MEANINGS,
     CandidateClass,
+    CandidateItem,
     CandidateScore,
     TuningScenario,
     build_candidate_item,
@@ -42,85 +47,112 @@ from .candidate import (
     measure_candidate,
     measure_candidate_task,
 )
-from .search_space import SearchSpace
+from .search_space import (
+    PAPER_GAINS,
+    SEARCH_SPACES,
+    ModelInformation,
+    SearchSpace,
+    build_model_information,
+    select_search_spaces,
+    weigh_joints,
+)
 
 ObjectivePoint = tuple[float, float]
+"""The objective and the effort of a run."""
 
 
 class Objective(StrEnum):
-    """What is weighed against effort."""
+    """The objective that is minimised besides effort."""
 
     ERROR = "error"
     SETTLING = "settling"
 
     @property
     def unit(self) -> str:
-        """Its unit."""
+        """Unit of the objective."""
         return "rad" if self is Objective.ERROR else "s"
 
     def point(self, score: CandidateScore) -> ObjectivePoint | None:
-        """Returns (objective, effort) of a run that may stand on a front, else None."""
+        """Returns (objective, effort) of a run, or None if the run may not stand on a front."""
         value = score.error_rad if self is Objective.ERROR else score.settled_s
-        if (
-            score.outcome is not CandidateClass.SETTLED
-            or value is None
-            or score.effort_nm is None
-        ):
+        if score.outcome is not CandidateClass.SETTLED:
+            return None
+        if value is None or score.effort_nm is None:
             return None
         return value, score.effort_nm
 
 
 def find_pareto_front(points: Sequence[ObjectivePoint | None]) -> list[int]:
-    """Returns the places of the points that none dominates, by rising effort; None does not
-    compete.
+    """Returns the indices of the points that no point dominates, by rising effort.
+
+    Args:
+        points: the points; None stands for a run that does not compete.
     """
-    order = sorted(
-        (point[1], point[0], n) for n, point in enumerate(points) if point is not None
-    )
-    kept: list[int] = []
-    least = float("inf")
-    for _, value, n in order:
-        if value < least:
-            kept.append(n)
-            least = value
-    return kept
+    competitors = []
+    for index, point in enumerate(points):
+        if point is not None:
+            value, effort_nm = point
+            competitors.append((effort_nm, value, index))
+    front = list[int]()
+    least_value = float("inf")
+    for _, value, index in sorted(competitors):
+        if value < least_value:
+            front.append(index)
+            least_value = value
+    return front
 
 
 def compute_crowding(points: Sequence[ObjectivePoint]) -> list[float]:
-    """Returns how alone each point of a front is: the side of the box between its neighbours;
-    ends: inf.
+    """Returns the crowding distance of each point of a front: large for an isolated point.
 
-    After Deb, Pratap, Agarwal and Meyarivan, "A fast and elitist multiobjective genetic
-    algorithm: NSGA-II", IEEE Trans. Evolutionary Computation 6 (2002).
+    The distance is half the perimeter of the box between the neighbours of the point, each side
+    relative to the span of the front. The two ends have infinity. Source: Deb, Pratap, Agarwal
+    and Meyarivan, "A fast and elitist multiobjective genetic algorithm: NSGA-II", IEEE Trans.
+    Evolutionary Computation 6 (2002).
+
+    Args:
+        points: the points of the front, by rising effort.
     """
     if len(points) < 3:
         return [float("inf")] * len(points)
-    spans = [abs(points[-1][axis] - points[0][axis]) or 1.0 for axis in (0, 1)]
-    inner = [
-        sum(abs(after[axis] - before[axis]) / spans[axis] for axis in (0, 1))
-        for before, after in zip(points[:-2], points[2:], strict=True)
-    ]
-    return [float("inf"), *inner, float("inf")]
+    value_span = abs(points[-1][0] - points[0][0]) or 1.0
+    effort_span = abs(points[-1][1] - points[0][1]) or 1.0
+    distances = [float("inf")]
+    for before, after in zip(points[:-2], points[2:], strict=True):
+        value_side = abs(after[0] - before[0]) / value_span
+        effort_side = abs(after[1] - before[1]) / effort_span
+        distances.append(value_side + effort_side)
+    distances.append(float("inf"))
+    return distances
 
 
 REFINEMENT_STEPS = (0.12, 0.08, 0.05, 0.03)
-"""Deviation of the refinements, round by round, as a share of the logarithm of a gain's range.
+"""Standard deviation of the steps of each refinement round, as a share of the logarithm of a
+gain's range.
 """
 GAIN_DIGITS = 4
-"""Gains are rounded to so many significant digits before they are tried, so that a command can
-name them.
+"""Significant digits to which gains are rounded before they are run: a command can name them.
 """
 
 CandidateGains = dict[str, float]
 
 
 class CandidateSearch:
-    """One law's search, and what it found.
+    """The search of one law's gains, round by round.
+
+    In each round the caller runs the candidates of `propose_candidates` and passes their scores
+    to `record_scores`.
+
+    Args:
+        space: the law and the ranges of its gains.
+        budget: number of candidates.
+        seed: seed of the search, the same for every law.
+        objective: the objective besides effort.
 
     Attributes:
-        tried: the gains that were tried, in order.
-        scores: what came of them, in the same order.
-        rounds: how many candidates each round has; the budget in all.
+        tried: the gains of all candidates that have run, in order.
+        scores: the scores of these candidates, in the same order.
+        rounds: number of candidates of each round; the sum is the budget.
     """
 
     def __init__(
@@ -130,89 +162,116 @@ class CandidateSearch:
         self.tried: list[CandidateGains] = []
         self.scores: list[CandidateScore] = []
         self._objective = objective
-        self._rng = np.random.default_rng(seed)  # the same for every law
-        self._logs = np.log([[knob.low, knob.high] for knob in space.knobs])
-        first = (budget + 1) // 2
-        count = len(REFINEMENT_STEPS)
-        share, more = divmod(budget - first, count)
-        self.rounds = [first, *(share + (n < more) for n in range(count))]
+        self._rng = np.random.default_rng(seed)
+        log_bounds = np.log([[knob.low, knob.high] for knob in space.knobs])
+        self._log_low = log_bounds[:, 0]
+        self._log_range = log_bounds[:, 1] - log_bounds[:, 0]
+        sampled = (budget + 1) // 2
+        refinements = len(REFINEMENT_STEPS)
+        share, remainder = divmod(budget - sampled, refinements)
+        self.rounds = [sampled, *(share + (n < remainder) for n in range(refinements))]
 
     @property
     def points(self) -> list[ObjectivePoint | None]:
-        """(objective, effort) of every candidate; None of one that may stand on no front."""
+        """(objective, effort) of each candidate; None if it may not stand on a front."""
         return [self._objective.point(score) for score in self.scores]
 
     @property
     def front(self) -> list[int]:
-        """Places of the candidates that none of the same law dominates, by rising effort."""
+        """Indices of the candidates that no candidate of this law dominates, by effort."""
         return find_pareto_front(self.points)
 
     @property
+    def front_points(self) -> list[ObjectivePoint]:
+        """(objective, effort) of the candidates on the front, by rising effort."""
+        points = self.points
+        return [point for index in self.front if (point := points[index]) is not None]
+
+    @property
     def outcomes(self) -> dict[CandidateClass, int]:
-        """How many candidates are of each class, all of them counted."""
-        return {
-            outcome: sum(score.outcome is outcome for score in self.scores)
-            for outcome in CandidateClass
-        }
+        """Number of candidates of each class."""
+        counts = Counter(score.outcome for score in self.scores)
+        return {outcome: counts[outcome] for outcome in CandidateClass}
 
-    def ask(self, number: int) -> list[CandidateGains]:
-        """Returns the candidates of a round; `tell` has taken all earlier ones."""
-        shape = self.rounds[number], len(self.space.knobs)
-        if number == 0:
-            # takes half a second, which most commands can do without
-            from scipy.stats import (
-                qmc,
-            )
+    def propose_candidates(self, round_number: int) -> list[CandidateGains]:
+        """Returns the candidates of a round, after all earlier rounds have been recorded.
 
-            places = qmc.LatinHypercube(shape[1], rng=self._rng).random(shape[0])
+        Args:
+            round_number: 0 for the Latin hypercube, then the refinement rounds.
+        """
+        shape = (self.rounds[round_number], len(self.space.knobs))
+        if round_number == 0:
+            # imported late: SciPy costs half a second, and most commands do not need it
+            from scipy.stats import qmc
+
+            count, dimensions = shape
+            positions = qmc.LatinHypercube(dimensions, rng=self._rng).random(count)
         else:
-            parents = self._parents(shape[0])
-            moved = parents + REFINEMENT_STEPS[number - 1] * self._rng.standard_normal(shape)
-            places = np.clip(moved, 0.0, 1.0)
-        return [self._gains(place) for place in places]
+            parents = self._select_parents(shape[0])
+            deviation = REFINEMENT_STEPS[round_number - 1]
+            steps = deviation * self._rng.standard_normal(shape)
+            positions = np.clip(parents + steps, 0.0, 1.0)
+        return [self._compute_gains(position) for position in positions]
 
-    def tell(self, gains: Sequence[CandidateGains], scores: Sequence[CandidateScore]) -> None:
-        """Takes what came of a round's candidates."""
+    def record_scores(
+        self, gains: Sequence[CandidateGains], scores: Sequence[CandidateScore]
+    ) -> None:
+        """Records the scores of a round's candidates.
+
+        Args:
+            gains: the candidates.
+            scores: their scores, in the same order.
+        """
         self.tried += gains
         self.scores += scores
 
-    def _parents(self, count: int) -> Array:
-        """Returns places to refine: every other time the best, else the loneliest points of the
-        front.
+    def _select_parents(self, count: int) -> Array:
+        """Returns the positions that a round refines, shape (count, gains), each in [0, 1].
 
-        Where nothing settled yet, those that erred least without diverging; where all diverged,
-        anything.
+        Every other parent is the best candidate. The others take turns by rank, see
+        `_rank_candidates`.
         """
-        points = self.points
-        places = self.front
-        if places:
-            lonely = compute_crowding([points[n] or (0.0, 0.0) for n in places])
-            by_space = [
-                n
-                for _, n in sorted(zip(lonely, places, strict=True), key=lambda pair: -pair[0])
-            ]
-            best = places[-1]
-        else:
-            errors = [
-                (s.outcome is CandidateClass.DIVERGED, s.error_rad or 0.0) for s in self.scores
-            ]
-            by_space = sorted(range(len(errors)), key=errors.__getitem__)
-            best = by_space[0]
-            by_space = by_space[: max(1, count // 4)]
-        chosen = [
-            best if k % 2 == 0 else by_space[k // 2 % len(by_space)] for k in range(count)
-        ]
-        tried = [[self.tried[n][knob.name] for knob in self.space.knobs] for n in chosen]
-        logs = np.log(np.reshape(tried, (count, len(self.space.knobs))))
-        parents: Array = (logs - self._logs[:, 0]) / (self._logs[:, 1] - self._logs[:, 0])
-        return parents
+        best, ranked = self._rank_candidates(count)
+        parents = []
+        for n in range(count):
+            index = best if n % 2 == 0 else ranked[n // 2 % len(ranked)]
+            parents.append([self.tried[index][knob.name] for knob in self.space.knobs])
+        logs = np.log(np.reshape(parents, (count, len(self.space.knobs))))
+        positions: Array = (logs - self._log_low) / self._log_range
+        return positions
 
-    def _gains(self, place: Array) -> CandidateGains:
-        logs = self._logs[:, 0] + place * (self._logs[:, 1] - self._logs[:, 0])
-        return {
-            knob.name: min(max(float(f"{np.exp(log):.{GAIN_DIGITS}g}"), knob.low), knob.high)
-            for knob, log in zip(self.space.knobs, logs, strict=True)
-        }
+    def _rank_candidates(self, count: int) -> tuple[int, list[int]]:
+        """Returns the index of the best candidate, and the indices of candidates to refine.
+
+        With a front, the best candidate has the least objective, and the most isolated points
+        of the front come first. Without a front, the candidates with the least error come
+        first, those that diverged last; a quarter of `count` of them is kept.
+        """
+        front = self.front
+        if front:
+            distances = compute_crowding(self.front_points)
+            crowding = dict(zip(front, distances, strict=True))
+            ranked = sorted(front, key=lambda index: -crowding[index])
+            return front[-1], ranked
+        keys = []
+        for score in self.scores:
+            diverged = score.outcome is CandidateClass.DIVERGED
+            keys.append((diverged, score.error_rad or 0.0))
+        ranked = sorted(range(len(keys)), key=keys.__getitem__)
+        return ranked[0], ranked[: max(1, count // 4)]
+
+    def _compute_gains(self, position: Array) -> CandidateGains:
+        """Returns the gains at a position in the search space, rounded and within their ranges.
+
+        Args:
+            position: shares of the logarithms of the ranges, shape (gains,), each in [0, 1].
+        """
+        logs = self._log_low + position * self._log_range
+        gains = {}
+        for knob, log in zip(self.space.knobs, logs, strict=True):
+            value = float(f"{np.exp(log):.{GAIN_DIGITS}g}")
+            gains[knob.name] = min(max(value, knob.low), knob.high)
+        return gains
 
 
 DEFAULT_BUDGET = 64
@@ -220,13 +279,21 @@ DEFAULT_BUDGET = 64
 MAX_BUDGET = 100_000
 MAX_TUNING_SEEDS = 1000
 MAX_TICKS = 10_000_000
-"""Ticks of all sites that one candidate may take; a run of a minute at 1 kHz with three sites
-has 180 000.
+"""Largest number of ticks of a candidate, over all sites: a run of a minute with three sites at
+1 kHz has 180 000.
 """
+_PROBE_S = 2.0
+"""Duration of the run from which the time of a search is estimated, s."""
 
 
 class PaperGainsResult(NamedTuple):
-    """The gains that the paper prints, measured."""
+    """The measured result of the gains that the paper prints.
+
+    Attributes:
+        name: the name of the candidate.
+        candidate: the candidate as an experiment.
+        score: the score of the candidate.
+    """
 
     name: str
     candidate: TuningScenario
@@ -234,238 +301,288 @@ class PaperGainsResult(NamedTuple):
 
 
 class TuningPlan(NamedTuple):
-    """A comparison that can be run: `budget` candidates per law, `seed` of the search.
+    """A comparison of laws, checked and ready to run.
 
-    `others` is the experiment with further seeds: of each candidate the mean over all seeds
-    counts.
+    Attributes:
+        base: the experiment.
+        spaces: the laws with their search spaces.
+        budget: number of candidates per law.
+        seed: seed of the search.
+        objective: the objective besides effort.
+        knowledge: the model information that all laws get.
+        others: the experiment with further seeds; the score of a candidate is the mean over all
+            seeds.
     """
 
     base: TuningScenario
-    spaces: list[search_space.SearchSpace]
+    spaces: list[SearchSpace]
     budget: int
     seed: int
     objective: Objective
-    knowledge: search_space.ModelInformation
+    knowledge: ModelInformation
     others: tuple[TuningScenario, ...] = ()
 
     @property
     def runs(self) -> int:
-        """How many runs it takes, those with printed gains and twins counted."""
-        candidates = len(self.spaces) * self.budget + len(self.printed(self.base))
+        """Number of runs, with those of the printed gains and of twins."""
+        candidates = len(self.spaces) * self.budget + len(self.build_paper_scenarios(self.base))
         return candidates * (1 + self.twin) * (1 + len(self.others))
 
     @property
     def twin(self) -> bool:
-        """True if the pose is measured on a twin: then every candidate is two runs."""
+        """True if the pose is measured on a twin: then every candidate takes two runs."""
         return build_twin(self.base.scenario) is not None
 
-    def printed(self, base: TuningScenario) -> dict[str, TuningScenario]:
-        """Returns the gains that the paper prints, by name, with the common information and
-        without.
+    def build_paper_scenarios(self, base: TuningScenario) -> dict[str, TuningScenario]:
+        """Returns an experiment with the gains that the paper prints, by name.
+
+        There are two variants: with the model information that all laws get, and without any.
+
+        Args:
+            base: the experiment.
         """
-        told = search_space.SEARCH_SPACES["adaptive"].controls(
-            base.scenario, self.knowledge, search_space.PAPER_GAINS
-        )
-        untold = {name: {**table, "theta_hat0": 0.0} for name, table in told.items()}
-        controls = {"as printed": told, "as printed, told nothing": untold}
-        return {name: base.with_controls(tables) for name, tables in controls.items()}
+        space = SEARCH_SPACES["adaptive"]
+        informed = space.controls(base.scenario, self.knowledge, PAPER_GAINS)
+        uninformed = {site: {**table, "theta_hat0": 0.0} for site, table in informed.items()}
+        return {
+            "as printed": base.with_controls(informed),
+            "as printed, told nothing": base.with_controls(uninformed),
+        }
 
     def estimate_s(self, jobs: int | None = None) -> float:
-        """Returns about how long the search will take, s: by a short run of the experiment."""
+        """Returns an estimate of the duration of the search, in s, from a short run.
+
+        Args:
+            jobs: number of processes; None: one per core.
+        """
         scenario = self.base.scenario
-        brief_s = min(scenario.duration_s, _PROBE_S)
-        brief = msgspec.structs.replace(scenario, duration_s=brief_s).text
-        measure_candidate(brief, None)  # loads the compiled core
+        probe_s = min(scenario.duration_s, _PROBE_S)
+        probe = msgspec.structs.replace(scenario, duration_s=probe_s).text
+        measure_candidate(probe, None)  # loads the compiled core
         clock = SystemClock()
-        began_ns = clock.monotonic_ns()
-        measure_candidate(brief, None)
-        run_s = (clock.monotonic_ns() - began_ns) * 1e-9 * scenario.duration_s / brief_s
-        return run_s * self.runs / min(jobs or count_cores(), len(self.spaces) * self.budget)
+        start_ns = clock.monotonic_ns()
+        measure_candidate(probe, None)
+        elapsed_s = (clock.monotonic_ns() - start_ns) * 1e-9
+        run_s = elapsed_s * scenario.duration_s / probe_s
+        processes = min(jobs or count_cores(), len(self.spaces) * self.budget)
+        return run_s * self.runs / processes
 
     def run(
         self, jobs: int | None = None, progress: Progress = ignore_progress, on: Workers = None
     ) -> "TuningResult":
-        """Searches every law and returns what was found.
+        """Searches the gains of every law and returns the result.
+
+        Args:
+            jobs: number of processes; None: one per core.
+            progress: called with the number of finished and of all candidates.
+            on: the workers to use; None: processes of this machine.
 
         Raises:
-            RunFailed: a candidate ended its workers, or the cluster is gone.
+            RunFailed: a candidate ended its workers, or the cluster is not available any more.
         """
         searches = [
             CandidateSearch(space, self.budget, self.seed, self.objective)
             for space in self.spaces
         ]
         bases = (self.base, *self.others)
-        printed = list(map(self.printed, bases))
-        measured: list[CandidateScore] = []
-        total = len(searches) * self.budget + len(printed[0])
-        done = 0
+        paper_scenarios = [self.build_paper_scenarios(base) for base in bases]
+        paper_names = list(paper_scenarios[0])
+        paper_items = [
+            build_candidate_item([scenarios[name] for scenarios in paper_scenarios])
+            for name in paper_names
+        ]
+        total = len(searches) * self.budget + len(paper_items)
+        paper_scores: list[CandidateScore] = []
+        finished = 0
 
-        def show(more: int, _: int) -> None:
-            progress(done + more, total)
+        def report_progress(in_round: int, _: int) -> None:
+            progress(finished + in_round, total)
 
         if not is_core_cached():
-            FusedRun(self.base.scenario).advance_to(
-                _PROBE_S
-            )  # compiles, once for all processes
+            # compiles the core once, before the processes start
+            FusedRun(self.base.scenario).advance_to(_PROBE_S)
         with open_worker_pool(jobs, on, most=total) as pool:
-            for number in range(len(searches[0].rounds)):
-                asked = [search.ask(number) for search in searches]
-                tasks = [
-                    build_candidate_item(
-                        [base.with_gains(search.space, self.knowledge, one) for base in bases]
-                    )
-                    for search, batch in zip(searches, asked, strict=True)
-                    for one in batch
-                ]
-                if number == 0:
-                    tasks += [
-                        build_candidate_item([of[name] for of in printed])
-                        for name in printed[0]
-                    ]
-                scores = iter(pool.map(measure_candidate_task, tasks, show))
-                done += len(tasks)
-                for search, batch in zip(searches, asked, strict=True):
-                    search.tell(batch, [next(scores) for _ in batch])
-                measured += scores
-        paper = [
-            PaperGainsResult(*one, score)
-            for one, score in zip(printed[0].items(), measured, strict=True)
-        ]
-        return TuningResult(self, searches, paper)
+            for round_number in range(len(searches[0].rounds)):
+                proposals = [search.propose_candidates(round_number) for search in searches]
+                items: list[CandidateItem] = []
+                for search, candidates in zip(searches, proposals, strict=True):
+                    items += self._build_items(bases, search.space, candidates)
+                if round_number == 0:
+                    items += paper_items
+                scores = iter(pool.map(measure_candidate_task, items, report_progress))
+                finished += len(items)
+                for search, candidates in zip(searches, proposals, strict=True):
+                    search.record_scores(candidates, [next(scores) for _ in candidates])
+                paper_scores += scores
+        printed = []
+        for name, score in zip(paper_names, paper_scores, strict=True):
+            printed.append(PaperGainsResult(name, paper_scenarios[0][name], score))
+        return TuningResult(self, searches, printed)
+
+    def _build_items(
+        self,
+        bases: Sequence[TuningScenario],
+        space: SearchSpace,
+        candidates: Sequence[CandidateGains],
+    ) -> list[CandidateItem]:
+        """Returns the tasks that measure candidates of one law.
+
+        Args:
+            bases: the experiment with each seed.
+            space: the law and its gains.
+            candidates: the values of the gains.
+        """
+        items = []
+        for gains in candidates:
+            seeds = [base.with_gains(space, self.knowledge, gains) for base in bases]
+            items.append(build_candidate_item(seeds))
+        return items
 
 
 _EDGE = 1.02
-"""A gain within 2 % of the end of its range is at its edge."""
-_PROBE_S = 2.0
-"""Duration of the run by which a search is estimated, s."""
+"""A gain within 2 % of an end of its range stands at the edge."""
 
 
 @dataclass(frozen=True, repr=False)
 class TuningResult(Result):
-    """A comparison that was run; laws in the order in which they were asked for."""
+    """The result of a comparison of tuned laws.
+
+    Attributes:
+        plan: the comparison.
+        found: the search of each law, in the order of the plan.
+        printed: the results of the gains that the paper prints.
+    """
 
     plan: TuningPlan
     found: list[CandidateSearch]
     printed: list[PaperGainsResult]
 
     def blocks(self) -> Iterator[Any]:
-        """Yields its text."""
+        """Yields the blocks of the result as text."""
         from .tuning_report import compose_tuning
 
         return compose_tuning(self)
 
     def headline(self) -> str:
-        """Returns which laws were compared in which scenario."""
-        fronts = ", ".join(f"{one.space.law} {len(one.front)}" for one in self.found)
+        """Returns the scenario, the laws and the sizes of their fronts, as a sentence."""
+        fronts = ", ".join(f"{search.space.law} {len(search.front)}" for search in self.found)
         return f"{self.plan.base.scenario.name}: points on the front: {fronts}"
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the keys of `trilat compare --tune --json`."""
-        asked = self.plan
-        base = self.plan.base
-        scenario = base.scenario
-        weights = search_space.weigh_joints(base.scenario)
+        printed = []
+        for result in self.printed:
+            facts = msgspec.to_builtins(result.score)
+            command = result.candidate.command
+            printed.append({"name": result.name, **facts, "command": command})
         return {
-            "scenario": {
-                "source": base.source,
-                "overrides": list(base.overrides),
-                "name": scenario.name,
-                "seed": scenario.seed,
-                "sites": len(scenario.names),
-                "duration_s": scenario.duration_s,
-                "tau_limit_nm": {
-                    name: spec.limits.tau_limit_nm for name, spec in scenario.sites.items()
-                },
-            },
-            "procedure": {
-                "candidates_per_law": asked.budget,
-                "seed": asked.seed,
-                "seeds": 1 + len(asked.others),
-                "latin_hypercube": (asked.budget + 1) // 2,
-                "refining_steps": list(REFINEMENT_STEPS),
-                "runs": asked.runs,
-                "twin": asked.twin,
-                "objective": asked.objective.value,
-                "objective_unit": asked.objective.unit,
-                "gravity_told": asked.knowledge.gravity,
-                "knowledge": asked.knowledge.text,
-                "box": asked.knowledge.box,
-                **({"joint_weights": weights} if weights else {}),
-                "outcomes": {outcome.value: text for outcome, text in CLASS_MEANINGS.items()},
-            },
-            "laws": {found.space.law: self._describe_law(found) for found in self.found},
-            "as_printed": [
-                {
-                    "name": one.name,
-                    **msgspec.to_builtins(one.score),
-                    "command": one.candidate.command,
-                }
-                for one in self.printed
-            ],
+            "scenario": self._describe_scenario(),
+            "procedure": self._describe_procedure(),
+            "laws": {search.space.law: self._describe_law(search) for search in self.found},
+            "as_printed": printed,
         }
 
-    def _describe_law(self, found: CandidateSearch) -> dict[str, Any]:
-        tried = [
-            {"gains": gains, **msgspec.to_builtins(score)}
-            for gains, score in zip(found.tried, found.scores, strict=True)
-        ]
-        shared = self.shared(found)
+    def _describe_scenario(self) -> dict[str, Any]:
+        """Returns the entry "scenario" of `to_dict`."""
+        base = self.plan.base
+        scenario = base.scenario
+        limits_nm = {name: spec.limits.tau_limit_nm for name, spec in scenario.sites.items()}
         return {
-            "told": found.space.told,
-            "searched": [knob._asdict() for knob in found.space.knobs],
-            "outcomes": {outcome.value: count for outcome, count in found.outcomes.items()},
-            "front": [
-                {
-                    "candidate": place,
-                    **tried[place],
-                    "on_the_front_of_all": place in shared,
-                    "command": self.candidate(found, place).command,
-                }
-                for place in found.front
-            ],
-            "candidates": tried,
+            "source": base.source,
+            "overrides": list(base.overrides),
+            "name": scenario.name,
+            "seed": scenario.seed,
+            "sites": len(scenario.names),
+            "duration_s": scenario.duration_s,
+            "tau_limit_nm": limits_nm,
+        }
+
+    def _describe_procedure(self) -> dict[str, Any]:
+        """Returns the entry "procedure" of `to_dict`."""
+        plan = self.plan
+        facts: dict[str, Any] = {
+            "candidates_per_law": plan.budget,
+            "seed": plan.seed,
+            "seeds": 1 + len(plan.others),
+            "latin_hypercube": (plan.budget + 1) // 2,
+            "refining_steps": list(REFINEMENT_STEPS),
+            "runs": plan.runs,
+            "twin": plan.twin,
+            "objective": plan.objective.value,
+            "objective_unit": plan.objective.unit,
+            "gravity_told": plan.knowledge.gravity,
+            "knowledge": plan.knowledge.text,
+            "box": plan.knowledge.box,
+        }
+        weights = weigh_joints(plan.base.scenario)
+        if weights:
+            facts["joint_weights"] = weights
+        facts["outcomes"] = {outcome.value: text for outcome, text in CLASS_MEANINGS.items()}
+        return facts
+
+    def _describe_law(self, search: CandidateSearch) -> dict[str, Any]:
+        """Returns the entry of a law in `to_dict`: its search space, front and candidates."""
+        candidates = []
+        for gains, score in zip(search.tried, search.scores, strict=True):
+            candidates.append({"gains": gains, **msgspec.to_builtins(score)})
+        overall_front = self.list_overall_front(search)
+        front = []
+        for index in search.front:
+            point = {
+                "candidate": index,
+                **candidates[index],
+                "on_the_front_of_all": index in overall_front,
+                "command": self.candidate(search, index).command,
+            }
+            front.append(point)
+        return {
+            "told": search.space.known_facts,
+            "searched": [knob._asdict() for knob in search.space.knobs],
+            "outcomes": {outcome.value: count for outcome, count in search.outcomes.items()},
+            "front": front,
+            "candidates": candidates,
         }
 
     def to_rows(self) -> list[dict[str, Any]]:
         """Returns a row per candidate."""
-        laws = self.to_dict()["laws"].items()
-        return [
-            {
-                "law": law,
-                **{key: value for key, value in one.items() if key != "gains"},
-                **one["gains"],
-            }
-            for law, found in laws
-            for one in found["candidates"]
-        ]
+        rows = []
+        for law, facts in self.to_dict()["laws"].items():
+            for candidate in facts["candidates"]:
+                gains = candidate.pop("gains")
+                rows.append({"law": law, **candidate, **gains})
+        return rows
 
-    def candidate(self, found: CandidateSearch, place: int) -> TuningScenario:
-        """Returns one candidate as an experiment."""
-        return self.plan.base.with_gains(found.space, self.plan.knowledge, found.tried[place])
+    def candidate(self, search: CandidateSearch, index: int) -> TuningScenario:
+        """Returns the candidate with an index in a law's search, as an experiment."""
+        plan = self.plan
+        return plan.base.with_gains(search.space, plan.knowledge, search.tried[index])
 
-    def at_edge(self, found: CandidateSearch) -> list[str]:
-        """Returns which gains of a law's best point stand at an edge of their range: it may lie
-        beyond.
+    def list_edge_gains(self, search: CandidateSearch) -> list[str]:
+        """Returns the gains of a law's best point that stand at an edge of their range.
+
+        The best value of such a gain may lie outside the range.
         """
-        if not found.front:
+        if not search.front:
             return []
-        best = found.tried[found.front[-1]]
-        return [
-            knob.name
-            for knob in found.space.knobs
-            if not knob.low * _EDGE < best[knob.name] < knob.high / _EDGE
-        ]
+        best = search.tried[search.front[-1]]
+        names = []
+        for knob in search.space.knobs:
+            is_inside = knob.low * _EDGE < best[knob.name] < knob.high / _EDGE
+            if not is_inside:
+                names.append(knob.name)
+        return names
 
-    def shared(self, found: CandidateSearch) -> list[int]:
-        """Returns the places of a law's front that no candidate of any law dominates."""
-        points = [
-            (other.space.law, place, points[place])
-            for other in self.found
-            for points in [other.points]
-            for place in other.front
-        ]
-        kept = [points[n] for n in find_pareto_front([point for _, _, point in points])]
-        return [place for law, place, _ in kept if law == found.space.law]
+    def list_overall_front(self, search: CandidateSearch) -> list[int]:
+        """Returns the indices of a law's candidates that no candidate of any law dominates."""
+        points = []
+        owners = []
+        for other in self.found:
+            other_points = other.points
+            for index in other.front:
+                points.append(other_points[index])
+                owners.append((other.space.law, index))
+        overall_front = [owners[n] for n in find_pareto_front(points)]
+        return [index for law, index in overall_front if law == search.space.law]
 
 
 def plan_tuning(
@@ -479,14 +596,14 @@ def plan_tuning(
     gravity_percent: float = 100.0,
     seeds: int = 1,
 ) -> TuningPlan:
-    """Returns a comparison, checked and ready to run; overrides are texts KEY=VALUE.
+    """Returns the plan of a comparison of tuned laws, checked and ready to run.
 
-    The other arguments are those of `trilat_net.tune`: seeds of the scenario are those from its
-    own on.
+    The arguments are those of `trilat_net.tune`; overrides are texts KEY=VALUE. The seeds of
+    the scenario count up from its own seed.
 
     Raises:
-        ScenarioError: the scenario is none, or laws cannot be compared in it.
-        UsageError: another argument cannot be right.
+        ScenarioError: the scenario is not valid, or laws cannot be compared in it.
+        UsageError: another argument is not valid.
     """
     if not 1 <= budget <= MAX_BUDGET:
         raise UsageError(
@@ -500,28 +617,29 @@ def plan_tuning(
         raise UsageError(
             f"--seeds is how many runs each candidate has, 1 to {MAX_TUNING_SEEDS}, not {seeds}"
         )
-    knowledge = search_space.build_model_information(gravity_percent)
-    found = load_tuning_scenario(source, overrides)
-    scenario = found.scenario
-    spaces = search_space.select_search_spaces(
-        [name_law_classes(law) for law in laws], scenario
-    )
+    knowledge = build_model_information(gravity_percent)
+    base = load_tuning_scenario(source, overrides)
+    scenario = base.scenario
+    spaces = select_search_spaces([name_law_classes(law) for law in laws], scenario)
     ticks = sum(map(scenario.ticks, scenario.names))
     if ticks > MAX_TICKS:
         problem = (
-            f"a candidate would take {count_nouns(ticks, 'tick')}, at most "
-            f"{MAX_TICKS} are given: shorten it with --duration"
+            f"a candidate would take {count_nouns(ticks, 'tick')}, and at most {MAX_TICKS} are "
+            "allowed: shorten it with --duration"
         )
-        raise ScenarioError(problem, path="duration_s", source=found.source)
+        raise ScenarioError(problem, path="duration_s", source=base.source)
     check_comparable(scenario)
-    more = range(scenario.seed + 1, scenario.seed + seeds) if scenario.random else ()
-    others = tuple(load_tuning_scenario(source, (*overrides, f"seed={one}")) for one in more)
+    others = []
+    if scenario.random:
+        for other_seed in range(scenario.seed + 1, scenario.seed + seeds):
+            texts = (*overrides, f"seed={other_seed}")
+            others.append(load_tuning_scenario(source, texts))
     return TuningPlan(
-        base=found,
+        base=base,
         spaces=spaces,
         budget=budget,
         seed=seed,
         objective=Objective(objective),
         knowledge=knowledge,
-        others=others,
+        others=tuple(others),
     )

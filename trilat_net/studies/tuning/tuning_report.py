@@ -1,11 +1,14 @@
-"""A comparison as tables, as a Markdown page, as JSON, and as a figure of error against effort.
+"""Presents a comparison of tuned laws: as tables, a Markdown page, JSON, and a figure.
 
-Files: front.json, front.md, front.png, front.pdf.
+The figure shows error against effort. `write_tuning` writes front.json, front.md, front.png and
+front.pdf.
 
-Invariant: a function of the result alone, without a clock: equal plans give equal bytes; the
-JSON is the result, the others are views of it. Heads carry the unit, and every run is counted
-in some column. Every stable run at the pose is drawn, on a front or not; the gains that the
-paper prints are stars, on no front.
+Invariant:
+    - The files are a function of the result alone: equal plans give equal bytes.
+    - The JSON is the result; the other files are views of it.
+    - The heads of the tables carry the units, and each run is counted in exactly one class.
+    - The figure shows every stable run at the pose, whether on a front or not. The gains that
+      the paper prints are stars, on no front.
 """
 
 import json
@@ -29,188 +32,235 @@ from .search_space import SEARCH_SPACES, weigh_joints
 from .tuning_plan import MAX_BUDGET, CandidateSearch, Objective, TuningPlan, TuningResult
 
 _MAX_FRONT_ROWS = 8
-"""Points of a front that the text shows; the files hold all."""
+"""Points of a front that the text shows; the files hold all of them."""
 
 
 def compose_tuning(tuned: TuningResult) -> Iterator[Block]:
-    """Yields the laws, the classes, the fronts, the gains as printed, notes, and commands to
-    run.
+    """Yields the text of a comparison.
+
+    The text has the laws, the classes, the fronts, the printed gains, notes, and commands.
     """
     yield tabulate_laws(tuned)
     yield from (f"  {line}" for line in list_class_meanings())
-    for law in tuned.found:
-        if law.front:
+    for search in tuned.found:
+        if search.front:
             yield ""
-            yield tabulate_front(tuned, law, _MAX_FRONT_ROWS)
-    yield f"  * no candidate of any law is better in both; of long fronts {_MAX_FRONT_ROWS} points are shown"
+            yield tabulate_front(tuned, search, _MAX_FRONT_ROWS)
+    yield (
+        "  * no candidate of any law is better in both objectives; of a long front "
+        f"{_MAX_FRONT_ROWS} points are shown"
+    )
     yield ""
     yield tabulate_paper_gains(tuned)
-    for law in tuned.found:
-        for gain in tuned.at_edge(law):
-            yield f"note: {law.space.law} is best at the edge of the range of {gain}; widen the search"
+    for search in tuned.found:
+        for gain in tuned.list_edge_gains(search):
+            yield (
+                f"note: {search.space.law} is best at the edge of the range of {gain}; widen "
+                "the search"
+            )
     yield ""
-    if not any(law.front for law in tuned.found):
+    if not any(search.front for search in tuned.found):
         yield (
-            "no candidate of any law is stable and at the pose: a longer --duration or a larger --budget "
-            "may show more"
+            "no candidate of any law is stable and at the pose: a longer --duration or a "
+            "larger --budget may show more"
         )
         return
-    yield "the last of each front, to run; front.md has the others:"
-    for law in tuned.found:
-        yield from (f"  {tuned.candidate(law, place).command}" for place in law.front[-1:])
+    yield "commands for the last point of each front; front.md has the others:"
+    for search in tuned.found:
+        if search.front:
+            yield f"  {tuned.candidate(search, search.front[-1]).command}"
 
 
 def tabulate_laws(tuned: TuningResult) -> TextTable:
-    """Returns a row per law: what became of its candidates, and the two ends of its front."""
-    value = f"{tuned.plan.objective} {tuned.plan.objective.unit}"
-    heads = ("law", "tried", *(one.word for one in reversed(CandidateClass)), "front", "of all")
+    """Returns a table with a row per law: the class counts and the two ends of the front."""
+    classes = list(reversed(CandidateClass))
+    objective = f"{tuned.plan.objective} {tuned.plan.objective.unit}"
+    heads = ("law", "tried", *(outcome.word for outcome in classes), "front", "of all")
+    heads += (f"least {objective}", "at effort N m", "least effort N m", f"at {objective}")
     rows = []
-    for found in tuned.found:
-        counts = found.outcomes
-        points = found.points
-        front = found.front
-        ends = [points[place] or (None, None) for place in front[-1:] + front[:1]]
-        best, cheapest = ends or [(None, None)] * 2
-        classes = (str(counts[outcome]) for outcome in reversed(CandidateClass))
-        places = str(len(front)), str(len(tuned.shared(found)))
-        numbers = map(format_number, (*best, *cheapest[::-1]))
-        rows.append((found.space.law, str(len(found.tried)), *classes, *places, *numbers))
-    heads = (*heads, f"least {value}", "at effort N m", "least effort N m", f"at {value}")
+    for search in tuned.found:
+        outcomes = search.outcomes
+        row = [search.space.law, str(len(search.tried))]
+        row += [str(outcomes[outcome]) for outcome in classes]
+        row.append(str(len(search.front)))
+        row.append(str(len(tuned.list_overall_front(search))))
+        row += _format_front_ends(search)
+        rows.append(tuple(row))
     return TextTable(heads, rows, align="lr")
 
 
+def _format_front_ends(search: CandidateSearch) -> list[str]:
+    """Returns the table cells of the two ends of a front.
+
+    The cells are the least objective with its effort, and the least effort with its objective.
+    """
+    front = search.front_points
+    if not front:
+        return [format_number(None)] * 4
+    least_value, effort_nm = front[-1]
+    value, least_effort_nm = front[0]
+    numbers = (least_value, effort_nm, least_effort_nm, value)
+    return [format_number(number) for number in numbers]
+
+
 def tabulate_search(plan: TuningPlan) -> TextTable:
-    """Returns a row per law and gain: its range, and the information the law gets."""
+    """Returns a table with a row per gain: its law and range, and the facts the law gets."""
     rows = []
     for space in plan.spaces:
-        for n, knob in enumerate(space.knobs):
+        facts = space.known_facts  # stands in the first row of the law only
+        for knob in space.knobs:
             name = f"{knob.name} ({knob.where})" if knob.where else knob.name
-            told = space.told if n == 0 else ""
-            rows.append(
-                (space.law, name, knob.unit or "-", f"{knob.low:g}", f"{knob.high:g}", told)
-            )
-    return TextTable(("law", "gain", "unit", "from", "to", "told"), rows, align="lllrrl")
+            unit = knob.unit or "-"
+            rows.append((space.law, name, unit, f"{knob.low:g}", f"{knob.high:g}", facts))
+            facts = ""
+    heads = ("law", "gain", "unit", "from", "to", "information")
+    return TextTable(heads, rows, align="lllrrl")
 
 
 def tabulate_front(
-    tuned: TuningResult, found: CandidateSearch, most: int = MAX_BUDGET
+    tuned: TuningResult, search: CandidateSearch, most: int = MAX_BUDGET
 ) -> TextTable:
-    """Returns a law's front by rising effort; * marks what no law's candidate dominates."""
-    count = len(found.front)
-    kept = {round(n) for n in np.linspace(0, count - 1, min(most, count))}
-    shared = tuned.shared(found)
-    gains = [f"{knob.name} {knob.unit}".strip() for knob in found.space.knobs]
-    rows = [
-        (
-            f"{found.space.law} {n}{'*' if place in shared else ''}",
-            *(f"{found.tried[place][knob.name]:g}" for knob in found.space.knobs),
-            *_score_cells(found.scores[place]),
-        )
-        for n, place in enumerate(found.front, 1)
-        if n - 1 in kept
-    ]
-    return TextTable(("law", *gains, *_SCORE_HEADS), rows, align="lr")
+    """Returns a table of a law's front, by rising effort.
+
+    A * marks the points that no candidate of any law dominates.
+
+    Args:
+        tuned: the comparison.
+        search: the search of the law.
+        most: largest number of rows; of a longer front, evenly spread points with both ends.
+    """
+    count = len(search.front)
+    shown = {round(n) for n in np.linspace(0, count - 1, min(most, count))}
+    overall_front = tuned.list_overall_front(search)
+    knobs = search.space.knobs
+    rows = []
+    for n, index in enumerate(search.front):
+        if n not in shown:
+            continue
+        mark = "*" if index in overall_front else ""
+        gains = [f"{search.tried[index][knob.name]:g}" for knob in knobs]
+        score = _format_score(search.scores[index])
+        rows.append((f"{search.space.law} {n + 1}{mark}", *gains, *score))
+    heads = [f"{knob.name} {knob.unit}".strip() for knob in knobs]
+    return TextTable(("law", *heads, *_SCORE_HEADS), rows, align="lr")
 
 
 def tabulate_paper_gains(tuned: TuningResult) -> TextTable:
-    """Returns a row for each way to take the gains that the paper prints."""
-    rows = [
-        (one.name, one.score.outcome.word, *_score_cells(one.score)) for one in tuned.printed
-    ]
+    """Returns a table with a row per variant of the gains that the paper prints."""
+    rows = []
+    for result in tuned.printed:
+        score = result.score
+        rows.append((result.name, score.outcome.word, *_format_score(score)))
     return TextTable(("law", "class", *_SCORE_HEADS), rows, align="llr")
 
 
 _SCORE_HEADS = ("error rad", "spread rad", "pose rad", "effort N m", "settled s", "clamped %")
 
 
-def _score_cells(score: CandidateScore) -> tuple[str, ...]:
-    error = _with_interval(score.error_rad, score.error_half_rad)
-    effort = _with_interval(score.effort_nm, score.effort_half_nm)
-    spread, pose, settled = map(
-        format_number, (score.spread_rad, score.pose_rad, score.settled_s)
-    )
-    return error, spread, pose, effort, settled, f"{100.0 * score.saturated:.3g}"
-
-
-def _with_interval(mean: float | None, half: float | None) -> str:
+def _format_score(score: CandidateScore) -> tuple[str, ...]:
+    """Returns the table cells of a score, in the order of `_SCORE_HEADS`."""
     return (
-        format_number(mean) if mean is None or half is None else str(MeanInterval(mean, half))
+        _format_mean(score.error_rad, score.error_half_rad),
+        format_number(score.spread_rad),
+        format_number(score.pose_rad),
+        _format_mean(score.effort_nm, score.effort_half_nm),
+        format_number(score.settled_s),
+        f"{100.0 * score.saturated:.3g}",
     )
+
+
+def _format_mean(mean: float | None, half: float | None) -> str:
+    """Returns a mean as text, with its interval if there is one."""
+    if mean is None or half is None:
+        return format_number(mean)
+    return str(MeanInterval(mean, half))
 
 
 def describe_procedure(plan: TuningPlan) -> list[str]:
-    """Returns what was the same for all, a sentence each."""
+    """Returns the conditions that are the same for all laws, a sentence each."""
     scenario = plan.base.scenario
-    clamps = np.hstack([spec.limits.tau_limit_nm for spec in scenario.sites.values()])
-    clamp = " to ".join(f"{value:g}" for value in dict.fromkeys((clamps.min(), clamps.max())))
-    informed = any(space.law == "known" for space in plan.spaces)
+    sampled = (plan.budget + 1) // 2
+    limits_nm = np.hstack([spec.limits.tau_limit_nm for spec in scenario.sites.values()])
+    limit_range = dict.fromkeys((limits_nm.min(), limits_nm.max()))  # one entry if all agree
+    limits = " to ".join(f"{limit:g}" for limit in limit_range)
+    knowledge = plan.knowledge.text
+    if any(space.law == "known" for space in plan.spaces):
+        knowledge += "; known gets the exact inertia as well"
     lines = [
-        f"{count_nouns(plan.budget, 'candidate')} per law, {(plan.budget + 1) // 2} of a "
-        "Latin hypercube, the others "
-        f"refined; seed {plan.seed}",
-        f"{scenario.duration_s:g} s of {scenario.name}, its seed {scenario.seed}, "
-        f"torques clamped at {clamp} N m",
-        plan.knowledge.text + ("; known gets inertia exactly as well" if informed else ""),
-        "error: RMS distance of the arms from the pose of a weightless consensus; effort: RMS of tau - G(q)",
+        f"{count_nouns(plan.budget, 'candidate')} per law, {sampled} of a Latin hypercube, the "
+        f"others refined; seed {plan.seed}",
+        f"{scenario.duration_s:g} s of {scenario.name} with its seed {scenario.seed}, torques "
+        f"clamped at {limits} N m",
+        knowledge,
+        "error: RMS distance of the arms from the pose of a weightless consensus; effort: RMS "
+        "of tau - G(q)",
     ]
-    if weights := weigh_joints(scenario):
+    weights = weigh_joints(scenario)
+    if weights:
         shares = ", ".join(f"{weight:g}" for weight in weights)
         lines.append(
-            f"of Kp, Kd, K and d the joints have {shares} times the number, by their inertia"
+            f"Kp, Kd, K and d of the joints are {shares} times the number, by their inertia"
         )
     if plan.others:
-        lines.append(
-            f"every candidate is the mean of {count_nouns(1 + len(plan.others), 'seed')}, "
-            "with its 95 % interval"
-        )
+        seeds = count_nouns(1 + len(plan.others), "seed")
+        lines.append(f"every candidate is the mean of {seeds}, with its 95 % interval")
     if plan.objective is Objective.SETTLING:
         lines.append(
-            "sought: the time from which the largest |e| stays below 0.01 rad, against effort"
+            "minimised: the time from which the largest |e| stays below 0.01 rad, and effort"
         )
     if plan.twin:
         lines.append(
-            "the pose is judged on the twin without torques that have no target, and walls"
+            "the pose is judged on the twin: the scenario without walls and without torques "
+            "that have no target"
         )
     return lines
 
 
 def list_class_meanings() -> list[str]:
-    """Returns what the classes mean, a line each, in the order in which they are asked."""
+    """Returns the meanings of the classes, a line each; the first class that applies counts."""
     return [f"{outcome.word}: {text}" for outcome, text in CLASS_MEANINGS.items()]
 
 
 def build_tuning_page(tuned: TuningResult) -> str:
-    """Returns the whole comparison in Markdown, with the command of every point of a front."""
+    """Returns the comparison as a page in Markdown, with a command per point of a front."""
     scenario = tuned.plan.base.scenario
     parts = [
         f"# {scenario.name}: laws compared fairly",
-        "\n".join(f"- {line}" for line in describe_procedure(tuned.plan)),
+        _format_list(describe_procedure(tuned.plan)),
         tabulate_laws(tuned).markdown(),
-        "Classes, the first that holds:",
-        "\n".join(f"- {line}" for line in list_class_meanings()),
-        "## Searched",
+        "Classes, the first that applies:",
+        _format_list(list_class_meanings()),
+        "## Search ranges",
         tabulate_search(tuned.plan).markdown(),
         "## Fronts",
-        "A * marks what no candidate of any law dominates.",
+        "A * marks the points that no candidate of any law dominates.",
     ]
-    for found in tuned.found:
-        commands = [tuned.candidate(found, place).command for place in found.front]
-        front = [tabulate_front(tuned, found).markdown(), _block(commands)]
-        parts += [
-            f"### {found.space.law}",
-            *(front if found.front else ["None of its candidates is stable and at the pose."]),
-        ]
-    parts += ["## As printed", tabulate_paper_gains(tuned).markdown()]
-    parts += [_block([one.candidate.command for one in tuned.printed])]
+    for search in tuned.found:
+        parts.append(f"### {search.space.law}")
+        if search.front:
+            commands = [tuned.candidate(search, index).command for index in search.front]
+            parts.append(tabulate_front(tuned, search).markdown())
+            parts.append(_format_code(commands))
+        else:
+            parts.append("No candidate of this law is stable and at the pose.")
+    parts.append("## As printed")
+    parts.append(tabulate_paper_gains(tuned).markdown())
+    parts.append(_format_code([result.candidate.command for result in tuned.printed]))
     return "\n\n".join(parts) + "\n"
 
 
-def _block(lines: Sequence[str]) -> str:
+def _format_list(lines: Sequence[str]) -> str:
+    """Returns lines as a bulleted list in Markdown."""
+    return "\n".join(f"- {line}" for line in lines)
+
+
+def _format_code(lines: Sequence[str]) -> str:
+    """Returns lines as a block of code in Markdown."""
     return "\n".join(["```", *lines, "```"])
 
 
 FRONT_WIDTH_IN = 3.5
-"""One column of a page of two."""
+"""Width of the figure, in inches: a column of a page with two columns."""
 _HEIGHT_IN = 3.1
 _SIZE_PT = 8.0
 _MARKS = ("o", "s", "^", "D", "v", "P")
@@ -218,90 +268,102 @@ _LABELS = {Objective.ERROR: "error (rad)", Objective.SETTLING: "settling time (s
 
 
 def draw_front(tuned: TuningResult) -> Figure:
-    """Returns the fronts of all laws in one panel, both axes logarithmic."""
+    """Returns a figure with the fronts of all laws in one panel, on logarithmic axes."""
     with style.styled_figure(REPORT_SIZE, _HEIGHT_IN) as figure:
         figure.set_figwidth(FRONT_WIDTH_IN)
         axes = figure.add_subplot()
-        drawn = [_draw_law(axes, found) for found in tuned.found]
-        stars = _draw_printed(axes, tuned)
+        handles = [_draw_law(axes, search) for search in tuned.found]
+        handles += _draw_paper_gains(axes, tuned)
         axes.set_xlabel("effort (N m)", fontsize=_SIZE_PT)
         axes.set_ylabel(_LABELS[tuned.plan.objective], fontsize=_SIZE_PT)
         axes.tick_params(labelsize=_SIZE_PT)
-        shown = [number for line in axes.lines for number in np.ravel(line.get_xydata())]
-        if not shown:
+        drawn = [number for line in axes.lines for number in np.ravel(line.get_xydata())]
+        if not drawn:
             style.annotate_empty_panel(axes, "no stable candidate at the pose")
-        elif min(shown) > 0.0:
+        elif min(drawn) > 0.0:
             axes.set(xscale="log", yscale="log")
             for axis in (axes.xaxis, axes.yaxis):
                 style.set_plain_log_axis(axis)
-        look: dict[str, Any] = {"labelspacing": 0.3, "columnspacing": 0.8, "handlelength": 1.2}
-        handles = [*drawn, *stars]
         figure.legend(
-            handles=handles, loc="outside upper center", ncols=2, fontsize=_SIZE_PT, **look
+            handles=handles,
+            loc="outside upper center",
+            ncols=2,
+            fontsize=_SIZE_PT,
+            labelspacing=0.3,
+            columnspacing=0.8,
+            handlelength=1.2,
         )
     return figure
 
 
-def _draw_law(axes: Axes, found: CandidateSearch) -> Line2D:
-    """Draws a law's stable runs faintly and its front on top; returns its entry of the legend."""
-    names = list(dict.fromkeys([*SEARCH_SPACES, found.space.law]))
-    place = names.index(found.space.law)
-    colour = SITE_COLOURS[place % len(SITE_COLOURS)]
-    mark = _MARKS[place % len(_MARKS)]
-    points = found.points
-    settled = [point for point in points if point is not None]
-    front = [point for place in found.front if (point := points[place]) is not None]
-    faint: dict[str, Any] = {
-        "linestyle": "",
-        "markersize": 2.0,
-        "alpha": 0.3,
-        "markeredgewidth": 0.0,
-    }
-    plain: dict[str, Any] = {
-        "marker": mark,
+def _draw_law(axes: Axes, search: CandidateSearch) -> Line2D:
+    """Draws a law's stable runs faintly and its front on top; returns its legend entry."""
+    law = search.space.law
+    laws = list(dict.fromkeys([*SEARCH_SPACES, law]))
+    rank = laws.index(law)
+    marker = _MARKS[rank % len(_MARKS)]
+    colour = SITE_COLOURS[rank % len(SITE_COLOURS)]
+
+    settled = [point for point in search.points if point is not None]
+    axes.plot(
+        [effort_nm for _, effort_nm in settled],
+        [value for value, _ in settled],
+        marker=marker,
+        color=colour,
+        linestyle="",
+        markersize=2.0,
+        alpha=0.3,
+        markeredgewidth=0.0,
+    )
+
+    look: dict[str, Any] = {
+        "marker": marker,
         "markersize": 3.5,
         "linewidth": 1.1,
         "color": colour,
     }
-    axes.plot(
-        [x for _, x in settled], [y for y, _ in settled], marker=mark, color=colour, **faint
-    )
-    axes.step([x for _, x in front], [y for y, _ in front], where="post", **plain)
-    count = found.outcomes[CandidateClass.SETTLED]
-    return Line2D([], [], label=f"{found.space.law} ({count}/{len(found.scores)})", **plain)
+    front = search.front_points
+    efforts_nm = [effort_nm for _, effort_nm in front]
+    values = [value for value, _ in front]
+    axes.step(efforts_nm, values, where="post", **look)
+    stable = search.outcomes[CandidateClass.SETTLED]
+    return Line2D([], [], label=f"{law} ({stable}/{len(search.scores)})", **look)
 
 
-def _draw_printed(axes: Axes, tuned: TuningResult) -> list[Line2D]:
-    """Draws the gains of the paper as stars; returns their entries of the legend."""
+def _draw_paper_gains(axes: Axes, tuned: TuningResult) -> list[Line2D]:
+    """Draws the gains that the paper prints as stars; returns their legend entries."""
     entries = []
-    for one, fill in zip(tuned.printed, ("full", "none"), strict=True):
-        point = tuned.plan.objective.point(one.score)
+    for result, fill in zip(tuned.printed, ("full", "none"), strict=True):
         look: dict[str, Any] = {
             "linestyle": "",
             "marker": "*",
             "markersize": 7.0,
             "fillstyle": fill,
+            "color": style.REFERENCE,
         }
-        look["color"] = style.REFERENCE
+        label = result.name
+        outcome = result.score.outcome
+        point = tuned.plan.objective.point(result.score)
         if point is not None:
-            axes.plot([point[1]], [point[0]], **look)
-        outcome = one.score.outcome
-        reason = "never" if outcome is CandidateClass.SETTLED else outcome.word
-        label = one.name if point is not None else f"{one.name} ({reason})"
+            value, effort_nm = point
+            axes.plot([effort_nm], [value], **look)
+        elif outcome is CandidateClass.SETTLED:
+            label += " (never)"  # a stable run that has not settled at its end
+        else:
+            label += f" ({outcome.word})"
         entries.append(Line2D([], [], label=label, **look))
     return entries
 
 
 def write_tuning(tuned: TuningResult, folder: Path) -> list[Path]:
-    """Writes a comparison into a folder that exists, and returns the paths."""
-    data = folder / "front.json"
-    text = folder / "front.md"
-    write_whole(
-        data, json.dumps(tuned.to_dict(), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-    )
-    write_whole(text, build_tuning_page(tuned))
+    """Writes a comparison into an existing folder, and returns the paths of the files."""
+    json_path = folder / "front.json"
+    page_path = folder / "front.md"
+    picture_paths = [folder / "front.png", folder / "front.pdf"]
+    text = json.dumps(tuned.to_dict(), indent=2, ensure_ascii=False, allow_nan=False)
+    write_whole(json_path, text + "\n")
+    write_whole(page_path, build_tuning_page(tuned))
     figure = draw_front(tuned)
-    pictures = [folder / "front.png", folder / "front.pdf"]
-    for path in pictures:
+    for path in picture_paths:
         style.write_figure(figure, path, style.REPORT_DPI)
-    return [data, text, *pictures]
+    return [json_path, page_path, *picture_paths]
