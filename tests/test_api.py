@@ -311,7 +311,7 @@ WRONG: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda _: tn.linear("two_sites", pose=["x"]),
         "a pose consists of angles in rad",
     ),
-    "bench": (lambda _: tn.bench(seeds=0), "^seeds is how many, 1 to 1000, not 0"),
+    "bench": (lambda _: tn.bench(seeds=0), "^seeds is a number from 1 to 1000, not 0"),
 }
 
 

@@ -35,15 +35,15 @@ from trilat_net.studies.bench.bench_plan import (
     build_settings,
     choose_round_trip,
     find_stale,
-    name_settings,
+    format_settings,
     read_gains,
     tune_laws,
     write_gains,
 )
 from trilat_net.studies.bench.bench_results import (
     LEAST_CONTACT_N,
-    BenchPlace,
     BenchRun,
+    CellResult,
     build_bench_page,
     encode_runs,
 )
@@ -176,7 +176,7 @@ def test_a_wall_that_is_hardly_touched_masks_the_numbers() -> None:
     results = BenchResults(
         BenchPlan("round-trips", [cell], [("p_d", "level")]), {(cell.key, 1): run}
     )
-    assert results.places[0].mean("error_rad") is None
+    assert results.places[0].compute_mean("error_rad") is None
     assert "no contact" in build_bench_page(results, "trilat bench")
 
 
@@ -286,16 +286,16 @@ def make_run(cell: BenchCell, seed: int, **more: Any) -> BenchRun:
     return BenchRun(cell.name, cell.inputs, seed, True, "", **facts)
 
 
-def place(*errors: float | None) -> BenchPlace:
+def place(*errors: float | None) -> CellResult:
     cell = asked().cells[1]
-    return BenchPlace(
+    return CellResult(
         cell, [make_run(cell, n, error_rad=error) for n, error in enumerate(errors)]
     )
 
 
 def test_intervals_over_twenty_seeds_are_those_of_scipy() -> None:
     errors = tuple(0.3 + 0.01 * (7 * n % 20) for n in range(20))
-    found: Any = place(*errors).mean("error_rad")
+    found: Any = place(*errors).compute_mean("error_rad")
     low, high = stats.t.interval(0.95, 19, np.mean(errors), stats.sem(errors))
     assert (found.mean - found.half, found.mean + found.half) == pytest.approx(
         (low, high), rel=1e-12
@@ -303,10 +303,10 @@ def test_intervals_over_twenty_seeds_are_those_of_scipy() -> None:
     share = stats.binomtest(20, 20).proportion_ci(method="wilson")
     assert place(*errors).interval == pytest.approx((share.low, share.high), rel=1e-12)
     assert place(*errors[:19]).interval is None
-    assert place(*errors[:19]).mean("error_rad") == pytest.approx(
+    assert place(*errors[:19]).compute_mean("error_rad") == pytest.approx(
         np.mean(errors[:19]), rel=1e-12
     )
-    assert place(0.31, None).mean("error_rad") is None
+    assert place(0.31, None).compute_mean("error_rad") is None
 
 
 FULL = plan_bench("full", tasks=["handover", "outage"], links=["rtt272"])
@@ -351,7 +351,7 @@ def test_gains_of_all_studies_are_there_and_within_their_ranges() -> None:
 def test_kept_gains_are_the_least_error_that_keeps_the_margin(tmp_path: Path) -> None:
     found = tune_laws({"level": ["p_d"]}, 1, budget=4)
     assert [one.round_trip_ms for one in found] == list(TUNED_ROUND_TRIPS_MS)
-    settings = name_settings(build_settings("level", "contact", "rtt272"))
+    settings = format_settings(build_settings("level", "contact", "rtt272"))
     (search,) = plan_tuning("_bench_two", settings, laws=["p_d"], budget=8).run(1).found
     places = [
         n for n, score in enumerate(search.scores) if score.outcome is CandidateClass.SETTLED
@@ -393,14 +393,14 @@ def test_gains_of_another_law_or_scenario_are_stale() -> None:
 @pytest.mark.parametrize(
     ("more", "words"),
     [
-        ({"study": "smal"}, "no study 'smal' in it; did you mean 'small'"),
-        ({"laws": ["p_dd"]}, "no law 'p_dd' in it; did you mean"),
-        ({"tasks": ["handover"]}, "no task 'handover' in it"),
-        ({"links": ["rtt9"]}, "no link 'rtt9' in it; did you mean"),
-        ({"seeds": 0}, "seeds is how many, 1 to 1000, not 0"),
+        ({"study": "smal"}, "no study 'smal' is available; did you mean 'small'"),
+        ({"laws": ["p_dd"]}, "no law 'p_dd' is available; did you mean"),
+        ({"tasks": ["handover"]}, "no task 'handover' is available"),
+        ({"links": ["rtt9"]}, "no link 'rtt9' is available; did you mean"),
+        ({"seeds": 0}, "seeds is a number from 1 to 1000, not 0"),
         (
             {"study": "full", "laws": ["smith"], "tasks": ["handover"]},
-            "handover asks for two users",
+            "cannot run in handover",
         ),
     ],
 )

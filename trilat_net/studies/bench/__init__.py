@@ -1,5 +1,6 @@
-"""The suite: control laws on the same tasks, links and seeds, with gains that one procedure
-tuned.
+"""The benchmark suite: control laws on the same tasks, links and seeds.
+
+One procedure tunes the gains of all laws.
 """
 
 from .bench_plan import BenchPlan, plan_bench

@@ -8,7 +8,6 @@ Invariant:
 """
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -65,32 +64,47 @@ def draw_bench(results: BenchResults, name: str) -> Figure:
     label, quantity = FIGURES_OF_BENCH[name]
     links = results.plan.links
     fields = _collect_fields(results, name)
-    known = np.concatenate([field[np.isfinite(field)].ravel() for field in fields.values()])
-    scale: Any = Normalize(0.0, 1.0)
-    if quantity:
-        smallest = float(known.min()) if known.size else 0.1
-        largest = float(known.max()) if known.size else 1.0
-        # a logarithmic scale needs limits above 0
-        scale = LogNorm(max(smallest, 1e-6), max(largest, 2e-6))
-    height = sum(_HEAD_IN / 2 + _ROW_IN * len(field) for field in fields.values()) + _HEAD_IN
-    form = make_print_size(_WIDTH_IN)
-    with style.styled_figure(form, height) as figure:
-        ratios = [len(field) for field in fields.values()]
-        grid = style.add_panels(figure, len(fields), 1, sharex=True, height_ratios=ratios)[:, 0]
-        for axes, (task, field) in zip(grid, fields.items(), strict=True):
+    scale = _choose_scale(list(fields.values())) if quantity else Normalize(0.0, 1.0)
+    laws_of_panels = [len(field) for field in fields.values()]
+    panels_height = sum(_HEAD_IN / 2 + _ROW_IN * laws for laws in laws_of_panels)
+    size = make_print_size(_WIDTH_IN)
+    with style.styled_figure(size, panels_height + _HEAD_IN) as figure:
+        grid = style.add_panels(
+            figure,
+            len(fields),
+            1,
+            sharex=True,
+            height_ratios=laws_of_panels,
+        )
+        panels = grid[:, 0]
+        for axes, (task, field) in zip(panels, fields.items(), strict=True):
             image = axes.imshow(
-                field, aspect="auto", cmap=_PALETTE, norm=scale, interpolation="nearest"
+                field,
+                aspect="auto",
+                cmap=_PALETTE,
+                norm=scale,
+                interpolation="nearest",
             )
-            _mark(axes, results, task)
+            _label_laws(axes, results, task)
+            _mark_cells(axes, results, task)
             axes.set_title(task)
-        grid[-1].set_xticks(range(len(links)), links, rotation=90, fontsize=_TEXT_PT)
-        figure.colorbar(image, ax=list(grid), label=label, fraction=0.03)
+        panels[-1].set_xticks(range(len(links)), links, rotation=90, fontsize=_TEXT_PT)
+        figure.colorbar(image, ax=list(panels), label=label, fraction=0.03)
     return figure
+
+
+def _choose_scale(fields: list[Array]) -> Normalize:
+    """Returns a logarithmic scale of colours from the least to the largest number."""
+    known = np.concatenate([field[np.isfinite(field)].ravel() for field in fields])
+    smallest = float(known.min()) if known.size else 0.1
+    largest = float(known.max()) if known.size else 1.0
+    # a logarithmic scale needs limits above 0
+    return LogNorm(max(smallest, 1e-6), max(largest, 2e-6))
 
 
 def _list_laws(results: BenchResults, task: str) -> list[tuple[str, str]]:
     """Returns law and form of each row of a task's panel: the laws with results."""
-    return [(law, form) for law, form in results.plan.laws if any(results.of(task, law))]
+    return [(law, form) for law, form in results.plan.laws if any(results.select(task, law))]
 
 
 def _collect(results: BenchResults, task: str, quantity: str) -> Array:
@@ -98,8 +112,8 @@ def _collect(results: BenchResults, task: str, quantity: str) -> Array:
     laws = _list_laws(results, task)
     links = results.plan.links
     field = np.full((len(laws), len(links)), np.nan)
-    for result in results.of(task):
-        value = result.mean(quantity) if quantity else result.stable / len(result.runs)
+    for result in results.select(task):
+        value = result.compute_mean(quantity) if quantity else result.stable / len(result.runs)
         if value is not None:
             row = laws.index((result.cell.law, result.cell.form))
             column = links.index(result.cell.link)
@@ -107,15 +121,20 @@ def _collect(results: BenchResults, task: str, quantity: str) -> Array:
     return field
 
 
-def _mark(axes: Axes, results: BenchResults, task: str) -> None:
-    """Labels the rows of a panel and marks its cells with runs that are not stable."""
+def _label_laws(axes: Axes, results: BenchResults, task: str) -> None:
+    """Writes the laws beside the rows of a panel."""
     laws = _list_laws(results, task)
-    links = results.plan.links
     labels = [name_law(law, form) for law, form in laws]
     axes.set_yticks(range(len(laws)), labels, fontsize=_TEXT_PT)
     axes.grid(visible=False)
     axes.set_facecolor(_NONE)
-    for result in results.of(task):
+
+
+def _mark_cells(axes: Axes, results: BenchResults, task: str) -> None:
+    """Marks the cells of a panel that have runs that are open or not stable."""
+    laws = _list_laws(results, task)
+    links = results.plan.links
+    for result in results.select(task):
         x = [links.index(result.cell.link)]
         y = [laws.index((result.cell.law, result.cell.form))]
         if result.count(Stability.NOT_STABLE):

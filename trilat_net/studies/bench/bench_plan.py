@@ -1,14 +1,15 @@
-"""The plan of the suite: tasks, links and laws, cells, and the gains that one procedure tuned
-for each law.
+"""The plan of the benchmark suite: its tasks, links, laws and cells, and the tuned gains.
 
-Invariant: gains come from `trilat bench --tune` alone and are kept in a file. Each entry has
-the fingerprint of what it was tuned for, the resolved scenario and the sources of the law: a
-stale one is named wherever it is used. A law of which no candidate keeps the margin has none,
-and no runs. A plan is a function of the study, what is chosen of it, and the tuned gains; what
-cannot be right is refused before the first run.
+A task and a link are sets of overrides of a shipped scenario, with a second user or without.
+Every run of the suite is therefore a command of `trilat sim`. A plan is a function of the
+study, the selected part of the study, and the tuned gains.
 
-A task and a link are overrides of one of two shipped scenarios, with and without a second user;
-so every run of the suite is a command of `trilat sim`.
+Invariant:
+    - Gains come from `trilat bench --tune` only, and are stored in a file.
+    - Gains carry a fingerprint of the resolved scenario and of the law's sources. Gains with
+      another fingerprint are reported wherever they are used.
+    - A law has no gains, and no runs, if none of its candidates keeps the stability margin.
+    - Impossible selections are refused before the first run.
 """
 
 import hashlib
@@ -41,16 +42,15 @@ from ..tuning.search_space import SEARCH_SPACES, ModelInformation
 from ..tuning.tuning_plan import CandidateSearch, plan_tuning
 
 Settings = Mapping[str, Any]
-"""Overrides by key."""
+"""Overrides of a scenario by key."""
 
 BASES = {"three": "_bench_three", "two": "_bench_two", "level": "_bench_two"}
-"""Per form the scenario: three sites, two sites, and two sites whose arms lie in a level plane.
+"""Scenario of each form: three sites, two sites, and two sites whose arms lie in a level plane.
 """
-_START = (-0.6, 1.8)
 _OUT = (-0.4557864690179811, 1.3957985827210313)
-"""The pose whose end effector is 0.30 m further out, at the same height."""
+"""Pose whose end effector is 0.30 m further out than at the start, at the same height."""
 _LESS_OUT = (-0.4901506797631161, 1.484043235051833)
-"""The same 0.24 m further out: 0.09 m instead of 0.15 m behind the wall."""
+"""Pose whose end effector is 0.24 m further out: 0.09 m behind the wall instead of 0.15 m."""
 _LEFT = (-0.4, 1.8)
 _RIGHT = (-0.8, 1.8)
 _HAND = {"kind": "spring", "stiffness_nm_rad": 50.0, "damping_nm_s_rad": 5.0}
@@ -63,39 +63,44 @@ _WALL = {
 _CUT_S = (2.0, 5.0)
 _BURST_SAMPLES = 100.0
 _FIRST = 0.75
+"""Share a of the first user before a handover."""
 _SECOND = 0.25
-"""The share a of the first user, before a handover and after it."""
+"""Share a of the first user after a handover."""
 
 
-def _hand(to: Sequence[float], begin_s: float = 1.0, **more: Any) -> dict[str, Any]:
+def _build_hand(
+    to_rad: Sequence[float], move_start_s: float = 1.0, **keys: Any
+) -> dict[str, Any]:
+    """Returns the table of a hand that moves to a pose within 2 s, with further keys."""
     return {
         **_HAND,
-        "to_rad": list(to),
-        "move_start_s": begin_s,
-        "move_end_s": begin_s + 2.0,
-        **more,
+        "to_rad": list(to_rad),
+        "move_start_s": move_start_s,
+        "move_end_s": move_start_s + 2.0,
+        **keys,
     }
 
 
-def _shares(a: float) -> dict[str, dict[str, float]]:
+def _build_dominance(a: float) -> dict[str, dict[str, float]]:
+    """Returns the table of dominance, by site and peer, if the first user has the share a."""
     names = ("m1", "m2", "s")
-    rows = zip(names, complementary_shares(a).tolist(), strict=True)
-    return {
-        name: {peer: share for peer, share in zip(names, row, strict=True) if share}
-        for name, row in rows
-    }
+    dominance = {}
+    for name, row in zip(names, complementary_shares(a).tolist(), strict=True):
+        shares = zip(names, row, strict=True)
+        dominance[name] = {peer: share for peer, share in shares if share}
+    return dominance
 
 
 class BenchTask(NamedTuple):
-    """A task.
+    """A task of the suite.
 
     Attributes:
-        about: what it asks, in words.
-        settings: what makes it of the scenario.
-        users: how many it needs.
-        cut_s: when the links of the slave are cut, s; None: never.
-        duration_s: over which its errors and efforts are measured, s; a run lasts so long or
-            longer.
+        about: description of the task.
+        settings: overrides that turn a form's scenario into the task.
+        users: number of users that the task needs.
+        cut_s: start and end of the outage of all links of the slave, in s; None: no outage.
+        duration_s: time over which errors and efforts are measured, in s. A run lasts at least
+            as long.
     """
 
     about: str
@@ -106,83 +111,95 @@ class BenchTask(NamedTuple):
 
 
 _HANDOVER: dict[str, Any] = {
-    "sites.m1.hands": [_hand(_LEFT, end_s=8.0)],
-    "sites.m2.hands": [_hand(_RIGHT, 10.0, from_rad=list(_LEFT), start_s=8.0)],
-    "dominance": _shares(_FIRST),
+    "sites.m1.hands": [_build_hand(_LEFT, end_s=8.0)],
+    "sites.m2.hands": [_build_hand(_RIGHT, 10.0, from_rad=list(_LEFT), start_s=8.0)],
+    "dominance": _build_dominance(_FIRST),
     "timeline": [
         {"at_s": 7.0, "dominance": site, "to": row, "ramp_s": 2.0}
-        for site, row in _shares(_SECOND).items()
+        for site, row in _build_dominance(_SECOND).items()
     ],
 }
 TASKS = {
-    "free": BenchTask("a user moves the slave by 0.3 m", {"sites.m1.hands": [_hand(_OUT)]}),
+    "free": BenchTask(
+        "a user moves the slave by 0.3 m", {"sites.m1.hands": [_build_hand(_OUT)]}
+    ),
     "contact": BenchTask(
-        "a wall of 2000 N/m is in the slave's way at half of that",
-        {"sites.m1.hands": [_hand(_OUT)], "sites.s.environment": [_WALL]},
+        "as free, but after half of the way the slave meets a wall of 2000 N/m",
+        {"sites.m1.hands": [_build_hand(_OUT)], "sites.s.environment": [_WALL]},
     ),
     "handover": BenchTask(
-        "one user lets go while dominance goes to the other",
+        "the first user lets go while dominance passes to the second",
         _HANDOVER,
         users=2,
         duration_s=24.0,
     ),
     "disagree": BenchTask(
-        "two users, of whom the first leads, hold poses that are 0.4 rad apart",
+        "two users hold poses 0.4 rad apart; the first user leads",
         {
-            "sites.m1.hands": [_hand(_LEFT)],
-            "sites.m2.hands": [_hand(_RIGHT)],
-            "dominance": _shares(_FIRST),
+            "sites.m1.hands": [_build_hand(_LEFT)],
+            "sites.m2.hands": [_build_hand(_RIGHT)],
+            "dominance": _build_dominance(_FIRST),
         },
         users=2,
     ),
     "outage": BenchTask(
-        "the slave hears nothing, and is not heard, for 3 s of free motion",
-        {"sites.m1.hands": [_hand(_OUT)]},
+        "during free motion, all links of the slave fail for 3 s",
+        {"sites.m1.hands": [_build_hand(_OUT)]},
         cut_s=_CUT_S,
     ),
 }
 
-LINKS: dict[str, Settings] = {
-    f"rtt{rtt_ms}" + (f"-loss{percent}" if percent else ""): {
-        "model": "constant",
-        "delay_ms": rtt_ms / 2,
-        **({"loss": percent / 100, "loss_burst": _BURST_SAMPLES} if percent else {}),
-    }
-    for percent in GRID_LOSSES_PERCENT
-    for rtt_ms in GRID_ROUND_TRIPS_MS
-}
-"""By name the keys of all links. Losses come in bursts of 0.1 s: single ones cost a tick at 1
-kHz.
-"""
+
+def _build_constant_links() -> dict[str, Settings]:
+    """Returns the links with a constant delay, with and without losses, by name."""
+    links: dict[str, Settings] = {}
+    for percent in GRID_LOSSES_PERCENT:
+        for rtt_ms in GRID_ROUND_TRIPS_MS:
+            name = f"rtt{rtt_ms}"
+            keys: dict[str, Any] = {"model": "constant", "delay_ms": rtt_ms / 2}
+            if percent:
+                name += f"-loss{percent}"
+                # at 1 kHz a single lost sample costs a site only one tick
+                keys |= {"loss": percent / 100, "loss_burst": _BURST_SAMPLES}
+            links[name] = keys
+    return links
+
+
+LINKS: dict[str, Settings] = _build_constant_links()
+"""Keys of all links, by name. Losses come in bursts of 0.1 s."""
 LINKS |= {name: {"preset": name} for name in ("4g", "5g", "geo")}
 LINKS["trace"] = {"model": "trace", "file": "busy_machine.csv", "at_end": "loop"}
 
 _MEAN_MS = {"geo": 300.0}
-"""Mean delays of presets for which `ROUND_TRIPS` take longer than the tasks do, ms."""
+"""Mean delays, in ms, of presets for which `ROUND_TRIPS` take longer than the tasks."""
 
-SHORTER_REACH: Settings = {"sites.m1.hands": [_hand(_LESS_OUT)]}
-"""What makes of `contact` the same with a shorter reach: of both the stiffness at the hand is
-found.
+SHORTER_REACH: Settings = {"sites.m1.hands": [_build_hand(_LESS_OUT)]}
+"""Overrides that give the task `contact` a shorter reach.
+
+The stiffness at the hand follows from the difference between both reaches.
 """
 
 _ROLES = ("master", "master", "slave")
 _TUNED_LAWS = {name: law for name, law in BUILT_IN.items() if law.tune}
 LAWS_OF_ANY = tuple(name for name, law in _TUNED_LAWS.items() if not law.explain_misfit(_ROLES))
+"""Laws that fit two users and a slave."""
 LAWS_OF_TWO = tuple(name for name in _TUNED_LAWS if name not in LAWS_OF_ANY)
+"""Laws for two sites only."""
 TUNED_ROUND_TRIPS_MS = (68, 272, 1088)
-"""The delays at which every law is tuned."""
+"""Round trips at which every law is tuned, in ms."""
 TUNING_TASK = "contact"
-"""The task in which it is; its twin without the wall is free motion."""
+"""The task in which laws are tuned; its twin without the wall is free motion."""
 
 
 class BenchStudy(NamedTuple):
     """A part of the suite.
 
     Attributes:
-        about: what it is for, in words.
-        tasks, links: by name.
-        laws: per form those that run in it.
-        seeds: of runs in which anything is drawn.
+        about: purpose of the study.
+        tasks: names of its tasks.
+        laws: names of its laws, by the form in which they run.
+        links: names of its links.
+        seeds: number of seeds of a cell whose link draws random numbers.
     """
 
     about: str
@@ -198,18 +215,23 @@ _LOSSY = ("rtt68-loss50", "rtt136-loss50", "rtt544-loss50")
 _COARSE = tuple(name for name in LINKS if "-loss" not in name or name in _LOSSY)
 STUDIES = {
     "full": BenchStudy(
-        about="every law and task", tasks=tuple(TASKS), laws=_ALL_LAWS, links=_COARSE, seeds=20
+        about="all laws in all tasks",
+        tasks=tuple(TASKS),
+        laws=_ALL_LAWS,
+        links=_COARSE,
+        seeds=20,
     ),
     "small": BenchStudy(
-        about="the same at three links",
+        about="all laws in all tasks, over three links",
         tasks=tuple(TASKS),
         laws=_ALL_LAWS,
         links=("rtt68", "rtt136-loss50", "4g"),
         seeds=2,
     ),
     "round-trips": BenchStudy(
-        about="after Rodriguez-Seda, Lee and Spong (2009): wave variables, a Smith predictor, synchronisation and "
-        "P+d with its relatives between two level arms, over round trips and losses",
+        about="after Rodriguez-Seda, Lee and Spong (2009): wave variables, a Smith predictor, "
+        "synchronisation, and P+d with its relatives, between two level arms, over a grid of "
+        "round trips and losses",
         tasks=("free", "contact"),
         laws={"level": ("wave", "smith", "sync", "adaptive", "p_d", "pd_d", "lee_spong")},
         links=_GRID,
@@ -219,48 +241,69 @@ STUDIES = {
 
 
 ROUND_TRIPS = 40
-"""A run lasts for so many round trips or longer."""
+"""A run lasts for at least this number of round trips."""
 
 
 def build_settings(form: str, task: str, link: str, seed: int | None = None) -> dict[str, Any]:
-    """Returns the overrides of a form's scenario that make a run of the suite, its law aside."""
-    asked = TASKS[task]
-    keys = dict(LINKS[link])
-    trips_s = 2e-3 * ROUND_TRIPS * keys.get("delay_ms", _MEAN_MS.get(link, 0.0))
-    settings = {**asked.settings, "link": keys, "duration_s": max(asked.duration_s, trips_s)}
-    if asked.cut_s is not None:
-        keys["outages_s"] = [list(asked.cut_s)]
-        if form == "three":  # the users hear each other all the time
-            settings |= {f"links.{name}.outages_s": [] for name in ("m1->m2", "m2->m1")}
+    """Returns the overrides that turn a form's scenario into a run, apart from the law.
+
+    Args:
+        form: a key of `BASES`.
+        task: a key of `TASKS`.
+        link: a key of `LINKS`.
+        seed: seed of the run; None: that of the scenario.
+    """
+    bench_task = TASKS[task]
+    link_keys = dict(LINKS[link])
+    delay_ms = link_keys.get("delay_ms", _MEAN_MS.get(link, 0.0))
+    trips_s = 2e-3 * ROUND_TRIPS * delay_ms
+    settings = {
+        **bench_task.settings,
+        "link": link_keys,
+        "duration_s": max(bench_task.duration_s, trips_s),
+    }
+    if bench_task.cut_s is not None:
+        link_keys["outages_s"] = [list(bench_task.cut_s)]
+        if form == "three":
+            # the outage is that of the slave: the users still receive each other
+            settings["links.m1->m2.outages_s"] = []
+            settings["links.m2->m1.outages_s"] = []
     if form == "level":
         settings["arm.g_m_s2"] = 0.0
-    return settings if seed is None else {**settings, "seed": seed}
+    if seed is not None:
+        settings["seed"] = seed
+    return settings
 
 
 GAINS_FILE = Path(str(resources.files("trilat_net.studies.bench") / "bench_gains.json"))
+"""The tuned gains, stored with the program."""
 KNOWLEDGE = ModelInformation()
 """All laws know gravity exactly."""
 TUNING_BUDGET = 16
-"""Candidates per gain of a law, at each delay."""
+"""Candidates per gain of a law, at each round trip."""
 TUNING_MARGIN = 1.5
-"""With the gains that are kept, the run is stable at the pose with so many times the delay,
-too, and
-"""
+"""Kept gains are stable at the pose with delays longer by this factor, too."""
 MARGIN_LENGTHS = 3.0
-"""so many times as long: what is slow is not taken for what lacks the margin."""
+"""Factor by which the run with longer delays is longer, so that a slow run does not fail."""
 
 
 class TunedGains(msgspec.Struct, frozen=True):
-    """The gains of a law in a form of the tasks at a round trip.
+    """The gains of a law in a form of the tasks, tuned at a round trip.
+
+    The procedure keeps the candidate with the least error among those that are stable at the
+    pose with the margin.
 
     Attributes:
-        gains: by name: of the stable candidates at the pose that have the margin those with the
-            least error; none if there is no such candidate.
-        settled: how many of the candidates were stable and at the pose.
-        tried: how many there were.
-        passed: how many of the stable ones with less error had not the margin.
-        error_rad, effort_nm: of that candidate; None without one.
-        fingerprint: of scenario and law.
+        form: a key of `BASES`.
+        law: name of the law.
+        round_trip_ms: the round trip, in ms.
+        gains: the kept gains by name; empty if no candidate was stable with the margin.
+        settled: number of candidates that were stable at the pose.
+        tried: number of all candidates.
+        passed: number of stable candidates with a smaller error but without the margin.
+        error_rad: error of the kept candidate, in rad; None if there is none.
+        effort_nm: effort of the kept candidate, in N m; None if there is none.
+        fingerprint: fingerprint of the scenario and the law.
     """
 
     form: str
@@ -274,144 +317,158 @@ class TunedGains(msgspec.Struct, frozen=True):
     effort_nm: float | None
     fingerprint: str
 
+    @property
+    def key(self) -> tuple[str, str, int]:
+        """Form, law and round trip, which identify the gains in the file."""
+        return self.form, self.law, self.round_trip_ms
+
     def __str__(self) -> str:
         return f"{self.law} ({self.form}, {self.round_trip_ms} ms)"
 
 
-def name_settings(settings: Settings) -> list[str]:
+def format_settings(settings: Settings) -> list[str]:
     """Returns overrides as texts KEY=VALUE."""
     return [f"{key}={format_toml_value(value)}" for key, value in settings.items()]
 
 
 def load_tuning_task(form: str, round_trip_ms: int) -> TuningScenario:
     """Returns the experiment in which the laws of a form are tuned."""
-    return load_tuning_scenario(
-        BASES[form], name_settings(build_settings(form, TUNING_TASK, f"rtt{round_trip_ms}"))
-    )
+    settings = build_settings(form, TUNING_TASK, f"rtt{round_trip_ms}")
+    return load_tuning_scenario(BASES[form], format_settings(settings))
 
 
 @cache
 def fingerprint_tuning(form: str, law: str, round_trip_ms: int) -> str:
-    """Returns the fingerprint of what a law is tuned for: the scenario, the law's sources and
-    its ranges.
+    """Returns the fingerprint of a tuning: of its scenario, the law's sources and the ranges.
+
+    Gains with another fingerprint were tuned for something else.
     """
     space = SEARCH_SPACES[law]
     assert space.kind is not None
-    sources = [
-        module for module in (control, inspect.getmodule(space.kind)) if module is not None
-    ]
-    source = "".join(map(inspect.getsource, sources))
+    modules = (control, inspect.getmodule(space.kind))
+    sources = "".join(inspect.getsource(module) for module in modules if module is not None)
     ranges = json.dumps([knob._asdict() for knob in space.knobs])
-    text = load_tuning_task(form, round_trip_ms).scenario.text
-    return hashlib.sha256(
-        "\0".join(
-            (text, source, ranges, f"{TUNING_BUDGET} {TUNING_MARGIN} {MARGIN_LENGTHS}")
-        ).encode()
-    ).hexdigest()[:16]
+    scenario_text = load_tuning_task(form, round_trip_ms).scenario.text
+    procedure = f"{TUNING_BUDGET} {TUNING_MARGIN} {MARGIN_LENGTHS}"
+    content = "\0".join([scenario_text, sources, ranges, procedure])
+    return hashlib.sha256(content.encode()).hexdigest()[:16]
 
 
 def read_gains(path: Path = GAINS_FILE) -> dict[tuple[str, str, int], TunedGains]:
-    """Returns all tuned gains, by form, law and round trip."""
-    entries = (
-        msgspec.json.decode(path.read_bytes(), type=list[TunedGains]) if path.exists() else []
-    )
-    return {(one.form, one.law, one.round_trip_ms): one for one in entries}
+    """Returns all tuned gains of a file, by form, law and round trip in ms."""
+    if not path.exists():
+        return {}
+    entries = msgspec.json.decode(path.read_bytes(), type=list[TunedGains])
+    return {gains.key: gains for gains in entries}
 
 
 def find_stale(entries: Iterable[TunedGains]) -> list[str]:
-    """Returns the gains that were tuned for another scenario, or for another text of the law."""
+    """Returns the names of gains that were tuned for another scenario or text of the law."""
     return [
-        str(one)
-        for one in entries
-        if fingerprint_tuning(one.form, one.law, one.round_trip_ms) != one.fingerprint
+        str(gains) for gains in entries if fingerprint_tuning(*gains.key) != gains.fingerprint
     ]
 
 
 def choose_round_trip(mean_ms: float) -> int:
-    """Returns at which round trip the gains for a link were tuned: the next one that is no
-    shorter.
+    """Returns the round trip of the gains for a link: the next tuned one that is not shorter.
+
+    The longest tuned round trip serves all links that are longer.
     """
-    longer = (tuned_ms for tuned_ms in TUNED_ROUND_TRIPS_MS if tuned_ms >= mean_ms)
-    return next(longer, TUNED_ROUND_TRIPS_MS[-1])
+    for tuned_ms in TUNED_ROUND_TRIPS_MS:
+        if tuned_ms >= mean_ms:
+            return tuned_ms
+    return TUNED_ROUND_TRIPS_MS[-1]
 
 
-def _has_margin(form: str, round_trip_ms: int, search: CandidateSearch, place: int) -> bool:
-    """Returns whether a candidate, as it is, is stable at the pose if delays are longer by the
-    margin.
+def _has_margin(form: str, round_trip_ms: int, search: CandidateSearch, candidate: int) -> bool:
+    """Returns True if a candidate stays stable at the pose when delays grow by the margin.
+
+    Args:
+        form: a key of `BASES`.
+        round_trip_ms: round trip of the tuning, in ms.
+        search: the search.
+        candidate: index of the candidate; its gains are used unchanged.
     """
     base = load_tuning_task(form, round_trip_ms)
-    controls = search.space.controls(base.scenario, KNOWLEDGE, search.tried[place])
+    controls = search.space.controls(base.scenario, KNOWLEDGE, search.tried[candidate])
     longer = {
         "link.delay_ms": 0.5 * TUNING_MARGIN * round_trip_ms,
         "duration_s": MARGIN_LENGTHS * base.scenario.duration_s,
     }
-    texts = (*base.overrides, *name_settings(longer))
-    found = load_tuning_scenario(base.source, texts).with_controls(controls)
-    return measure_candidate(*found.texts).outcome is CandidateClass.SETTLED
+    overrides = (*base.overrides, *format_settings(longer))
+    experiment = load_tuning_scenario(base.source, overrides).with_controls(controls)
+    return measure_candidate(*experiment.texts).outcome is CandidateClass.SETTLED
 
 
 def tune_laws(
-    wanted: Mapping[str, Sequence[str]],
+    laws_by_form: Mapping[str, Sequence[str]],
     jobs: int | None = None,
     on: Workers = None,
     progress: Progress = ignore_progress,
     budget: int = TUNING_BUDGET,
 ) -> list[TunedGains]:
-    """Tunes the laws of every form at every delay, with `budget` candidates per gain; returns
-    their gains.
+    """Tunes laws at every round trip of the suite, and returns their gains.
 
-    `jobs` and `on` are those of `trilat_net.tune`; `progress` gets the tunings that are done,
-    and all.
+    Args:
+        laws_by_form: names of the laws, by form.
+        jobs: number of processes, as for `trilat_net.tune`.
+        on: a cluster, as for `trilat_net.tune`.
+        progress: called with the number of finished tunings and of all tunings.
+        budget: number of candidates per gain of a law.
     """
-    found: list[TunedGains] = []
-    total = len(TUNED_ROUND_TRIPS_MS) * sum(map(len, wanted.values()))
-    for form, laws in wanted.items():
+    tuned: list[TunedGains] = []
+    total = len(TUNED_ROUND_TRIPS_MS) * sum(map(len, laws_by_form.values()))
+    for form, laws in laws_by_form.items():
         for round_trip_ms in TUNED_ROUND_TRIPS_MS:
             base = load_tuning_task(form, round_trip_ms)
-            for size in sorted({len(SEARCH_SPACES[law].knobs) for law in laws}):
-                alike = [law for law in laws if len(SEARCH_SPACES[law].knobs) == size]
+            gain_counts = {law: len(SEARCH_SPACES[law].knobs) for law in laws}
+            # a plan has one budget for all of its laws, so laws are grouped by their gains
+            for count in sorted(set(gain_counts.values())):
                 plan = plan_tuning(
-                    base.source, base.overrides, laws=alike, budget=size * budget
+                    base.source,
+                    base.overrides,
+                    laws=[law for law in laws if gain_counts[law] == count],
+                    budget=count * budget,
                 )
-                found += [
-                    _keep(form, round_trip_ms, one) for one in plan.run(jobs, on=on).found
-                ]
-                progress(len(found), total)
-    return found
+                searches = plan.run(jobs, on=on).found
+                tuned += [_select_gains(form, round_trip_ms, search) for search in searches]
+                progress(len(tuned), total)
+    return tuned
 
 
-def _keep(form: str, round_trip_ms: int, search: CandidateSearch) -> TunedGains:
+def _select_gains(form: str, round_trip_ms: int, search: CandidateSearch) -> TunedGains:
+    """Returns the gains of the stable candidate with the least error that has the margin."""
     law = search.space.law
     scores = search.scores
     settled = [n for n, score in enumerate(scores) if score.outcome is CandidateClass.SETTLED]
-    candidates = sorted(settled, key=lambda n: scores[n].error_rad or 0.0)
-    kept = (
-        n for n, at in enumerate(candidates) if _has_margin(form, round_trip_ms, search, at)
-    )
-    passed = next(kept, len(candidates))
-    place = candidates[passed] if passed < len(candidates) else None
+    settled.sort(key=lambda n: scores[n].error_rad or 0.0)
+    selected = None
+    passed = 0
+    for candidate in settled:
+        if _has_margin(form, round_trip_ms, search, candidate):
+            selected = candidate
+            break
+        passed += 1
     return TunedGains(
         form=form,
         law=law,
         round_trip_ms=round_trip_ms,
-        gains={} if place is None else search.tried[place],
-        settled=len(candidates),
+        gains={} if selected is None else search.tried[selected],
+        settled=len(settled),
         tried=len(search.tried),
         passed=passed,
-        error_rad=None if place is None else scores[place].error_rad,
-        effort_nm=None if place is None else scores[place].effort_nm,
+        error_rad=None if selected is None else scores[selected].error_rad,
+        effort_nm=None if selected is None else scores[selected].effort_nm,
         fingerprint=fingerprint_tuning(form, law, round_trip_ms),
     )
 
 
-def write_gains(found: Sequence[TunedGains], path: Path = GAINS_FILE) -> None:
-    """Writes gains into the file of the suite, in place of those of the same law, form and
-    delay.
-    """
-    kept: dict[Any, TunedGains] = read_gains(path) | {
-        (one.form, one.law, one.round_trip_ms): one for one in found
-    }
-    rows = [json.dumps(msgspec.to_builtins(kept[key])) for key in sorted(kept)]
+def write_gains(tuned: Sequence[TunedGains], path: Path = GAINS_FILE) -> None:
+    """Writes gains into a file, and replaces those of the same form, law and round trip."""
+    entries = read_gains(path)
+    for gains in tuned:
+        entries[gains.key] = gains
+    rows = [json.dumps(msgspec.to_builtins(entries[key])) for key in sorted(entries)]
     write_whole(path, "[\n" + ",\n".join(rows) + "\n]\n")
 
 
@@ -419,7 +476,16 @@ MAX_BENCH_SEEDS = 1000
 
 
 class BenchCell(NamedTuple):
-    """One law in a task over a link; with the gains that it has there."""
+    """A law in a task over a link, with its gains and seeds.
+
+    Attributes:
+        task: a key of `TASKS`.
+        law: name of the law.
+        link: a key of `LINKS`.
+        form: a key of `BASES`.
+        tuned: gains of the law for this link.
+        seeds: seeds of the runs.
+    """
 
     task: str
     law: str
@@ -430,14 +496,14 @@ class BenchCell(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Its name in results."""
+        """Name of the cell in results: task/law/link."""
         return f"{self.task}/{self.law}/{self.link}"
 
     @property
     def inputs(self) -> str:
-        """A digest of what its runs are made of: the scenario, task, link and gains."""
+        """A digest of everything that determines the runs: scenario, task, link and gains."""
         parts = (
-            _base_text(self.form),
+            _load_base_text(self.form),
             build_settings(self.form, self.task, self.link),
             self.tuned,
         )
@@ -445,25 +511,24 @@ class BenchCell(NamedTuple):
 
     @property
     def key(self) -> str:
-        """What its runs are called in the journal, see `BenchRun.cell`."""
+        """Name of the cell in the journal, as in `BenchRun.cell`; other gains, another name."""
         return f"{self.name} {self.inputs}"
 
     def build(self, seed: int) -> TuningScenario:
-        """Returns the experiment of one of its runs."""
-        settings = name_settings(build_settings(self.form, self.task, self.link, seed))
-        return load_tuning_scenario(BASES[self.form], settings).with_gains(
-            SEARCH_SPACES[self.law], KNOWLEDGE, self.tuned.gains
-        )
+        """Returns the experiment of the run with a seed."""
+        settings = build_settings(self.form, self.task, self.link, seed)
+        base = load_tuning_scenario(BASES[self.form], format_settings(settings))
+        return base.with_gains(SEARCH_SPACES[self.law], KNOWLEDGE, self.tuned.gains)
 
 
 class BenchPlan(NamedTuple):
     """The suite, or a part of it, ready to run.
 
     Attributes:
-        study: its name.
-        cells: in the order in which they run.
-        laws: all that were asked for, with their forms: those without cells have empty rows.
-        without: of the gains in question those of which there are none.
+        study: name of the study.
+        cells: the cells in the order in which they run.
+        laws: all selected laws with their forms; a law without cells has an empty row.
+        without: tunings of the selected laws that found no gains.
     """
 
     study: str
@@ -473,34 +538,35 @@ class BenchPlan(NamedTuple):
 
     @property
     def tasks(self) -> list[str]:
-        """The tasks that run, in order."""
+        """Tasks of the cells, in order."""
         return list(dict.fromkeys(cell.task for cell in self.cells))
 
     @property
     def links(self) -> list[str]:
-        """The links over which they run, in order."""
+        """Links of the cells, in order."""
         return list(dict.fromkeys(cell.link for cell in self.cells))
 
     @property
     def runs(self) -> int:
-        """How many runs there are."""
+        """Number of runs of all cells."""
         return sum(len(cell.seeds) for cell in self.cells)
 
     def cell(self, name: str) -> BenchCell:
-        """Returns a cell by its name, as in contact/wave/rtt272.
+        """Returns the cell with a name, as in contact/wave/rtt272.
 
         Raises:
-            UsageError: there is none of that name.
+            UsageError: no cell has that name.
         """
-        names = {cell.name: cell for cell in self.cells}
-        if name not in names:
-            hint = suggest_nearest(name, list(names)) or f"; the first is {next(iter(names))}"
+        cells = {cell.name: cell for cell in self.cells}
+        if name not in cells:
+            hint = suggest_nearest(name, list(cells)) or f"; the first is {next(iter(cells))}"
             raise UsageError(f"there is no cell {name!r}{hint}")
-        return names[name]
+        return cells[name]
 
 
 @cache
-def _base_text(form: str) -> str:
+def _load_base_text(form: str) -> str:
+    """Returns the resolved text of a form's scenario."""
     return load_tuning_scenario(BASES[form]).scenario.text
 
 
@@ -512,53 +578,70 @@ def plan_bench(
     links: Sequence[str] = (),
     seeds: int | None = None,
 ) -> BenchPlan:
-    """Returns the suite, checked and ready to run; its arguments are those of
-    `trilat_net.bench`.
+    """Returns a study of the suite, or a part of it, checked and ready to run.
+
+    Args:
+        study: a key of `STUDIES`.
+        tasks: names of the selected tasks; empty: all of the study.
+        laws: names of the selected laws; empty: all of the study.
+        links: names of the selected links, of which any of `LINKS` will do; empty: all of the
+            study.
+        seeds: number of seeds; None: that of the study.
 
     Raises:
-        UsageError: there is no such study, task, law or link, or no gains for a law.
+        UsageError: a name is unknown, a law has not been tuned, or no cell remains.
     """
-    asked = STUDIES[_choose("study", study, list(STUDIES))]
-    if seeds is not None and not 1 <= seeds <= MAX_BENCH_SEEDS:
-        raise UsageError(f"--seeds is how many, 1 to {MAX_BENCH_SEEDS}, not {seeds}")
-    known = [law for laws_of_form in asked.laws.values() for law in laws_of_form]
-    chosen_tasks = [_choose("task", name, list(asked.tasks)) for name in tasks] or list(
-        asked.tasks
+    bench_study = STUDIES[_check_name("study", study, list(STUDIES))]
+    if seeds is None:
+        seeds = bench_study.seeds
+    elif not 1 <= seeds <= MAX_BENCH_SEEDS:
+        raise UsageError(f"--seeds is a number from 1 to {MAX_BENCH_SEEDS}, not {seeds}")
+    all_laws = [law for form_laws in bench_study.laws.values() for law in form_laws]
+    tasks = _select_names("task", tasks, default=bench_study.tasks)
+    laws = _select_names("law", laws, default=all_laws)
+    links = _select_names("link", links, default=bench_study.links, known=list(LINKS))
+
+    tuned_cells = list(
+        _list_cells(study=bench_study, tasks=tasks, laws=laws, links=links, seeds=seeds)
     )
-    chosen_laws = [_choose("law", name, known) for name in laws] or known
-    chosen_links = [_choose("link", name, list(LINKS)) for name in links] or list(asked.links)
-    count = asked.seeds if seeds is None else seeds
-    listed = list(
-        _list_cells(
-            study=asked, tasks=chosen_tasks, laws=chosen_laws, links=chosen_links, seeds=count
-        )
-    )
-    cells = [cell for cell in listed if cell.tuned.gains]
-    without = {str(cell.tuned): cell.tuned for cell in listed if not cell.tuned.gains}
+    cells = [cell for cell in tuned_cells if cell.tuned.gains]
+    without = {str(cell.tuned): cell.tuned for cell in tuned_cells if not cell.tuned.gains}
     if not cells:
-        names = ", ".join(chosen_tasks)
-        why = (
-            f"no candidate was stable for {', '.join(without)}"
-            if without
-            else f"{names} asks for two users"
-        )
-        raise UsageError(
-            f"{', '.join(chosen_laws)}: {why}, or hands over; choose another task or link"
-        )
-    rows = [
-        (law, form) for form, laws in asked.laws.items() for law in laws if law in chosen_laws
-    ]
+        raise UsageError(_explain_no_cells(tasks, laws, list(without)))
+    rows = []
+    for form, form_laws in bench_study.laws.items():
+        rows += [(law, form) for law in form_laws if law in laws]
     return BenchPlan(study, cells, rows, list(without.values()))
 
 
+def _explain_no_cells(tasks: Sequence[str], laws: Sequence[str], without: list[str]) -> str:
+    """Returns the error text for a selection without a cell."""
+    law_names = ", ".join(laws)
+    if without:
+        return (
+            f"{law_names}: no candidate was stable for {', '.join(without)}; "
+            "choose another link or law"
+        )
+    return (
+        f"{law_names} cannot run in {', '.join(tasks)}: two users or a handover are more than "
+        "the law supports; choose another task or law"
+    )
+
+
+NO_GAINS = "no gains"
+
+
 def explain_no_cell(law: str, form: str, task: str) -> str:
-    """Returns why a law does not run in a task, in the word of the tables; "no gains" if only
-    they lack.
+    """Returns the reason why a law does not run in a task, as the tables print it.
+
+    For a law that fits the task the reason is `NO_GAINS`.
     """
-    if TASKS[task].users > 1 and form != "three":
+    bench_task = TASKS[task]
+    if bench_task.users > 1 and form != "three":
         return "-"
-    fixed = "timeline" in TASKS[task].settings and BUILT_IN[law].Settings.fixed_shares
-    return "no handover" if fixed else "no gains"
+    if "timeline" in bench_task.settings and BUILT_IN[law].Settings.fixed_shares:
+        return "no handover"
+    return NO_GAINS
 
 
 def _list_cells(
@@ -568,38 +651,77 @@ def _list_cells(
     links: Sequence[str],
     seeds: int,
 ) -> Iterator[BenchCell]:
+    """Yields the cells of the selected tasks, laws and links, with or without gains."""
     gains = read_gains()
-    facts = {link: _describe_link(link) for link in links}
-    for form, laws_of_form in study.laws.items():
-        for law in (law for law in laws_of_form if law in laws):
-            for task in (
-                task for task in tasks if explain_no_cell(law, form, task) == "no gains"
-            ):
-                for link, (random, mean_ms) in facts.items():
-                    at_ms = choose_round_trip(2.0 * mean_ms)
-                    tuned = gains.get((form, law, at_ms))
-                    if tuned is None:
-                        remedy = f"make them: trilat bench --tune --law {law}"
-                        raise UsageError(
-                            f"there are no gains of {law} for {at_ms} ms; {remedy}"
-                        )
-                    chosen = tuple(range(1, 1 + (seeds if random else 1)))
+    link_facts = {link: _describe_link(link) for link in links}
+    for form, form_laws in study.laws.items():
+        for law in form_laws:
+            if law not in laws:
+                continue
+            for task in tasks:
+                if explain_no_cell(law, form, task) != NO_GAINS:
+                    continue
+                for link, (random, mean_ms) in link_facts.items():
+                    count = seeds if random else 1
                     yield BenchCell(
-                        task=task, law=law, link=link, form=form, tuned=tuned, seeds=chosen
+                        task=task,
+                        law=law,
+                        link=link,
+                        form=form,
+                        tuned=_find_gains(gains, form, law, mean_ms),
+                        seeds=tuple(range(1, 1 + count)),
                     )
 
 
+def _find_gains(
+    gains: Mapping[tuple[str, str, int], TunedGains], form: str, law: str, delay_ms: float
+) -> TunedGains:
+    """Returns the gains of a law for a mean delay one way, in ms.
+
+    Raises:
+        UsageError: the law has not been tuned at that delay.
+    """
+    round_trip_ms = choose_round_trip(2.0 * delay_ms)
+    tuned = gains.get((form, law, round_trip_ms))
+    if tuned is None:
+        raise UsageError(
+            f"{law} has no gains for a round trip of {round_trip_ms} ms; tune the law with: "
+            f"trilat bench --tune --law {law}"
+        )
+    return tuned
+
+
 def _describe_link(link: str) -> tuple[bool, float]:
-    """Returns if anything of a link is drawn, and its mean delay one way, ms."""
-    scenario = load_tuning_scenario(
-        BASES["two"], name_settings({"link": dict(LINKS[link])})
-    ).scenario
+    """Returns True if a link draws random numbers, and its mean delay one way, in ms."""
+    settings = format_settings({"link": dict(LINKS[link])})
+    scenario = load_tuning_scenario(BASES["two"], settings).scenario
     first = next(iter(scenario.links.values()))
     return scenario.random, first.moments().mean_ms
 
 
-def _choose(option: str, name: str, known: Sequence[str]) -> str:
+def _select_names(
+    option: str,
+    names: Sequence[str],
+    *,
+    default: Sequence[str],
+    known: Sequence[str] | None = None,
+) -> list[str]:
+    """Returns the names of an option after a check, or the default if there are no names.
+
+    Args:
+        option: the option, without its dashes.
+        names: names from the user.
+        default: names in place of an empty selection.
+        known: names that exist; None: those of `default`.
+    """
+    if known is None:
+        known = default
+    return [_check_name(option, name, known) for name in names] or list(default)
+
+
+def _check_name(option: str, name: str, known: Sequence[str]) -> str:
+    """Returns the name from an option if it is known; raises UsageError otherwise."""
     if name not in known:
-        hint = suggest_nearest(name, list(known)) or f"; there are {', '.join(known)}"
-        raise UsageError(f"--{option}: there is no {option} {name!r} in it{hint}")
+        hint = suggest_nearest(name, list(known)) or f"; available: {', '.join(known)}"
+        raise UsageError(f"--{option}: no {option} {name!r} is available{hint}")
     return name

@@ -1,8 +1,11 @@
-"""The results of the suite: its runs by place, as tables, as Markdown, as CSV and as JSON.
+"""The results of the benchmark suite by cell, as tables, Markdown, CSV and JSON.
 
-Invariant: a function of the runs alone, without a clock: equal results give equal bytes. A
-number over seeds has its 95 % interval, and every run that is not stable shows. No law is
-ranked.
+Invariant:
+    - The output is a function of the runs alone, without a clock: equal results give equal
+      bytes.
+    - A number over seeds has its 95 % interval.
+    - Every run that is not stable is visible.
+    - No law is ranked.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,49 +20,59 @@ from ...reporting.result_text import Block, TextTable, format_number
 from ...results import Result
 from ..intervals import MeanInterval, mean_interval, wilson_interval
 from ..study_folder import encode_csv
-from .bench_plan import STUDIES, TASKS, BenchCell, BenchPlan, explain_no_cell
+from .bench_plan import STUDIES, TASKS, BenchCell, BenchPlan, TunedGains, explain_no_cell
 
 LEAST_CONTACT_N = 1.0
-"""A mean force of the wall below this, at the end, is no contact, N."""
+"""Least mean force of the wall at the end of a run with contact, in N."""
 PASSIVE_J = -1e-3
-"""What hands, friction and wall have put into a passive run is never less, J."""
+"""Least energy that hands, friction and wall have put into a passive run at any time, in J."""
 LONGEST_S = 100.0
-"""No run is made longer; so long, too, is the one that refutes or confirms one that is not
-stable, s.
-"""
+"""Duration in s of the longest runs, and of those that confirm or refute an unstable run."""
+LEAST_SEEDS = 20
+"""Least number of runs for which there is an interval."""
 
 
 def name_run(key: str, to_s: float) -> str:
-    """Returns what the runs of a cell are called in the journal; those that were made again, of
-    their own.
+    """Returns the name of a cell's runs in the journal.
+
+    Args:
+        key: key of the cell.
+        to_s: duration of a repeated run, in s, which is part of its name; 0 for a first run.
     """
     return f"{key} to {to_s:g} s" if to_s else key
 
 
 class BenchRun(msgspec.Struct, frozen=True):
-    """One finished run of the suite.
+    """A finished run of the suite.
 
     Attributes:
-        name: of its cell, task/law/link.
-        inputs: a digest of what the cell is made of.
-        random: whether another seed would be another run.
-        sha256: of its scenario.
-        stability, behaviour: its judgement (docs/definitions.md), by its end and its twins.
-        text: the judgement in words.
-        length_s: how long the run was that is judged, s.
-        to_s: it was made again for so long because it was not stable, s; 0: it was not.
-        confirmed: whether that run was not stable either; None: there was none.
-        bounded: no joint passed `BOUND_RAD_S`, or left its start by more than `THROWN_RAD`.
-        energy_j: the least that hands, friction and wall had put in until any instant, J.
-        settled_s: since when all arms stay where they end, s; None: not within the run.
-        error_rad: RMS distance of the slave from its users, undelayed, weighted by dominance,
-            over the time of the task; None where the run diverged, as the numbers below.
-        effort_nm: RMS of tau - G(q) over sites and joints.
-        hand_nm: RMS torque of the operators over joints, of the sites that have one.
-        wall_n: mean force of the wall in the last quarter, N; None without a wall.
-        force_peak_n: largest force of the wall, N.
-        stiffness_n_m: what the user feels of the wall, by two reaches, N/m; None unless both
-            come to rest.
+        name: name of its cell, task/law/link.
+        inputs: digest of everything that determines the runs of the cell.
+        seed: seed of the run.
+        random: True if another seed would give another run.
+        sha256: digest of its scenario.
+        stability: judgement of its end and its twins (docs/definitions.md).
+        behaviour: class of its end.
+        text: explanation of the judgement.
+        length_s: duration of the judged run, in s.
+        to_s: duration in s of a run that was repeated because it was not stable; 0 for a first
+            run.
+        confirmed: True if the repeated run was not stable either, False if it refuted the
+            first run; None without a repeated run.
+        bounded: True if no joint passed `BOUND_RAD_S`, or left its start by more than
+            `THROWN_RAD`.
+        energy_j: least energy that hands, friction and wall had put in at any time, in J.
+        settled_s: time from which all arms stay at their final poses, in s; None if they do
+            not within the run.
+        error_rad: RMS distance of the slave from its users, in rad, undelayed, weighted by
+            dominance, over the time of the task. This and the following numbers are None if
+            the run diverged.
+        effort_nm: RMS of tau - G(q) over sites and joints, in N m.
+        hand_nm: RMS torque of the operators over the joints of sites with an operator, in N m.
+        wall_n: mean force of the wall in the last quarter, in N; None without a wall.
+        force_peak_n: largest force of the wall, in N; None without a wall.
+        stiffness_n_m: stiffness that the user feels, from two reaches, in N/m; None unless the
+            arms come to rest at both.
     """
 
     name: str
@@ -85,26 +98,25 @@ class BenchRun(msgspec.Struct, frozen=True):
 
     @property
     def cell(self) -> str:
-        """Its cell, told apart from one of the same name with other gains, and from a longer
-        run of it.
+        """Name of the run's cell in the journal.
+
+        Cells of the same name with other gains, and repeated runs, have names of their own.
         """
         return name_run(f"{self.name} {self.inputs}", self.to_s)
 
     @property
-    def doubtful(self) -> bool:
-        """True if it is not stable, did not diverge, and is not as long as one that would
-        confirm it.
-        """
+    def needs_confirmation(self) -> bool:
+        """True if the run is not stable, did not diverge, and is shorter than `LONGEST_S`."""
         diverged = self.behaviour is EndBehaviour.DIVERGED
-        return (
-            self.stability is Stability.NOT_STABLE
-            and not diverged
-            and self.length_s < LONGEST_S
-        )
+        is_short = self.length_s < LONGEST_S
+        return self.stability is Stability.NOT_STABLE and not diverged and is_short
 
     @property
     def masked(self) -> bool:
-        """True if it was to touch a wall, and did not: its numbers are those of free motion."""
+        """True if the slave was to touch a wall but did not.
+
+        The numbers of such a run would be those of free motion.
+        """
         return self.wall_n is not None and self.wall_n < LEAST_CONTACT_N
 
 
@@ -114,144 +126,177 @@ QUANTITIES = {
     "hand_nm": "RMS torque of the hands, N m",
     "force_peak_n": "largest force of the wall, N",
     "stiffness_n_m": "stiffness at the user's hand, by two reaches, N/m",
-    "settled_s": "since when all arms stay where they end, s",
+    "settled_s": "time from which all arms stay at their final poses, s",
 }
-"""The numbers of a run that are averaged over its seeds; those of runs without contact are
-masked.
-"""
-LEAST_SEEDS = 20
-"""Of fewer runs there is no interval."""
+"""Labels of the numbers that are averaged over seeds. A run without contact masks its cell."""
+_QUANTITIES_OF_ALL = ("error_rad", "effort_nm", "settled_s")
+_QUANTITIES_BY_TASK = {
+    "free": ["hand_nm"],
+    "disagree": ["hand_nm"],
+    "contact": ["stiffness_n_m", "force_peak_n"],
+}
+_JUDGEMENTS = (Stability.STABLE, Stability.OPEN, Stability.NOT_STABLE)
 
 
-class BenchPlace(NamedTuple):
-    """A cell with the runs of all its seeds."""
+class CellResult(NamedTuple):
+    """A cell with the runs of all its seeds.
+
+    Attributes:
+        cell: the cell.
+        runs: a run per seed.
+    """
 
     cell: BenchCell
     runs: Sequence[BenchRun]
 
     @property
     def stable(self) -> int:
-        """How many of its runs are stable."""
+        """Number of stable runs."""
         return self.count(Stability.STABLE)
 
     def count(self, stability: Stability) -> int:
-        """Returns how many of its runs have a judgement."""
+        """Returns the number of runs with a judgement."""
         return sum(run.stability is stability for run in self.runs)
 
     @property
     def judgement(self) -> Stability:
-        """Stable if all of its runs are, not stable if one is."""
-        found = {run.stability for run in self.runs}
-        return next(
-            one
-            for one in (Stability.NOT_STABLE, Stability.OPEN, Stability.STABLE)
-            if one in found
-        )
+        """The worst judgement of the runs: stable only if all runs are."""
+        if self.count(Stability.NOT_STABLE):
+            return Stability.NOT_STABLE
+        return Stability.OPEN if self.count(Stability.OPEN) else Stability.STABLE
 
     @property
     def masked(self) -> bool:
-        """True if a run was to touch a wall, and did not."""
+        """True if the slave was to touch a wall in some run but did not."""
         return any(run.masked for run in self.runs)
 
     @property
+    def is_passive(self) -> bool:
+        """True if no run gave back more energy than it got; False if a run diverged."""
+        return self.energy_j is not None and self.energy_j >= PASSIVE_J
+
+    @property
     def energy_j(self) -> float | None:
-        """The least energy of its runs, J; None if one diverged."""
+        """The least energy of the runs, in J; None if a run diverged."""
         values = [run.energy_j for run in self.runs if run.energy_j is not None]
         return min(values) if len(values) == len(self.runs) else None
 
     @property
     def interval(self) -> tuple[float, float] | None:
-        """The 95 % interval of the share of stable runs; None of too few."""
-        return (
-            wilson_interval(self.stable, len(self.runs))
-            if len(self.runs) >= LEAST_SEEDS
-            else None
-        )
+        """The 95 % interval of the share of stable runs; None for fewer than `LEAST_SEEDS`."""
+        if len(self.runs) < LEAST_SEEDS:
+            return None
+        return wilson_interval(self.stable, len(self.runs))
 
-    def mean(self, quantity: str) -> float | MeanInterval | None:
-        """Returns a number's mean over the seeds, with its interval if they are enough."""
+    def compute_mean(self, quantity: str) -> float | MeanInterval | None:
+        """Returns the mean of a quantity over the seeds, with its interval if they suffice.
+
+        Args:
+            quantity: a key of `QUANTITIES`.
+
+        Returns:
+            None if the cell is masked, or if a run has no such number.
+        """
         values = [getattr(run, quantity) for run in self.runs]
         if None in values or self.masked:
             return None
-        return mean_interval(values) if len(values) >= LEAST_SEEDS else float(np.mean(values))
+        if len(values) >= LEAST_SEEDS:
+            return mean_interval(values)
+        return float(np.mean(values))
 
 
 class BenchResults(Result):
     """The results of a suite.
 
     Attributes:
-        plan: of what.
-        places: every cell with its runs, in the order of the plan.
-        runs: all of them, in that order.
+        plan: plan of the suite.
+        places: all cells with their runs, in the order of the plan.
+        runs: all runs, in that order.
     """
 
     def __init__(self, plan: BenchPlan, runs: dict[tuple[str, int], BenchRun]) -> None:
         self.plan = plan
-        self.places = [
-            BenchPlace(cell, [_confirm(runs, cell, seed) for seed in cell.seeds])
-            for cell in plan.cells
-        ]
-        self.runs = [run for place in self.places for run in place.runs]
+        self.places: list[CellResult] = []
+        for cell in plan.cells:
+            cell_runs = [_confirm_run(runs, cell, seed) for seed in cell.seeds]
+            self.places.append(CellResult(cell, cell_runs))
+        self.runs = [run for result in self.places for run in result.runs]
 
     def blocks(self) -> Iterator[Block]:
         """Yields verdicts, properties, each quantity of each task, and round trips."""
-        yield from (*describe_bench(self), "")
+        yield from describe_bench(self)
+        yield ""
         yield tabulate_verdicts(self)
         for task in self.plan.tasks:
             yield tabulate_properties(self, task)
-        for task, key in list_quantities(self):
-            if key != "effort_nm":
-                yield from ("", f"{task}: {QUANTITIES[key]}")
-                yield tabulate_quantity(self, task, key)
+        for task, quantity in list_quantities(self):
+            if quantity != "effort_nm":
+                yield ""
+                yield f"{task}: {QUANTITIES[quantity]}"
+                yield tabulate_quantity(self, task, quantity)
         if self.plan.study == "round-trips":
             yield tabulate_round_trips(self)
 
     def headline(self) -> str:
-        """Returns which study, and how many runs."""
-        return (
-            f"{self.plan.study}: {count_nouns(len(self.places), 'cell')}, "
-            f"{count_nouns(len(self.runs), 'run')}"
-        )
+        """Returns the study and the numbers of cells and runs."""
+        cells = count_nouns(len(self.places), "cell")
+        runs = count_nouns(len(self.runs), "run")
+        return f"{self.plan.study}: {cells}, {runs}"
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the keys of `trilat bench --json`."""
-        return {
-            "study": self.plan.study,
-            "gains": [
-                msgspec.to_builtins(one) | {"outcome": "settled"}
-                for one in {str(c.tuned): c.tuned for c in self.plan.cells}.values()
-            ],
-            "places": self.to_rows(),
-        }
+        entries = [
+            msgspec.to_builtins(gains) | {"outcome": "settled"}
+            for gains in _list_used_gains(self)
+        ]
+        return {"study": self.plan.study, "gains": entries, "places": self.to_rows()}
 
     def to_rows(self) -> list[dict[str, Any]]:
         """Returns a row per cell."""
-        return list(map(_place_row, self.places))
+        return list(map(_build_row, self.places))
 
-    def of(self, task: str, law: str = "", link: str = "") -> Iterator[BenchPlace]:
-        """Yields the places of a task, and of a law and a link if they are named."""
-        for place in self.places:
-            cell = place.cell
+    def select(self, task: str, law: str = "", link: str = "") -> Iterator[CellResult]:
+        """Yields the results of a task; of a law and a link only, if these are not ""."""
+        for result in self.places:
+            cell = result.cell
             if cell.task == task and law in ("", cell.law) and link in ("", cell.link):
-                yield place
+                yield result
+
+    def find(self, task: str, law: str, link: str) -> CellResult | None:
+        """Returns the result of a cell; None if the cell did not run."""
+        return next(self.select(task, law, link), None)
 
 
-def _confirm(runs: dict[tuple[str, int], BenchRun], cell: BenchCell, seed: int) -> BenchRun:
-    """Returns a run, with the judgement of the longer one if there is one."""
+def _list_used_gains(results: BenchResults) -> list[TunedGains]:
+    """Returns the gains of all cells, each of them once."""
+    return list({str(cell.tuned): cell.tuned for cell in results.plan.cells}.values())
+
+
+def _confirm_run(runs: dict[tuple[str, int], BenchRun], cell: BenchCell, seed: int) -> BenchRun:
+    """Returns a run of a cell, with the judgement of its repeated run if there is one.
+
+    Args:
+        runs: all runs by cell and seed.
+        cell: the cell.
+        seed: seed of the run.
+    """
     run = runs[cell.key, seed]
-    longer = runs.get((name_run(cell.key, LONGEST_S), seed))
-    if run.stability is Stability.NOT_STABLE and run.length_s >= LONGEST_S:
-        return msgspec.structs.replace(run, confirmed=True)
-    if run.stability is not Stability.NOT_STABLE or longer is None:
+    if run.stability is not Stability.NOT_STABLE:
         return run
-    confirmed = longer.stability is Stability.NOT_STABLE
-    words = f"of {LONGEST_S:g} s: {longer.text}"
+    if run.length_s >= LONGEST_S:
+        return msgspec.structs.replace(run, confirmed=True)
+    repeated = runs.get((name_run(cell.key, LONGEST_S), seed))
+    if repeated is None:
+        return run
     return msgspec.structs.replace(
-        run, stability=longer.stability, text=words, confirmed=confirmed
+        run,
+        stability=repeated.stability,
+        text=f"of {LONGEST_S:g} s: {repeated.text}",
+        confirmed=repeated.stability is Stability.NOT_STABLE,
     )
 
 
-_SHOWN_LINKS = (
+_PRINTED_LINKS = (
     "rtt8",
     "rtt136",
     "rtt544",
@@ -262,258 +307,314 @@ _SHOWN_LINKS = (
     "geo",
     "trace",
 )
-"""Links of a table for people, if they are among those that ran; else all that ran."""
+"""Columns of a table if more links ran than fit into it."""
 OPEN_MARK = "?"
 UNSTABLE_MARK = "!"
 
 
 def list_quantities(results: BenchResults) -> list[tuple[str, str]]:
-    """Returns what is shown of the tasks that ran: each with a key of `QUANTITIES`."""
-    more = {
-        "free": ["hand_nm"],
-        "disagree": ["hand_nm"],
-        "contact": ["stiffness_n_m", "force_peak_n"],
-    }
+    """Returns the tables of quantities: pairs of a task that ran and a key of `QUANTITIES`."""
     tasks = results.plan.tasks
-    found = [(task, key) for key in ("error_rad", "effort_nm", "settled_s") for task in tasks]
-    return found + [(task, key) for task in tasks for key in more.get(task, [])]
+    pairs = [(task, quantity) for quantity in _QUANTITIES_OF_ALL for task in tasks]
+    for task in tasks:
+        pairs += [(task, quantity) for quantity in _QUANTITIES_BY_TASK.get(task, [])]
+    return pairs
 
 
 def name_law(law: str, form: str) -> str:
-    """Returns a law's name, with its sites if they are not three."""
+    """Returns the name of a law, with the number of its sites unless they are three."""
     return law if form == "three" else f"{law} (two sites)"
 
 
 def tabulate_verdicts(results: BenchResults) -> TextTable:
-    """Returns a row per law: of each task over how many links it is stable, open, and not
-    stable.
-    """
+    """Returns a row per law: for each task, the numbers of links by their verdict."""
     tasks = results.plan.tasks
-
-    def cell(law: str, form: str, task: str) -> str:
-        found = [place.judgement for place in results.of(task, law)]
-        counts = " / ".join(str(found.count(one)) for one in _JUDGEMENTS)
-        return counts if found else explain_no_cell(law, form, task)
-
-    rows = [
-        (name_law(*one), *(cell(*one, task) for task in tasks)) for one in results.plan.laws
-    ]
+    rows = []
+    for law, form in results.plan.laws:
+        cells = [_count_verdicts(results, law, form, task) for task in tasks]
+        rows.append([name_law(law, form), *cells])
     return TextTable(("links: stable / open / not stable", *tasks), rows, align="lr")
 
 
-_JUDGEMENTS = (Stability.STABLE, Stability.OPEN, Stability.NOT_STABLE)
+def _count_verdicts(results: BenchResults, law: str, form: str, task: str) -> str:
+    """Returns the numbers of stable, open and unstable links, or why the law did not run."""
+    verdicts = [result.judgement for result in results.select(task, law)]
+    if not verdicts:
+        return explain_no_cell(law, form, task)
+    return " / ".join(str(verdicts.count(judgement)) for judgement in _JUDGEMENTS)
 
 
 def tabulate_properties(results: BenchResults, task: str) -> TextTable:
-    """Returns a row per law: over how many links each property holds of all runs, and the least
-    energy.
+    """Returns a row per law: for each property, the number of links where all runs have it.
+
+    A further column has the least energy, and the last the number of links without contact.
     """
+    headers = (
+        task,
+        "bounded",
+        "passive",
+        "least energy, J",
+        "converged",
+        "stable",
+        "no contact",
+    )
     rows = []
     for law, form in results.plan.laws:
-        places = list(results.of(task, law))
-        if not places:
-            rows.append((name_law(law, form), explain_no_cell(law, form, task), *[""] * 5))
-            continue
-        energies = [place.energy_j for place in places]
-        least = min((one for one in energies if one is not None), default=None)
-        kept = (
-            sum(all(run.bounded for run in place.runs) for place in places),
-            sum(one is not None and one >= PASSIVE_J for one in energies),
-            sum(all(run.settled_s is not None for run in place.runs) for place in places),
-            sum(place.judgement is Stability.STABLE for place in places),
-        )
-        energy = "-" if least is None else f"{least if least < -1e-9 else 0.0:.2g}"
-        shown = [f"{count}/{len(places)}" for count in kept]
-        masked = str(sum(place.masked for place in places))
-        rows.append(
-            (name_law(law, form), shown[0], shown[1], energy, shown[2], shown[3], masked)
-        )
-    heads = ("bounded", "passive", "least energy, J", "converged", "stable", "no contact")
-    return TextTable((task, *heads), rows, align="lr")
+        name = name_law(law, form)
+        law_results = list(results.select(task, law))
+        if law_results:
+            rows.append([name, *_describe_properties(law_results)])
+        else:
+            rows.append([name, explain_no_cell(law, form, task)])
+    return TextTable(headers, rows, align="lr")
+
+
+def _describe_properties(law_results: Sequence[CellResult]) -> list[str]:
+    """Returns the cells of a law's row in the table of properties, without its name."""
+    bounded = 0
+    passive = 0
+    converged = 0
+    stable = 0
+    masked = 0
+    for result in law_results:
+        bounded += all(run.bounded for run in result.runs)
+        passive += result.is_passive
+        converged += all(run.settled_s is not None for run in result.runs)
+        stable += result.judgement is Stability.STABLE
+        masked += result.masked
+    links = len(law_results)
+    return [
+        f"{bounded}/{links}",
+        f"{passive}/{links}",
+        _format_least_energy(law_results),
+        f"{converged}/{links}",
+        f"{stable}/{links}",
+        str(masked),
+    ]
+
+
+def _format_least_energy(law_results: Sequence[CellResult]) -> str:
+    """Returns the least energy of the results in J, as a cell of a table."""
+    energies_j = [result.energy_j for result in law_results if result.energy_j is not None]
+    if not energies_j:
+        return "-"
+    least_j = min(energies_j)
+    # rounding of the sum over a run
+    return f"{least_j if least_j < -1e-9 else 0.0:.2g}"
 
 
 def tabulate_quantity(results: BenchResults, task: str, quantity: str) -> TextTable:
-    """Returns a row per law and a column per link: means over seeds; marks say what is not
-    stable.
+    """Returns a row per law and a column per link: means over seeds, with marks.
+
+    The marks tell runs that are open or not stable. A law that does not fit the task has no
+    row.
+
+    Args:
+        results: the results.
+        task: a task that ran.
+        quantity: a key of `QUANTITIES`.
     """
     links = results.plan.links
-    if len(links) > len(_SHOWN_LINKS):
-        links = [link for link in links if link in _SHOWN_LINKS]
+    if len(links) > len(_PRINTED_LINKS):
+        links = [link for link in links if link in _PRINTED_LINKS]
     rows = []
     for law, form in results.plan.laws:
-        missing = explain_no_cell(law, form, task)
-        cells = []
+        reason = explain_no_cell(law, form, task)
+        if reason == "-":
+            continue
+        row = [name_law(law, form)]
         for link in links:
-            place = next(results.of(task, law, link), None)
-            cells.append(missing if place is None else _describe_place(place, quantity))
-        if missing != "-":
-            rows.append((name_law(law, form), *cells))
+            result = results.find(task, law, link)
+            row.append(reason if result is None else _describe_result(result, quantity))
+        rows.append(row)
     return TextTable((task, *links), rows, align="lr")
 
 
-def _describe_place(place: BenchPlace, quantity: str) -> str:
-    value = place.mean(quantity)
-    found = place.judgement
-    mark = {Stability.NOT_STABLE: UNSTABLE_MARK, Stability.OPEN: OPEN_MARK}.get(found, "")
-    if place.masked:
+def _describe_result(result: CellResult, quantity: str) -> str:
+    """Returns the mean of a quantity as a cell of a table, or why the cell has no number."""
+    marks = {Stability.NOT_STABLE: UNSTABLE_MARK, Stability.OPEN: OPEN_MARK}
+    mark = marks.get(result.judgement, "")
+    if result.masked:
         return f"no contact{mark}"
-    if any(run.behaviour is EndBehaviour.DIVERGED for run in place.runs):
+    if any(run.behaviour is EndBehaviour.DIVERGED for run in result.runs):
         return f"diverged{mark}"
-    if value is None and quantity == "settled_s":
-        return f"not within {max(run.length_s for run in place.runs):g}{mark}"
-    if value is None:
+    mean = result.compute_mean(quantity)
+    if mean is None:
+        if quantity == "settled_s":
+            longest_s = max(run.length_s for run in result.runs)
+            return f"not within {longest_s:g}{mark}"
         return mark or "none"
-    return (str(value) if isinstance(value, MeanInterval) else f"{value:.4g}") + mark
+    text = str(mean) if isinstance(mean, MeanInterval) else f"{mean:.4g}"
+    return text + mark
 
 
 def tabulate_round_trips(results: BenchResults) -> TextTable:
-    """Returns what the published study speaks of: how much delay and loss make of the errors of
-    each law.
+    """Returns a row per task and law: how its error grows with delay, and with losses.
+
+    These are the effects that the published study reports.
     """
-
-    def error(law: str, task: str, link: str) -> float | None:
-        place = next(results.of(task, law, link), None)
-        value = None if place is None else place.mean("error_rad")
-        return value.mean if isinstance(value, MeanInterval) else value
-
-    def ratio(above: float | None, below: float | None) -> str:
-        return f"{above / below:.3g}" if above is not None and below else "-"
-
     rows = []
     for task in results.plan.tasks:
         for law, _ in results.plan.laws:
-            first = error(law, task, "rtt8")
-            later = error(law, task, "rtt272")
-            times = (
-                ratio(error(law, task, "rtt1088"), first),
-                ratio(error(law, task, "rtt272-loss50"), later),
+            short = _find_error(results, task, law, "rtt8")
+            medium = _find_error(results, task, law, "rtt272")
+            long = _find_error(results, task, law, "rtt1088")
+            lossy = _find_error(results, task, law, "rtt272-loss50")
+            rows.append(
+                [
+                    task,
+                    law,
+                    format_number(short, 4),
+                    _format_ratio(long, short),
+                    _format_ratio(lossy, medium),
+                ]
             )
-            rows.append((task, law, format_number(first, 4), *times))
-    heads = (
+    headers = (
         "task",
         "law",
         "error at 8 ms, rad",
-        "1088 ms: times that",
-        "272 ms: half lost, times none lost",
+        "1088 ms / 8 ms",
+        "272 ms, half lost / none lost",
     )
-    return TextTable(heads, rows, align="llr")
+    return TextTable(headers, rows, align="llr")
+
+
+def _find_error(results: BenchResults, task: str, law: str, link: str) -> float | None:
+    """Returns the mean error of a cell in rad; None if there is no such number."""
+    result = results.find(task, law, link)
+    mean = None if result is None else result.compute_mean("error_rad")
+    return mean.mean if isinstance(mean, MeanInterval) else mean
+
+
+def _format_ratio(numerator: float | None, denominator: float | None) -> str:
+    """Returns a ratio as a cell of a table, or a dash if a number is missing or 0."""
+    if numerator is None or not denominator:
+        return "-"
+    return f"{numerator / denominator:.3g}"
 
 
 def describe_bench(results: BenchResults) -> Iterator[str]:
-    """Yields what ran, in lines."""
+    """Yields the description of a suite in lines: its study, runs, tasks and missing laws."""
     plan = results.plan
+    cells = count_nouns(len(plan.cells), "cell")
+    runs = count_nouns(len(results.runs), "run")
     seeds = max(len(cell.seeds) for cell in plan.cells)
     yield f"{plan.study}: {STUDIES[plan.study].about}"
-    yield (
-        f"{count_nouns(len(plan.cells), 'cell')}, "
-        f"{count_nouns(len(results.runs), 'run')}: one per cell without randomness, else {seeds}"
-    )
+    yield f"{cells}, {runs}: one per cell without randomness, otherwise {seeds}"
     unstable = [run for run in results.runs if run.stability is Stability.NOT_STABLE]
-    refuted = sum(run.confirmed is False for run in results.runs)
     confirmed = sum(bool(run.confirmed) for run in unstable)
+    refuted = sum(run.confirmed is False for run in results.runs)
     yield (
-        f"not stable: {count_nouns(len(unstable), 'run')}, {confirmed} confirmed by one "
-        f"of 100 s; {refuted} refuted by it"
+        f"not stable: {count_nouns(len(unstable), 'run')}; runs of {LONGEST_S:g} s confirmed "
+        f"{confirmed} of them, and refuted {refuted} more"
     )
-    for task in dict.fromkeys(cell.task for cell in plan.cells):
+    for task in plan.tasks:
         yield f"{task}: {TASKS[task].about}"
-    for law, form in results.plan.laws:
+    for law, form in plan.laws:
         if form == "two":
-            yield f"{law} is for two sites: it runs in the tasks of one user, without the second"
+            yield f"{law} is a law for two sites: it runs only in the tasks for one user"
     if plan.without:
         names = ", ".join(map(str, plan.without))
-        yield f"no candidate was stable at the pose with the margin, so nothing runs: {names}"
+        yield f"no runs, because no candidate was stable at the pose with the margin: {names}"
 
 
 def tabulate_gains(results: BenchResults) -> TextTable:
-    """Returns a row per law, form and delay: the gains in use."""
-    used = {str(cell.tuned): cell.tuned for cell in results.plan.cells}
-    used |= {str(one): one for one in results.plan.without}
-    rows = [
-        (
-            name_law(one.law, one.form),
-            str(one.round_trip_ms),
-            ", ".join(f"{key} {value:g}" for key, value in one.gains.items()) or "none",
-            f"{one.settled}/{one.tried}",
-            str(one.passed),
+    """Returns a row per law, form and round trip: the gains, and how they were selected."""
+    used = {str(gains): gains for gains in _list_used_gains(results)}
+    used |= {str(gains): gains for gains in results.plan.without}
+    rows = []
+    for tuned in used.values():
+        gains = ", ".join(f"{name} {value:g}" for name, value in tuned.gains.items())
+        rows.append(
+            [
+                name_law(tuned.law, tuned.form),
+                str(tuned.round_trip_ms),
+                gains or "none",
+                f"{tuned.settled}/{tuned.tried}",
+                str(tuned.passed),
+            ]
         )
-        for one in used.values()
-    ]
-    return TextTable(
-        ("law", "tuned at, ms", "gains", "stable", "without margin"), rows, align="lrlrr"
-    )
+    headers = ("law", "tuned at, ms", "gains", "stable", "without margin")
+    return TextTable(headers, rows, align="lrlrr")
 
 
 def build_bench_page(
     results: BenchResults, command: str, pictures: Mapping[str, str] = {}
 ) -> str:
-    """Returns the results in Markdown, under the command that makes them.
+    """Returns the results in Markdown, below the command that writes them.
 
     Args:
         results: the results.
-        command: the command that makes them.
-        pictures: by the name of a picture's file beside the page, what the picture shows.
+        command: the command.
+        pictures: the subject of each picture, by the name of its file beside the page.
     """
     parts = [
         f"# The suite: {results.plan.study}",
         f"    {command}",
         "\n".join(f"- {line}" for line in describe_bench(results)),
         tabulate_verdicts(results).markdown(),
-        f"{OPEN_MARK}: a run is open, {UNSTABLE_MARK}: one is not stable; +-: 95 % over seeds of one link.",
+        f"{OPEN_MARK}: some run is open. {UNSTABLE_MARK}: some run is not stable. "
+        "+-: 95 % interval over the seeds of a link.",
     ]
     parts += [f"![{text}]({name})" for name, text in pictures.items()]
     for task in results.plan.tasks:
-        parts += [f"## {task}: properties", tabulate_properties(results, task).markdown()]
-    for task, key in list_quantities(results):
-        parts += [
-            f"## {task}: {QUANTITIES[key]}",
-            tabulate_quantity(results, task, key).markdown(),
-        ]
+        parts.append(f"## {task}: properties")
+        parts.append(tabulate_properties(results, task).markdown())
+    for task, quantity in list_quantities(results):
+        parts.append(f"## {task}: {QUANTITIES[quantity]}")
+        parts.append(tabulate_quantity(results, task, quantity).markdown())
     if results.plan.study == "round-trips":
-        parts += ["## Delay against loss", tabulate_round_trips(results).markdown()]
-    parts += ["## Gains", tabulate_gains(results).markdown()]
+        parts.append("## Delay against loss")
+        parts.append(tabulate_round_trips(results).markdown())
+    parts.append("## Gains")
+    parts.append(tabulate_gains(results).markdown())
     return "\n\n".join(parts) + "\n"
 
 
 def encode_runs(results: BenchResults) -> str:
     """Returns a row per run as CSV."""
     cells = {cell.name: cell for cell in results.plan.cells}
-    rows = [_place_columns(cells[run.name]) | msgspec.to_builtins(run) for run in results.runs]
-    return encode_csv(rows, [*_PLACE, *BenchRun.__struct_fields__])
+    rows = [
+        _build_cell_columns(cells[run.name]) | msgspec.to_builtins(run) for run in results.runs
+    ]
+    return encode_csv(rows, [*_CELL_COLUMNS, *BenchRun.__struct_fields__])
 
 
-_GONE = ("reflected", "reflected_half", "observed", "least_j")
-"""Keys that had numbers once: no key is taken away (docs/json.md)."""
-_PLACE = ("task", "law", "link", "form")
+_FORMER_KEYS = ("reflected", "reflected_half", "observed", "least_j")
+"""Keys that once had numbers. They stay, as null: no key is removed (docs/json.md)."""
+_CELL_COLUMNS = ("task", "law", "link", "form")
 
 
-def _place_columns(cell: BenchCell) -> dict[str, Any]:
-    return {name: getattr(cell, name) for name in _PLACE}
+def _build_cell_columns(cell: BenchCell) -> dict[str, Any]:
+    """Returns the columns that identify a cell."""
+    return {name: getattr(cell, name) for name in _CELL_COLUMNS}
 
 
-def _place_row(place: BenchPlace) -> dict[str, Any]:
-    low, high = place.interval or (None, None)
-    counts = {one.value.replace(" ", "_"): place.count(one) for one in Stability}
-    row = {
-        **_place_columns(place.cell),
-        "runs": len(place.runs),
-        **counts,
-        "share_low": low,
-        "share_high": high,
-    }
-    for key in QUANTITIES:
-        value = place.mean(key)
-        row[key], row[f"{key}_half"] = (
-            value if isinstance(value, MeanInterval) else (value, None)
-        )
-    row |= dict.fromkeys(_GONE)
+def _build_row(result: CellResult) -> dict[str, Any]:
+    """Returns the row of a cell in JSON and CSV, with unknown numbers as None."""
+    share_low = None
+    share_high = None
+    if result.interval is not None:
+        share_low, share_high = result.interval
+    row = _build_cell_columns(result.cell)
+    row["runs"] = len(result.runs)
+    for stability in Stability:
+        row[stability.value.replace(" ", "_")] = result.count(stability)
+    row["share_low"] = share_low
+    row["share_high"] = share_high
+    for quantity in QUANTITIES:
+        mean = result.compute_mean(quantity)
+        has_interval = isinstance(mean, MeanInterval)
+        row[quantity] = mean.mean if has_interval else mean
+        row[f"{quantity}_half"] = mean.half if has_interval else None
+    row |= dict.fromkeys(_FORMER_KEYS)
     row |= {
-        "judgement": place.judgement.value,
-        "bounded": all(run.bounded for run in place.runs),
-        "energy_j": place.energy_j,
-        "length_s": max(run.length_s for run in place.runs),
-        "contact": not place.masked,
-        "confirmed": sum(run.confirmed is True for run in place.runs),
-        "refuted": sum(run.confirmed is False for run in place.runs),
+        "judgement": result.judgement.value,
+        "bounded": all(run.bounded for run in result.runs),
+        "energy_j": result.energy_j,
+        "length_s": max(run.length_s for run in result.runs),
+        "contact": not result.masked,
+        "confirmed": sum(run.confirmed is True for run in result.runs),
+        "refuted": sum(run.confirmed is False for run in result.runs),
     }
     return row

@@ -1,11 +1,14 @@
-"""Runs the suite: a run's judgement by its end and by its twins, its numbers, the folder and
-its journal.
+"""Runs the benchmark suite: judges and measures each run, and keeps it in the study's folder.
 
-Invariant: a run's numbers are a function of its scenario. Errors, efforts and forces are those
-of the log that its command makes, over the time of its task; what is judged lasts as long as
-the judgement needs. The number of processes, their order and the number of interruptions do not
-enter. A run that is in the journal is never made again; one with other gains is another run. A
-folder belongs to one version of the program on one arithmetic.
+A run is judged by its end and by its twins (`analysis.run_end`, `analysis.twin_growth`). Its
+errors, efforts and forces are those of the log that its command writes, over the time of the
+task. The judgement uses the whole run, which lasts as long as the judgement needs.
+
+Invariant:
+    - The numbers of a run are a function of its scenario. The number of processes, their order
+      and interruptions have no influence.
+    - A run that is in the journal is never repeated. A run with other gains is another run.
+    - A folder belongs to one version of the program and one arithmetic.
 """
 
 import json
@@ -32,29 +35,37 @@ from ..executor import Progress, Workers, ignore_progress, open_worker_pool
 from ..measure_run import RecordBatch, run_whole
 from ..study_folder import RunJournal, StudyFolder, build_resume_hint, describe_program
 from ..tuning.candidate import load_tuning_scenario
-from .bench_plan import SHORTER_REACH, TASKS, BenchCell, BenchPlan, name_settings
+from .bench_plan import SHORTER_REACH, TASKS, BenchCell, BenchPlan, format_settings
 from .bench_results import LONGEST_S, BenchResults, BenchRun, name_run
 
 SLAVE = "s"
 USER = "m1"
 BOUND_RAD_S = 5.0
-"""No joint of a bounded run is faster, rad/s, and none further from its start than
-`THROWN_RAD`.
+"""Largest joint velocity of a bounded run, in rad/s.
+
+No joint of such a run leaves its start by more than `THROWN_RAD`.
 """
 REST_S = 2.0
-"""A run has converged if its arms stay within `SETTLED_ERROR_RAD` of their last pose for so
-long, s.
+"""Least time in s for which the arms of a converged run stay within `SETTLED_ERROR_RAD` of
+their final poses.
 """
 TWINS = 3
-"""Twins of a run of the first seed, pushed at all joints, at single ones, and in estimates;
-else one.
+"""Number of twins of the run with the first seed; the runs with other seeds have one.
+
+The three are pushed at all joints, at single joints, and in the estimates.
 """
 TIME_CONSTANTS = 6.0
-"""A run lasts for so many of its slowest time constants, but for no longer than `LONGEST_S`."""
+"""Least duration of a run in its slowest time constants, up to `LONGEST_S`."""
 
 
 class BenchRunItem(NamedTuple):
-    """One run to be made: picklable, with all that a worker needs; `to_s` as that of a run."""
+    """A run to execute, with everything that a worker needs; can be pickled.
+
+    Attributes:
+        cell: the cell.
+        seed: the seed.
+        to_s: duration of a repeated run, in s; 0 for a first run.
+    """
 
     cell: BenchCell
     seed: int
@@ -65,7 +76,16 @@ class BenchRunItem(NamedTuple):
 
 
 class _JudgedRun(NamedTuple):
-    """A run with all of its records, and its judgement."""
+    """A run with all of its records, and its judgement.
+
+    Attributes:
+        scenario: the scenario, whose duration is that of the run.
+        records: all records by site.
+        end: the end of the run.
+        twins: growth of small pushes.
+        stability: the judgement.
+        text: its explanation.
+    """
 
     scenario: Scenario
     records: dict[str, RecordBatch]
@@ -74,170 +94,225 @@ class _JudgedRun(NamedTuple):
     stability: Stability
     text: str
 
+    @property
+    def diverged(self) -> bool:
+        """True if a site left its limits."""
+        return self.end.diverged_at_s is not None
 
-def run_bench_task(task: BenchRunItem) -> BenchRun:
-    """Makes one run, in whatever process."""
-    cell = task.cell
-    scenario = task.cell.build(task.seed).scenario
-    twins = TWINS if task.seed == cell.seeds[0] else 1
-    judged = _run(scenario, task.to_s or scenario.duration_s, twins)
-    if not task.to_s:
+
+def run_bench_task(item: BenchRunItem) -> BenchRun:
+    """Executes, judges and measures a run, in any process."""
+    cell = item.cell
+    scenario = cell.build(item.seed).scenario
+    twins = TWINS if item.seed == cell.seeds[0] else 1
+    judged = _judge(scenario, item.to_s or scenario.duration_s, twins)
+    if not item.to_s:
         judged = _lengthen(judged, twins)
-    found = (
-        judged.stability,
-        judged.end.behaviour,
-        judged.text,
-        judged.scenario.duration_s,
-        task.to_s,
+    run = BenchRun(
+        name=cell.name,
+        inputs=cell.inputs,
+        seed=item.seed,
+        random=scenario.random,
+        sha256=scenario.sha256,
+        stability=judged.stability,
+        behaviour=judged.end.behaviour,
+        text=judged.text,
+        length_s=judged.scenario.duration_s,
+        to_s=item.to_s,
     )
-    made = BenchRun(cell.name, cell.inputs, task.seed, scenario.random, scenario.sha256, *found)
-    if judged.end.diverged_at_s is None:
-        made = _measure(made, judged, TASKS[cell.task].duration_s)
-        if cell.task == "contact" and not made.masked:
-            made = msgspec.structs.replace(made, stiffness_n_m=_find_stiffness(task, judged))
-    return made
+    if judged.diverged:
+        return run
+    run = _measure(run, judged, TASKS[cell.task].duration_s)
+    if cell.task == "contact" and not run.masked:
+        stiffness_n_m = _estimate_stiffness(item, judged)
+        run = msgspec.structs.replace(run, stiffness_n_m=stiffness_n_m)
+    return run
 
 
-def _run(scenario: Scenario, length_s: float, twins: int) -> _JudgedRun:
+def _judge(scenario: Scenario, length_s: float, twins: int) -> _JudgedRun:
+    """Runs a scenario for a time in s, with a number of twins, and judges the run."""
     scenario = msgspec.structs.replace(scenario, duration_s=length_s)
-    (records, end) = run_whole(scenario)
-    growth = TwinGrowth("none were asked for")
+    records, end = run_whole(scenario)
+    growth = TwinGrowth("no twins were requested")
     if end.diverged_at_s is None and twins:
         growth = measure_virtual_twins(scenario, end, length_s, twins)
-    found = judge_end_by_twins(end, growth, settles=None, rises=False)
+    verdict = judge_end_by_twins(end, growth, settles=None, rises=False)
     return _JudgedRun(
         scenario=scenario,
         records=records,
         end=end,
         twins=growth,
-        stability=found.stability,
-        text=found.reason or end.text,
+        stability=verdict.stability,
+        text=verdict.reason or end.text,
     )
 
 
 def _lengthen(judged: _JudgedRun, twins: int) -> _JudgedRun:
-    """Returns a run that lasts for its slowest time constants; not stable is what twice as long
-    is, too.
+    """Returns the run, repeated over a longer time if its judgement needs more time.
+
+    A run has to last for `TIME_CONSTANTS` of its slowest time constants. A run that is not
+    stable is repeated over twice its length, and the longer run is judged.
     """
-    length_s = judged.scenario.duration_s
+    if judged.diverged:
+        return judged
     rates = [judged.end.error.rate_per_s, judged.end.speed.rate_per_s]
-    rates += [one.rate_per_s for one in judged.twins.pushes if one.factor > 0.0]
-    wanted_s = TIME_CONSTANTS * max((-1.0 / rate for rate in rates if rate < 0.0), default=0.0)
+    rates += [push.rate_per_s for push in judged.twins.pushes if push.factor > 0.0]
+    slowest_s = max((-1.0 / rate for rate in rates if rate < 0.0), default=0.0)
+    length_s = judged.scenario.duration_s
+    wanted_s = TIME_CONSTANTS * slowest_s
+    # more time than LONGEST_S can only help a run that is still open
     if judged.stability is Stability.OPEN or wanted_s < LONGEST_S:
         wanted_s = min(wanted_s, LONGEST_S)
-        if length_s < wanted_s and judged.end.diverged_at_s is None:
+        if length_s < wanted_s:
             length_s = float(math.ceil(wanted_s))
-            judged = _run(judged.scenario, length_s, twins)
-    if judged.stability is Stability.NOT_STABLE and judged.end.diverged_at_s is None:
-        return _run(judged.scenario, 2.0 * length_s, twins)
+            judged = _judge(judged.scenario, length_s, twins)
+    if judged.stability is Stability.NOT_STABLE and not judged.diverged:
+        return _judge(judged.scenario, 2.0 * length_s, twins)
     return judged
 
 
-def _measure(made: BenchRun, judged: _JudgedRun, duration_s: float) -> BenchRun:
+def _measure(run: BenchRun, judged: _JudgedRun, duration_s: float) -> BenchRun:
+    """Returns a run with its numbers.
+
+    Args:
+        run: the run.
+        judged: the same run with its records.
+        duration_s: time over which errors, efforts and forces are measured, in s.
+    """
     scenario = judged.scenario
     whole = judged.records
-    records = {
-        name: one.between(0, round(duration_s * NS_PER_S)) for name, one in whole.items()
-    }
-    efforts = []
-    hands = []
-    walls = []
+    task_end_ns = round(duration_s * NS_PER_S)
+    records = {name: batch.between(0, task_end_ns) for name, batch in whole.items()}
+    squared_efforts = []
+    squared_hand_torques = []
+    wall_forces = []
     for name, record in records.items():
         spec = scenario.sites[name]
         arm = build_arm_rows(scenario, name)
-        efforts.append(np.mean((record.tau - arm.gravity_torque(record.q)) ** 2))
+        effort = record.tau - arm.gravity_torque(record.q)
+        squared_efforts.append(np.mean(effort**2))
         if spec.hands:
-            hands.append(np.mean(_find_hand_torque(scenario, name, record) ** 2))
+            hand_torque = _compute_hand_torque(scenario, name, record)
+            squared_hand_torques.append(np.mean(hand_torque**2))
         tip = arm.place_end_effector(record.q, record.qd)
         t_s = record.t_ns / NS_PER_S
-        walls += [wall_force(wall, t_s, tip) for wall in list_walls(spec)]
-    starts = [np.abs(one.q - scenario.sites[name].q0_rad).max() for name, one in whole.items()]
-    fastest = max(np.abs(one.qd).max() for one in whole.values())
+        wall_forces += [wall_force(wall, t_s, tip) for wall in list_walls(spec)]
+    last_quarters = [force[3 * len(force) // 4 :] for force in wall_forces]
     return msgspec.structs.replace(
-        made,
-        bounded=bool(fastest <= BOUND_RAD_S and max(starts) <= THROWN_RAD),
+        run,
+        bounded=_is_bounded(scenario, whole),
         energy_j=find_least_energy(whole),
         settled_s=_find_settled_s(whole),
-        error_rad=_follow_error_rad(scenario, records),
-        effort_nm=float(np.sqrt(np.mean(efforts))),
-        hand_nm=float(np.sqrt(np.mean(hands))),
-        wall_n=max((float(one[3 * len(one) // 4 :].mean()) for one in walls), default=None),
-        force_peak_n=max((float(one.max()) for one in walls), default=None),
+        error_rad=_measure_error_rad(scenario, records),
+        effort_nm=float(np.sqrt(np.mean(squared_efforts))),
+        hand_nm=float(np.sqrt(np.mean(squared_hand_torques))),
+        wall_n=max((float(force.mean()) for force in last_quarters), default=None),
+        force_peak_n=max((float(force.max()) for force in wall_forces), default=None),
     )
 
 
-def _find_hand_torque(scenario: Scenario, name: str, record: RecordBatch) -> Array:
-    """Returns the torque of the operators ON an arm, without the friction of its joints, shape
-    (K, n).
+def _is_bounded(scenario: Scenario, records: dict[str, RecordBatch]) -> bool:
+    """Returns True if all joints stayed below `BOUND_RAD_S` and near their start."""
+    for name, record in records.items():
+        distance_rad = np.abs(record.q - scenario.sites[name].q0_rad)
+        speed_rad_s = np.abs(record.qd)
+        if distance_rad.max() > THROWN_RAD or speed_rad_s.max() > BOUND_RAD_S:
+            return False
+    return True
+
+
+def _compute_hand_torque(scenario: Scenario, name: str, record: RecordBatch) -> Array:
+    """Returns the torque of the operators on an arm, shape (K, n), N m.
+
+    The friction of the arm's joints is part of the exogenous torque, and is taken out.
     """
-    dampers = (
-        one for one in scenario.sites[name].environment if isinstance(one, ViscousEnvironment)
-    )
-    return sum((np.array(one.damping_nm_s_rad) * record.qd for one in dampers), -record.tau_x)
+    torque: Array = -record.tau_x
+    for source in scenario.sites[name].environment:
+        if isinstance(source, ViscousEnvironment):
+            torque = torque + np.array(source.damping_nm_s_rad) * record.qd
+    return torque
 
 
 def find_least_energy(records: dict[str, RecordBatch]) -> float:
-    """Returns the least over time of sum_i int -tau_x' qd dt: what came from outside until
-    then, J.
+    """Returns the least energy that came from outside until any time, in J.
 
-    All arms begin at rest, so that of a passive network with passive controllers none is below
+    The energy until t is the integral over 0..t of sum_i -tau_x_i' qd_i, by the trapezoidal
+    rule. All arms begin at rest: a passive network with passive controllers stays at or above
     zero.
     """
-    power = sum(-np.sum(one.tau_x * one.qd, axis=1) for one in records.values())
+    power = sum(-np.sum(record.tau_x * record.qd, axis=1) for record in records.values())
     h_s = 1e-9 * np.diff(records[SLAVE].t_ns[:2])[0]
-    return float(np.cumsum(np.concatenate([[0.0], 0.5 * h_s * (power[1:] + power[:-1])])).min())
+    work = 0.5 * h_s * (power[1:] + power[:-1])
+    energy = np.cumsum(np.concatenate([[0.0], work]))
+    return float(energy.min())
 
 
 def _find_settled_s(records: dict[str, RecordBatch]) -> float | None:
-    """Returns since when every joint stays where it ends, s; None if that is too short a time
-    ago.
+    """Returns the time from which every joint stays at its final angle, in s.
+
+    Returns None if that time is less than `REST_S` before the end of the run.
     """
     last_s = 0.0
     for record in records.values():
-        away = np.flatnonzero(np.abs(record.q - record.q[-1]).max(axis=1) > SETTLED_ERROR_RAD)
-        last_s = max(last_s, record.t_ns[away[-1]] / NS_PER_S if len(away) else 0.0)
-    return float(last_s) if last_s <= records[SLAVE].t_ns[-1] / NS_PER_S - REST_S else None
+        distance_rad = np.abs(record.q - record.q[-1]).max(axis=1)
+        outside = np.flatnonzero(distance_rad > SETTLED_ERROR_RAD)
+        if len(outside):
+            last_s = max(last_s, record.t_ns[outside[-1]] / NS_PER_S)
+    end_s = records[SLAVE].t_ns[-1] / NS_PER_S
+    return float(last_s) if last_s <= end_s - REST_S else None
 
 
-def _find_stiffness(task: BenchRunItem, far: _JudgedRun) -> float | None:
-    """Returns by how much more the user has to push to get so much further, along the wall's
-    normal, N/m.
+def _estimate_stiffness(item: BenchRunItem, far: _JudgedRun) -> float | None:
+    """Returns the stiffness that the user feels along the wall's normal, in N/m.
+
+    The stiffness is the additional force for a longer reach, divided by the additional
+    distance, when both runs are at rest.
+
+    Args:
+        item: the run with the longer reach.
+        far: the same run with its records.
+
+    Returns:
+        None if one of the runs does not come to rest.
     """
-    built = task.cell.build(task.seed)
-    short = load_tuning_scenario(
-        built.source, (*built.overrides, *name_settings(SHORTER_REACH))
-    )
-    near = _run(short.scenario, far.scenario.duration_s, twins=0)
-    if None in (_find_settled_s(near.records), _find_settled_s(far.records)):
+    built = item.cell.build(item.seed)
+    overrides = (*built.overrides, *format_settings(SHORTER_REACH))
+    shorter = load_tuning_scenario(built.source, overrides)
+    near = _judge(shorter.scenario, far.scenario.duration_s, twins=0)
+    if _find_settled_s(near.records) is None or _find_settled_s(far.records) is None:
         return None
-    (near_m, near_n) = _find_push(near)
-    (far_m, far_n) = _find_push(far)
+    near_m, near_n = _measure_push(near)
+    far_m, far_n = _measure_push(far)
     return float((far_n - near_n) / (far_m - near_m))
 
 
-def _find_push(judged: _JudgedRun) -> tuple[float, float]:
-    """Returns of the last second where the user's end effector is along x, m, and how it is
-    pushed, N.
+def _measure_push(judged: _JudgedRun) -> tuple[float, float]:
+    """Returns the user's mean position in m and force in N along x, over the last second.
+
+    The force F follows from the torque of the hand, J' F = tau.
     """
     scenario = judged.scenario
-    record = judged.records[USER].since(judged.records[USER].t_ns[-1] - NS_PER_S)
+    record = judged.records[USER]
+    record = record.since(record.t_ns[-1] - NS_PER_S)
     tip = build_arm_rows(scenario, USER).place_end_effector(record.q, record.qd)
-    torque = _find_hand_torque(scenario, USER, record)
-    force = np.linalg.solve(np.swapaxes(tip.J, 1, 2), torque[:, :, np.newaxis])[:, 0, 0]
-    return float(tip.position[:, 0].mean()), float(force.mean())
+    torque = _compute_hand_torque(scenario, USER, record)
+    J_transposed = np.swapaxes(tip.J, 1, 2)
+    force_x = np.linalg.solve(J_transposed, torque[:, :, np.newaxis])[:, 0, 0]
+    position_x = tip.position[:, 0]
+    return float(position_x.mean()), float(force_x.mean())
 
 
-def _follow_error_rad(scenario: Scenario, records: dict[str, RecordBatch]) -> float:
-    peers = scenario.peers(SLAVE)
-    own = records[SLAVE]
-    t_s = own.t_ns / NS_PER_S
+def _measure_error_rad(scenario: Scenario, records: dict[str, RecordBatch]) -> float:
+    """Returns the RMS distance of the slave from its users, weighted by dominance, in rad."""
+    slave = records[SLAVE]
+    t_s = slave.t_ns / NS_PER_S
     period_s = 1.0 / scenario.sites[SLAVE].rate_hz
-    alpha = evaluate_ramps(*list_scripted_ramps(scenario, SLAVE), t_s, period_s).alpha
-    led: Array = sum(
-        (alpha[:, n, None] * records[peer].q for n, peer in enumerate(peers)),
-        np.zeros_like(own.q),
-    )
-    return float(np.sqrt(np.mean((own.q - led) ** 2)))
+    start, ramps = list_scripted_ramps(scenario, SLAVE)
+    alpha = evaluate_ramps(start, ramps, t_s, period_s).alpha
+    reference: Array = np.zeros_like(slave.q)
+    for index, peer in enumerate(scenario.peers(SLAVE)):
+        reference = reference + alpha[:, index, None] * records[peer].q
+    return float(np.sqrt(np.mean((slave.q - reference) ** 2)))
 
 
 ORIGIN_NAME = "origin.json"
@@ -248,34 +323,52 @@ BenchFolder = StudyFolder[BenchPlan, BenchRun]
 
 
 def prepare_bench_folder(plan: BenchPlan, path: Path | None = None) -> BenchFolder:
-    """Returns the folder of a suite, made, or as it was left; by default `runs/bench-STUDY`.
+    """Makes the folder of a suite, or opens an existing folder with its finished runs.
+
+    Args:
+        plan: plan of the suite.
+        path: the folder; None: `runs/bench-STUDY`.
 
     Raises:
-        UsageError: it holds something else, or runs from elsewhere, or cannot be made.
+        UsageError: the folder has other content, or runs of another version or arithmetic, or
+            cannot be made.
     """
-    chosen = path or Path("runs") / f"bench-{plan.study}"
     if path is None:
-        refuse_link(chosen)
+        path = Path("runs") / f"bench-{plan.study}"
+        refuse_link(path)
     arithmetic, versions = describe_program()
     facts = {"arithmetic": arithmetic, **versions}
-    file = chosen / ORIGIN_NAME
     origin = json.dumps(facts, indent=2) + "\n"
-    if not file.exists():
-        make_results_folder(chosen, "", force=None)
-        write_whole(file, origin)
-    elif (before := file.read_text(encoding="utf-8")) != origin:
-        there, here = (" ".join(text.split()) for text in (before, origin))
-        raise UsageError(
-            f"{chosen}: holds runs of {there}, and this is {here}; results are not mixed: choose another "
-            "folder with --out"
-        )
-    remedy = build_resume_hint("bench", "--study", plan.study, "--out", str(chosen))
-    return BenchFolder(
-        chosen,
-        plan,
-        facts,
-        remedy,
-        lambda: RunJournal(chosen / JOURNAL_NAME, origin, BenchRun, remedy),
+    origin_file = path / ORIGIN_NAME
+    if origin_file.exists():
+        _check_origin(path, origin_file.read_text(encoding="utf-8"), origin)
+    else:
+        make_results_folder(path, "", force=None)
+        write_whole(origin_file, origin)
+    remedy = build_resume_hint("bench", "--study", plan.study, "--out", str(path))
+    journal_file = path / JOURNAL_NAME
+    return StudyFolder(
+        path=path,
+        plan=plan,
+        facts=facts,
+        remedy=remedy,
+        journal=lambda: RunJournal(journal_file, origin, BenchRun, remedy),
+    )
+
+
+def _check_origin(path: Path, folder_origin: str, origin: str) -> None:
+    """Refuses a folder whose runs come from another version or arithmetic.
+
+    Raises:
+        UsageError: both origins differ.
+    """
+    if folder_origin == origin:
+        return
+    folder_text = " ".join(folder_origin.split())
+    local_text = " ".join(origin.split())
+    raise UsageError(
+        f"{path}: the runs in this folder are of {folder_text}, and this program is "
+        f"{local_text}; results are not mixed: choose another folder with --out"
     )
 
 
@@ -287,29 +380,54 @@ def run_bench(
     *,
     confirm: bool = False,
 ) -> BenchResults:
-    """Runs what is left of a suite, and returns all of it; other arguments are those of
-    `trilat_net.bench`.
+    """Executes the runs of a suite that its journal lacks, and returns all results.
 
-    What the journal of the folder has is not run again; `progress` gets the runs that are done,
-    and all.
+    Args:
+        folder: folder of the suite.
+        jobs: number of processes, as for `trilat_net.bench`.
+        on: a cluster, as for `trilat_net.bench`.
+        progress: called with the number of finished runs and of all runs.
+        confirm: True to repeat runs that are not stable over `LONGEST_S`.
 
     Raises:
-        RunFailed: a run ended its workers, or the cluster is gone. What is done is kept.
+        RunFailed: a run ended its workers, or the cluster is gone. Finished runs are kept.
     """
     plan = folder.plan
+    items = [BenchRunItem(cell, seed) for cell in plan.cells for seed in cell.seeds]
     with folder.journal() as journal:
-        asked = [BenchRunItem(cell, seed) for cell in plan.cells for seed in cell.seeds]
-        for again in (False, True)[: 1 + confirm]:
-            if again:
-                found = [(one, journal.done[one.cell.key, one.seed]) for one in asked]
-                asked = [one._replace(to_s=LONGEST_S) for one, run in found if run.doubtful]
-            keys = [(name_run(one.cell.key, one.to_s), one.seed) for one in asked]
-            tasks = [
-                one for key, one in zip(keys, asked, strict=True) if key not in journal.done
+        _run_pending(journal, items, jobs, on, progress)
+        if confirm:
+            repeated = [
+                item._replace(to_s=LONGEST_S)
+                for item in items
+                if journal.done[item.cell.key, item.seed].needs_confirmation
             ]
-            if tasks:
-                hint = "; what is done is kept: the same command goes on"
-                with open_worker_pool(jobs, on, most=len(tasks), hint=hint) as pool:
-                    done = len(asked) - len(tasks)
-                    journal.run_pending(pool, run_bench_task, tasks, done, len(asked), progress)
+            _run_pending(journal, repeated, jobs, on, progress)
         return BenchResults(plan, journal.done)
+
+
+def _run_pending(
+    journal: RunJournal[BenchRun],
+    items: list[BenchRunItem],
+    jobs: int | None,
+    on: Workers,
+    progress: Progress,
+) -> None:
+    """Executes the runs that the journal lacks, and writes each to the journal as it ends."""
+    pending = []
+    for item in items:
+        key = name_run(item.cell.key, item.to_s)
+        if (key, item.seed) not in journal.done:
+            pending.append(item)
+    if not pending:
+        return
+    hint = "; finished runs are kept: the same command continues"
+    with open_worker_pool(jobs, on, most=len(pending), hint=hint) as pool:
+        journal.run_pending(
+            pool,
+            run_bench_task,
+            pending,
+            done=len(items) - len(pending),
+            total=len(items),
+            show=progress,
+        )
