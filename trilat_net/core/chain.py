@@ -42,6 +42,8 @@ COULOMB_SPEED = 0.01
 
 Three = tuple[float, float, float]
 Matrix = tuple[Three, Three, Three]
+Spatial = tuple[Three, Three]
+"""A spatial vector: its linear half and its angular half."""
 
 
 class ChainJoint(NamedTuple):
@@ -123,7 +125,11 @@ def build_chain(joints: Sequence[ChainJoint], width: int = 0) -> RowArray:
     row: Row
     for row, joint in zip(rows, joints, strict=True):
         x, y, z = joint.axis
-        cross_matrix = ((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))
+        cross_matrix = (
+            (0.0, -z, y),
+            (z, 0.0, -x),
+            (-y, x, 0.0),
+        )
         row.prismatic = int(joint.prismatic)
         row.axis = joint.axis
         row.origin = joint.origin_m
@@ -187,31 +193,31 @@ def scale(factor: float, a: Three) -> Three:
 @leaf
 def rotate(R: Array, a: Three) -> Three:
     """Returns R a."""
-    return (
-        R[0, 0] * a[0] + R[0, 1] * a[1] + R[0, 2] * a[2],
-        R[1, 0] * a[0] + R[1, 1] * a[1] + R[1, 2] * a[2],
-        R[2, 0] * a[0] + R[2, 1] * a[1] + R[2, 2] * a[2],
-    )
+    x, y, z = a
+    first = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z
+    second = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z
+    third = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z
+    return first, second, third
 
 
 @leaf
 def rotate_back(R: Array, a: Three) -> Three:
     """Returns R' a."""
-    return (
-        R[0, 0] * a[0] + R[1, 0] * a[1] + R[2, 0] * a[2],
-        R[0, 1] * a[0] + R[1, 1] * a[1] + R[2, 1] * a[2],
-        R[0, 2] * a[0] + R[1, 2] * a[1] + R[2, 2] * a[2],
-    )
+    x, y, z = a
+    first = R[0, 0] * x + R[1, 0] * y + R[2, 0] * z
+    second = R[0, 1] * x + R[1, 1] * y + R[2, 1] * z
+    third = R[0, 2] * x + R[1, 2] * y + R[2, 2] * z
+    return first, second, third
 
 
 def apply(a: Matrix, b: Three) -> Three:
     """Returns a b by sums in a fixed order."""
-    x, y, z = a
-    return (
-        x[0] * b[0] + x[1] * b[1] + x[2] * b[2],
-        y[0] * b[0] + y[1] * b[1] + y[2] * b[2],
-        z[0] * b[0] + z[1] * b[1] + z[2] * b[2],
-    )
+    row_1, row_2, row_3 = a
+    x, y, z = b
+    first = row_1[0] * x + row_1[1] * y + row_1[2] * z
+    second = row_2[0] * x + row_2[1] * y + row_2[2] * z
+    third = row_3[0] * x + row_3[1] * y + row_3[2] * z
+    return first, second, third
 
 
 def multiply(a: Matrix, b: Matrix) -> Matrix:
@@ -219,16 +225,18 @@ def multiply(a: Matrix, b: Matrix) -> Matrix:
 
     The sums have a fixed order. The sums of a library may differ in the last bit.
     """
-    columns = tuple(zip(*b, strict=True))
-    rows: list[Any] = []
-    for x, y, z in a:
-        rows.append(tuple(x * u + y * v + z * w for u, v, w in columns))
+    columns: Any = zip(*b, strict=True)
+    product_columns = [apply(a, column) for column in columns]
+    rows: Any = zip(*product_columns, strict=True)
     return tuple(rows)
 
 
 @leaf
 def place_joints(chain: RowArray, q: Vector) -> None:
-    """Writes R and p of each link in the previous link's frame, at joint positions q."""
+    """Writes R and p of each link in the previous link's frame, at joint positions q.
+
+    See `build_chain` for the rotation of a joint.
+    """
     for i in range(chain.shape[0]):
         row: Row = chain[i]
         sine = 0.0
@@ -238,13 +246,14 @@ def place_joints(chain: RowArray, q: Vector) -> None:
             versine = 1.0 - cosine
         for j in range(3):
             for k in range(3):
-                turn = row.at_rest[j, k] + sine * row.by_sine[j, k]
-                row.R[j, k] = turn + versine * row.by_cosine[j, k]
+                sine_part = sine * row.by_sine[j, k]
+                versine_part = versine * row.by_cosine[j, k]
+                row.R[j, k] = row.at_rest[j, k] + sine_part + versine_part
             row.p[j] = row.origin[j] + q[i] * row.slide[j]
 
 
 @leaf
-def _move(row: Row, linear: Three, angular: Three, rate: float) -> tuple[Three, Three]:
+def _move(row: Row, linear: Three, angular: Three, rate: float) -> Spatial:
     """Returns X V_p + S rate, a spatial velocity of a link from that of the previous link.
 
     Args:
@@ -253,15 +262,17 @@ def _move(row: Row, linear: Three, angular: Three, rate: float) -> tuple[Three, 
         angular: angular half of V_p, in the previous link's frame.
         rate: velocity of the joint.
     """
-    lin = rotate_back(row.R, add(linear, cross(angular, three(row.p))))
-    ang = rotate_back(row.R, angular)
+    velocity_at_p = add(linear, cross(angular, three(row.p)))
+    link_linear = rotate_back(row.R, velocity_at_p)
+    link_angular = rotate_back(row.R, angular)
+    joint_velocity = scale(rate, three(row.axis))
     if row.prismatic == 0:
-        return lin, add(ang, scale(rate, three(row.axis)))
-    return add(lin, scale(rate, three(row.axis))), ang
+        return link_linear, add(link_angular, joint_velocity)
+    return add(link_linear, joint_velocity), link_angular
 
 
 @leaf
-def _momentum(pi: Vector, first: int, linear: Three, angular: Three) -> tuple[Three, Three]:
+def _momentum(pi: Vector, first: int, linear: Three, angular: Three) -> Spatial:
     """Returns the spatial momentum I(pi) V.
 
     Args:
@@ -270,25 +281,29 @@ def _momentum(pi: Vector, first: int, linear: Three, angular: Three) -> tuple[Th
         linear: linear half of V.
         angular: angular half of V.
     """
+    m = pi[first]
     mc = (pi[first + 1], pi[first + 2], pi[first + 3])
-    xx = pi[first + 4]
-    xy = pi[first + 5]
-    yy = pi[first + 6]
-    xz = pi[first + 7]
-    yz = pi[first + 8]
-    zz = pi[first + 9]
-    spin_x = xx * angular[0] + xy * angular[1] + xz * angular[2]
-    spin_y = xy * angular[0] + yy * angular[1] + yz * angular[2]
-    spin_z = xz * angular[0] + yz * angular[1] + zz * angular[2]
-    linear_momentum = add(scale(pi[first], linear), cross(angular, mc))
-    angular_momentum = add(cross(mc, linear), (spin_x, spin_y, spin_z))
+    I_xx = pi[first + 4]
+    I_xy = pi[first + 5]
+    I_yy = pi[first + 6]
+    I_xz = pi[first + 7]
+    I_yz = pi[first + 8]
+    I_zz = pi[first + 9]
+    x, y, z = angular
+    spin_x = I_xx * x + I_xy * y + I_xz * z
+    spin_y = I_xy * x + I_yy * y + I_yz * z
+    spin_z = I_xz * x + I_yz * y + I_zz * z
+    spin = (spin_x, spin_y, spin_z)
+    linear_momentum = add(scale(m, linear), cross(angular, mc))
+    angular_momentum = add(cross(mc, linear), spin)
     return linear_momentum, angular_momentum
 
 
 @leaf
 def _along_axis(row: Row, linear: Three, angular: Three) -> float:
     """Returns S' f, the component of a spatial force along a joint's axis."""
-    return dot(three(row.axis), angular if row.prismatic == 0 else linear)
+    along = angular if row.prismatic == 0 else linear
+    return dot(three(row.axis), along)
 
 
 @leaf
@@ -298,17 +313,19 @@ def friction_torque(row: Row, speed: float) -> float:
     f(v) = viscous v + coulomb x / sqrt(1 + x^2),    x = v / COULOMB_SPEED
     """
     x = speed / COULOMB_SPEED
-    torque: float = row.viscous * speed + row.coulomb * (x / sqrt(1.0 + x * x))
-    return torque
+    viscous: float = row.viscous * speed
+    coulomb: float = row.coulomb * (x / sqrt(1.0 + x * x))
+    return viscous + coulomb
 
 
 @leaf
 def _pass_force(row: Row, before: Row) -> None:
     """Adds a link's spatial force to that of the previous link, in the previous frame."""
-    linear = rotate(row.R, three(row.f_lin))
-    angular = add(rotate(row.R, three(row.f_ang)), cross(three(row.p), linear))
-    put_three(before.f_lin, add(three(before.f_lin), linear))
-    put_three(before.f_ang, add(three(before.f_ang), angular))
+    force = rotate(row.R, three(row.f_lin))
+    lever_torque = cross(three(row.p), force)
+    torque = add(rotate(row.R, three(row.f_ang)), lever_torque)
+    put_three(before.f_lin, add(three(before.f_lin), force))
+    put_three(before.f_ang, add(three(before.f_ang), torque))
 
 
 @leaf
@@ -325,36 +342,49 @@ def propagate_motion(
         a: reference accelerations, which M multiplies, shape (n,).
     """
     still = (0.0, 0.0, 0.0)
-    V = W = (still, still)
-    A = ((-gravity[0], -gravity[1], -gravity[2]), still)
+    V_lin = still
+    V_ang = still
+    W_lin = still
+    W_ang = still
+    # A base that accelerates upwards has the same effect as gravity.
+    A_lin = (-gravity[0], -gravity[1], -gravity[2])
+    A_ang = still
     for i in range(chain.shape[0]):
         row: Row = chain[i]
-        V = _move(row, V[0], V[1], qd[i])
-        W = _move(row, W[0], W[1], v[i])
-        A = _move(row, A[0], A[1], a[i])
-        along = scale(v[i], three(row.axis))
+        V_lin, V_ang = _move(row, V_lin, V_ang, qd[i])
+        W_lin, W_ang = _move(row, W_lin, W_ang, v[i])
+        A_lin, A_ang = _move(row, A_lin, A_ang, a[i])
+        # V x (S v)
+        joint_velocity = scale(v[i], three(row.axis))
         if row.prismatic == 0:
-            A = (add(A[0], cross(V[0], along)), add(A[1], cross(V[1], along)))
+            A_lin = add(A_lin, cross(V_lin, joint_velocity))
+            A_ang = add(A_ang, cross(V_ang, joint_velocity))
         else:
-            A = (add(A[0], cross(V[1], along)), A[1])
-        put_three(row.V_lin, V[0])
-        put_three(row.V_ang, V[1])
-        put_three(row.W_lin, W[0])
-        put_three(row.W_ang, W[1])
-        put_three(row.A_lin, A[0])
-        put_three(row.A_ang, A[1])
+            A_lin = add(A_lin, cross(V_ang, joint_velocity))
+        put_three(row.V_lin, V_lin)
+        put_three(row.V_ang, V_ang)
+        put_three(row.W_lin, W_lin)
+        put_three(row.W_ang, W_ang)
+        put_three(row.A_lin, A_lin)
+        put_three(row.A_ang, A_ang)
 
 
 @leaf
-def _motion_cross(V: tuple[Three, Three], W: tuple[Three, Three]) -> tuple[Three, Three]:
+def _motion_cross(V: Spatial, W: Spatial) -> Spatial:
     """Returns V x W of two spatial velocities."""
-    return add(cross(V[1], W[0]), cross(V[0], W[1])), cross(V[1], W[1])
+    V_lin, V_ang = V
+    W_lin, W_ang = W
+    linear = add(cross(V_ang, W_lin), cross(V_lin, W_ang))
+    return linear, cross(V_ang, W_ang)
 
 
 @leaf
-def _force_cross(V: tuple[Three, Three], f: tuple[Three, Three]) -> tuple[Three, Three]:
+def _force_cross(V: Spatial, f: Spatial) -> Spatial:
     """Returns V x* f of a spatial velocity and a spatial force."""
-    return cross(V[1], f[0]), add(cross(V[1], f[1]), cross(V[0], f[0]))
+    V_lin, V_ang = V
+    force, torque = f
+    angular = add(cross(V_ang, torque), cross(V_lin, force))
+    return cross(V_ang, force), angular
 
 
 @leaf
@@ -371,30 +401,31 @@ def inverse_dynamics(
     n = chain.shape[0]
     for i in range(n):
         row: Row = chain[i]
+        first = LINK_PARAMETERS * i
         V = (three(row.V_lin), three(row.V_ang))
         W = (three(row.W_lin), three(row.W_ang))
-        first = LINK_PARAMETERS * i
-        f = _momentum(theta, first, three(row.A_lin), three(row.A_ang))
-        between = _motion_cross(V, W)
-        f_1 = _force_cross(V, _momentum(theta, first, W[0], W[1]))
-        f_2 = _force_cross(W, _momentum(theta, first, V[0], V[1]))
-        f_3 = _momentum(theta, first, between[0], between[1])
-        lin = add(add(f_1[0], f_2[0]), scale(-1.0, f_3[0]))
-        ang = add(add(f_1[1], f_2[1]), scale(-1.0, f_3[1]))
-        put_three(row.f_lin, add(f[0], scale(0.5, lin)))
-        put_three(row.f_ang, add(f[1], scale(0.5, ang)))
+        # I A
+        inertial_lin, inertial_ang = _momentum(theta, first, three(row.A_lin), three(row.A_ang))
+        # V x* I W + W x* I V - I (V x W)
+        V_x_I_W = _force_cross(V, _momentum(theta, first, W[0], W[1]))
+        W_x_I_V = _force_cross(W, _momentum(theta, first, V[0], V[1]))
+        V_x_W = _motion_cross(V, W)
+        I_V_x_W = _momentum(theta, first, V_x_W[0], V_x_W[1])
+        turning_lin = subtract(add(V_x_I_W[0], W_x_I_V[0]), I_V_x_W[0])
+        turning_ang = subtract(add(V_x_I_W[1], W_x_I_V[1]), I_V_x_W[1])
+        put_three(row.f_lin, add(inertial_lin, scale(0.5, turning_lin)))
+        put_three(row.f_ang, add(inertial_ang, scale(0.5, turning_ang)))
     for i in range(n - 1, -1, -1):
         row = chain[i]
-        borne = _along_axis(row, three(row.f_lin), three(row.f_ang))
-        torque[i] = borne + row.armature_kg_m2 * a[i] + friction_torque(row, v[i])
+        rigid = _along_axis(row, three(row.f_lin), three(row.f_ang))
+        drive = row.armature_kg_m2 * a[i]
+        torque[i] = rigid + drive + friction_torque(row, v[i])
         if i > 0:
             _pass_force(row, chain[i - 1])
 
 
 @leaf
-def _add_products(
-    factor: float, x: tuple[Three, Three], y: tuple[Three, Three], first: int, gradient: Array
-) -> None:
+def _add_products(factor: float, x: Spatial, y: Spatial, first: int, gradient: Array) -> None:
     """Adds factor times the gradient of x' I(pi) y with respect to pi.
 
     Args:
@@ -404,18 +435,24 @@ def _add_products(
         first: index of the link's first parameter.
         gradient: changed in its ten entries from `first`.
     """
-    (x_lin, x_ang) = x
-    (y_lin, y_ang) = y
-    lever = add(cross(y_lin, x_ang), cross(x_lin, y_ang))
-    gradient[first] += factor * dot(x_lin, y_lin)
+    x_lin, x_ang = x
+    y_lin, y_ang = y
+    x_1, x_2, x_3 = x_ang
+    y_1, y_2, y_3 = y_ang
+    by_m = dot(x_lin, y_lin)
+    by_mc = add(cross(y_lin, x_ang), cross(x_lin, y_ang))
+    by_Ixy = x_1 * y_2 + x_2 * y_1
+    by_Ixz = x_1 * y_3 + x_3 * y_1
+    by_Iyz = x_2 * y_3 + x_3 * y_2
+    gradient[first] += factor * by_m
     for j in range(3):
-        gradient[first + 1 + j] += factor * lever[j]
-    gradient[first + 4] += factor * (x_ang[0] * y_ang[0])
-    gradient[first + 5] += factor * (x_ang[0] * y_ang[1] + x_ang[1] * y_ang[0])
-    gradient[first + 6] += factor * (x_ang[1] * y_ang[1])
-    gradient[first + 7] += factor * (x_ang[0] * y_ang[2] + x_ang[2] * y_ang[0])
-    gradient[first + 8] += factor * (x_ang[1] * y_ang[2] + x_ang[2] * y_ang[1])
-    gradient[first + 9] += factor * (x_ang[2] * y_ang[2])
+        gradient[first + 1 + j] += factor * by_mc[j]
+    gradient[first + 4] += factor * (x_1 * y_1)
+    gradient[first + 5] += factor * by_Ixy
+    gradient[first + 6] += factor * (x_2 * y_2)
+    gradient[first + 7] += factor * by_Ixz
+    gradient[first + 8] += factor * by_Iyz
+    gradient[first + 9] += factor * (x_3 * y_3)
 
 
 @leaf
@@ -425,20 +462,19 @@ def parameter_gradient(chain: RowArray, gradient: Array) -> None:
         row: Row = chain[i]
         V = (three(row.V_lin), three(row.V_ang))
         W = (three(row.W_lin), three(row.W_ang))
-        s = (add(V[0], scale(-1.0, W[0])), add(V[1], scale(-1.0, W[1])))
+        A = (three(row.A_lin), three(row.A_ang))
+        s = (subtract(V[0], W[0]), subtract(V[1], W[1]))
+        V_x_s = _motion_cross(V, s)
+        W_x_s = _motion_cross(W, s)
+        V_x_W = _motion_cross(V, W)
         first = LINK_PARAMETERS * i
         for p in range(first, first + LINK_PARAMETERS):
             gradient[p] = 0.0
-        _add_products(
-            factor=1.0,
-            x=s,
-            y=(three(row.A_lin), three(row.A_ang)),
-            first=first,
-            gradient=gradient,
-        )
-        _add_products(factor=-0.5, x=_motion_cross(V, s), y=W, first=first, gradient=gradient)
-        _add_products(factor=-0.5, x=_motion_cross(W, s), y=V, first=first, gradient=gradient)
-        _add_products(factor=-0.5, x=s, y=_motion_cross(V, W), first=first, gradient=gradient)
+        # s' (V x* I W) = -(V x s)' I W, so each term has the form x' I y.
+        _add_products(factor=1.0, x=s, y=A, first=first, gradient=gradient)
+        _add_products(factor=-0.5, x=V_x_s, y=W, first=first, gradient=gradient)
+        _add_products(factor=-0.5, x=W_x_s, y=V, first=first, gradient=gradient)
+        _add_products(factor=-0.5, x=s, y=V_x_W, first=first, gradient=gradient)
 
 
 @leaf
@@ -452,24 +488,26 @@ def _add_composite(row: Row, before: Row) -> None:
     R = row.R
     m = pi[0]
     p = three(row.p)
-    h = rotate(R, (pi[1], pi[2], pi[3]))
+    mc = rotate(R, (pi[1], pi[2], pi[3]))
+    # x, y and z are the columns of R I. I is symmetric, and R I R' has the rows I_x, I_y, I_z.
     x = rotate(R, (pi[4], pi[5], pi[7]))
     y = rotate(R, (pi[5], pi[6], pi[8]))
     z = rotate(R, (pi[7], pi[8], pi[9]))
-    # x, y and z are the columns of R I; I is symmetric.
     I_x = rotate(R, (x[0], y[0], z[0]))
     I_y = rotate(R, (x[1], y[1], z[1]))
     I_z = rotate(R, (x[2], y[2], z[2]))
-    around = 2.0 * dot(p, h) + m * dot(p, p)
+    polar = 2.0 * dot(p, mc) + m * dot(p, p)
+    p_x, p_y, p_z = p
+    mc_x, mc_y, mc_z = mc
     total[0] += m
     for j in range(3):
-        total[1 + j] += h[j] + m * p[j]
-    total[4] += I_x[0] + around - 2.0 * p[0] * h[0] - m * p[0] * p[0]
-    total[5] += I_x[1] - p[0] * h[1] - p[1] * h[0] - m * p[0] * p[1]
-    total[6] += I_y[1] + around - 2.0 * p[1] * h[1] - m * p[1] * p[1]
-    total[7] += I_x[2] - p[0] * h[2] - p[2] * h[0] - m * p[0] * p[2]
-    total[8] += I_y[2] - p[1] * h[2] - p[2] * h[1] - m * p[1] * p[2]
-    total[9] += I_z[2] + around - 2.0 * p[2] * h[2] - m * p[2] * p[2]
+        total[1 + j] += mc[j] + m * p[j]
+    total[4] += I_x[0] + polar - 2.0 * p_x * mc_x - m * p_x * p_x
+    total[5] += I_x[1] - p_x * mc_y - p_y * mc_x - m * p_x * p_y
+    total[6] += I_y[1] + polar - 2.0 * p_y * mc_y - m * p_y * p_y
+    total[7] += I_x[2] - p_x * mc_z - p_z * mc_x - m * p_x * p_z
+    total[8] += I_y[2] - p_y * mc_z - p_z * mc_y - m * p_y * p_z
+    total[9] += I_z[2] + polar - 2.0 * p_z * mc_z - m * p_z * p_z
 
 
 @leaf
@@ -486,6 +524,7 @@ def mass_matrix(chain: RowArray, theta: Vector) -> None:
     still = (0.0, 0.0, 0.0)
     for i in range(n - 1, -1, -1):
         row = chain[i]
+        # The force that accelerates the composite body at the joint's unit acceleration.
         axis = three(row.axis)
         if row.prismatic == 0:
             linear, angular = _momentum(row.composite, 0, still, axis)
@@ -493,9 +532,10 @@ def mass_matrix(chain: RowArray, theta: Vector) -> None:
             linear, angular = _momentum(row.composite, 0, axis, still)
         row.M[i] = _along_axis(row, linear, angular) + row.armature_kg_m2
         for j in range(i - 1, -1, -1):
-            above: Row = chain[j + 1]
-            linear = rotate(above.R, linear)
-            angular = add(rotate(above.R, angular), cross(three(above.p), linear))
+            link: Row = chain[j + 1]
+            linear = rotate(link.R, linear)
+            lever_torque = cross(three(link.p), linear)
+            angular = add(rotate(link.R, angular), lever_torque)
             row.M[j] = _along_axis(chain[j], linear, angular)
         if i > 0:
             _add_composite(row, chain[i - 1])
@@ -504,11 +544,12 @@ def mass_matrix(chain: RowArray, theta: Vector) -> None:
 @leaf
 def _stop_torque(row: Row, q: float, qd: float) -> float:
     """Returns the torque of a joint's stops, a spring and a damper that never pull."""
+    damper = row.stop_damping * qd
     if q < row.lower:
-        push: float = row.stop_stiffness * (row.lower - q) - row.stop_damping * qd
+        push: float = row.stop_stiffness * (row.lower - q) - damper
         return max(push, 0.0)
     if q > row.upper:
-        push = row.stop_stiffness * (row.upper - q) - row.stop_damping * qd
+        push = row.stop_stiffness * (row.upper - q) - damper
         return min(push, 0.0)
     return 0.0
 
@@ -518,22 +559,28 @@ def _bias(chain: RowArray, theta: Vector, gravity: Vector, q: Vector, qd: Vector
     """Writes C qd + G + friction - stops into the rows' `bias`, after `place_joints`."""
     n = chain.shape[0]
     still = (0.0, 0.0, 0.0)
-    V = (still, still)
-    A = ((-gravity[0], -gravity[1], -gravity[2]), still)
+    V_lin = still
+    V_ang = still
+    A_lin = (-gravity[0], -gravity[1], -gravity[2])
+    A_ang = still
     for i in range(n):
         row: Row = chain[i]
-        V = _move(row, V[0], V[1], qd[i])
-        A = _move(row, A[0], A[1], 0.0)
-        along = scale(qd[i], three(row.axis))
+        V_lin, V_ang = _move(row, V_lin, V_ang, qd[i])
+        A_lin, A_ang = _move(row, A_lin, A_ang, 0.0)
+        # V x (S qd)
+        joint_velocity = scale(qd[i], three(row.axis))
         if row.prismatic == 0:
-            A = (add(A[0], cross(V[0], along)), add(A[1], cross(V[1], along)))
+            A_lin = add(A_lin, cross(V_lin, joint_velocity))
+            A_ang = add(A_ang, cross(V_ang, joint_velocity))
         else:
-            A = (add(A[0], cross(V[1], along)), A[1])
+            A_lin = add(A_lin, cross(V_ang, joint_velocity))
+        # I A + V x* I V
         first = LINK_PARAMETERS * i
-        f = _momentum(theta, first, A[0], A[1])
-        turning = _force_cross(V, _momentum(theta, first, V[0], V[1]))
-        put_three(row.f_lin, add(f[0], turning[0]))
-        put_three(row.f_ang, add(f[1], turning[1]))
+        force, torque = _momentum(theta, first, A_lin, A_ang)
+        momentum = _momentum(theta, first, V_lin, V_ang)
+        turning = _force_cross((V_lin, V_ang), momentum)
+        put_three(row.f_lin, add(force, turning[0]))
+        put_three(row.f_ang, add(torque, turning[1]))
     for i in range(n - 1, -1, -1):
         row = chain[i]
         rigid = _along_axis(row, three(row.f_lin), three(row.f_ang))
@@ -598,10 +645,12 @@ def find_acceleration(
         for j in range(i):
             other: Row = chain[j]
             for k in range(j):
-                row.M[j] -= row.M[k] * other.M[k] * chain[k].M[k]
+                pivot = chain[k].M[k]
+                row.M[j] -= row.M[k] * other.M[k] * pivot
             row.M[j] /= other.M[j]
         for k in range(i):
-            row.M[i] -= row.M[k] * row.M[k] * chain[k].M[k]
+            pivot = chain[k].M[k]
+            row.M[i] -= row.M[k] * row.M[k] * pivot
         total = torque[i] - row.bias
         for k in range(i):
             total -= row.M[k] * qdd[k]
@@ -637,13 +686,15 @@ def place_end_effector(chain: RowArray, tip: Vector) -> Three:
                 put_three(R_base[j], three(R[j]))
         else:
             before = chain[i - 1].R_base
-            position = add(position, rotate(before, three(row.p)))
+            offset = rotate(before, three(row.p))
+            position = add(position, offset)
             for k in range(3):
                 column = rotate(before, (R[0, k], R[1, k], R[2, k]))
                 R_base[0, k], R_base[1, k], R_base[2, k] = column
         put_three(row.axis_base, rotate(R_base, three(row.axis)))
         put_three(row.p_base, position)
-    position = add(position, rotate(chain[n - 1].R_base, three(tip)))
+    tip_offset = rotate(chain[n - 1].R_base, three(tip))
+    position = add(position, tip_offset)
     for i in range(n):
         row = chain[i]
         axis = three(row.axis_base)

@@ -29,8 +29,9 @@ from .rotation import compose_rotations, relative_rotation, rotation_matrix
 from .vectors import Array, Row, RowArray
 
 POSITION = 3
+"""Number of a task's coordinates without an orientation."""
 POSE = 6
-"""Count of a task's coordinates without and with an orientation."""
+"""Number of a task's coordinates with an orientation."""
 TINY = 1e-12
 """Below this pivot of J J', the end effector cannot move along the axis at all."""
 
@@ -63,12 +64,13 @@ def update_pose(s: Row, chain: RowArray) -> None:
         s.xd[j] = 0.0
     for i in range(chain.shape[0]):
         row: Row = chain[i]
+        rate = s.qd[i]
         for j in range(3):
             s.J[j, i] = s.scale * row.J_lin[j]
-            s.xd[j] += s.J[j, i] * s.qd[i]
+            s.xd[j] += s.J[j, i] * rate
             if s.shared == POSE:
                 s.J[3 + j, i] = row.J_ang[j]
-                s.xd[3 + j] += row.J_ang[j] * s.qd[i]
+                s.xd[3 + j] += row.J_ang[j] * rate
     _update_jacobian_rate(s, chain, position)
 
 
@@ -84,28 +86,35 @@ def _update_jacobian_rate(s: Row, chain: RowArray, tip: Three) -> None:
         tip: position of the end effector in base axes, m.
     """
     zeros = (0.0, 0.0, 0.0)
-    angular_speed = zeros
-    origin_speed = zeros
-    tip_speed = zeros
+    angular_velocity = zeros
+    origin_velocity = zeros
+    tip_velocity = zeros
     origin_before = zeros
     for i in range(chain.shape[0]):
-        tip_speed = add(tip_speed, scale(s.qd[i], three(chain[i].J_lin)))
+        column = three(chain[i].J_lin)
+        tip_velocity = add(tip_velocity, scale(s.qd[i], column))
     for i in range(chain.shape[0]):
         row: Row = chain[i]
         axis = three(row.axis_base)
         origin = three(row.p_base)
-        step = cross(angular_speed, subtract(origin, origin_before))
-        origin_speed = add(origin_speed, step)
+        joint_velocity = scale(s.qd[i], axis)
+        # The previous link carries the joint's origin along.
+        link_vector = subtract(origin, origin_before)
+        origin_velocity = add(origin_velocity, cross(angular_velocity, link_vector))
         origin_before = origin
         if row.prismatic == 0:
-            angular_speed = add(angular_speed, scale(s.qd[i], axis))
-            angular = cross(angular_speed, axis)
-            lever_rate = cross(axis, subtract(tip_speed, origin_speed))
-            linear = add(cross(angular, subtract(tip, origin)), lever_rate)
+            # The derivatives of the joint's columns, J_ang = axis and J_lin = axis x lever.
+            angular_velocity = add(angular_velocity, joint_velocity)
+            axis_rate = cross(angular_velocity, axis)
+            lever = subtract(tip, origin)
+            lever_rate = subtract(tip_velocity, origin_velocity)
+            linear = add(cross(axis_rate, lever), cross(axis, lever_rate))
+            angular = axis_rate
         else:
-            origin_speed = add(origin_speed, scale(s.qd[i], axis))
+            # The derivatives of J_ang = 0 and J_lin = axis.
+            origin_velocity = add(origin_velocity, joint_velocity)
+            linear = cross(angular_velocity, axis)
             angular = zeros
-            linear = cross(angular_speed, axis)
         for j in range(3):
             s.Jd[j, i] = s.scale * linear[j]
             if s.shared == POSE:
@@ -131,7 +140,8 @@ def update_orientation_reference(s: Row, links: RowArray) -> None:
         peer_velocity = scale(link.alpha, three(link.qd[3:]))
         ramp_velocity = scale(-link.alpha_rate, turn)
         velocity = add(velocity, add(peer_velocity, ramp_velocity))
-    reference = compose_rotations(scale(-1.0, difference), three(s.x[3:]))
+    turn_back = scale(-1.0, difference)
+    reference = compose_rotations(turn_back, three(s.x[3:]))
     put_three(s.q_des[3:], reference)
     put_three(s.qd_des[3:], velocity)
 
@@ -144,13 +154,17 @@ def _factor(s: Row, damping: float) -> None:
     """
     for j in range(s.shared):
         for k in range(j + 1):
-            total = damping + 1.0 - s.axes[j] if j == k else 0.0
+            total = 0.0
+            if k == j:
+                total = damping + 1.0 - s.axes[j]
             for i in range(s.joints):
                 total += s.J[j, i] * s.J[k, i]
             for p in range(k):
-                total -= s.A[j, p] * s.A[k, p] * s.A[p, p]
+                pivot = s.A[p, p]
+                total -= s.A[j, p] * s.A[k, p] * pivot
             if k < j:
-                total = total / s.A[k, k] if s.A[k, k] > TINY else 0.0
+                pivot = s.A[k, k]
+                total = total / pivot if pivot > TINY else 0.0
             s.A[j, k] = total
 
 
@@ -162,7 +176,8 @@ def _solve(s: Row, b: Array, y: Array) -> None:
         for k in range(j):
             y[j] -= s.A[j, k] * y[k]
     for j in range(s.shared - 1, -1, -1):
-        y[j] = y[j] / s.A[j, j] if s.A[j, j] > TINY else 0.0
+        pivot = s.A[j, j]
+        y[j] = y[j] / pivot if pivot > TINY else 0.0
         for k in range(j + 1, s.shared):
             y[j] -= s.A[k, j] * y[k]
 
@@ -182,15 +197,17 @@ def _factor_damped(s: Row) -> None:
     limit = s.singular_value * s.singular_value
     trace = 0.0
     for j in range(s.shared):
-        if not s.A[j, j] > TINY:
+        pivot = s.A[j, j]
+        if not pivot > TINY:
             trace = 1.0 / TINY
+        # Solving for a unit vector gives a column of the inverse.
         for k in range(s.shared):
             s.b[k] = 1.0 if k == j else 0.0
         _solve(s, s.b, s.y)
         trace += s.y[j] * s.axes[j]
-    least = 1.0 / trace if trace > 0.0 else limit
-    if least < limit:
-        _factor(s, limit - least)
+    lower_bound = 1.0 / trace if trace > 0.0 else limit
+    if lower_bound < limit:
+        _factor(s, limit - lower_bound)
 
 
 @leaf
@@ -220,29 +237,38 @@ def update_task_errors(s: Row) -> None:
     _update_axis_errors(s)
     _factor_damped(s)
     k = s.posture_rate
+    Jd_y = s.stage_q
+    J_y = s.stage_qd
+    # y, from J J' y = -Lambda e - J psi
     for j in range(m):
         s.b[j] = -s.Lambda[j] * s.e[j]
         for i in range(n):
-            s.b[j] += s.J[j, i] * k * (s.q[i] - s.posture[i])
+            posture_error = s.q[i] - s.posture[i]
+            s.b[j] += s.J[j, i] * k * posture_error
+    # v and a start as psi and its derivative.
     for i in range(n):
-        s.v[i] = -k * (s.q[i] - s.posture[i])
+        posture_error = s.q[i] - s.posture[i]
+        s.v[i] = -k * posture_error
         s.a[i] = -k * s.qd[i]
     _solve(s, s.b, s.y)
     for i in range(n):
-        s.stage_q[i] = 0.0
-        s.stage_qd[i] = 0.0
+        Jd_y[i] = 0.0
+        J_y[i] = 0.0
         for j in range(m):
-            s.stage_q[i] += s.Jd[j, i] * s.y[j]
-            s.stage_qd[i] += s.J[j, i] * s.y[j]
+            y = s.y[j]
+            Jd_y[i] += s.Jd[j, i] * y
+            J_y[i] += s.J[j, i] * y
+    # y', from J J' y' = -Lambda e' - Jd (psi + J' y) - J (psi' + Jd' y)
     for j in range(m):
         s.b[j] = -s.Lambda[j] * s.ed[j]
         for i in range(n):
-            turning = s.Jd[j, i] * (s.v[i] + s.stage_qd[i])
-            s.b[j] -= turning + s.J[j, i] * (s.a[i] + s.stage_q[i])
+            turning = s.Jd[j, i] * (s.v[i] + J_y[i])
+            s.b[j] -= turning + s.J[j, i] * (s.a[i] + Jd_y[i])
     _solve(s, s.b, s.y)
+    # v = psi + J' y and a = psi' + Jd' y + J' y'
     for i in range(n):
-        s.v[i] += s.stage_qd[i]
-        s.a[i] += s.stage_q[i]
+        s.v[i] += J_y[i]
+        s.a[i] += Jd_y[i]
         for j in range(m):
             s.a[i] += s.J[j, i] * s.y[j]
         s.r[i] = s.qd[i] - s.v[i]
@@ -261,12 +287,14 @@ def add_task_torque(s: Row, gains: Array, values: Array, factor: float, torque: 
     """
     for i in range(s.joints):
         for j in range(s.shared):
-            torque[i] += factor * s.J[j, i] * (gains[j] * values[j])
+            force = gains[j] * values[j]
+            torque[i] += factor * s.J[j, i] * force
 
 
 @leaf
 def update_wrench(s: Row) -> None:
     """Writes the wrench at the end effector that corresponds to tau_x, (J J')^-1 J tau_x."""
+    # b = J tau_x; `on_arm` is -tau_x.
     for j in range(s.shared):
         s.b[j] = 0.0
         for i in range(s.joints):

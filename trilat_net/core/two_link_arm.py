@@ -56,15 +56,12 @@ def theta_from_links(links: ArmLinks) -> Array:
     The first three entries are inertial, in kg m^2; the last two belong to gravity, in kg m.
     """
     l1, m1, lc1, I1, _, m2, lc2, I2 = links
-    return np.array(
-        [
-            m1 * lc1**2 + m2 * (l1**2 + lc2**2) + I1 + I2,
-            m2 * l1 * lc2,
-            m2 * lc2**2 + I2,
-            m1 * lc1 + m2 * l1,
-            m2 * lc2,
-        ]
-    )
+    theta_1 = m1 * lc1**2 + m2 * (l1**2 + lc2**2) + I1 + I2
+    theta_2 = m2 * l1 * lc2
+    theta_3 = m2 * lc2**2 + I2
+    theta_4 = m1 * lc1 + m2 * l1
+    theta_5 = m2 * lc2
+    return np.array([theta_1, theta_2, theta_3, theta_4, theta_5])
 
 
 def is_positive_definite(theta: Array) -> bool:
@@ -73,8 +70,9 @@ def is_positive_definite(theta: Array) -> bool:
     The determinant of M, theta_1 theta_3 - theta_3^2 - theta_2^2 cos^2 q_2, is smallest for the
     stretched arm.
     """
-    least = theta[0] * theta[2] - theta[2] ** 2 - theta[1] ** 2
-    return bool(theta[2] > 0.0 and least > 1e-9 * theta[0] * theta[2])
+    least_determinant = theta[0] * theta[2] - theta[2] ** 2 - theta[1] ** 2
+    margin = 1e-9 * theta[0] * theta[2]
+    return bool(theta[2] > 0.0 and least_determinant > margin)
 
 
 @leaf
@@ -91,8 +89,10 @@ def gravity(theta: Vector, g: float, q: Vector) -> Pair:
     """Returns the gravity torque G(q), N m."""
     s1, c1 = sincos(q[0])
     s2, c2 = sincos(q[1])
-    outer = theta[4] * g * (c1 * c2 - s1 * s2)
-    return theta[3] * g * c1 + outer, outer
+    c12 = c1 * c2 - s1 * s2
+    inner = theta[3] * g * c1
+    outer = theta[4] * g * c12
+    return inner + outer, outer
 
 
 @leaf
@@ -113,11 +113,17 @@ def regressor(g: float, q: Vector, qd: Vector, v: Vector, a: Vector) -> tuple[Fi
     """
     s1, c1 = sincos(q[0])
     s2, c2 = sincos(q[1])
-    outer = g * (c1 * c2 - s1 * s2)
-    y12 = c2 * (2.0 * a[0] + a[1]) - s2 * (qd[1] * v[0] + (qd[0] + qd[1]) * v[1])
-    y22 = c2 * a[0] + s2 * qd[0] * v[0]
-    first = (a[0], y12, a[1], g * c1, outer)
-    second = (0.0, y22, a[0] + a[1], 0.0, outer)
+    c12 = c1 * c2 - s1 * s2
+    a1 = a[0]
+    a2 = a[1]
+    # The first row of C v is -theta_2 sin(q2) times this sum.
+    coriolis_1 = qd[1] * v[0] + (qd[0] + qd[1]) * v[1]
+    y12 = c2 * (2.0 * a1 + a2) - s2 * coriolis_1
+    y22 = c2 * a1 + s2 * qd[0] * v[0]
+    gravity_1 = g * c1
+    gravity_12 = g * c12
+    first = (a1, y12, a2, gravity_1, gravity_12)
+    second = (0.0, y22, a1 + a2, 0.0, gravity_12)
     return first, second
 
 
@@ -139,13 +145,19 @@ def forward_dynamics(theta: Vector, g: float, q: Vector, qd: Vector, torque: Vec
     """
     s1, c1 = sincos(q[0])
     s2, c2 = sincos(q[1])
-    h = -theta[1] * s2
-    outer = theta[4] * g * (c1 * c2 - s1 * s2)
+    c12 = c1 * c2 - s1 * s2
+    qd1 = qd[0]
+    qd2 = qd[1]
     m11 = theta[0] + 2.0 * theta[1] * c2
     m12 = theta[2] + theta[1] * c2
     m22 = theta[2]
-    f1 = torque[0] - h * qd[1] * (2.0 * qd[0] + qd[1]) - theta[3] * g * c1 - outer
-    f2 = torque[1] + h * qd[0] * qd[0] - outer
+    h = -theta[1] * s2
+    coriolis_1 = h * qd2 * (2.0 * qd1 + qd2)
+    inner = theta[3] * g * c1
+    outer = theta[4] * g * c12
+    # The torques that accelerate the arm.
+    f1 = torque[0] - coriolis_1 - inner - outer
+    f2 = torque[1] + h * qd1 * qd1 - outer
     determinant = m11 * m22 - m12 * m12
     qdd1 = (m22 * f1 - m12 * f2) / determinant
     qdd2 = (m11 * f2 - m12 * f1) / determinant
@@ -157,9 +169,11 @@ def forward_kinematics(lengths: Vector, q: Vector) -> tuple[Pair, Pair]:
     """Returns the positions (x, y) of the elbow and the end effector from the base, m."""
     s1, c1 = sincos(q[0])
     s12, c12 = sincos(q[0] + q[1])
-    x = lengths[0] * c1
-    y = lengths[0] * s1
-    return (x, y), (x + lengths[1] * c12, y + lengths[1] * s12)
+    elbow_x = lengths[0] * c1
+    elbow_y = lengths[0] * s1
+    x = elbow_x + lengths[1] * c12
+    y = elbow_y + lengths[1] * s12
+    return (elbow_x, elbow_y), (x, y)
 
 
 @leaf
@@ -167,8 +181,9 @@ def end_effector_jacobian(lengths: Vector, q: Vector) -> tuple[Pair, Pair]:
     """Returns the end effector's Jacobian, m/rad, with rows x and y and a column per joint."""
     s1, c1 = sincos(q[0])
     s12, c12 = sincos(q[0] + q[1])
+    inner_x = lengths[0] * c1
     outer_x = lengths[1] * c12
     outer_y = lengths[1] * s12
     row_x = (-lengths[0] * s1 - outer_y, -outer_y)
-    row_y = (lengths[0] * c1 + outer_x, outer_x)
+    row_y = (inner_x + outer_x, outer_x)
     return row_x, row_y

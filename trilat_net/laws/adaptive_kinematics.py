@@ -45,30 +45,36 @@ LEAST_SINE = 0.1
 def _solve_jacobian(lengths: Pair, q: Pair, b: Pair) -> Pair:
     """Returns the solution of J y = b for the planar arm with these link lengths, m."""
     l1, l2 = lengths
-    s1, c1 = sincos(q[0])
-    s12, c12 = sincos(q[0] + q[1])
-    s2, _ = sincos(q[1])
+    q1, q2 = q
+    b_x, b_y = b
+    s1, c1 = sincos(q1)
+    s12, c12 = sincos(q1 + q2)
+    s2, _ = sincos(q2)
     if abs(s2) < LEAST_SINE:
         s2 = LEAST_SINE if s2 >= 0.0 else -LEAST_SINE
     x = l1 * c1 + l2 * c12
     y = l1 * s1 + l2 * s12
+    # Cramer's rule
     determinant = l1 * l2 * s2
-    first = l2 * (c12 * b[0] + s12 * b[1]) / determinant
-    second = -(x * b[0] + y * b[1]) / determinant
+    first = l2 * (c12 * b_x + s12 * b_y) / determinant
+    second = -(x * b_x + y * b_y) / determinant
     return first, second
 
 
 @leaf
 def _end_effector_motion(lengths: Pair, q: Pair, qd: Pair) -> tuple[float, float, float, float]:
     """Returns x, y, x' and y' of the end effector, m and m/s."""
-    s1, c1 = sincos(q[0])
-    s12, c12 = sincos(q[0] + q[1])
-    inner = lengths[0] * qd[0]
-    outer = lengths[1] * (qd[0] + qd[1])
-    x = lengths[0] * c1 + lengths[1] * c12
-    y = lengths[0] * s1 + lengths[1] * s12
-    xd = -s1 * inner - s12 * outer
-    yd = c1 * inner + c12 * outer
+    l1, l2 = lengths
+    q1, q2 = q
+    qd1, qd2 = qd
+    s1, c1 = sincos(q1)
+    s12, c12 = sincos(q1 + q2)
+    inner_speed = l1 * qd1
+    outer_speed = l2 * (qd1 + qd2)
+    x = l1 * c1 + l2 * c12
+    y = l1 * s1 + l2 * s12
+    xd = -s1 * inner_speed - s12 * outer_speed
+    yd = c1 * inner_speed + c12 * outer_speed
     return x, y, xd, yd
 
 
@@ -83,15 +89,20 @@ def _jacobian_rate_times(lengths: Pair, length_rates: Pair, q: Pair, qd: Pair, v
         qd: joint velocities, rad/s.
         v: the vector to multiply.
     """
-    s1, c1 = sincos(q[0])
-    s12, c12 = sincos(q[0] + q[1])
-    inner = lengths[0] * qd[0]
-    outer = lengths[1] * (qd[0] + qd[1])
-    v12 = v[0] + v[1]
-    row_x = -(inner * c1 + length_rates[0] * s1) * v[0]
-    row_x -= (outer * c12 + length_rates[1] * s12) * v12
-    row_y = (length_rates[0] * c1 - inner * s1) * v[0]
-    row_y += (length_rates[1] * c12 - outer * s12) * v12
+    l1, l2 = lengths
+    l1_rate, l2_rate = length_rates
+    q1, q2 = q
+    qd1, qd2 = qd
+    v1, v2 = v
+    s1, c1 = sincos(q1)
+    s12, c12 = sincos(q1 + q2)
+    inner_speed = l1 * qd1
+    outer_speed = l2 * (qd1 + qd2)
+    v12 = v1 + v2
+    row_x = -(inner_speed * c1 + l1_rate * s1) * v1
+    row_x -= (outer_speed * c12 + l2_rate * s12) * v12
+    row_y = (l1_rate * c1 - inner_speed * s1) * v1
+    row_y += (l2_rate * c12 - outer_speed * s12) * v12
     return row_x, row_y
 
 
@@ -99,10 +110,11 @@ def _jacobian_rate_times(lengths: Pair, length_rates: Pair, q: Pair, qd: Pair, v
 class AdaptiveKinematics(ControlLaw):
     """The paper's law for end-effector positions of planar arms with unknown lengths.
 
-    The end effector's position and velocity are measured and compared in the frame of the
-    bases. Masses and lengths are learnt. C. C. Cheah, C. Liu and J.-J. E. Slotine, "Adaptive
-    tracking control for robots with unknown kinematic and dynamic properties", Int. J. Robotics
-    Research 25(3), 283-296, 2006.
+    The position and the velocity of each end effector are measured, and compared in a frame
+    that all bases share. Masses and lengths are learnt.
+
+    Source: C. C. Cheah, C. Liu and J.-J. E. Slotine, "Adaptive tracking control for robots with
+    unknown kinematic and dynamic properties", Int. J. Robotics Research 25(3), 283-296, 2006.
 
     Attributes:
         Lambda: rate at which errors decay, per coordinate x and y, 1/s.
@@ -161,66 +173,79 @@ class AdaptiveKinematics(ControlLaw):
         now.to_all.x[1] = y
         now.to_all.xd[0] = xd
         now.to_all.xd[1] = yd
-        e0 = 0.0
-        e1 = 0.0
-        ed0 = xd
-        ed1 = yd
+
+        e_x = 0.0
+        e_y = 0.0
+        ed_x = xd
+        ed_y = yd
         for j in range(len(now.peers)):
             peer = now.peers[j]
             received = now.received[j]
             # Before its first sample, a peer counts as being at this arm's position, at rest.
             if peer.tick >= 0:
-                e0 += peer.alpha * (x - received.x[0])
-                e1 += peer.alpha * (y - received.x[1])
-                ed0 -= peer.alpha * received.xd[0]
-                ed1 -= peer.alpha * received.xd[1]
+                e_x += peer.alpha * (x - received.x[0])
+                e_y += peer.alpha * (y - received.x[1])
+                ed_x -= peer.alpha * received.xd[0]
+                ed_y -= peer.alpha * received.xd[1]
+
+        # The components of Kd ed across the links. J_hat' Kd ed sums them times the lengths.
         s1, c1 = sincos(q[0])
         s12, c12 = sincos(q[0] + q[1])
-        f0 = self.Kd[0] * ed0
-        f1 = self.Kd[1] * ed1
-        # Kd ed across each link: J_hat' Kd ed sums these forces times the lengths.
-        across = (c1 * f1 - s1 * f0, c12 * f1 - s12 * f0)
+        force_x = self.Kd[0] * ed_x
+        force_y = self.Kd[1] * ed_y
+        across_1 = c1 * force_y - s1 * force_x
+        across_2 = c12 * force_y - s12 * force_x
+        across = (across_1, across_2)
+
+        half_h = 0.5 * now.h_s
         for i in range(2):
             # Gamma_l Y_k' Kd ed
-            rate = self.length_gain_m_n * across[i] * (qd[0] + i * qd[1])
+            link_rate = qd[0] + i * qd[1]
+            rate = self.length_gain_m_n * across[i] * link_rate
             if now.k > 0:
-                length = self.lengths_m[i] + 0.5 * now.h_s * (self.rate_m_s[i] + rate)
+                length = self.lengths_m[i] + half_h * (self.rate_m_s[i] + rate)
                 self.lengths_m[i] = min(max(length, self.least_m), self.most_m)
             self.rate_m_s[i] = rate
         l1 = self.lengths_m[0]
         l2 = self.lengths_m[1]
+        lengths = (l1, l2)
         # An estimate at an edge of its box does not move.
         l1_rate = self.rate_m_s[0] if self.least_m < l1 < self.most_m else 0.0
         l2_rate = self.rate_m_s[1] if self.least_m < l2 < self.most_m else 0.0
-        v = _solve_jacobian((l1, l2), q, (-self.Lambda[0] * e0, -self.Lambda[1] * e1))
-        bias = _jacobian_rate_times(
-            lengths=(l1, l2), length_rates=(l1_rate, l2_rate), q=q, qd=qd, v=v
-        )
-        a0 = -self.Lambda[0] * ed0 - bias[0]
-        a1 = -self.Lambda[1] * ed1 - bias[1]
-        a = _solve_jacobian((l1, l2), q, (a0, a1))
+        length_rates = (l1_rate, l2_rate)
+
+        x_rate = -self.Lambda[0] * e_x
+        y_rate = -self.Lambda[1] * e_y
+        v = _solve_jacobian(lengths, q, (x_rate, y_rate))
+        bias = _jacobian_rate_times(lengths=lengths, length_rates=length_rates, q=q, qd=qd, v=v)
+        a_x = -self.Lambda[0] * ed_x - bias[0]
+        a_y = -self.Lambda[1] * ed_y - bias[1]
+        a = _solve_jacobian(lengths, q, (a_x, a_y))
         r = (qd[0] - v[0], qd[1] - v[1])
-        now.tau[0] = -self.Kp[0] * r[0] - (l1 * across[0] + l2 * across[1])
-        now.tau[1] = -self.Kp[1] * r[1] - l2 * across[1]
+
+        now.tau[0] = -self.Kp[0] * r[0] - (l1 * across_1 + l2 * across_2)
+        now.tau[1] = -self.Kp[1] * r[1] - l2 * across_2
         first, second = regressor(g=self.g_m_s2, q=q, qd=qd, v=v, a=a)
         for p in range(len(self.Yr)):
             Yr = first[p] * r[0] + second[p] * r[1]
             if now.k > 0:
-                self.theta_hat[p] -= 0.5 * now.h_s * self.Gamma[p] * (self.Yr[p] + Yr)
+                gain_s = half_h * self.Gamma[p]
+                self.theta_hat[p] -= gain_s * (self.Yr[p] + Yr)
             self.Yr[p] = Yr
-            now.theta_hat[p] = self.theta_hat[p]
-            now.tau[0] += first[p] * self.theta_hat[p]
-            now.tau[1] += second[p] * self.theta_hat[p]
+            estimate = self.theta_hat[p]
+            now.theta_hat[p] = estimate
+            now.tau[0] += first[p] * estimate
+            now.tau[1] += second[p] * estimate
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns the premises: constant delays, bent elbows, lengths within their bounds."""
+        """Returns the condition: constant delays, bent elbows, lengths within their bounds."""
         if np.isnan(situation.longest_s):
             return StabilityCondition(
                 None, "proved for constant delays, and a delay here varies"
             )
         text = (
             f"for every constant delay, while abs(sin q2) > {LEAST_SINE:g} and the lengths are "
-            f"within {self.least_m:g} and {self.most_m:g} m (sufficient); the run shows if "
+            f"between {self.least_m:g} and {self.most_m:g} m (sufficient); the run shows if "
             "elbows stay bent"
         )
         return StabilityCondition(None, text)

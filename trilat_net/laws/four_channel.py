@@ -1,8 +1,8 @@
 """The four-channel law, which exchanges positions and forces in both directions.
 
-q_des, qd_des, qdd_des and felt are the peers' motion and torque, weighted by dominance; tau_h
-is the torque ON an arm. With two sites, in Lawrence's symbols, C2 and C6 are gains of the
-master, C3 and C5 gains of the slave. Zero gains give the laws with fewer channels.
+The quantities q_des, qd_des, qdd_des and felt are the peers' motion and torque, weighted by
+dominance; tau_h is the torque ON an arm. In Lawrence's symbols, for two sites, C2 and C6 are
+gains of the master, and C3 and C5 gains of the slave. A gain of zero removes a channel.
 
 Invariant:
     - The law sends the acceleration that the arm's model has under the torques of the tick.
@@ -37,24 +37,30 @@ def send_acceleration(law: Any, now: LawInput) -> None:
     """Sends the solution qdd of M qdd = tau - tau_x - bias, with tau within the limits."""
     n = now.joints
     rows = law.rows
+    qdd = now.to_all.qdd
     width = n + 1
     for i in range(n):
+        first = i * width
         for j in range(n):
-            rows[i * width + j] = now.inertia[i][j]
-        applied = min(max(now.tau[i], -law.limit[i]), law.limit[i])
-        rows[i * width + n] = applied - now.tau_x[i] - now.bias[i]
+            rows[first + j] = now.inertia[i][j]
+        limit = law.limit[i]
+        applied = min(max(now.tau[i], -limit), limit)
+        rows[first + n] = applied - now.tau_x[i] - now.bias[i]
     # Gaussian elimination; M is positive definite, so pivoting is not needed.
     for column in range(n):
-        pivot = rows[column * width + column]
+        pivot_row = column * width
+        pivot = rows[pivot_row + column]
         for i in range(column + 1, n):
-            factor = rows[i * width + column] / pivot
+            first = i * width
+            factor = rows[first + column] / pivot
             for j in range(column, width):
-                rows[i * width + j] -= factor * rows[column * width + j]
+                rows[first + j] -= factor * rows[pivot_row + j]
     for i in range(n - 1, -1, -1):
-        remainder = rows[i * width + n]
+        first = i * width
+        remainder = rows[first + n]
         for j in range(i + 1, n):
-            remainder -= rows[i * width + j] * now.to_all.qdd[j]
-        now.to_all.qdd[i] = remainder / rows[i * width + i]
+            remainder -= rows[first + j] * qdd[j]
+        qdd[i] = remainder / rows[first + i]
 
 
 @compiled
@@ -65,8 +71,10 @@ class FourChannel(ControlLaw):
               + force_peer felt + force_own tau_h
 
     Without delay the coupling is ideally transparent if force_peer = 1 + force_own at both
-    sites and acceleration = 1. Lawrence, IEEE T-RA 9, 1993; local force feedback after
-    Hashtrudi-Zaad and Salcudean, IEEE T-RA 18, 2002.
+    sites and acceleration = 1.
+
+    Source: Lawrence, IEEE T-RA 9, 1993; local force feedback after Hashtrudi-Zaad and
+    Salcudean, IEEE T-RA 18, 2002.
 
     Attributes:
         K: stiffness per joint, N m/rad.
@@ -99,14 +107,22 @@ class FourChannel(ControlLaw):
         """Writes the torque, and sends the acceleration that the torque causes."""
         n = now.joints
         for i in range(n):
-            tau = self.gravity * now.gravity[i] + self.K[i] * (now.q_des[i] - now.q[i])
-            tau += self.B[i] * (now.qd_des[i] - now.qd[i])
-            tau += self.force_peer[i] * now.felt[i] - self.force_own[i] * now.tau_x[i]
+            gravity = self.gravity * now.gravity[i]
+            spring = self.K[i] * (now.q_des[i] - now.q[i])
+            damper = self.B[i] * (now.qd_des[i] - now.qd[i])
+            peer_force = self.force_peer[i] * now.felt[i]
+            local_force = self.force_own[i] * now.tau_x[i]
+            tau = gravity + spring
+            tau += damper
+            tau += peer_force - local_force
             if self.acceleration > 0.0:
+                # acceleration M qdd_des
                 for p in range(len(now.peers)):
+                    share = self.acceleration * now.peers[p].alpha
+                    peer_qdd = now.received[p].qdd
                     for j in range(n):
-                        inertia = self.acceleration * now.peers[p].alpha * now.inertia[i][j]
-                        tau += inertia * now.received[p].qdd[j]
+                        inertia = share * now.inertia[i][j]
+                        tau += inertia * peer_qdd[j]
             now.tau[i] = tau
         if self.acceleration > 0.0:
             send_acceleration(self, now)
@@ -115,7 +131,12 @@ class FourChannel(ControlLaw):
         """Returns the law of known gravity without the terms in qdd_des and tau_h."""
         known = (theta * self.gravity).tolist()
         return Gains(
-            law=Law.KNOWN, K=self.K, Kd=self.B, d=(0.0,), k_f=self.force_peer, known=known
+            law=Law.KNOWN,
+            K=self.K,
+            Kd=self.B,
+            d=(0.0,),
+            k_f=self.force_peer,
+            known=known,
         )
 
     def linear_form(self, at: LinearSituation) -> LinearForm | None:
@@ -131,7 +152,10 @@ class FourChannel(ControlLaw):
         return form
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:  # noqa: ARG002
-        """Returns that acceleration = 1 is unstable, or that Llewellyn's condition decides."""
+        """Returns an unmet condition for acceleration = 1, otherwise an undecided one.
+
+        Llewellyn's condition, which `trilat ports` evaluates, decides the other cases.
+        """
         if self.acceleration >= 1.0:
             return StabilityCondition(False, _NEUTRAL)
         return StabilityCondition(None, _LLEWELLYN)

@@ -1,6 +1,6 @@
 """PD+d whose damping follows from a published bound on the delay.
 
-The kernel computes this law (`core.control.damped_torque`); `LeeSpong.compute_torque` states
+The kernel computes this law (`core.control.damped_torque`). `LeeSpong.compute_torque` states
 the same law in plain Python, and `tests/control_laws/test_plain_torques.py` compares the two.
 """
 
@@ -19,8 +19,8 @@ from .interface import DAMPING, ERROR_DAMPING, STIFFNESS, ControlLaw, TuningSite
 class LeeSpong(ControlLaw):
     """PD+d with the damping d = K T_max + P_e, for delays up to T_max.
 
-    Lee and Spong, "Passive bilateral teleoperation with constant time delay", IEEE T-RO 22,
-    2006.
+    Source: Lee and Spong, "Passive bilateral teleoperation with constant time delay", IEEE T-RO
+    22, 2006.
 
     Attributes:
         K: stiffness per joint, N m/rad.
@@ -41,10 +41,11 @@ class LeeSpong(ControlLaw):
     @property
     def damping(self) -> tuple[float, ...]:
         """The damping d = K T_max + P_e per joint, N m s/rad."""
-        return tuple(
-            stiffness * 1e-3 * self.T_max_ms + extra
-            for stiffness, extra in zip(self.K, self.P_e, strict=True)
-        )
+        damping = []
+        for K, P_e in zip(self.K, self.P_e, strict=True):
+            needed = K * 1e-3 * self.T_max_ms
+            damping.append(needed + P_e)
+        return tuple(damping)
 
     def compute_torque(self, G: Array, e: Array, ed: Array, qd: Array) -> Array:
         """Returns the torque of each joint before the torque limits, N m.
@@ -57,11 +58,11 @@ class LeeSpong(ControlLaw):
             ed: derivative of the error, shape (n,), rad/s.
             qd: joint velocities, shape (n,), rad/s.
         """
-        K = np.array(self.K)
-        Kd = np.array(self.Kd)
-        d = np.array(self.damping)
+        spring = np.array(self.K) * e
+        damper = np.array(self.damping) * qd
+        error_damper = np.array(self.Kd) * ed
         # The order of the terms is the kernel's for the planar arm: the last bit depends on it.
-        return G - K * e - d * qd - Kd * ed
+        return G - spring - damper - error_damper
 
     def gains(self, theta: Array) -> Gains:
         """Returns the gains for the kernel, those of PD+d, for an arm with parameters theta."""

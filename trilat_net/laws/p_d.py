@@ -1,7 +1,7 @@
 """P+d: a spring to the peers and a damper, with known gravity.
 
-The kernel computes this law (`core.control.damped_torque`); `PD.compute_torque` states the
-same law in plain Python, and `tests/control_laws/test_plain_torques.py` compares the two.
+The kernel computes this law (`core.control.damped_torque`). `PD.compute_torque` states the same
+law in plain Python, and `tests/control_laws/test_plain_torques.py` compares the two.
 """
 
 from typing import ClassVar
@@ -45,13 +45,14 @@ class PD(ControlLaw):
             e: position error q - q_des, Eq. (9), shape (n,), rad.
             qd: joint velocities, shape (n,), rad/s.
         """
-        K = np.array(self.K)
-        d = np.array(self.d)
-        return G - K * e - d * qd
+        spring = np.array(self.K) * e
+        damper = np.array(self.d) * qd
+        return G - spring - damper
 
     def gains(self, theta: Array) -> Gains:
         """Returns the gains for the kernel, for an arm with parameters theta."""
-        return Gains(Law.KNOWN, K=self.K, d=self.d, known=(theta * self.gravity).tolist())
+        known = (theta * self.gravity).tolist()
+        return Gains(Law.KNOWN, K=self.K, d=self.d, known=known)
 
     def exchanges_positions(self) -> bool:
         """True if the law compensates gravity exactly."""

@@ -1,6 +1,6 @@
 """PD+d: a spring and a damper to the peers and a damper of the arm, with known gravity.
 
-The kernel computes this law (`core.control.damped_torque`); `PdD.compute_torque` states the
+The kernel computes this law (`core.control.damped_torque`). `PdD.compute_torque` states the
 same law in plain Python, and `tests/control_laws/test_plain_torques.py` compares the two.
 """
 
@@ -45,11 +45,11 @@ class PdD(ControlLaw):
             ed: derivative of the error, shape (n,), rad/s.
             qd: joint velocities, shape (n,), rad/s.
         """
-        K = np.array(self.K)
-        Kd = np.array(self.Kd)
-        d = np.array(self.d)
+        spring = np.array(self.K) * e
+        damper = np.array(self.d) * qd
+        error_damper = np.array(self.Kd) * ed
         # The order of the terms is the kernel's for the planar arm: the last bit depends on it.
-        return G - K * e - d * qd - Kd * ed
+        return G - spring - damper - error_damper
 
     def gains(self, theta: Array) -> Gains:
         """Returns the gains for the kernel, for an arm with parameters theta."""

@@ -5,9 +5,9 @@
     master   tau = G - K (q_m - x - w(t - T)) - d qd_m, where the model x is driven by q_m
     model    inertia x'' = K (q_m - x) - d x'
 
-Both ends run the same model. Therefore the law stores no past values, however long the delay
-is; w is the part of the slave's motion that the model misses, for example in contact. The
-setting `predicts` distinguishes the master.
+Both ends run the same model, so the law stores no past values, however long the delay is. The
+signal w is the part of the slave's motion that the model misses, for example in contact. The
+master is the site with `predicts` = true.
 
 Invariant:
     - The model moves like an arm whose torque is held over a tick (`digital`).
@@ -31,8 +31,8 @@ from .interface import DAMPING, INERTIA, STIFFNESS, ControlLaw, TuningSite
 class Smith(ControlLaw):
     """P+d of a master and a slave with a Smith predictor of the slave at the master.
 
-    Smith, "Closer control of loops with dead time", Chemical Engineering Progress 53, 1957
-    (cited from memory).
+    Source: Smith, "Closer control of loops with dead time", Chemical Engineering Progress 53,
+    1957 (cited from memory).
 
     Attributes:
         K: stiffness per joint, N m/rad.
@@ -62,22 +62,32 @@ class Smith(ControlLaw):
 
     def torque(self, now: LawInput) -> None:
         """Writes the torque, sends w, and advances the model by a tick."""
-        h_s = now.h_s
+        h = now.h_s
         for i in range(now.joints):
+            K = self.K[i]
+            d = self.d[i]
+            q = now.q[i]
+            peer_q = now.peers[0].q[i]
             if now.k == 0:
-                self.x[i] = now.peers[0].q[i] if self.predicts else now.q[i]
-            goal = self.x[i] + now.received[0].w[i] if self.predicts else now.peers[0].q[i]
-            now.tau[i] = (
-                self.gravity * now.gravity[i]
-                - self.K[i] * (now.q[i] - goal)
-                - self.d[i] * now.qd[i]
-            )
-            now.to_all.w[i] = 0.0 if self.predicts else now.q[i] - self.x[i]
-            master_q = now.q[i] if self.predicts else goal
-            model_torque = self.K[i] * (master_q - self.x[i]) - self.d[i] * self.xd[i]
+                self.x[i] = peer_q if self.predicts else q
+            x = self.x[i]
+            if self.predicts:
+                master_q = q
+                goal = x + now.received[0].w[i]
+                now.to_all.w[i] = 0.0
+            else:
+                master_q = peer_q
+                goal = peer_q
+                now.to_all.w[i] = q - x
+
+            spring = K * (q - goal)
+            damper = d * now.qd[i]
+            now.tau[i] = self.gravity * now.gravity[i] - spring - damper
+
+            model_torque = K * (master_q - x) - d * self.xd[i]
             acceleration = model_torque / self.inertia[i]
-            self.x[i] += h_s * self.xd[i] + 0.5 * h_s * h_s * acceleration
-            self.xd[i] += h_s * acceleration
+            self.x[i] += h * self.xd[i] + 0.5 * h * h * acceleration
+            self.xd[i] += h * acceleration
 
     def linear_gains(self, theta: Array) -> Gains | None:
         """Returns the law of known gravity with d, and at the slave also with K."""
@@ -86,15 +96,20 @@ class Smith(ControlLaw):
         return Gains(Law.KNOWN, K=K, d=self.d, known=known)
 
     def linear_form(self, at: LinearSituation) -> LinearForm | None:
-        """Returns the model, driven by the master's own pose or by the pose that it sent."""
+        """Returns the motion of the model, and the blocks of the torque or of w.
+
+        The model is driven by the position of the master, which the slave receives.
+        """
         (peer,) = at.peers
         K = np.array(self.K)
+        d = np.array(self.d)
         inertia = np.array(self.inertia)
+        master_q = "q" if self.predicts else "q_des"
         form = LinearForm(len(at.inertia), ("x", "xd"))
         form.add("x", "xd", 1.0)
         form.add("xd", "x", -K / inertia)
-        form.add("xd", "xd", -np.array(self.d) / inertia)
-        form.add("xd", "q" if self.predicts else "q_des", K / inertia)
+        form.add("xd", "xd", -d / inertia)
+        form.add("xd", master_q, K / inertia)
         if self.predicts:
             form.add("tau", "q", -K)
             form.add("tau", "x", K)
@@ -105,18 +120,19 @@ class Smith(ControlLaw):
         return form
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns that an exact model makes the loop one without delay."""
+        """Returns the condition for the predictor to remove the delay from the loop."""
         laws = situation.laws
-        if [getattr(law, "predicts", None) for law in laws].count(True) != 1:
+        predicting = [law for law in laws if getattr(law, "predicts", False)]
+        if len(predicting) != 1:
             return StabilityCondition(False, "one of the two sites has predicts = true")
         for law in laws:
             for key in ("K", "d", "inertia"):
                 if getattr(law, key, None) != getattr(self, key):
-                    text = "K, d and inertia must be alike at both sites"
+                    text = "K, d and inertia must be equal at both sites"
                     return StabilityCondition(False, text)
         text = (
-            "a slave in free motion whose inertia is the model's makes the loop one without "
-            "delay (d > 0); contact, and an inertia that changes, the model does not have"
+            "while the slave moves freely with the inertia of the model, the loop is stable as "
+            "without delay (d > 0); the model has no contact and no change of inertia"
         )
         return StabilityCondition(None, text)
 

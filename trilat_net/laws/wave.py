@@ -1,6 +1,6 @@
-"""Wave variables: lines with an impedance join the sites and carry waves.
+"""Wave variables: lines with an impedance b join the sites and carry waves.
 
-For one line and one joint, with c = sqrt(2 b) and v the wave that an end plays:
+For one line and one joint, with c = sqrt(2 b) and v the wave that an end plays, the force F is
 
     without a spring (K = 0)    F = b qd - c v, the arm gets -F,
                                 sends c step / h - v one tick later
@@ -8,15 +8,16 @@ For one line and one joint, with c = sqrt(2 b) and v the wave that an end plays:
                                 F = K (q_sd - q) + B (qd_sd - qd), the arm gets F,
                                 sends v - (c / b) F
 
-An end without a spring sends the motion of the period that has just ended. Therefore its waves
-add up to the steps of its arm, and to b h qd^2 / 4 more than the work of the arm. H lends this
-energy until the arm slows down.
+Each end has an account H of its energy: the energy that it took out of its lines, less the work
+of its torque on the arm, tau times the step in q. An end without a spring sends the motion of
+the period that has just ended. Therefore its waves add up to the steps of its arm, and their
+energy is b h qd^2 / 4 larger than the work of the arm. H lends this energy until the arm slows
+down.
 
 Invariant:
     - An end takes no more energy out of a line than it knows the other end to have put in, for
       any delay or loss of samples (except with the reception `hold`).
-    - An end puts in no more energy than it has, H: the energy that it took, less the work of
-      its torque on the arm, tau times the step in q.
+    - An end puts no more energy into its lines than H.
 """
 
 import math
@@ -45,8 +46,8 @@ from .conditions import (
 from .interface import DAMPING, STIFFNESS, EnergyLaw, TuningSite
 
 RECEPTIONS = ("replay", "zero", "scaled", "hold")
-"""Ways of playing waves, by number. `hold` repeats the last wave; it is not passive and serves
-for comparison.
+"""Ways of playing waves, see `Wave`. `hold` repeats the last wave; it is not passive, and
+serves only for comparison.
 """
 _REPLAY = 0
 _SCALED = 2
@@ -61,8 +62,8 @@ STAMP_FILTER_TICKS = 20.0
 def replay_wave(law: Any, index: int, fresh: float, energy: float, h: float) -> float:
     """Returns the wave to play so that lost waves are made up for, as far as energy allows.
 
-    The integral of the lost waves is owed. It is played at its mean rate or slower. Each unit
-    of the integral spends at most its part of the energy.
+    The integral of the lost waves is owed. It is played at its mean rate or slower. The energy
+    is divided evenly over the owed integral: a unit of the integral may cost only its part.
 
     Args:
         law: the law.
@@ -71,17 +72,20 @@ def replay_wave(law: Any, index: int, fresh: float, energy: float, h: float) -> 
         energy: the known energy, J.
         h: the period, s.
     """
-    owed = abs(law.owed_U[index])
+    owed_U = law.owed_U[index]
+    owed_s = law.owed_s[index]
+    owed = abs(owed_U)
     if owed == 0.0:
         return fresh
-    sign = 1.0 if law.owed_U[index] > 0.0 else -1.0
-    mean = owed / max(law.owed_s[index], CONCEALED_S, h)
+    sign = 1.0 if owed_U > 0.0 else -1.0
+    mean = owed / max(owed_s, CONCEALED_S, h)
     # The other half of the reserve is for waves that are concealed.
     available = max(energy - 0.5 * law.reserve, 0.0)
+    # Beside the wave f, an extra wave e costs f + e / 2 per unit of the integral.
     affordable = 2.0 * (available / owed - sign * fresh)
     extra: float = max(0.0, min(affordable, mean))
-    law.owed_U[index] -= sign * extra * h
-    law.owed_s[index] = max(law.owed_s[index] - extra / mean * h, 0.0)
+    law.owed_U[index] = owed_U - sign * extra * h
+    law.owed_s[index] = max(owed_s - extra / mean * h, 0.0)
     return fresh + sign * extra
 
 
@@ -97,11 +101,13 @@ def conceal_wave(law: Any, index: int, energy: float, h: float) -> float:
         energy: the known energy, J.
         h: the period, s.
     """
-    most = math.sqrt(2.0 * max(energy, 0.0) / max(CONCEALED_S, h))
+    duration_s = max(CONCEALED_S, h)
+    most = math.sqrt(2.0 * max(energy, 0.0) / duration_s)
     held = max(-most, min(most, law.wave[index]))
     played: float = held
     if law.owed_U[index] * held > 0.0:
-        remaining = energy - 0.5 * held * held * h
+        spent = 0.5 * held * held * h
+        remaining = energy - spent
         played = replay_wave(law=law, index=index, fresh=held, energy=remaining, h=h)
     law.owed_U[index] -= held * h
     law.held_s[index] += h
@@ -136,10 +142,13 @@ def receive_wave(law: Any, now: LawInput, j: int, i: int, missed: float) -> floa
         law.wave[index] = fresh
         fresh_energy = 0.5 * fresh * fresh * h
         if missed > 0.0:
-            energy = max(received.E[i] - law.E_seen[index] - fresh_energy, 0.0)
+            # The sums U and E contain the waves that did not arrive.
+            missed_energy = received.E[i] - law.E_seen[index] - fresh_energy
+            energy = max(missed_energy, 0.0)
             law.owed_U[index] += received.U[i] - law.U_seen[index] - fresh * h
             if energy > 0.0:
-                law.owed_s[index] += max(missed * h - law.held_s[index], 0.0)
+                missed_s = missed * h
+                law.owed_s[index] += max(missed_s - law.held_s[index], 0.0)
             sent.W[i] += energy
         law.held_s[index] = 0.0
         law.U_seen[index] = received.U[i]
@@ -148,12 +157,15 @@ def receive_wave(law: Any, now: LawInput, j: int, i: int, missed: float) -> floa
     if law.playing == _REPLAY and missed >= 0.0:
         played = replay_wave(law=law, index=index, fresh=fresh, energy=sent.W[i], h=h)
     elif law.playing == _SCALED:
-        most = math.sqrt(2.0 * max(sent.W[i] + fresh_energy, 0.0) / h)
-        played = max(-most, min(most, math.sqrt(law.rate[j]) * law.wave[index]))
+        known_energy = max(sent.W[i] + fresh_energy, 0.0)
+        most = math.sqrt(2.0 * known_energy / h)
+        scaled = math.sqrt(law.rate[j]) * law.wave[index]
+        played = max(-most, min(most, scaled))
     elif law.playing == _HOLD:
         played = law.wave[index]
-    sent.W[i] += fresh_energy - 0.5 * played * played * h
-    now.to_all.H[i] += 0.5 * played * played * h
+    played_energy = 0.5 * played * played * h
+    sent.W[i] += fresh_energy - played_energy
+    now.to_all.H[i] += played_energy
     return played
 
 
@@ -171,11 +183,13 @@ def follow_wave(law: Any, now: LawInput, j: int, i: int, v: float) -> float:
     B = law.B[i]
     qd = now.qd[i]
     stretch = law.q_sd[index] - now.q[i]
+    spring_force = K * stretch
     c = math.sqrt(2.0 * b)
-    qd_sd = (c * v - K * stretch + B * qd) / (b + B)
-    force: float = K * stretch + B * (qd_sd - qd)
+    qd_sd = (c * v - spring_force + B * qd) / (b + B)
+    stretch_rate = qd_sd - qd
+    force: float = spring_force + B * stretch_rate
     # The energy that the spring is expected to receive in this period.
-    law.spring_gain_J[i] += (K * stretch * (qd_sd - qd)) * h
+    law.spring_gain_J[i] += (spring_force * stretch_rate) * h
     law.q_sd[index] += h * qd_sd
     now.sent[j].u[i] = v - c / b * force
     return force
@@ -198,7 +212,9 @@ def close_wave_period(law: Any, now: LawInput, i: int) -> None:
             spring += 0.5 * law.K[i] * stretch * stretch
     if now.k == 0:
         H[i] = law.reserve + spring
-    H[i] -= law.beta * (now.tau_before[i] - law.carried[i]) * (now.q[i] - now.q_before[i])
+    coupling_torque = now.tau_before[i] - law.carried[i]
+    step = now.q[i] - now.q_before[i]
+    H[i] -= law.beta * coupling_torque * step
     law.spring[i] = spring
     most = law.reserve + spring
     if law.K[i] > 0.0 and H[i] > most:
@@ -222,16 +238,19 @@ def send_waves(law: Any, now: LawInput, i: int, committed: float) -> None:
     for j in range(len(now.peers)):
         wave = now.sent[j].u[i]
         requested += 0.5 * wave * wave * h
-    most = now.to_all.H[i] - law.spring[i] - committed - 0.5 * law.reserve
+    free = now.to_all.H[i] - law.spring[i] - committed - 0.5 * law.reserve
+    available = max(free, 0.0)
     share = 1.0
-    if requested > max(most, 0.0):
-        share = math.sqrt(max(most, 0.0) / requested)
+    if requested > available:
+        share = math.sqrt(available / requested)
     for j in range(len(now.peers)):
         sent = now.sent[j]
-        sent.u[i] *= share
-        sent.U[i] += sent.u[i] * h
-        sent.E[i] += 0.5 * sent.u[i] * sent.u[i] * h
-        now.to_all.H[i] -= 0.5 * sent.u[i] * sent.u[i] * h
+        wave = sent.u[i] * share
+        energy = 0.5 * wave * wave * h
+        sent.u[i] = wave
+        sent.U[i] += wave * h
+        sent.E[i] += energy
+        now.to_all.H[i] -= energy
 
 
 def find_line_impedance(lines: Mapping[str, Any], site: str, peer: str) -> Any:
@@ -250,25 +269,29 @@ class Wave(EnergyLaw):
     """Wave variables: waves carry energy along a line of impedance b between two sites.
 
     At an end without a spring, F = b qd - c v and u = c qd - v with c = sqrt(2 b), where v is
-    the received wave and u the sent wave. An end with K and B follows by them and, with B = b,
-    reflects nothing. The sites share as b_ij / sum_k b_ik. After Anderson and Spong (1989) and
-    Niemeyer and Slotine (1991).
+    the received wave and u the sent wave. An end with K and B follows by this spring and
+    damper; with B = b it reflects no waves. Site i follows site j with the share
+    b_ij / sum_k b_ik.
+
+    Source: Anderson and Spong (1989); Niemeyer and Slotine (1991).
 
     Attributes:
         b: impedance per joint, N m s/rad.
         K: spring of an end that moves its arm by a spring, per joint, N m/rad; 0: no spring.
         B: damper of such an end, per joint, N m s/rad; b matches it to the line.
         lines: impedances of single lines, for all joints, as in { "m1-s" = 18.0 }, N m s/rad; 0
-            removes a line, and lines that are not named have b. "shares": the impedances with
-            which sites share by their dominance factors at the start, b on average, if these
-            factors are reversible; otherwise b.
-        beta: divisor of the site's torque, dimensionless: it weights whom each user feels.
+            removes a line, and lines that are not named have b. "shares": impedances that give
+            the dominance factors at the start, b on average, if these factors are reversible;
+            otherwise b.
+        beta: divisor of the site's torque, dimensionless; it scales the forces that the users
+            feel relative to each other.
         reception: how waves are played if samples are late or lost. "replay": the last wave is
             held, and missed waves are made up for, as far as the known energy allows; "zero":
             missed waves are dropped, and positions drift; "scaled": the last wave continues,
             times sqrt(1 - T'), for delays that vary continuously.
-        reserve_J: initial energy of an end per joint, and again for playing each line. Waves
-            are reduced where an end has less than half of it.
+        reserve_J: initial energy of an end per joint, J, and the same energy again for playing
+            the waves of each line. An end that has less than half of the reserve sends smaller
+            waves.
     """
 
     b: PositiveJoints = (10.0,)
@@ -337,6 +360,7 @@ class Wave(EnergyLaw):
         for i in range(n):
             close_wave_period(self, now, i)
             if self.K[i] == 0.0:
+                # An end without a spring sends the motion of the period that has just ended.
                 step = now.q[i] - now.q_before[i]
                 for j in range(len(now.peers)):
                     index = j * n + i
@@ -362,7 +386,8 @@ class Wave(EnergyLaw):
                 played = receive_wave(law=self, now=now, j=j, i=i, missed=missed)
                 self.played[index] = played
                 if self.K[i] == 0.0:
-                    force = math.sqrt(2.0 * b) * played - b * now.qd[i]
+                    c = math.sqrt(2.0 * b)
+                    force = c * played - b * now.qd[i]
                 else:
                     force = follow_wave(law=self, now=now, j=j, i=i, v=played)
                 now.tau[i] += force / self.beta
@@ -375,10 +400,11 @@ class Wave(EnergyLaw):
 
     def energies(self, seen: LawRecords) -> LawEnergies:
         """Returns the energies of the waves, of the end, and of its dampers."""
+        coupling_torque = seen.tau - seen.memory["carried"]
         return LawEnergies(
             gave=[peer.sent["E"] for peer in seen.peers],
             took=[peer.received["E"] - peer.sent["W"] for peer in seen.peers],
-            port=-self.beta * sum_work(seen.tau - seen.memory["carried"], seen.q),
+            port=-self.beta * sum_work(coupling_torque, seen.q),
             store=seen.to_all["H"],
             taken=seen.memory["damped"].sum(axis=1),
             observed=[peer.sent["W"] for peer in seen.peers],
@@ -387,12 +413,13 @@ class Wave(EnergyLaw):
         )
 
     def find_problem(self, rates_hz: Mapping[str, int]) -> KeyProblem | None:
-        """Returns a line that does not join two sites, or that the tick rates differ, or None.
+        """Returns the problem of a line that joins no two sites, or of unequal rates, or None.
 
         The rates must be equal because a wave lasts for a tick.
         """
         pairs = [sorted(pair) for pair in permutations(rates_hz, 2)]
-        for line in () if self.lines == "shares" else self.lines:
+        lines = () if self.lines == "shares" else self.lines
+        for line in lines:
             if sorted(line.split("-", 1)) not in pairs:
                 names = ", ".join(rates_hz)
                 return KeyProblem(
@@ -419,22 +446,26 @@ class Wave(EnergyLaw):
         lines: dict[str, Any] = {}
         pairs = list(combinations(range(len(names)), 2))
         D = find_balancing_weights(alpha)
-        if D is not None and np.array_equal(alpha > 0.0, alpha.T > 0.0):
-            mean = sum(float(D[i] * alpha[i, j]) for i, j in pairs) / len(pairs)
-            for i, j in pairs:
-                share = float(f"{D[i] * alpha[i, j] / mean:.12g}")
+        is_symmetric = np.array_equal(alpha > 0.0, alpha.T > 0.0)
+        if D is not None and is_symmetric:
+            weights = [float(D[i] * alpha[i, j]) for i, j in pairs]
+            mean = sum(weights) / len(pairs)
+            for (i, j), weight in zip(pairs, weights, strict=True):
+                # Twelve digits, so that rounding errors of the weights do not show.
+                share = float(f"{weight / mean:.12g}")
                 lines[f"{names[i]}-{names[j]}"] = tuple(share * b for b in self.b)
         return replace(cast(Any, self), lines=lines)
 
     def explain_idle_shares(self, at: LawSituation) -> str:
-        """Returns that lines replace the shares, if they do not realise the shares, or ""."""
+        """Returns how the lines share, if they do not realise the dominance factors, or ""."""
         site = at.names[at.site]
-        impedances = [
-            self.find_impedances(site, peer)[0] if peer != site else 0.0 for peer in at.names
-        ]
-        lines = np.array(impedances)
-        total = lines.sum()
-        if np.allclose(lines, at.alpha[at.site] * total, atol=1e-6 * total):
+        impedances = np.zeros(len(at.names))
+        for n, peer in enumerate(at.names):
+            if peer != site:
+                impedances[n] = self.find_impedances(site, peer)[0]
+        total = impedances.sum()
+        shares = at.alpha[at.site]
+        if np.allclose(impedances, shares * total, atol=1e-6 * total):
             return ""
         text = "lines share as b_ij / sum b_ik"
         if self.lines or find_balancing_weights(at.alpha) is not None:
@@ -487,32 +518,33 @@ class Wave(EnergyLaw):
         K = np.array(self.K)
         B = np.array(self.B)
         c = np.sqrt(2.0 * b)
-        # Per column the derivative of q_sd and the spring's part of the force.
+        damping = b + B
+        # Per column the derivative of q_sd, and the force without the part B times it.
         columns: tuple[tuple[BlockKey, Array, Any], ...] = (
-            (("from", j), c / (b + B), 0.0),
-            (state, -K / (b + B), K),
-            ("q", K / (b + B), -K),
-            ("qd", B / (b + B), -B),
+            (("from", j), c / damping, 0.0),
+            (state, -K / damping, K),
+            ("q", K / damping, -K),
+            ("qd", B / damping, -B),
         )
-        for column, rate, direct in columns:
-            force = direct + B * rate
+        for column, rate, direct_force in columns:
+            force = direct_force + B * rate
             form.add(state, column, rate)
             form.add("tau", column, force / self.beta)
             form.add(("to", j), column, -c / b * force)
         form.add(("to", j), ("from", j), 1.0)
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns that the lines are passive, and how the site shares."""
+        """Returns the condition: passive surroundings, and the shares that the lines give."""
         site = situation.names[situation.site]
         peers = [name for name in situation.names if name != site]
-        weights = [self.find_impedances(site, peer)[0] for peer in peers]
-        total = sum(weights) or 1.0
-        shares = ", ".join(
-            f"{peer} {line / total:.4g}" for peer, line in zip(peers, weights, strict=True)
-        )
+        impedances = [self.find_impedances(site, peer)[0] for peer in peers]
+        total = sum(impedances) or 1.0
+        shares = []
+        for peer, impedance in zip(peers, impedances, strict=True):
+            shares.append(f"{peer} {impedance / total:.4g}")
         text = (
-            f"lines are passive whatever delays, jitter and loss are, where {PASSIVE_OUTSIDE}; "
-            f"the shares of {site} are b_ij / sum b_ik, {shares}"
+            f"lines are passive for any delays, jitter and loss, where {PASSIVE_OUTSIDE}; "
+            f"the shares of {site} are b_ij / sum b_ik: {', '.join(shares)}"
         )
         return StabilityCondition(True, text)
 
