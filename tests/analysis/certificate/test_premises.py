@@ -166,7 +166,7 @@ def test_a_sampled_wall_gives_half_k_dx_squared_a_tick() -> None:
     assert found.site == "s"
     assert found.generated_j == pytest.approx(gives, rel=0.02)
     assert found.required_damping_n_s_m == pytest.approx(0.5 * 2000.0 / 200.0)
-    assert found.damping_n_s_m == 0.0
+    assert found.arm_damping_n_s_m == 0.0
 
 
 def test_it_fails_the_premise_by_name() -> None:
