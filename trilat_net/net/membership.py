@@ -1,18 +1,24 @@
-"""Membership of a session: who takes part, and who is present.
+"""Find out which processes take part in a session, and which of them are present.
 
-A member is a site or a recorder. Each start of a member has its own boot, a random number; a
-liveliness token under that boot shows others that the member is present. Members learn one
-another's identities (`Info`) by queries.
+A member is a process that takes part in a session: a site, which runs one arm and its control
+loop, or a recorder, which writes the log. Every start of a process has a boot, a random number
+that distinguishes the start from earlier and later ones.
+
+Members find each other in two ways. Each member declares a Zenoh liveliness token whose key
+contains its boot, so that the network itself reports when the member appears and disappears.
+Each member also replies to queries with its identity (`Info`): the boot, the scenario, the
+clock and the state of the session.
 
 Invariant:
-    - A different scenario, a running session, and a second start of a present member are
-      refused at the first exchange. Replies of strangers are ignored, and kept for the error
-      message.
+    - A site refuses a session that runs already or has another scenario, and a second start of
+      a member that is present, when their first identity arrives. Nothing has moved by then.
+    - Replies from programs that are not members of the session are ignored. The reason why they
+      cannot be read is kept for the error message.
     - A recorder may join a running session, and several recorders may be present. A recorder
-      that joins late reads identities, epoch and boots from the running members. It waits for
-      the members that are present and answer pings, and not for those that left.
-    - A site joins a running session only if `LateSites.may_join_late` is True, which requires
-      that every site of the scenario waits for its peers and aligns with them.
+      that joins late learns the sites, the start time and the boots from the running sites. It
+      waits only for members that are still present and answer pings.
+    - A site may join a running session only if `LateSites.may_join_late` is True. This requires
+      that every site of the scenario waits for its peers and aligns with them before it moves.
 """
 
 import hashlib
@@ -43,17 +49,17 @@ def new_boot() -> int:
 def describe_member(
     member: str, boot: int, clock: Clock, scenario: str = "", **fields: object
 ) -> Info:
-    """Returns the identity of a member on this machine.
+    """Returns the identity with which a member of this process introduces itself.
 
     Args:
-        member: name of the member.
-        boot: random number of the process start.
-        clock: clock of the member.
-        scenario: text of the member's scenario; "" if the member has none.
-        **fields: further fields of `Info`.
+        member: Name of the member.
+        boot: Random number that identifies this start of the process.
+        clock: Clock of the member.
+        scenario: Text of the scenario file. Empty if the member does not know the scenario.
+        **fields: Further fields of `Info`.
     """
     digest = hashlib.sha256(scenario.encode()).hexdigest() if scenario else ""
-    facts = {
+    basic_fields = {
         "member": member,
         "boot": boot,
         "scenario_sha256": digest,
@@ -62,26 +68,41 @@ def describe_member(
         "clock": clock.identity(),
         "fingerprint": compute_fingerprint(),
     }
-    return msgspec.convert({**facts, **fields}, Info)
+    return msgspec.convert({**basic_fields, **fields}, Info)
 
 
 def liveliness_token(session: str, member: str, boot: int) -> str:
-    """Returns the key of the liveliness token of one start of a member."""
+    """Returns the key of the token that shows that one start of a member is present.
+
+    Zenoh tells all members of the session when a token appears, and when the process that
+    declared the token has disappeared.
+    """
     return topics.key(session, member, topics.ALIVE) + f"/{boot}"
 
 
 def read_messages(inbox: Inbox, kind: type[M]) -> Iterator[M]:
-    """Yields the messages of one kind that wait in a ring, and skips other payloads."""
+    """Removes all waiting messages from an inbox, and yields those of one type.
+
+    Payloads that cannot be decoded as this type are skipped without an error, because any
+    program on the network can publish under the key of the inbox.
+    """
     while (message := inbox.poll()) is not None:
-        # Payloads of strangers are skipped here; sites and recorder count them.
+        # Sites and recorders count the payloads that they cannot decode.
         with suppress(WireError):
             yield decode(message[1], kind)
 
 
 def read_records(inbox: Inbox, layout: Layout | None = None) -> Iterator[State]:
-    """Yields the records that wait in a ring.
+    """Removes all waiting messages from an inbox, and yields the records that they contain.
 
-    Other payloads are skipped, and so is the rest of a block after an unreadable record.
+    A record is the result of one tick of a site's control loop. Sites publish their records in
+    blocks. If a record of a block cannot be decoded, that record and the rest of the block are
+    skipped without an error.
+
+    Args:
+        inbox: Inbox of the records of one site.
+        layout: Expected numbers of joints and peers. A record that differs counts as
+            undecodable. None accepts all numbers.
     """
     while (message := inbox.poll()) is not None:
         with suppress(WireError):
@@ -90,17 +111,21 @@ def read_records(inbox: Inbox, layout: Layout | None = None) -> Iterator[State]:
 
 
 class EventPublisher:
-    """Publishes a member's events, and replies to queries for the member's identity.
+    """Publishes the events of one member, and replies to queries for the member's identity.
+
+    Events are numbered messages such as "start", "mode" or "end". The recorder stores them, and
+    the other members react to them.
 
     Args:
-        bus: connection of the member.
-        session: name of the session.
-        info: identity of the member.
-        keep: receives the payload of every published event.
+        bus: Network connection of the member.
+        session: Name of the session.
+        info: Identity of the member.
+        keep: Function that receives the payload of every published event, for example to store
+            it until the recorder has it.
 
     Attributes:
-        info: identity with which queries are replied to.
-        published: number of events published so far.
+        info: Current identity of the member.
+        published: Number of events published so far. It is the number of the next event.
     """
 
     def __init__(
@@ -113,15 +138,25 @@ class EventPublisher:
         self._queries = bus.query_inbox(topics.key(session, info.member, topics.INFO))
 
     def publish(self, kind: str, text: str, **fields: object) -> Event:
-        """Publishes an event with the next number, and returns the event."""
-        facts = {
+        """Publishes an event under the next number.
+
+        Args:
+            kind: Kind of the event, which programs read.
+            text: Sentence of the event, which people read.
+            **fields: Further fields of `Event`. They may also replace the basic fields, as when
+                an event is published again.
+
+        Returns:
+            The event.
+        """
+        basic_fields = {
             "member": self.info.member,
             "boot": self.info.boot,
             "n": self.published,
             "kind": kind,
             "text": text,
         }
-        event = msgspec.convert({**facts, **fields}, Event)
+        event = msgspec.convert({**basic_fields, **fields}, Event)
         self.published += 1
         payload = encode(event)
         self._keep(payload)
@@ -129,26 +164,29 @@ class EventPublisher:
         return event
 
     def update(self, **fields: object) -> None:
-        """Changes fields of the identity."""
+        """Changes fields of the identity. Later queries receive the changed identity."""
         self.info = msgspec.structs.replace(self.info, **fields)
 
     def answer_queries(self) -> None:
-        """Replies to all waiting queries for the identity."""
+        """Replies with the current identity to all queries that are waiting."""
         while (query := self._queries.poll()) is not None:
             query.reply(encode(self.info))
 
 
 class MemberQuery:
-    """Repeated query for the identities of a session's members.
+    """Repeated query for the identities of the members of a session.
+
+    A query may be lost, and members may start at any time. Therefore the query is repeated
+    until the owner of this object no longer calls `poll`.
 
     Args:
-        bus: connection of the member that queries.
-        clock: clock of that member.
-        session: name of the session.
-        member: name of the member to query; "*" for all members.
+        bus: Network connection of the member that sends the query.
+        clock: Clock of that member.
+        session: Name of the session.
+        member: Name of the member to query, or "*" for all members.
 
     Attributes:
-        unreadable: why a reply cannot be read, by member.
+        unreadable: For each member whose reply cannot be decoded, the reason.
     """
 
     def __init__(self, bus: Bus, clock: Clock, session: str, member: str = "*") -> None:
@@ -156,7 +194,11 @@ class MemberQuery:
         self._query = RepeatedQuery(bus, clock, topics.key(session, member, topics.INFO))
 
     def poll(self) -> Iterator[Info]:
-        """Yields the identities that have arrived, and repeats the query when it is due."""
+        """Yields the identities that have arrived, and repeats the query if it is due.
+
+        A reply is skipped if it cannot be decoded, or if the name in the identity differs from
+        the name in the key under which the reply arrived.
+        """
         while (reply := self._query.poll()) is not None:
             _, key, payload = reply
             parts = topics.parse_key(key)
@@ -164,7 +206,7 @@ class MemberQuery:
                 continue
             try:
                 info = decode(payload, Info)
-            except WireError as error:  # another version of this program, or a stranger
+            except WireError as error:  # another version of this program, or another program
                 self.unreadable[parts.member] = str(error)
                 continue
             if parts.member == info.member:
@@ -173,13 +215,14 @@ class MemberQuery:
 
 
 class LateSites(NamedTuple):
-    """Rules for sites that join late, as one site of a session knows them.
+    """Rules about sites that join a session while it runs, from the view of one site.
 
     Attributes:
-        may_join_late: True if this site may join a running session. Then every site of the
-            scenario waits for its peers and aligns with them.
-        not_awaited: sites without which the session starts, if this site is the leader.
-        rate_hz: tick rate of this site.
+        may_join_late: True if this site may join a running session. The caller sets it if
+            every site of the scenario waits for its peers and aligns with them.
+        not_awaited: Names of the sites that the session does not wait for at its start. Only
+            the leader, the first site of the scenario, uses this field.
+        rate_hz: Tick rate of this site.
     """
 
     may_join_late: bool = False
@@ -188,21 +231,24 @@ class LateSites(NamedTuple):
 
 
 class Membership:
-    """The other members of a session, as one member knows them.
+    """List of the other members of a session, kept up to date by one member.
+
+    A site uses this list to decide when the session can start. A recorder uses it to learn the
+    sites, and to join a running session.
 
     Args:
-        bus: connection of this member.
-        clock: clock of this member.
-        session: name of the session.
-        publisher: publishes the events of this member.
-        sites: sites of the scenario, the leader first. Empty for a recorder, which learns the
-            sites from the members.
-        late: rules for sites that join late.
+        bus: Network connection of this member.
+        clock: Clock of this member.
+        session: Name of the session.
+        publisher: Publishes the events of this member.
+        sites: Names of the scenario's sites. The first one is the leader. Empty for a recorder,
+            which learns the sites from the members.
+        late: Rules about sites that join late.
 
     Attributes:
-        others: identities of the other members that are known and present, by name.
-        alive: boots of the members that are present, as text.
-        gone: boots of the members that have disappeared, as text.
+        others: Identity of each other member that is known and present, by name.
+        alive: Boots of the members that are present, as text.
+        gone: Boots of the members that have disappeared, as text.
     """
 
     def __init__(
@@ -233,63 +279,84 @@ class Membership:
 
     @property
     def is_leader(self) -> bool:
-        """True if this member is the first site of the scenario."""
+        """True if this member is the first site of the scenario, which starts the session."""
         return self._sites[:1] == (self.local_info.member,)
 
     @property
     def unreadable(self) -> dict[str, str]:
-        """Why the replies of members of the session cannot be read, by member."""
-        members = (*self._sites, topics.RECORDER)
+        """For each member of the session whose reply cannot be decoded, the reason."""
+        expected_members = (*self._sites, topics.RECORDER)
         return {
-            name: reason for name, reason in self._query.unreadable.items() if name in members
+            name: reason
+            for name, reason in self._query.unreadable.items()
+            if name in expected_members
         }
 
     def boots(self) -> dict[str, int]:
-        """Returns the boots of all members present, including this member."""
+        """Returns the boot of each member that is present, including this member."""
         boots = {name: info.boot for name, info in self.others.items()}
         return boots | {self.local_info.member: self.local_info.boot}
 
     def clocks(self) -> dict[str, str]:
-        """Returns the clock identities of all members present, including this member."""
+        """Returns the clock of each member that is present, including this member.
+
+        Members with the same clock run on the same machine.
+        """
         clocks = {name: info.clock for name, info in self.others.items()}
         return clocks | {self.local_info.member: self.local_info.clock}
 
     def list_missing(self) -> list[str]:
-        """Returns the members that the session waits for and that are not known yet."""
-        needs_recorder = any(
-            info.needs_recorder for info in (self.local_info, *self.others.values())
-        )
-        recorder = [topics.RECORDER] if needs_recorder or self._recorder_boots else []
+        """Lists the members that must still appear before the session can start.
+
+        These are the sites of the scenario that are not known yet, except those that need not
+        be awaited. The recorder is listed if a member needs it or if its token has appeared.
+        """
+        members = [self.local_info, *self.others.values()]
+        needs_recorder = any(info.needs_recorder for info in members)
+        awaited = [*self._sites]
+        if needs_recorder or self._recorder_boots:
+            awaited.append(topics.RECORDER)
+
         not_missing = {self.local_info.member, *self.others, *self._late.not_awaited}
-        return [name for name in (*self._sites, *recorder) if name not in not_missing]
+        return [name for name in awaited if name not in not_missing]
 
     def has_restarted(self, name: str, boot: int) -> bool:
-        """True if a member is present with another boot, and not with this boot."""
+        """Returns True if a member was started again, and its start `boot` is not present."""
         info = self.others.get(name)
         return info is not None and info.boot != boot and str(boot) not in self.alive
 
     def list_running(self) -> list[Info]:
-        """Returns the running sites that agree on the members of the session, by name."""
-        infos = [
-            info
-            for _, info in sorted(self.others.items())
-            if info.running and info.scenario and info.boots.get(info.member) == info.boot
-        ]
-        # Some of the sites may have admitted this member already: its boot is left out.
+        """Lists the running sites that agree on who takes part in the session.
+
+        Every running site states the boots of the members that it has admitted. Two sites agree
+        if they state the same boots. The boot of this member is ignored in the comparison,
+        because some sites may have admitted this member already while others have not.
+
+        Returns:
+            The identities of the sites that agree with the first running site, sorted by name.
+        """
+        running = []
+        for _, info in sorted(self.others.items()):
+            is_admitted = info.boots.get(info.member) == info.boot
+            if info.running and info.scenario and is_admitted:
+                running.append(info)
+        if not running:
+            return []
+
         local_boot = {self.local_info.member: self.local_info.boot}
-        return [
-            info for info in infos if info.boots | local_boot == infos[0].boots | local_boot
-        ]
+        expected_boots = running[0].boots | local_boot
+        return [info for info in running if info.boots | local_boot == expected_boots]
 
     def poll(self, *, may_have_started: bool) -> None:
-        """Receives identities, repeats the query, and forgets members that are gone.
+        """Receives identities, repeats the query for them, and removes members that are gone.
 
         Args:
-            may_have_started: True if this member has sent `ready`: then other members may run
-                before this member knows that the session has started.
+            may_have_started: True if this member has published that it is ready. From then on
+                the session may start before this member knows, so that the identity of a
+                running site is no reason to refuse the session.
 
         Raises:
-            SessionError: this member cannot be part of the session.
+            SessionError: This member cannot be part of the session.
         """
         for info in self._query.poll():
             self.receive_identity(info, may_have_started=may_have_started)
@@ -297,67 +364,95 @@ class Membership:
             self._update_presence(parts.member, parts.boot, is_alive=is_alive)
 
     def _update_presence(self, member: str, boot: str, *, is_alive: bool) -> None:
+        """Applies the news that the token of one start of a member appeared or disappeared.
+
+        Args:
+            member: Name of the member.
+            boot: Boot of the start, as text, as in the key of the token.
+            is_alive: True if the token appeared.
+        """
+        is_recorder = member == topics.RECORDER
         if is_alive:
             self.alive.add(boot)
             self.gone.discard(boot)
-        else:
-            self.alive.discard(boot)
-            self.gone.add(boot)
-        if member == topics.RECORDER and is_alive:
-            self._recorder_boots.add(boot)
-        elif member == topics.RECORDER:
+            if is_recorder:
+                self._recorder_boots.add(boot)
+            return
+
+        self.alive.discard(boot)
+        self.gone.add(boot)
+        if is_recorder:
             self._recorder_boots.discard(boot)
         info = self.others.get(member)
-        if not is_alive and info is not None and str(info.boot) == boot:
+        if info is not None and str(info.boot) == boot:
             del self.others[member]
 
     def receive_identity(self, info: Info, *, may_have_started: bool) -> None:
-        """Receives the identity of a member; see `poll` for `may_have_started`.
+        """Adds a member to the list, or refuses it, when its identity arrives.
+
+        Args:
+            info: Identity of the member.
+            may_have_started: True if the session may have started already, see `poll`.
 
         Raises:
-            SessionError: this member cannot be part of the session.
+            SessionError: This member cannot be part of the session, because it runs already,
+                has another scenario, or has another start of this member.
         """
         local = self.local_info
-        is_second_recorder = not self._sites and info.member == topics.RECORDER
+        is_recorder = info.member == topics.RECORDER
+        is_second_recorder = not self._sites and is_recorder
         if info.boot == local.boot or is_second_recorder:
             return
-        if info.running and not may_have_started and not self._may_join(info):
+
+        is_running = info.running and not may_have_started
+        if is_running and not self._may_join(info):
             raise SessionError(
                 f"session {self._session!r} is running; {info.member} is at tick {info.ticks}"
             )
         if info.member == local.member:
-            # Of two starts of one member the one with the lower boot stays.
+            # If a member was started twice, the start with the lower boot stays.
             if info.boot < local.boot:
                 raise SessionError(
                     f"there is already a {local.member} in session {self._session!r}"
                 )
             return
+
         has_other_scenario = info.scenario_sha256 not in ("", local.scenario_sha256)
         if self._sites and has_other_scenario:
-            if info.running and not may_have_started:
+            if is_running:
                 raise SessionError(
                     f"session {self._session!r} runs another scenario, "
                     f"according to {info.member}"
                 )
             self._refuse(info)
             return
+
         known = self.others.get(info.member, info)
-        if info.member == topics.RECORDER and known.boot != info.boot:
-            return  # of several recorders, the first one counts as the member
-        if not self._sites or info.member in self._sites or info.member == topics.RECORDER:
+        if is_recorder and known.boot != info.boot:
+            return  # of several recorders, only the first one is a member
+        is_in_scenario = not self._sites or info.member in self._sites
+        if is_in_scenario or is_recorder:
             self.others[info.member] = info
 
     def _may_join(self, info: Info) -> bool:
-        """True if this member may join the running session that a member is part of."""
-        if not self._sites:
+        """Returns True if this member may join the session that runs according to `info`.
+
+        A recorder needs the boots of the session's members. A site must be allowed to join
+        late, and must not run in the session already.
+        """
+        is_local_recorder = not self._sites
+        if is_local_recorder:
             return bool(info.boots)
         return self._late.may_join_late and info.member != self.local_info.member
 
     def _refuse(self, info: Info) -> None:
-        """Refuses a member with another scenario; leaves the session if the leader has one.
+        """Handles a member whose scenario differs from the scenario of this member.
+
+        The scenario of the leader counts. If this member is the leader, it publishes once that
+        the other member is refused. If the other member is the leader, this member gives up.
 
         Raises:
-            SessionError: the member is the leader, whose scenario counts.
+            SessionError: The other member is the leader.
         """
         local = self.local_info
         text = (
@@ -372,16 +467,21 @@ class Membership:
 
 
 class Epoch(NamedTuple):
-    """Tick 0 of a session, and the first tick of a site that joins late.
+    """Common start time of a session, as one member knows it.
+
+    The epoch is the time of tick 0. `SessionJoin.poll` returns this object when the members
+    have agreed on the epoch, or when this member was admitted to a running session.
 
     Attributes:
-        mono_ns: the epoch on this process's monotonic clock.
-        unix_ns: the epoch in Unix time, as the leader read it.
-        boots: boots of the members, by name.
-        epochs: the epoch on every member's own clock; empty for a recorder that joins late.
-        first: the first tick of this site.
-        coming: the event with which a site that joins late announces itself. The site repeats
-            the event until all peers acknowledge its samples.
+        mono_ns: The epoch on the monotonic clock of this process.
+        unix_ns: The epoch in Unix time, as the leader's clock showed it.
+        boots: Boot of each member, by name.
+        epochs: The epoch on each member's own monotonic clock, by name. Empty for a recorder
+            that joins late, which needs only its own clock.
+        first: First tick that this site executes. It is 0 unless the site joins late.
+        coming: Event with which this site asked to join the running session. The site publishes
+            the event again until all peers acknowledge its samples. None if the site was there
+            from the start.
     """
 
     mono_ns: int
