@@ -1,15 +1,22 @@
-"""The real-time loop of a site on an absolute tick grid, and the inbox of its peers' samples.
+"""Real-time control loop of a site, and the queue of the samples that its peers send.
 
-Invariant (L1):
-    - Tick k lies at the epoch plus k periods of the leader's grid; the site wakes up for it in
-      its turn.
-    - Lateness is telemetry and enters no formula. A late loop runs its missed ticks back to
-      back and counts them. With an external arm it skips them, because the arm has moved on in
-      the meantime: the numbers of its ticks then jump.
-    - No received payload can raise out of the loop: it is a peer's sample, or it is counted by
-      reason and dropped.
-    - Samples are decoded when they arrive, before their tick. They carry the instants of their
-      arrival, not of the tick that reads them.
+A site is a process that runs one arm. In every tick (one period of the control loop), the loop
+sleeps until the tick is due, takes the samples that the peers have sent meanwhile, computes the
+torque, and publishes the state of its own arm: a sample for the peers, and a record of the tick
+for the recorder.
+
+Invariant (rule L1):
+    - Tick k is due k periods after the epoch, the common start time of the session. The periods
+      are those of the leader, the first site of the scenario. Sites on one machine wake up one
+      after another within the period.
+    - A late tick is reported but changes no number: formulas contain the nominal time of a
+      tick, never the measured one. A late loop executes the missed ticks immediately one after
+      another and counts them. With an external arm it skips them, because the arm has moved on
+      in the meantime. The numbers of its ticks then have a gap.
+    - A message from the network cannot raise an exception in the loop. It is either a valid
+      sample of a peer, or it is dropped and counted by the reason.
+    - A sample is decoded when it arrives, outside the loop. It is stamped with the time of its
+      arrival, not with the time of the tick that reads it.
 """
 
 from bisect import bisect_right
@@ -44,34 +51,38 @@ if TYPE_CHECKING:
 
 
 def make_sample_readers(setup: SiteSetup) -> list[Callable[[bytes], PeerSample | WireError]]:
-    """Returns a decoder of samples for each peer of a site.
+    """Returns a decoder of samples for each peer of a site, in the order of the links.
 
-    The decoders run in threads of the network, where nothing may raise: they return the error.
+    The decoders run in network threads, where an exception would be lost. Therefore a decoder
+    returns the error instead of raising it.
     """
     layouts = [setup.layout._replace(sent=link.channel.record_size) for link in setup.links]
     return [make_reader(PeerSample, layout) for layout in layouts]
 
 
 GLIDE_AHEAD_LIMIT_NS = NS_PER_S
-"""Under `glide`, samples stamped further ahead than this are dropped."""
+"""Under `glide`, samples whose stamp is further in the future than this are dropped, in ns."""
 STEP_MARGIN_RAD = 0.02
-"""Distance by which a joint may exceed the way that its speed limit allows."""
+"""Tolerance for the distance that a joint moves between two samples, in rad."""
 
 
 class PeerInbox:
-    """The samples of a site's peers.
+    """Queue of the samples that arrived from the peers of a site, and the checks of a sample.
 
-    Messages of other boots are dropped. A site that joins late ignores samples stamped before
-    its own first tick. Under `glide`, samples that the peer's arm cannot have reached since the
-    previous one are dropped, and so are samples far ahead.
+    Samples of other boots (starts of a peer's process) are dropped. A site that joins a running
+    session ignores samples from before its own first tick.
+
+    If the scenario lets the arm glide back to its peers after a break, two more kinds of
+    samples are dropped: those far in the future, and those that the peer's arm cannot have
+    reached from its previous sample within its speed limit.
 
     Args:
-        links: the links from the peers, in scenario order; all other sequences have this order.
-        rings: the inboxes of the samples, with the instants of arrival.
-        boots: the peers' boots.
-        monitors: the timing monitors of the links.
-        dropped: counts dropped samples by reason.
-        from_ns: the site's first tick, ns since the epoch.
+        links: Links from the peers. All other sequences have the same order.
+        rings: Inboxes of the samples, with the time of each arrival.
+        boots: Boots of the peers.
+        monitors: Timing monitors of the links.
+        dropped: Number of dropped samples by reason. The counts are increased in place.
+        from_ns: Time of the site's first tick, in ns since the epoch.
     """
 
     def __init__(
@@ -89,35 +100,55 @@ class PeerInbox:
         self._boots = list(boots)
         self._monitors = monitors
         self._dropped = dropped
+        # For each peer: the newest tick that was received or need not be received, and the last
+        # tick before the first that was expected from the peer's present boot.
         self._last = [first_tick_at(from_ns, link.rate_hz) - 1 for link in links]
         self._skipped_until = list(self._last)
         self._newest: list[PeerSample | None] = [None] * len(links)
         if from_ns:
-            # Samples that arrived during the wait must not burden the first tick.
+            # Discard the samples that arrived during the wait. Otherwise the first tick would
+            # have to process all of them.
             self.drain(from_ns)
 
     def admit(self, index: int, boot: int, first: int) -> None:
-        """Accepts from now on only samples of a peer's new boot, from its tick `first` on."""
+        """Accepts from now on only samples of a new boot of a peer.
+
+        Args:
+            index: Index of the peer.
+            boot: The new boot.
+            first: First tick of the new boot.
+        """
         self._boots[index] = boot
         self._newest[index] = None
         self._last[index] = max(self._last[index], first - 1)
         self._skipped_until[index] = self._last[index]
 
     def find_last_tick_of(self, index: int, boot: int) -> int | None:
-        """Returns the last tick received from a peer's present boot, if `boot` is another one.
+        """Returns the last tick that was received of the boot that a new boot replaces.
 
-        Returns None if `boot` is the present boot, or if no sample of the present one arrived.
+        Args:
+            index: Index of the peer.
+            boot: The new boot of the peer.
+
+        Returns:
+            The tick. None if `boot` is already the accepted boot of the peer, or if no sample
+            of the accepted boot has arrived.
         """
         last_tick = self._last[index]
-        if boot != self._boots[index] and last_tick > self._skipped_until[index]:
+        has_received = last_tick > self._skipped_until[index]
+        if boot != self._boots[index] and has_received:
             return last_tick
         return None
 
     def drain(self, since_epoch_ns: int) -> list[Arrival]:
-        """Returns the arrived samples, peer by peer, each in order; at most MAX_ARRIVALS.
+        """Removes the samples that have arrived, and returns those that pass all checks.
 
         Args:
-            since_epoch_ns: the present time, ns since the epoch.
+            since_epoch_ns: Present time, in ns since the epoch.
+
+        Returns:
+            At most `MAX_ARRIVALS` samples, peer by peer, in the order of their arrival. Further
+            samples stay in the queue.
         """
         arrivals: list[Arrival] = []
         for index, ring in enumerate(self._rings):
@@ -131,7 +162,17 @@ class PeerInbox:
     def _accept(
         self, index: int, sample: PeerSample | WireError, arrived_ns: int, since_epoch_ns: int
     ) -> Arrival | None:
-        """Returns the arrival of a sample; None if the sample is dropped."""
+        """Checks one sample, counts it if it is dropped, and measures its delay.
+
+        Args:
+            index: Index of the peer.
+            sample: The sample, or the error with which its decoding failed.
+            arrived_ns: Time of its arrival on the local clock, in ns.
+            since_epoch_ns: Present time, in ns since the epoch.
+
+        Returns:
+            The sample as an input of the tick. None if the sample is dropped.
+        """
         if isinstance(sample, WireError):
             self._dropped[sample.reason] += 1
             return None
@@ -150,10 +191,17 @@ class PeerInbox:
         if glides and not self._is_reachable(index, sample):
             self._dropped["implausible"] += 1
             return None
-        if sample.tick > self._last[index] + 1:  # lost on the way, or the ring overflowed
-            self._dropped["missing"] += sample.tick - self._last[index] - 1
+        # Samples between the last one and this one were lost, or the ring overflowed.
+        missing = sample.tick - self._last[index] - 1
+        if missing > 0:
+            self._dropped["missing"] += missing
         self._last[index] = max(self._last[index], sample.tick)
         delay_ns = self._monitors[index].receive(sample, arrived_ns)
+        channel: Sequence[
+            float
+        ] = ()  # what the control law of the peer sends to the law of this site
+        if sample.ch:
+            channel = link.channel.select_for_peer(sample.ch, link.index_at_peer)
         return Arrival(
             peer=index,
             tick=sample.tick,
@@ -161,20 +209,25 @@ class PeerInbox:
             qd=sample.qd,
             latency_us=delay_ns // 1000,
             tau_x=sample.tau_x,
-            ch=link.channel.select_for_peer(sample.ch, link.index_at_peer) if sample.ch else (),
+            ch=channel,
         )
 
     def _is_reachable(self, index: int, sample: PeerSample) -> bool:
-        """True if the peer's arm can have moved from its newest sample to this one."""
+        """Returns True if the peer's arm can have moved from its newest sample to this one.
+
+        Each joint speed must be within its limit. Each joint must have moved by at most the
+        limit times the time between the samples, plus `STEP_MARGIN_RAD`. The comparisons are
+        negated so that NaN fails them.
+        """
         link = self._links[index]
         newest = self._newest[index]
         for speed, limit in zip(sample.qd, link.speed_limit, strict=True):
-            if not abs(speed) <= limit:  # also refuses NaN
+            if not abs(speed) <= limit:
                 return False
         if newest is not None:
             elapsed_s = abs(sample.tick - newest.tick) / link.rate_hz
-            steps = zip(sample.q, newest.q, link.speed_limit, strict=True)
-            for angle, newest_angle, limit in steps:
+            joints = zip(sample.q, newest.q, link.speed_limit, strict=True)
+            for angle, newest_angle, limit in joints:
                 if not abs(angle - newest_angle) <= limit * elapsed_s + STEP_MARGIN_RAD:
                     return False
         if newest is None or sample.tick > newest.tick:
@@ -185,45 +238,48 @@ class PeerInbox:
 BLOCKS_PER_S = 100
 """Recorders receive the records of 10 ms in one block."""
 WAKES_PER_S = 200
-"""Peers on the same machine receive the samples of 5 ms together, if none is due sooner."""
+"""Peers on the same machine receive the samples of 5 ms together, if they need none sooner."""
 MIN_HELD_DELAY_US = 100_000
-"""Smallest delay of a link whose samples may be held back for that long."""
+"""Smallest delay of a link whose samples may be sent late without an effect, in us."""
 
 
 def may_hold_samples(scenario: Scenario, name: str) -> bool:
-    """True if all links from a site delay its samples by at least `MIN_HELD_DELAY_US`.
+    """Returns True if a site may send several samples together without changing the run.
 
-    The site must receive the events of changes of these links, to stop holding samples in time.
+    This is so if every link from the site delays its samples by at least `MIN_HELD_DELAY_US`:
+    peers do not use a sample before that time. The delay of a link may be shortened during the
+    run. Therefore the site must receive the events of its peers, and stop holding samples when
+    an event reports a change.
     """
-    links = [
-        link
-        for site in scenario.names
-        for link in scenario.setup(site).links
-        if link.peer == name
-    ]
-    models = [model for link in links for model in link.models]
-    return all(
-        max(model.playout_us, model.location * (model.kind == DelayKind.CONSTANT))
-        >= MIN_HELD_DELAY_US
-        for model in models
-    )
+    for receiver in scenario.names:
+        for link in scenario.setup(receiver).links:
+            if link.peer != name:
+                continue
+            for model in link.models:
+                constant_us = model.location * (model.kind == DelayKind.CONSTANT)
+                if max(model.playout_us, constant_us) < MIN_HELD_DELAY_US:
+                    return False
+    return True
 
 
 class StateBlock:
-    """The records of a site's latest ticks, which recorders receive in blocks.
+    """Collects the records of a site's ticks, and sends them to the recorders in blocks.
 
-    Recorders receive a record after the peers have received its sample.
+    Blocks cost less computing time than single messages. A record is always sent after the
+    sample of its tick, because it contains the time at which the sample was sent.
 
     Args:
-        site: the kernel's site.
-        boot: the boot of this process.
-        send: publishes the encoded records of a block.
-        turn: the site's index in the scenario, so that sites of one processor take turns.
-        single: whether every record is sent with its tick, for the program of an external arm.
+        site: The site in the simulation kernel.
+        boot: Boot of this process.
+        send: Function that publishes the encoded records of a block.
+        turn: Index of the site in the scenario. Sites on one machine send their blocks in
+            different ticks, so that the work is spread over time.
+        single: True if each record is sent in its own tick, as the program of an external arm
+            requires.
 
     Attributes:
-        holds_samples: whether peers receive several samples at once, so that they wake up less
-            often.
+        holds_samples: True if the samples for the peers are collected as well, so that peers on
+            the same machine are woken up less often.
     """
 
     def __init__(
@@ -244,39 +300,47 @@ class StateBlock:
         self.holds_samples = False
         self._waiting_records: list[tuple[Any, ...]] = []
         self._records: list[tuple[Any, ...]] = []
+        # Records whose samples are not sent yet, and records that wait for their block. The
+        # fields of an entry are the arguments of `encode_state` after the peers.
 
     def add(self, output: TickRecord, *facts: Any) -> bool:
-        """Adds the record of a tick.
+        """Adds the record of a tick, and decides if the block must be sent now.
 
         Args:
-            output: the record.
-            facts: the further arguments of `encode_state` up to the stamps.
+            output: The record.
+            facts: The arguments of `encode_state` between the record and the sending time.
 
         Returns:
-            True if the block is due. It is due at every tick while somebody holds the arm: the
-            holder receives every record at once.
+            True if the block is complete, or if somebody holds the arm. The program of that
+            person needs every record at once.
         """
         self._waiting_records.append((output, *facts))
         is_held = bool(output.hand) and HandInForce.read(output.hand).source > 0
-        return is_held or (output.tick + 1) % self._ticks == self._turn
+        is_block_complete = (output.tick + 1) % self._ticks == self._turn
+        return is_held or is_block_complete
 
     def send_samples(self, k: int, send: Callable[[TickRecord], tuple[Any, ...]]) -> None:
-        """Sends the waiting samples, if peers receive samples after tick `k`.
+        """Sends the waiting samples to the peers, unless they are held until a later tick.
 
         Args:
-            k: the tick.
-            send: sends the sample of a record and returns its stamps.
+            k: The present tick.
+            send: Function that sends the sample of a record. It returns the sending time and
+                the echoes, which become part of the record.
         """
-        if not self.holds_samples or (k + 1 - self._turn) % self._ticks_per_wake == 0:
-            self._add_stamps(send)
+        is_wake_tick = (k + 1 - self._turn) % self._ticks_per_wake == 0
+        if not self.holds_samples or is_wake_tick:
+            self._send_waiting_samples(send)
 
-    def _add_stamps(self, send: Callable[[TickRecord], tuple[Any, ...]]) -> None:
-        self._records += [(*record, *send(record[0])) for record in self._waiting_records]
+    def _send_waiting_samples(self, send: Callable[[TickRecord], tuple[Any, ...]]) -> None:
+        """Sends all waiting samples, and completes their records with the sending time."""
+        for entry in self._waiting_records:
+            output = entry[0]
+            self._records.append((*entry, *send(output)))
         self._waiting_records.clear()
 
     def flush(self, send: Callable[[TickRecord], tuple[Any, ...]]) -> None:
-        """Sends all waiting samples and records."""
-        self._add_stamps(send)
+        """Sends all waiting samples to the peers, and then all records to the recorders."""
+        self._send_waiting_samples(send)
         site = self._site
         records = self._records
         self._records = []
@@ -294,7 +358,12 @@ def _publish_sample(
     io: "RunningSite",
     output: TickRecord,
 ) -> tuple[Any, ...]:
-    """Publishes the sample of a record; returns its time of sending and its echoes."""
+    """Publishes the sample of a tick.
+
+    Returns:
+        The time of sending on the local clock in ns, and the echoes: which samples of the peers
+        have arrived, and when. The peers compute round trip times from them.
+    """
     sent_ns = timing.record_sent(output.tick, clock.monotonic_ns())
     echo = timing.pop_echo()
     io.publish_sample(encode_sample(name, boot, output, sent_ns, echo))
@@ -315,25 +384,27 @@ def run_loop(
     *,
     catches_up: bool = True,
 ) -> TickRecord | None:
-    """Runs a site in real time.
+    """Executes the ticks of a site in real time.
 
     Args:
-        site: the kernel's site.
-        boot: the boot of this process.
-        ticks: the tick before which the run ends.
-        clock: the clock of this process.
-        inbox: the samples of the peers.
-        timing: the deadlines and clocks of the site.
-        stats: the statistics of the loop.
-        states: the records for the recorders.
-        io: the steps, messages and events of the site.
-        first: the first tick.
-        catches_up: whether missed ticks are run back to back; otherwise they are skipped.
+        site: The site in the simulation kernel.
+        boot: Boot of this process.
+        ticks: Number of the tick before which the run ends.
+        clock: Clock of this process.
+        inbox: Samples of the peers.
+        timing: Times at which ticks are due, and clocks of the peers.
+        stats: Statistics of the loop.
+        states: Records on their way to the recorders.
+        io: Computes a tick, and handles messages and events.
+        first: Number of the first tick.
+        catches_up: True if missed ticks are executed one after another, False if they are
+            skipped.
 
     Returns:
-        The last record; None if no tick was run.
+        The record of the last tick. None if no tick was executed.
     """
     send = partial(_publish_sample, site.name, boot, clock, timing, io)
+    # Work that can wait is done only if more than a quarter of the period is left.
     quarter_ns = NS_PER_S // (4 * site.rate_hz)
     deadline_ns = timing.deadline_ns(first)
     busy_us = 0
@@ -345,6 +416,7 @@ def run_loop(
         clock.sleep_until(deadline_ns)
         if io.should_stop():
             break
+
         woke_ns = clock.monotonic_ns()
         skipped = 0
         if not catches_up and k > first and woke_ns >= timing.deadline_ns(k + 1):
@@ -353,25 +425,32 @@ def run_loop(
             k += skipped
             deadline_ns = timing.deadline_ns(k)
         late_us = max(0, (woke_ns - deadline_ns) // 1000)
-        arrivals = inbox.drain(k * NS_PER_S // site.rate_hz + woke_ns - deadline_ns)
+
+        # Compute the tick. The present time is the nominal time of the tick plus its lateness.
+        since_epoch_ns = k * NS_PER_S // site.rate_hz + woke_ns - deadline_ns
+        arrivals = inbox.drain(since_epoch_ns)
         output = io.step(k, arrivals)
         if output is None:  # the law or the plant failed: this tick has no record
             break
         last = output
+
+        # Publish. The statistics count records, which must therefore be sent before them.
         block_due = states.add(output, arrivals, late_us, busy_us)
         states.send_samples(k, send)
         stats.count_tick(late_us, busy_us, skipped)
         stats_due = stats.is_due(k, skipped)
-        if block_due or stats_due:  # the statistics count records that must exist by then
+        if block_due or stats_due:
             states.flush(send)
         if stats_due:
-            io.publish_link(encode(stats.pop_stats(output, timing.pop_measurements(woke_ns))))
+            measurements = timing.pop_measurements(woke_ns)
+            io.publish_link(encode(stats.pop_stats(output, measurements)))
             io.run_housekeeping(k, output.t_ns)
         if output.mode is Mode.DIVERGED:
             break
         if output.cmd or output.mode is not mode:
             mode = output.mode
             io.report_tick(output)
+
         k += 1
         deadline_ns = timing.deadline_ns(k)
         if (block_due or has_slack_work) and deadline_ns - clock.monotonic_ns() > quarter_ns:

@@ -1,10 +1,18 @@
-"""One site as one process: it joins a session, runs, and leaves.
+"""Run one site as one process: join a session, control the arm, and leave.
+
+A site is a process that runs one arm and its control loop. `run_site` connects to the network,
+builds the parts of the site, agrees with the other members on the epoch (the time of tick 0),
+runs the loop, and waits until the recorders have stored everything.
+
+The control loop itself is in `site_loop`. It calls a `RunningSite` of this module in every tick
+and ten times a second.
 
 Invariant:
-    - A site announces itself only when its subscriptions are declared and its step is compiled.
+    - A site announces itself only after it has declared its subscriptions and compiled its
+      control step. Other members can rely on a site that they see.
     - The arm is braked until the epoch.
-    - After its last tick, the site stays until every recorder present has all messages of this
-      site, or until a time limit.
+    - After its last tick, the site stays until every recorder that is present has stored all
+      messages of the site, or until a time limit.
 """
 
 import signal
@@ -56,22 +64,23 @@ from .site_loop import PeerInbox, run_loop
 from .site_parts import SiteOptions, SiteParts
 
 POLL_NS = 5_000_000
+"""Longest pause between two polls while the site joins or leaves a session, in ns."""
 NO_BOOT = -1
-"""The boot of a peer that is not present yet."""
+"""Stands for the boot of a peer that is not present yet."""
 STATUS_PERIOD_S = 5
-"""Time between two status lines, s."""
+"""Time between two status lines for the user, in s."""
 LINGER_NS = 10 * NS_PER_S
-"""Longest wait after the last query of a recorder.
+"""Longest time that a site waits at its end after the last query of a recorder, in ns.
 
 A recorder whose process was suspended, or whose connection broke, needs seconds to connect
 again: the lease of Zenoh, 5 s, and one attempt after that.
 """
 ANNOUNCE_AFTER_NS = NS_PER_S
-"""A longer wait is announced to the user."""
+"""Time after which a site tells the user that it is waiting for a recorder, in ns."""
 LEAVE_TIMEOUT_NS = 2 * NS_PER_S
-"""Wait after the last recorder has left with everything; its process is ending."""
+"""Time that a site waits after the last recorder has stored everything and left, in ns."""
 QUERIED_NS = NS_PER_S
-"""A recorder whose last query is younger counts as present, even without a liveliness token."""
+"""A recorder counts as present for this time after its last query, even without a token."""
 
 
 def run_site(
@@ -80,20 +89,20 @@ def run_site(
     """Runs one site of a scenario from its start to its end.
 
     Args:
-        scenario: the scenario of the session.
-        name: the site's name.
-        options: how the site joins the session.
-        say: prints a line for the user.
+        scenario: Scenario of the session.
+        name: Name of the site.
+        options: How the site connects to the session, and how long it waits for others.
+        say: Function that prints a line for the user.
 
     Returns:
-        The exit code: 0, or 128 plus the number of the signal that ended the site.
+        Exit code of the process: 0, or 128 plus the number of the signal that ended the site.
 
     Raises:
-        SessionError: the session could not begin.
-        UsageError: an endpoint cannot be used.
-        ScenarioError: the user's law cannot be imported or differs from the scenario's, or an
-            external arm lacks limits.
-        RunFailed: the run diverged, the user's law failed, or the arm fell silent.
+        SessionError: The session could not begin.
+        UsageError: An endpoint cannot be used.
+        ScenarioError: The user's control law cannot be imported or differs from the law that
+            the scenario names, or the scenario lacks the limits of an external arm.
+        RunFailed: The run diverged, the user's law failed, or the arm fell silent.
     """
     check_outside_arms(scenario)
     # A site that rejoins a session needs its keys for less time: see `join_session`.
@@ -130,14 +139,17 @@ def run_site(
 
 
 def join_and_run(parts: SiteParts) -> int:
-    """Joins a session, runs and leaves.
+    """Joins a session with the parts of a site, runs the site, and leaves the session.
+
+    A site with an external arm, or with an operator program in another process, first waits for
+    the first message from there.
 
     Returns:
-        The exit code of the process.
+        Exit code of the process.
 
     Raises:
-        SessionError: the session could not begin.
-        RunFailed: the run failed.
+        SessionError: The session could not begin.
+        RunFailed: The run failed.
     """
     timeout_ns = int(parts.options.join_timeout_s * 1e9)
     give_up_ns = parts.clock.monotonic_ns() + timeout_ns
@@ -158,14 +170,14 @@ def join_session(parts: SiteParts, give_up_ns: int) -> "RunningSite | None":
     """Announces the site, and waits for the other members and the epoch.
 
     Args:
-        parts: the parts of the site.
-        give_up_ns: when to give up, on this process's monotonic clock.
+        parts: Parts of the site.
+        give_up_ns: Time at which the site gives up, on the monotonic clock of this process.
 
     Returns:
-        The running site; None if a signal ended the wait.
+        The site, ready to run. None if a signal ended the wait.
 
     Raises:
-        SessionError: the session did not begin in time, or this site cannot be part of it.
+        SessionError: The session did not begin in time, or this site cannot be part of it.
     """
     scenario = parts.scenario
     options = parts.options
@@ -198,7 +210,8 @@ def join_session(parts: SiteParts, give_up_ns: int) -> "RunningSite | None":
             return RunningSite(parts, publisher, pinger, epoch)
         if joining.announced_first_tick != first_tick:
             first_tick = joining.announced_first_tick
-            # Prepared here, since it takes 0.1 s for every hour of the running session.
+            # The first tick of a site that joins late. It is prepared before the epoch, because
+            # the preparation takes 0.1 s for every hour that the session has been running.
             parts.site.start_at(first_tick)
         now_ns = parts.clock.monotonic_ns()
         if now_ns > give_up_ns:
@@ -208,6 +221,12 @@ def join_session(parts: SiteParts, give_up_ns: int) -> "RunningSite | None":
 
 
 def _describe_failed_join(parts: SiteParts, joining: SessionJoin) -> SessionError:
+    """Returns the error for a site that has waited in vain for its session to begin.
+
+    Its sentence names the reason: that of the join if it is known, otherwise the members that
+    are missing. Replies of members that could not be decoded are added, as they often explain
+    why a member seems to be missing.
+    """
     options = parts.options
     missing = joining.membership.list_missing()
     reason = joining.reason
@@ -224,10 +243,26 @@ def _describe_failed_join(parts: SiteParts, joining: SessionJoin) -> SessionErro
 
 
 class RunningSite:
-    """A site between the epoch and its last tick.
+    """A site from the epoch until it has left the session.
 
-    The loop calls `use_slack` after a block of records, if a quarter of a period is left. If
-    that returns True, the loop calls it again after the next tick.
+    `join_session` creates this object. The loop calls its methods: `should_stop` and `step` in
+    every tick, `report_tick` after ticks in which something changed, and `run_housekeeping` ten
+    times a second. After the last tick, `leave_session` completes the work.
+
+    If a quarter of a period is left after a block of records was published, the loop also calls
+    `use_slack`, which answers a recorder's query for lost messages. If `use_slack` returns
+    True, the loop calls it again after the next tick.
+
+    Args:
+        parts: Parts of the site.
+        publisher: Publishes the events of the site.
+        pinger: Offsets of the other members' clocks, as estimated by pings.
+        epoch: The agreed epoch, and the members of the session.
+
+    Attributes:
+        publish_sample: Function that publishes a sample, the state that peers receive.
+        publish_link: Function that publishes statistics of the loop and its links.
+        use_slack: Function that the loop calls if time is left.
     """
 
     def __init__(
@@ -239,12 +274,14 @@ class RunningSite:
         self._epoch = epoch
         self._failure: RunFailed | None = None
         self._mode = Mode.RUN
-        self._skipped = list[str]()
-        self._output: TickRecord | None = None
+        self._skipped = list[str]()  # ranges of ticks that are not published yet
+        self._output: TickRecord | None = None  # the record of the newest tick
+        # Seconds of the session in which a status line, a `waiting` event and an alarm were
+        # last issued. They limit how often these are repeated.
         self._status_s = 0
         self._waiting_s = 0
-        self._has_given_up = False
         self._alarm_s = -1
+        self._has_given_up = False
         self._rejoined_ns = tick_ns(epoch.first, site.rate_hz)
         self.publish_sample = parts.publish_sample
         self.publish_link = parts.publish_link
@@ -270,9 +307,10 @@ class RunningSite:
         )
 
     def _make_timing(self, pinger: Pinger) -> SiteTiming:
-        """Returns the timing of the site, with its turn among the sites of this machine.
+        """Returns the schedule of the site's ticks, and the timing of its links.
 
-        Sites with the same clock run on the same machine.
+        Sites on one machine have the same clock. They wake up one after another in each period,
+        in the order of the scenario, so that they do not compete for the processors.
         """
         parts = self._parts
         epoch = self._epoch
@@ -289,8 +327,11 @@ class RunningSite:
                     estimator=pinger.estimator(boot),
                 )
             )
-        local_names = {peer.name for peer in peers if peer.is_own and peer.name in epoch.boots}
-        local_names.add(parts.name)
+        local_names = {parts.name}
+        for peer in peers:
+            is_present = peer.name in epoch.boots
+            if peer.is_own and is_present:
+                local_names.add(peer.name)
         self._local_sites = [name for name in scenario.names if name in local_names]
         turn = self._local_sites.index(parts.name)
         rate_hz = max(scenario.sites[name].rate_hz for name in self._local_sites)
@@ -303,17 +344,19 @@ class RunningSite:
         )
 
     def run(self) -> None:
-        """Runs all ticks, or until the run ends early."""
+        """Runs the ticks of the scenario until the last one, or until the run ends early."""
         parts = self._parts
+        # Samples may wait for the next block only if all peers share this machine.
         parts.states.holds_samples &= all(meter.peer.is_own for meter in self._timing.monitors)
         self._publish_setup()
+        stop_request = ChangeRequest(order="stop", source="the operator")
         known_site = make_site_known(
             parts.options.session,
             parts.name,
             parts.scenario.names,
             parts.boot,
             parts.options.connection,
-            encode(ChangeRequest(order="stop", source="the operator")),
+            encode(stop_request),
         )
         with known_site, parts.watchdog:
             self._output = run_loop(
@@ -336,54 +379,76 @@ class RunningSite:
             self._publish_skipped(output.tick, output.t_ns)
 
     def _publish_setup(self) -> None:
-        """Publishes the settings of the process, the clocks, and how the arm stands."""
+        """Publishes the settings of the process and the clocks, and tells them to the user.
+
+        A site that joins a running session also publishes the event `join`. An external arm is
+        bound to the start of the run here: the warning says if the arm is elsewhere.
+        """
         parts = self._parts
-        texts = self._clock_texts
+        user_lines = self._clock_texts
         obtained = realtime.prepare(parts.options.cpu, len(self._local_sites))
         obtained["turn"] = f"{self._timing.turn_ns // 1000} us after the grid"
         settings = [f"{key}: {value}" for key, value in obtained.items()]
         self._publisher.publish(
             "setup",
-            ", ".join([*settings, *texts]),
+            ", ".join([*settings, *user_lines]),
             epoch_mono_ns=self._epoch.mono_ns,
             clock=parts.clock.identity(),
         )
+
         begins = "the session begins"
-        if first := self._epoch.first:
-            t_ns = tick_ns(first, parts.site.rate_hz)
+        first_tick = self._epoch.first
+        if first_tick:
+            t_ns = tick_ns(first_tick, parts.site.rate_hz)
             begins = f"joins the running session at t = {t_ns * 1e-9:.3f} s"
             self._publisher.publish(
                 "join",
                 f"{parts.name} {begins}",
                 t_ns=t_ns,
                 boots=self._epoch.boots,
-                ticks=first,
+                ticks=first_tick,
             )
         parts.say(f"{begins}; {obtained['scheduling']}, memory {obtained['memory']}")
         self._publish_clocks(self._timing.list_initial_notices(), 0)
+
         if parts.arm is not None:
             warning = parts.arm.bind(parts.scenario.sites[parts.name].q0_rad)
             if warning:
                 self._publisher.publish("arm", f"{parts.name}: {warning}")
-                texts = [*texts, warning]
-        for text in texts:
-            parts.say(text)
+                user_lines = [*user_lines, warning]
+        for line in user_lines:
+            parts.say(line)
 
     def _publish_clocks(self, notices: Iterable[ClockNotice], t_ns: int) -> None:
+        """Publishes events about the peers' clocks, at time `t_ns` since the epoch."""
         for notice in notices:
             self._publisher.publish(**notice, t_ns=t_ns)
 
     def should_stop(self) -> bool:
-        """Returns True if the run ends before its next tick."""
+        """Receives from the arm and the dead-man switch, and decides if the run ends now.
+
+        Returns:
+            True if the site failed, if a member ended the run for all, if the user stopped the
+            session or this process, or if a peer has been away for too long.
+        """
         parts = self._parts
-        for input_ in (parts.arm, parts.switch):
-            if input_ is not None:
-                input_.poll()
-        ended = self._failure or parts.monitor.ended_by or parts.changes.stopped
-        return bool(ended) or parts.interrupt.is_requested() or self._has_given_up
+        for device in (parts.arm, parts.switch):
+            if device is not None:
+                device.poll()
+        is_ended = self._failure or parts.monitor.ended_by or parts.changes.stopped
+        return bool(is_ended) or parts.interrupt.is_requested() or self._has_given_up
 
     def step(self, k: int, arrivals: Sequence[Arrival]) -> TickRecord | None:
-        """Steps the site; returns None if its law or plant failed, which ends the run."""
+        """Executes tick `k`: reads the inputs, computes the torque, and moves a simulated arm.
+
+        Args:
+            k: Number of the tick.
+            arrivals: Samples of the peers that have arrived since the previous tick.
+
+        Returns:
+            The record of the tick. None if the user's own law, plant or operator failed, which
+            ends the run.
+        """
         parts = self._parts
         measured = None if parts.arm is None else parts.arm.newest
         hand = () if parts.hand is None else parts.hand.track(parts.site, k)
@@ -406,24 +471,27 @@ class RunningSite:
         return self._output
 
     def run_housekeeping(self, k: int, t_ns: int) -> None:
-        """Replies to queries, follows the leader's grid, and publishes news.
+        """Does the work that is not urgent: replies, clocks, members, and news for the user.
 
-        The loop calls it ten times a second, after the statistics of tick `k` at its nominal
-        time `t_ns`, ns since the epoch.
+        The loop calls this method ten times a second.
+
+        Args:
+            k: Tick that was executed last.
+            t_ns: Nominal time of that tick, in ns since the epoch.
         """
         parts = self._parts
         nominal_ns = tick_ns(k + 1, parts.site.rate_hz)
         grid_ns = self._timing.schedule.due_ns(k + 1) - nominal_ns
         self._publisher.update(ticks=k + 1, grid_ns=grid_ns)
         self._publisher.answer_queries()
-        self._publish_clocks(
-            self._timing.update_clocks(k + 1, parts.clock.monotonic_ns()), t_ns
-        )
+        notices = self._timing.update_clocks(k + 1, parts.clock.monotonic_ns())
+        self._publish_clocks(notices, t_ns)
         self._watch_members(t_ns)
         self._rejoin(t_ns)
         if parts.hand is not None:
             for _, text in parts.hand.news:
-                parts.say(text.partition(": ")[2])
+                _, _, text_without_site = text.partition(": ")
+                parts.say(text_without_site)
             self._publish_news("hand", parts.hand.news)
         self._publish_news("mark", parts.changes.marks)
         self._publish_skipped(k, t_ns)
@@ -434,13 +502,22 @@ class RunningSite:
             parts.say(self._describe_status(self._output))
 
     def _publish_news(self, kind: str, news: list[tuple[int, str]]) -> None:
-        """Publishes and removes all news, which are pairs of a tick and a text."""
+        """Publishes all news of one kind, and empties their list.
+
+        Args:
+            kind: Kind of the events.
+            news: Tick and sentence of each piece of news.
+        """
         rate_hz = self._parts.site.rate_hz
         for tick, text in news:
             self._publisher.publish(kind, text, t_ns=tick_ns(tick, rate_hz), ticks=tick)
         news.clear()
 
     def _publish_skipped(self, k: int, t_ns: int) -> None:
+        """Publishes which ticks the site has skipped since the last call, in one event.
+
+        A site skips ticks only if its arm is external, and the loop was late.
+        """
         if self._skipped:
             ticks = " ".join(self._skipped)
             self._skipped = []
@@ -448,43 +525,69 @@ class RunningSite:
             self._publisher.publish("overrun", text, t_ns=t_ns, ticks=k + 1, command=ticks)
 
     def _publish_waiting(self, k: int, t_ns: int) -> None:
-        """Publishes once a second that the site is too far from its peers to approach them."""
+        """Reports once a second that the arm is too far from its peers to approach them.
+
+        This can only happen if the scenario lets an arm glide back to its peers after a break.
+        The arm then waits until somebody moves it closer.
+        """
         output = self._output
         if output is None or output.mode not in (Mode.WAITING, Mode.HOLD):
             return
         if self._parts.setup.on_stale.action is not StaleAction.GLIDE:
             return
         second = t_ns // NS_PER_S
-        if find_life_reason(output) is LifeReason.ALIGN_LIMIT and second > self._waiting_s:
+        is_too_far = find_life_reason(output) is LifeReason.ALIGN_LIMIT
+        if is_too_far and second > self._waiting_s:
             self._waiting_s = second
             text = describe_mode(self._parts.name, output, glides=True)
             self._publisher.publish("waiting", text, t_ns=t_ns, ticks=k)
             self._parts.say(text)
 
     def _watch_members(self, t_ns: int) -> None:
-        """Tracks the members that join and leave, and admits the peers that join."""
+        """Follows which members leave and join, and decides if this site still waits for them.
+
+        Args:
+            t_ns: Present time, in ns since the epoch.
+        """
         parts = self._parts
         monitor = parts.monitor
         monitor.watch(self._publisher, t_ns)
         if monitor.changed:
-            # A change holds from 100 ms after its request, so no earlier sample was due sooner.
+            # From now on every sample is published in its own tick, because a change may
+            # shorten the delay of a link. A change takes effect 100 ms after its request at the
+            # earliest, so that no sample held until now was already needed.
             parts.states.holds_samples = False
+
+        # A peer whose samples arrive is present, even if its token was lost.
         if monitor.departed:
             for meter in self._timing.monitors:
                 if meter.is_receiving(parts.clock.monotonic_ns()):
                     monitor.mark_present(meter.peer.name, t_ns)
+
         for event in monitor.admitted:
             self._admit_peer(event, t_ns)
         monitor.admitted.clear()
-        patience_s = parts.options.leave_timeout_s
-        if patience_s is None:
-            self._has_given_up = False
-        else:
-            since_ns = min((left_ns for left_ns, _ in monitor.departed.values()), default=t_ns)
-            self._has_given_up = t_ns - since_ns > patience_s * NS_PER_S
+        self._has_given_up = self._is_peer_away_too_long(t_ns)
+
+    def _is_peer_away_too_long(self, t_ns: int) -> bool:
+        """Returns True if a peer left longer ago than the user's options tolerate."""
+        patience_s = self._parts.options.leave_timeout_s
+        departures = self._parts.monitor.departed.values()
+        if patience_s is None or not departures:
+            return False
+        first_left_ns = min(left_ns for left_ns, _ in departures)
+        return t_ns - first_left_ns > patience_s * NS_PER_S
 
     def _admit_peer(self, event: Event, t_ns: int) -> None:
-        """Accepts samples of a peer's new boot from the tick on that its event names."""
+        """Prepares this site for a peer that joins the running session.
+
+        From the tick that the event names, samples of the peer's new boot are accepted. Samples
+        of its previous boot are not accepted any more.
+
+        Args:
+            event: Event with which the peer announced its join.
+            t_ns: Present time, in ns since the epoch.
+        """
         parts = self._parts
         index = parts.site.peers.index(event.member)
         join_ns = tick_ns(event.ticks, parts.scenario.sites[event.member].rate_hz)
@@ -497,27 +600,36 @@ class RunningSite:
         parts.say(f"{event.member} joins at t = {join_ns * 1e-9:.3f} s")
 
     def _rejoin(self, t_ns: int) -> None:
-        """Announces this site's join again, once a second, while a heard peer ignores the site.
+        """Repeats the announcement to join while a peer that is heard ignores this site.
 
-        A peer whose connection was broken at the time of the join has not received that event.
+        A peer whose connection was broken at the time of the join has not received the
+        announcement, and drops the samples of this site. The announcement is repeated at most
+        once a second, until every peer that is heard acknowledges samples of this site.
         """
         coming = self._epoch.coming
         now_ns = self._parts.clock.monotonic_ns()
         if coming is None or t_ns < self._rejoined_ns + NS_PER_S:
             return
-        meters = self._timing.monitors
-        if any(
-            meter.is_receiving(now_ns) and meter.is_acknowledged(now_ns) is None
-            for meter in meters
-        ):
+        is_ignored = False
+        for meter in self._timing.monitors:
+            if meter.is_receiving(now_ns) and meter.is_acknowledged(now_ns) is None:
+                is_ignored = True
+                break
+        if is_ignored:
             self._rejoined_ns = t_ns
             fields = {**asdict(coming), "t_ns": t_ns, "n": self._publisher.published}
             self._publisher.publish(**fields)
 
     def _publish_last_heard(self, index: int, coming: Event, t_ns: int) -> None:
-        """Publishes the last tick that was received of a peer's previous boot.
+        """Publishes the last tick that was received from the previous boot of a peer.
 
-        That boot may have ended without an event of its own.
+        The previous boot may have been killed before it could publish its own end. Its last
+        tick tells the recorder how many records to expect.
+
+        Args:
+            index: Index of the peer.
+            coming: Event with which the new boot of the peer announced its join.
+            t_ns: Present time, in ns since the epoch.
         """
         tick = self._inbox.find_last_tick_of(index, coming.boot)
         if tick is None:
@@ -532,7 +644,7 @@ class RunningSite:
         )
 
     def _describe_status(self, output: TickRecord) -> str:
-        """Returns a line with the time, the mode, the error, the torque and the problems."""
+        """Composes the status line: time, mode, error, torque, late ticks, dropped messages."""
         parts = self._parts
         position = np.array([output.shared()[0]])
         desired = np.array([output.q_des])
@@ -553,10 +665,13 @@ class RunningSite:
         )
 
     def report_tick(self, output: TickRecord) -> None:
-        """Publishes the changes that a tick has applied, and a change of the mode."""
+        """Publishes which changes took effect in a tick, and whether the mode has changed.
+
+        The skipped ticks are only collected here. `run_housekeeping` publishes them together.
+        """
         parts = self._parts
-        # Skipped ticks are collected here, and published together by `run_housekeeping`.
-        if skipped := count_skipped_ticks(output.cmd):
+        skipped = count_skipped_ticks(output.cmd)
+        if skipped:
             self._skipped.append(f"{output.tick - skipped}-{output.tick - 1}")
         for change in output.cmd:
             if count_skipped_ticks([change]):
@@ -579,9 +694,10 @@ class RunningSite:
             self._raise_alarm(output)
 
     def _raise_alarm(self, output: TickRecord) -> None:
-        """Prints an alarm with its reason and a remedy.
+        """Prints an alarm for the user, with its reason and a remedy.
 
-        An arm that is stopped always raises one; an arm that holds at most one a second.
+        An arm that is stopped raises an alarm each time. An arm that holds its position may
+        change its mode many times, and raises at most one alarm a second.
         """
         parts = self._parts
         mode = output.mode
@@ -593,7 +709,7 @@ class RunningSite:
             self._alarm_s = second
         if rule.action is not StaleAction.GLIDE:
             return
-        lost: Sequence[str] = ()
+        lost: Sequence[str] = ()  # peers without which the arm continues
         if rule.degrades and mode is Mode.RETURN:
             lost = parts.site.layout.list_lost_peers(output.mem, parts.site.peers)
         alarm = find_alarm(
@@ -608,28 +724,33 @@ class RunningSite:
             parts.say(f"*** {alarm}")
 
     def leave_session(self) -> int:
-        """Publishes the end, waits for the recorders, and returns the exit code.
+        """Publishes how the run ended, waits for the recorders, and tells the user the result.
+
+        Returns:
+            Exit code of the process: 0, or 128 plus the number of the signal that ended the
+            run.
 
         Raises:
-            PeerLeft: a peer left before the end and did not return.
-            RunFailed: the run failed, at this site or at a peer.
+            PeerLeft: A peer left before the end and did not return.
+            RunFailed: The run failed, at this site or at a peer.
         """
         parts = self._parts
         interrupt = parts.interrupt
         monitor = parts.monitor
         self._publish_end()
-        # Signals that arrive later end the wait for the recorders, and do not change the code.
+        # The exit code is read before the wait: a later signal only ends the wait.
         code = interrupt.exit_code if interrupt.is_requested() else 0
         monitor.watch(self._publisher, self._t_ns)
         if topics.RECORDER in monitor.boots or monitor.recorders:
             self._await_recorders()
         ticks = count_nouns(self._ticks, "tick")
-        counts = parts.stats.dropped.items()
-        dropped = ", ".join(f"{count} {reason}" for reason, count in counts)
-        parts.say(
-            f"{ticks}, {parts.stats.overruns} of them late by a period or more"
-            + (f"; dropped: {dropped}" if dropped else "")
-        )
+        summary = f"{ticks}, {parts.stats.overruns} of them late by a period or more"
+        dropped_counts = parts.stats.dropped.items()
+        if dropped_counts:
+            dropped = ", ".join(f"{count} {reason}" for reason, count in dropped_counts)
+            summary += f"; dropped: {dropped}"
+        parts.say(summary)
+
         if self._failure is not None:
             raise self._failure
         if monitor.ended_by:
@@ -641,34 +762,47 @@ class RunningSite:
         return code
 
     def _publish_end(self) -> None:
-        """Publishes the failure, the law's hiccups and the end, with their causes."""
+        """Publishes the events at the end of a run.
+
+        They are the failure if there was one, delays of the user's own code, and the event
+        `end`, whose sentence says how many ticks were executed and why the run ended early.
+        """
         parts = self._parts
         output = self._output
-        kind = "failed"
+        failure_kind = "failed"
         if output is not None and output.mode is Mode.DIVERGED:
-            kind = "diverged"
+            failure_kind = "diverged"
             self._failure = RunFailed(describe_divergence(parts.name, output))
         if self._failure is not None:
-            self._publish_end_event(kind, str(self._failure))
+            self._publish_end_event(failure_kind, str(self._failure))
+
         for code in parts.watchdog.codes:
-            if hiccups := code.describe_hiccups():
+            hiccups = code.describe_hiccups()
+            if hiccups:
                 self._publish_end_event("law", hiccups)
                 parts.say(hiccups)
+
         about, cause = self._find_cause()
-        if unheard := [
-            meter.peer.name for meter in self._timing.monitors if meter.is_unacknowledged
-        ]:
+        meters = self._timing.monitors
+        unheard = [meter.peer.name for meter in meters if meter.is_unacknowledged]
+        if unheard:
             cause += f"; {', '.join(unheard)} did not hear it at the end"
         text = f"{parts.name} made {count_nouns(self._ticks, 'tick')}{cause}"
         self._publish_end_event("end", text, about=about)
 
     @property
     def _departures(self) -> str:
-        """The sentences about the sites that have left, "" if all are present."""
+        """Sentences about the sites that have left. Empty if all sites are present."""
         return "; ".join(text for _, text in self._parts.monitor.departed.values())
 
     def _find_cause(self) -> tuple[str, str]:
-        """Returns which member ended the run early, and the end of a sentence that says why."""
+        """Finds out why the run ended before the last tick of the scenario.
+
+        Returns:
+            The member that ended the run, and the end of a sentence that names the cause. The
+            member is empty if no single member is the cause. Both are empty if the run was
+            completed.
+        """
         parts = self._parts
         monitor = parts.monitor
         if self._failure is not None:
@@ -684,13 +818,18 @@ class RunningSite:
         return next(iter(monitor.departed), ""), f": {self._departures}"
 
     def _publish_end_event(self, kind: str, text: str, about: str = "") -> None:
+        """Publishes an event with the number of executed ticks and the time of the last one."""
         self._publisher.publish(kind, text, t_ns=self._t_ns, ticks=self._ticks, about=about)
 
     def _await_recorders(self) -> None:
-        """Waits until every recorder has stored everything, then `stay_s` for them to leave.
+        """Waits until every recorder has stored the messages of this site and has left.
 
-        A signal does not shorten the first wait, since records that are not stored are lost
-        with this process; a second signal ends it.
+        Recorders query the site for messages that were lost on the way, and the site must
+        reply. Once all is stored, the site stays for the time that the user's options allow,
+        until the recorders have left.
+
+        A first signal does not shorten the wait for the recorders: records that are not stored
+        would be lost with this process. A second signal ends it.
         """
         parts = self._parts
         clock = parts.clock
@@ -705,13 +844,18 @@ class RunningSite:
                 give_up_ns = max(give_up_ns, queried_ns + LINGER_NS)
             self._publisher.answer_queries()
             monitor.watch(self._publisher, self._t_ns)
+
             is_gone = not monitor.recorders and clock.monotonic_ns() - queried_ns > QUERIED_NS
-            if is_gone and monitor.stored:  # a recorder that lacks messages may come back
+            # A recorder that has gone, but still lacks messages, may come back: then the limit
+            # stays as it is.
+            if is_gone and monitor.stored:
                 give_up_ns = min(give_up_ns, clock.monotonic_ns() + LEAVE_TIMEOUT_NS)
             if monitor.read_stored(self._ticks) and monitor.all_stored:
                 give_up_ns = clock.monotonic_ns() + int(parts.options.stay_s * 1e9)
+
             waited_ns = clock.monotonic_ns() - begun_ns
-            if not is_announced and not monitor.all_stored and waited_ns > ANNOUNCE_AFTER_NS:
+            is_long = not monitor.all_stored and waited_ns > ANNOUNCE_AFTER_NS
+            if is_long and not is_announced:
                 is_announced = True
                 parts.say(
                     "keeps its last records until the recorder has them, "
@@ -720,8 +864,11 @@ class RunningSite:
             clock.sleep_until(clock.monotonic_ns() + POLL_NS)
 
     def _may_leave(self) -> bool:
-        """Returns True if the user insists, or ended the run and the recorders have it all."""
+        """Returns True if the site need not wait for the recorders any longer.
+
+        This is so after a second signal. After a first signal, it is so once the recorders have
+        stored everything.
+        """
         interrupt = self._parts.interrupt
-        return interrupt.is_repeated() or (
-            self._parts.monitor.all_stored and interrupt.is_requested()
-        )
+        is_complete = self._parts.monitor.all_stored and interrupt.is_requested()
+        return interrupt.is_repeated() or is_complete

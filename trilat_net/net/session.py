@@ -1,22 +1,29 @@
-"""The start of a session: the members connect and agree on one epoch, the instant of tick 0.
+"""Start a session: the members find each other and agree on the epoch, the time of tick 0.
 
-The first site of the scenario is the leader. Once every member has replied consistently, the
-leader publishes the event `epoch`, which names an epoch and the boots of the members. Each
-member replies `ready`. If all replies arrive in time, the leader publishes `start`; otherwise
-the leader announces another epoch.
+A member is a process that takes part in the session: a site, which runs one arm and its control
+loop, or a recorder. The first site of the scenario is the leader. A normal start has three
+steps, each of which is an event that a member publishes:
 
-A recorder that joins late learns the epoch from the running members. So does a site that may
-join late: it publishes `coming` with its first tick, and joins when every running site has
-published `admit` in time. The running sites do so once the site's earlier start is gone.
+1. `epoch`: Once all members are known, the leader proposes an epoch about half a second ahead,
+   with the list of the members.
+2. `ready`: Each member agrees.
+3. `start`: If all members have agreed in time, the leader confirms the epoch. Otherwise it
+   proposes another one.
 
-The epoch is an instant of the leader's monotonic clock. A member on another clock converts the
-instant by pings, to half a round trip. It is ready only when it knows all clocks that it needs.
+A session may also be joined while it runs. A recorder reads the epoch from the running sites. A
+site publishes `coming` with its first tick, and joins if every running site replies with
+`admit` before that tick. The running sites do so once the previous start of the site is gone.
+
+The epoch is a time on the leader's monotonic clock. A member on another machine converts it to
+its own clock. It measures the offset between the clocks by pings, with an error of at most half
+a round trip, and is ready only when it knows all clocks that it needs.
 
 Invariant:
-    - The members agree on one epoch, whatever the order in which they start.
-    - No member starts without `start` or, if it joins late, without a running member.
-    - Wall clocks decide nothing.
-    - Everything is polled; nothing waits.
+    - The members agree on one epoch, in whatever order they were started.
+    - No member starts without the event `start`. A member that joins late does not start
+      without a running site.
+    - The time of day decides nothing, because the time of day of two machines may differ.
+    - No method waits. The caller polls `SessionJoin` until the epoch is known.
 """
 
 from collections.abc import Mapping, Sequence
@@ -38,30 +45,32 @@ from .messages import Event, Info
 from .pinging import Pinger, answer_pings
 
 EPOCH_AHEAD_NS = 500_000_000
-"""Time from the announcement of an epoch to the epoch, besides two round trips, in ns."""
+"""Time from the proposal of an epoch to the epoch, in ns. Two round trips are added to it."""
 DECIDE_NS = 150_000_000
-"""Time before the epoch at which all replies must be there, besides a round trip, in ns."""
+"""Time before the epoch by which all members must agree, in ns. A round trip is added to it."""
 LATE_GATHER_NS = 1_500_000_000
-"""Time to wait for further members of a running session after the first one, in ns."""
+"""Time that a member waits to learn further sites of a running session, in ns."""
 
 
 class SessionJoin:
-    """The joining of a session by one member; call `poll` regularly until it returns the epoch.
+    """Joins one member to a session.
 
-    The member must have declared its subscriptions before.
+    The member first declares its subscriptions, so that it misses no message of a session that
+    knows the member. It then creates this object, and calls `poll` regularly until the epoch is
+    returned.
 
     Args:
-        bus: connection of this member.
-        clock: clock of this member.
-        session: name of the session.
-        publisher: publishes the events of this member.
-        sites: sites of the scenario, the leader first; empty for a recorder.
-        late: rules for sites that join late.
+        bus: Network connection of this member.
+        clock: Clock of this member.
+        session: Name of the session.
+        publisher: Publishes the events of this member.
+        sites: Names of the scenario's sites. The first one is the leader. Empty for a recorder.
+        late: Rules about sites that join late.
 
     Attributes:
-        refusal: why a running site has refused this one; "" if no site has refused it.
-        membership: the other members.
-        pinger: estimates of the members' clocks.
+        refusal: Why a running site has refused this site. Empty if no site has refused it.
+        membership: The other members of the session.
+        pinger: Measures the offsets of the other members' clocks.
     """
 
     def __init__(
@@ -79,7 +88,8 @@ class SessionJoin:
         self._sites = tuple(sites)
         self._late = late
         self.refusal = ""
-        self._coming: tuple[Event, Epoch] | None = None  # the last `coming`, and its epoch
+        # The newest request of this site to join a running session: its event and its epoch.
+        self._coming: tuple[Event, Epoch] | None = None
         self._admitted_by: set[str] = set()
         self._admitted_boots: dict[str, int] = {}  # boots of others that joined meanwhile
         self._events = bus.inbox(topics.key(session, "*", topics.EVENT), 256)
@@ -89,16 +99,21 @@ class SessionJoin:
         self.pinger = Pinger(bus, clock, session)
         self._found_running_ns: int | None = None  # when a running session was found
         answer_pings(bus, clock, session, publisher.info)
+        # The proposal that this member has not agreed to yet, and the one that it has agreed to
+        # or, as the leader, has made. The epoch is on the clock of this member.
         self._offered: Event | None = None
-        self._epoch_ns = 0
         self._announced: Event | None = None
+        self._epoch_ns = 0
         self._attempt = 0
         self._ready_epochs: dict[str, int] = {}  # the epoch on each ready member's clock
         bus.announce(liveliness_token(session, self._info.member, self._info.boot))
 
     @property
     def reason(self) -> str:
-        """Why this site has not joined a running session; "" if the reason is not known."""
+        """Why this site could not join a running session. Empty if the reason is not known.
+
+        The reason is a refusal, or the names of the running sites that have not admitted it.
+        """
         running = {info.member for info in self.membership.list_running()}
         missing = sorted(running - self._admitted_by)
         if self.refusal or self._coming is None or not missing:
@@ -107,48 +122,73 @@ class SessionJoin:
 
     @property
     def announced_first_tick(self) -> int:
-        """The first tick that this site has announced to a running session; else 0."""
-        return 0 if self._coming is None else self._coming[0].ticks
+        """First tick that this site named when it requested to join a running session.
+
+        It is 0 if the site has not requested to join.
+        """
+        if self._coming is None:
+            return 0
+        coming, _ = self._coming
+        return coming.ticks
 
     @property
     def _info(self) -> Info:
+        """Identity of this member."""
         return self._publisher.info
 
     def poll(self) -> Epoch | None:
-        """Receives messages and replies to them; returns the epoch once it is fixed.
+        """Receives messages, replies to them, and takes the next step towards the start.
+
+        A running session is joined if the rules permit it. Otherwise the leader proposes and
+        confirms an epoch, and the other members wait for its events.
+
+        Returns:
+            The epoch once it is fixed. None until then.
 
         Raises:
-            SessionError: this member cannot be part of the session.
+            SessionError: This member cannot be part of the session.
         """
         membership = self.membership
         now_ns = self._clock.monotonic_ns()
         self._publisher.answer_queries()
-        membership.poll(
-            may_have_started=self._announced is not None and not membership.is_leader
-        )
-        self.pinger.poll(self._other_clocks(membership.boots(), membership.clocks()))
+        may_have_started = self._announced is not None and not membership.is_leader
+        membership.poll(may_have_started=may_have_started)
+        self.pinger.poll(self._list_other_clocks(membership.boots(), membership.clocks()))
+
         epoch = self._read_events()
-        if epoch is None:
-            self._reply_ready()
-            running = membership.list_running()
-            if running and (self._late.may_join_late or not self._sites):
-                # Before an announced epoch, `start` may still be under way.
-                if self._announced is None or now_ns >= self._epoch_ns:
-                    epoch = self._join_late(running, now_ns)
-            elif membership.is_leader:
-                epoch = self._lead()
-            if not running:
-                self._found_running_ns = None
+        if epoch is not None:
+            return epoch
+        self._reply_ready()
+        running = membership.list_running()
+        may_join_running = self._late.may_join_late or not self._sites
+        if running and may_join_running:
+            # Until the proposed epoch has passed, its confirmation may still arrive.
+            may_start_normally = self._announced is not None and now_ns < self._epoch_ns
+            if not may_start_normally:
+                epoch = self._join_late(running, now_ns)
+        elif membership.is_leader:
+            epoch = self._lead()
+        if not running:
+            self._found_running_ns = None
         return epoch
 
     def _join_late(self, running: Sequence[Info], now_ns: int) -> Epoch | None:
-        """Returns the epoch of a running session once this member may join the session.
+        """Joins a session that is running already.
 
-        All present members must be known, and must have admitted this member if it is a site.
+        All sites of the session that are present must be known first, and so must their clocks.
+        A recorder may then record at once. A site must be admitted by the running sites.
+
+        Args:
+            running: Identities of the running sites.
+            now_ns: Present time on the local clock, in ns.
+
+        Returns:
+            The epoch of the session once this member may take part. None until then.
         """
         if self._found_running_ns is None:
             self._found_running_ns = now_ns
-        if self._awaits_sites(running) and (now_ns - self._found_running_ns < LATE_GATHER_NS):
+        waited_ns = now_ns - self._found_running_ns
+        if self._awaits_sites(running) and waited_ns < LATE_GATHER_NS:
             return None
         local_clock = self._info.clock
         foreign_boots = {info.boot for info in running if info.clock != local_clock}
@@ -157,40 +197,51 @@ class SessionJoin:
         source = self._select_epoch_source(running)
         if source is None:
             return None
-        # The offset at present counts: the clocks' drift apart since the epoch is unknown.
+
+        # Convert with the present offset. The offset at the epoch is not known, as the clocks
+        # have drifted since.
         offset_ns = 0
         if source.clock != local_clock:
             offset_ns = self.pinger.estimate(source.boot).extrapolate_ns(now_ns)
         epoch = Epoch(source.epoch_mono_ns - offset_ns, source.epoch_unix_ns, source.boots)
-        if not self._sites:
+        is_recorder = not self._sites
+        if is_recorder:
             return epoch
+
+        # The site follows the schedule on which the ticks are now, not on which they started.
         grid_ns = (source.grid_ns or source.epoch_mono_ns) - offset_ns
         return self._request_admission(epoch._replace(mono_ns=grid_ns), running, now_ns)
 
     def _awaits_sites(self, running: Sequence[Info]) -> bool:
-        """True if a site of the running session is present and not known to run yet."""
+        """Returns True if a site of the session is present, but is not known to run yet.
+
+        Sites that have disappeared or were started again are not awaited.
+        """
         membership = self.membership
-        sites = {
-            name
-            for name, boot in running[0].boots.items()
-            if str(boot) not in membership.gone and not membership.has_restarted(name, boot)
-        }
-        sites -= {topics.RECORDER, self._info.member}
-        return {info.member for info in running} < sites
+        present_sites = set()
+        for name, boot in running[0].boots.items():
+            is_gone = str(boot) in membership.gone or membership.has_restarted(name, boot)
+            if not is_gone:
+                present_sites.add(name)
+        present_sites -= {topics.RECORDER, self._info.member}
+        return {info.member for info in running} < present_sites
 
     def _select_epoch_source(self, running: Sequence[Info]) -> Info | None:
-        """Returns the running site that states the epoch, or None if no clock is known.
+        """Selects the running site from which this member takes the epoch.
 
-        A site on this member's clock is best, because its epoch needs no conversion; else the
-        first site of the scenario, whose schedule the others follow.
+        A site on this machine is best, because its epoch needs no conversion between clocks.
+        The next best is the first site of the scenario, whose schedule the others follow.
+
+        Returns:
+            The identity of the site. None if the clock of no running site is known yet.
         """
         local_clock = self._info.clock
         indices = {name: index for index, name in enumerate(self._sites)}
 
-        def preference(info: Info) -> tuple[bool, int]:
+        def rank(info: Info) -> tuple[bool, int]:
             return info.clock != local_clock, indices.get(info.member, -1)
 
-        for info in sorted(running, key=preference):
+        for info in sorted(running, key=rank):
             if info.clock == local_clock or self.pinger.knows_clocks([info.boot]):
                 return info
         return None
@@ -198,35 +249,41 @@ class SessionJoin:
     def _request_admission(
         self, epoch: Epoch, running: Sequence[Info], now_ns: int
     ) -> Epoch | None:
-        """Publishes `coming`, repeatedly; returns the epoch once every running site admits."""
+        """Requests admission to the running session, and checks if all running sites grant it.
+
+        The request is the event `coming` with a first tick about half a second ahead. If a site
+        has not replied shortly before that tick, another request with a later tick follows.
+
+        Args:
+            epoch: The epoch of the session on the clock of this site.
+            running: Identities of the running sites.
+            now_ns: Present time on the local clock, in ns.
+
+        Returns:
+            The epoch and the first tick once all running sites have admitted this site. None
+            until then.
+        """
         info = self._info
         rate_hz = self._late.rate_hz
         slowest_ns = self.pinger.slowest_ns()
         if self._coming is not None:
-            coming, announced_epoch = self._coming
-            first_ns = announced_epoch.mono_ns + tick_ns(coming.ticks, rate_hz)
-            if now_ns < first_ns - DECIDE_NS:
-                if not self._admitted_by >= {site.member for site in running}:
+            coming, requested_epoch = self._coming
+            first_tick_ns = requested_epoch.mono_ns + tick_ns(coming.ticks, rate_hz)
+            if now_ns < first_tick_ns - DECIDE_NS:
+                running_names = {site.member for site in running}
+                if not self._admitted_by >= running_names:
                     return None
-                epochs = {site.member: site.epoch_mono_ns for site in running}
-                return announced_epoch._replace(
-                    boots={
-                        **running[0].boots,
-                        **self._admitted_boots,
-                        info.member: info.boot,
-                    },
-                    epochs=epochs | {info.member: announced_epoch.mono_ns},
-                    first=coming.ticks,
-                    coming=coming,
-                )
-        since_ns = now_ns - epoch.mono_ns
-        first = first_tick_at(since_ns + EPOCH_AHEAD_NS + 2 * slowest_ns, rate_hz)
+                return self._make_late_epoch(coming, requested_epoch, running)
+
+        since_epoch_ns = now_ns - epoch.mono_ns
+        first_tick_after_ns = since_epoch_ns + EPOCH_AHEAD_NS + 2 * slowest_ns
+        first = first_tick_at(first_tick_after_ns, rate_hz)
         self._attempt += 1
         self._admitted_by = set()
         coming = self._publisher.publish(
             "coming",
             f"{info.member} comes to the running session, from tick {first} on",
-            t_ns=since_ns,
+            t_ns=since_epoch_ns,
             ticks=first,
             attempt=self._attempt,
             epoch_mono_ns=epoch.mono_ns,
@@ -237,8 +294,29 @@ class SessionJoin:
         self._coming = coming, epoch
         return None
 
-    def _other_clocks(self, boots: Mapping[str, int], clocks: Mapping[str, str]) -> set[int]:
-        """Returns the boots of the sites whose clock is not this member's clock."""
+    def _make_late_epoch(self, coming: Event, epoch: Epoch, running: Sequence[Info]) -> Epoch:
+        """Returns the epoch of a running session, with this site among the members.
+
+        Args:
+            coming: Request of this site that all running sites have granted.
+            epoch: The epoch that the request stated.
+            running: Identities of the running sites.
+        """
+        info = self._info
+        boots = {**running[0].boots, **self._admitted_boots, info.member: info.boot}
+        epochs = {site.member: site.epoch_mono_ns for site in running}
+        epochs[info.member] = epoch.mono_ns
+        return epoch._replace(boots=boots, epochs=epochs, first=coming.ticks, coming=coming)
+
+    def _list_other_clocks(
+        self, boots: Mapping[str, int], clocks: Mapping[str, str]
+    ) -> set[int]:
+        """Returns the boots of the sites on other machines, whose clocks must be measured.
+
+        Args:
+            boots: Boot of each member, by name.
+            clocks: Identity of each member's clock, by name.
+        """
         return {
             boot
             for name, boot in boots.items()
@@ -246,31 +324,39 @@ class SessionJoin:
         }
 
     def _read_events(self) -> Epoch | None:
-        """Receives events; returns the epoch once its announcement is followed by `start`."""
+        """Receives the events of all members, and acts on those about the start.
+
+        Returns:
+            The epoch once the leader has confirmed the proposal that this member agreed to.
+            None until then.
+        """
         for event in read_messages(self._events, Event):
             if event.boots.get(event.member) != event.boot:
-                continue  # the announcement does not include its sender
+                continue  # the sender is not a member according to its own event
             if event.kind == "epoch":
                 self._receive_announcement(event)
                 continue
             self._receive_admission(event)
+
             announced = self._announced
             if announced is None:
                 continue
             if event.attempt != announced.attempt or event.boots != announced.boots:
-                continue
+                continue  # the event belongs to another proposal
             if event.kind == "ready":
                 self._ready_epochs[event.member] = event.epoch_mono_ns
-            elif (
-                event.kind == "start"
-                and event.boot == announced.boot
-                and event.epochs.keys() == announced.boots.keys()
-            ):
-                return self._make_epoch(event)
+            elif event.kind == "start" and event.boot == announced.boot:
+                includes_all = event.epochs.keys() == announced.boots.keys()
+                if includes_all:
+                    return self._make_epoch(event)
         return None
 
     def _receive_admission(self, event: Event) -> None:
-        """Notes which running sites admit or refuse this site, and whom they admit besides."""
+        """Notes if a running site admits or refuses this site, or admits another site.
+
+        Args:
+            event: An event of a running site. Events of other kinds are ignored.
+        """
         if event.kind == "admit" and event.about in event.boots:
             self._admitted_boots[event.about] = event.boots[event.about]
         info = self._info
@@ -285,31 +371,38 @@ class SessionJoin:
             self._admitted_by.add(event.member)
 
     def _receive_announcement(self, event: Event) -> None:
-        """Receives the announcement of an epoch, and replies `ready` if it is for this member.
+        """Receives the proposal of an epoch, and agrees if it includes this member.
+
+        Proposals of sites other than the leader are ignored, and so are proposals to a recorder
+        that does not know the scenario yet.
 
         Raises:
-            SessionError: the announcement is for another start of this site.
+            SessionError: The proposal includes another start of this site.
         """
         if self.membership.is_leader or (self._sites and event.member != self._sites[0]):
             return
-        knows_scenario = self._sites or any(
-            info.scenario and event.boots.get(name) == info.boot
-            for name, info in self.membership.others.items()
-        )
+        knows_scenario = bool(self._sites)
+        for name, info in self.membership.others.items():
+            if info.scenario and event.boots.get(name) == info.boot:
+                knows_scenario = True
         if not knows_scenario:
-            return  # a recorder that has not learnt the scenario is not ready
-        if event.boots.get(self._info.member) == self._info.boot:
+            return
+
+        local = self._info
+        if event.boots.get(local.member) == local.boot:
             if not self._is_bound(event):
                 self._offered = event
                 self._reply_ready()
-        # Not for recorders: of two recorders, one joins late.
-        elif self._info.member in event.boots and self._sites:
-            raise SessionError(
-                f"session {self._session!r} goes on with another {self._info.member}"
-            )
+        # A proposal with another recorder is no error: of two recorders, one joins late.
+        elif local.member in event.boots and self._sites:
+            raise SessionError(f"session {self._session!r} goes on with another {local.member}")
 
     def _is_bound(self, event: Event) -> bool:
-        """True if this member is `ready` for another leader, who may still send `start`."""
+        """Returns True if this member has agreed to a proposal of another leader process.
+
+        That leader may still confirm its proposal, until its epoch has passed or the leader has
+        disappeared.
+        """
         announced = self._announced
         return (
             announced is not None
@@ -319,16 +412,20 @@ class SessionJoin:
         )
 
     def _reply_ready(self) -> None:
-        """Replies `ready` to an announcement once all clocks that it needs are known."""
+        """Agrees to the waiting proposal once all clocks that this member needs are known.
+
+        The reply states the proposed epoch on the clock of this member.
+        """
         event = self._offered
         if event is None:
             return
-        if not self.pinger.knows_clocks(self._other_clocks(event.boots, event.clocks)):
+        if not self.pinger.knows_clocks(self._list_other_clocks(event.boots, event.clocks)):
             return
         self._offered = None
         self._announced = event
         estimate = self.pinger.estimate(event.boot)
-        # The offset is needed at the epoch, whose local instant is known roughly at first.
+        # The offset is needed at the epoch, but the local time of the epoch depends on the
+        # offset. A rough local time is precise enough, as the clocks drift slowly.
         rough_epoch_ns = event.epoch_mono_ns - estimate.offset_ns
         self._epoch_ns = event.epoch_mono_ns - estimate.extrapolate_ns(rough_epoch_ns)
         self._publisher.publish(
@@ -341,24 +438,31 @@ class SessionJoin:
         )
 
     def _lead(self) -> Epoch | None:
-        """Announces an epoch once all members are present; returns it once all are ready."""
+        """Takes the next step of the leader: proposes an epoch, or confirms or withdraws it.
+
+        An epoch is proposed once all members are present and their clocks are known. It is
+        confirmed once all members have agreed. It is withdrawn if a member is too late, is gone
+        or has joined meanwhile. The next call then proposes another one.
+
+        Returns:
+            The epoch once it is confirmed. None until then.
+        """
         now_ns = self._clock.monotonic_ns()
         membership = self.membership
         announced = self._announced
         if announced is None:
-            other_clocks = self._other_clocks(membership.boots(), membership.clocks())
+            other_clocks = self._list_other_clocks(membership.boots(), membership.clocks())
             if not membership.list_missing() and self.pinger.knows_clocks(other_clocks):
                 self._announce(now_ns)
             return None
+
         decide_ns = self._epoch_ns - DECIDE_NS - self.pinger.slowest_ns()
-        if (
-            now_ns >= decide_ns
-            or announced.boots != membership.boots()
-            or membership.list_missing()
-        ):
-            # A member was too late, is gone, or has joined: another attempt follows.
+        is_too_late = now_ns >= decide_ns
+        have_members_changed = announced.boots != membership.boots()
+        ready_members = self._ready_epochs.keys() | {self._info.member}
+        if is_too_late or have_members_changed or membership.list_missing():
             self._announced = None
-        elif self._ready_epochs.keys() | {self._info.member} >= set(announced.boots):
+        elif ready_members >= set(announced.boots):
             start = self._publisher.publish(
                 "start",
                 "all are ready",
@@ -370,7 +474,11 @@ class SessionJoin:
         return None
 
     def _announce(self, now_ns: int) -> None:
-        """Publishes the announcement of an epoch."""
+        """Proposes an epoch to the members that are present, as the leader.
+
+        Args:
+            now_ns: Present time on the local clock, in ns.
+        """
         boots = self.membership.boots()
         self._ready_epochs = {}
         self._attempt += 1
@@ -388,6 +496,7 @@ class SessionJoin:
         )
 
     def _make_epoch(self, start: Event) -> Epoch:
+        """Returns the confirmed epoch, given the leader's event `start`."""
         assert self._announced is not None
         return Epoch(
             mono_ns=self._epoch_ns,

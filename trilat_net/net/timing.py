@@ -1,19 +1,28 @@
-"""Timing of a running site: tick deadlines, time stamps, and the clock offset of each link.
+"""Keep the time of a running site: when ticks are due, and how far the peers' clocks are off.
 
-Tick k is due at k * 10^9 // rate_hz ns after the epoch. Sites on one machine wake up one after
-another after that instant, see `find_turn_ns`.
+A site executes one tick per period of its control loop. Tick k is due k * 10^9 // rate_hz ns
+after the epoch, the common start time of the session. Sites on one machine wake up one after
+another within the period (`find_turn_ns`).
 
-Four stamps make a round trip: the local sending (t1) and the peer's receipt (t2) of the record
-that the peer echoes, and the peer's sending (t3) and the local receipt (t4) of the record that
-carries the echo.
+Each site measures the link from each of its peers, with four time stamps:
+
+    t1: this site sends a sample           (this site's clock)
+    t2: the peer receives that sample      (the peer's clock)
+    t3: the peer sends a sample of its own (the peer's clock)
+    t4: this site receives that sample     (this site's clock)
+
+Samples carry t2 and t3, as "echo" and sending time. No message can arrive before it was sent.
+Therefore the offset of the peer's clock (peer minus local) is at most t2 - t1 and at least
+t3 - t4. `offset` computes an estimate from the tightest of these limits.
 
 Invariant:
-    - Rule L1: ticks are due to the nanosecond, on the leader's clock.
-    - A site on another clock follows the leader's clock by slewing its schedule by at most
-      SLEW_LIMIT, never by a step. While the leader is away, the site follows the leader's clock
-      as last estimated.
-    - Measuring changes no number of a run: an impossible stamp is counted, and its sample is
-      used all the same.
+    - Rule L1: ticks are due on the leader's clock, to the nanosecond. The leader is the first
+      site of the scenario.
+    - A site on another machine follows the leader's clock by running its own schedule slightly
+      faster or slower, by at most SLEW_LIMIT, and never by a step. While the leader is away,
+      the site continues with the last estimate.
+    - Measurements do not change a run. If a sample seems to arrive before it was sent, it is
+      counted as a fault, but it is used all the same.
 """
 
 from array import array
@@ -36,63 +45,75 @@ from .offset import (
 from .topics import ticks_per_stats
 
 SLEW_LIMIT = 200_000.0
-"""Largest deviation of a schedule's rate from its clock, ns/s (200 ppm)."""
+"""Largest deviation of the rate of a schedule from the rate of its clock, in ns/s (200 ppm)."""
 _CORRECTION_TIME_S = 2.0
 """Time constant with which a schedule corrects its error, in s.
 
-It is long against the noise of an offset estimate.
+It is long compared with the noise of an offset estimate, so that the noise is averaged.
 """
 
 
 class TickSchedule:
-    """Schedule of one site's ticks, on the site's clock.
+    """Times at which the ticks of one site are due, on the clock of that site.
+
+    The schedule is linear in k. Its rate can be adjusted, so that it follows the leader's.
+
+    Args:
+        epoch_ns: Time of tick 0 on the site's clock, in ns.
+        rate_hz: Tick rate of the site.
 
     Attributes:
-        slew: rate by which the schedule lags behind the clock, ns/s.
-        error_ns: lateness against the leader's schedule at the last `adjust_rate`.
+        slew: Deviation of the rate: time that the schedule adds to each second, in ns/s.
+        error_ns: Lateness compared with the leader's schedule at the last `adjust_rate`, in ns.
     """
 
     def __init__(self, epoch_ns: int, rate_hz: int) -> None:
         self.slew = 0.0
         self.error_ns = 0
         self._rate_hz = rate_hz
+        # Nominal time and scheduled time of the tick from which on the present rate applies.
         self._base_nominal_ns = 0
         self._base_ns = epoch_ns
         self._slew_per_ns = 0.0
 
     def due_ns(self, k: int) -> int:
-        """Returns the instant at which tick `k` is due, on the site's clock, in ns."""
+        """Returns the time at which tick `k` is due, on the site's clock, in ns."""
         passed_ns = k * NS_PER_S // self._rate_hz - self._base_nominal_ns
         return self._base_ns + passed_ns + int(passed_ns * self._slew_per_ns)
 
     def adjust_rate(self, k: int, error_ns: int, drift: float) -> None:
         """Adjusts the rate from tick `k` on, so that the schedule approaches the leader's.
 
+        The new rate compensates the drift between the clocks, and reduces the error with the
+        time constant `_CORRECTION_TIME_S`. It is limited to `SLEW_LIMIT`.
+
         Args:
-            k: the tick; no earlier than that of the last adjustment.
-            error_ns: lateness of the tick against the leader's schedule.
-            drift: drift of the leader's clock against the site's clock, ns/s.
+            k: The tick. It must not be earlier than the tick of the previous adjustment.
+            error_ns: Lateness of the tick compared with the leader's schedule, in ns.
+            drift: Rate of the leader's clock relative to the site's clock, in ns/s.
         """
         self._base_ns = self.due_ns(k)
         self._base_nominal_ns = k * NS_PER_S // self._rate_hz
         self.error_ns = error_ns
-        self.slew = min(max(-drift - error_ns / _CORRECTION_TIME_S, -SLEW_LIMIT), SLEW_LIMIT)
+        wanted_slew = -drift - error_ns / _CORRECTION_TIME_S
+        self.slew = min(max(wanted_slew, -SLEW_LIMIT), SLEW_LIMIT)
         self._slew_per_ns = self.slew / NS_PER_S
 
 
 WINDOW_NS = 1_000_000_000
-"""Length of a window of the offset estimate, in ns."""
+"""Length of a window of time stamps, from which an offset is estimated, in ns."""
 FIRST_WINDOW_NS = 100_000_000
 FIRST_WINDOWS = 5
-"""The first windows are shorter, so that the offsets soon become better than those of pings."""
+"""The first windows are shorter, so that better offsets soon replace those of the pings."""
 _NO_DELAY_NS = 1 << 62
-"""Larger than any delay: there is no measurement yet."""
+"""Initial value of a smallest delay, larger than any delay that can be measured."""
 
 
 class SentStamps:
-    """Sending times of the latest local records, by tick.
+    """Ring of the times at which the latest samples of this site were sent, by tick.
 
-    The capacity is enough for round trips of several seconds.
+    When a peer's echo of a sample arrives, its sending time is looked up here. The capacity of
+    16 384 ticks is enough for round trips of several seconds.
     """
 
     def __init__(self, capacity: int = 1 << 14) -> None:
@@ -100,27 +121,27 @@ class SentStamps:
         self._entries = array("q", [-1, 0]) * capacity  # tick and sending time, alternately
 
     def record(self, tick: int, sent_ns: int) -> None:
-        """Stores the sending time of a record, on the local clock."""
+        """Stores the time on the local clock at which the sample of a tick was sent."""
         slot = 2 * (tick % self._capacity)
         self._entries[slot] = tick
         self._entries[slot + 1] = sent_ns
 
     def find_ns(self, tick: int) -> int | None:
-        """Returns the sending time of a record, or None if it is no longer stored."""
+        """Returns when the sample of a tick was sent, or None if that is no longer stored."""
         slot = 2 * (tick % self._capacity)
         return self._entries[slot + 1] if self._entries[slot] == tick else None
 
 
 class PeerClock(NamedTuple):
-    """Clock of a peer at the start of the session.
+    """Clock of a peer, as known when the session starts or when the peer joins.
 
     Attributes:
-        name: name of the peer.
-        epoch_ns: instant of tick 0 on the peer's clock.
-        index_at_peer: index of this site among the peer's peers.
-        estimate: offset of the peer's clock.
-        estimator: the limits of the offset that pings found; None if this site and the peer
-            share one clock.
+        name: Name of the peer.
+        epoch_ns: Time of tick 0 on the peer's clock, in ns.
+        index_at_peer: Index of this site among the peers of that peer. Echoes name sites by it.
+        estimate: Offset of the peer's clock.
+        estimator: Estimator that already contains the limits from pings. None if the peer runs
+            on this machine, and therefore on this clock.
     """
 
     name: str
@@ -131,28 +152,32 @@ class PeerClock(NamedTuple):
 
     @property
     def is_own(self) -> bool:
-        """True if the peer's clock is this site's clock, too."""
+        """True if the peer runs on this machine, and therefore on the same clock."""
         return self.estimator is None
 
 
 class LinkTimingMonitor:
-    """Timing of one link, at its receiving end.
+    """Measures the delay of one link, and the offset between the clocks of its two sites.
+
+    The site at the receiving end of the link creates the monitor, and passes every sample of
+    the peer to `receive`. Offsets are estimated from windows of time stamps. An impossible
+    combination of stamps is a fault: it shows that a clock has stepped.
 
     Args:
-        peer: clock of the sending peer.
-        sent: sending times of this site's records.
+        peer: Clock of the sending peer.
+        sent: Times at which this site sent its own samples.
 
     Attributes:
-        peer: clock of the sending peer.
-        offset: offset of the peer's clock, in use.
-        faults: number of impossible stamps and of contradicting windows since the start.
-        newest: tick of the newest sample since the last echo, and its arrival on the local
-            clock, in ns.
-        worst_ns: longest time by which a sample arrived before it was sent, since the last
-            notice.
-        contradicted: True if a window has contradicted those before since the last notice.
-        is_unacknowledged: True from the notice that the peer acknowledges nothing until the
-            notice that it does so again.
+        peer: Clock of the sending peer.
+        offset: Offset of the peer's clock that is in use.
+        faults: Number of impossible stamps, and of windows that contradict earlier ones.
+        newest: Newest sample since the last echo: its tick, and its arrival on the local clock
+            in ns. None if no sample has arrived since.
+        worst_ns: Longest time by which a sample seemed to arrive before it was sent, since the
+            last event about a fault, in ns. 0 if there was none.
+        contradicted: True if a window has contradicted earlier windows since that event.
+        is_unacknowledged: True if an event has reported that the peer acknowledges no samples,
+            and no event has reported that it acknowledges samples again.
     """
 
     def __init__(self, peer: PeerClock, sent: SentStamps) -> None:
@@ -163,7 +188,7 @@ class LinkTimingMonitor:
         self.admit(peer)
 
     def admit(self, peer: PeerClock) -> None:
-        """Starts anew with another start of the peer, and its clock."""
+        """Starts anew for a new process of the peer, which may have another clock."""
         self.peer = peer
         self.offset = SlewedOffset(peer.estimate)
         self.newest: tuple[int, int] | None = None
@@ -181,18 +206,22 @@ class LinkTimingMonitor:
         self._open_window()
 
     def _open_window(self) -> None:
-        # The smallest delays of the window give its tightest limits.
+        """Starts a window of time stamps without any measurement.
+
+        Only the smallest delay in each direction is kept, because it gives the tightest limit
+        of the offset.
+        """
         self._smallest_outward_ns = _NO_DELAY_NS
         self._smallest_return_ns = _NO_DELAY_NS
         self._ceiling: OffsetLimit | None = None
         self._floor: OffsetLimit | None = None
 
     def receive(self, sample: PeerSample, arrived_ns: int) -> int:
-        """Evaluates the stamps of one sample.
+        """Measures the delay of a sample, and evaluates its echoes.
 
         Args:
-            sample: the sample.
-            arrived_ns: its arrival on the local clock.
+            sample: The sample.
+            arrived_ns: Time of its arrival on the local clock, in ns.
 
         Returns:
             The one-way delay of the sample, in ns.
@@ -214,6 +243,8 @@ class LinkTimingMonitor:
         if self.newest is None or sample.tick > self.newest[0]:
             self.newest = sample.tick, arrived_ns
         self._received_ns = arrived_ns
+
+        # An echo states when the peer received a sample of this site.
         for index, tick, peer_arrival_ns in sample.echo:
             if index != self._index_at_peer:
                 continue
@@ -233,27 +264,37 @@ class LinkTimingMonitor:
         return delay_ns
 
     def is_receiving(self, now_ns: int) -> bool:
-        """True if a sample of the peer arrived within UNHEARD_NS."""
+        """Returns True if a sample of the peer has arrived within the last UNHEARD_NS."""
         return self._received_ns >= 0 and now_ns - self._received_ns <= UNHEARD_NS
 
     def is_acknowledged(self, now_ns: int) -> bool | None:
-        """True if the peer acknowledged a newer sample within UNHEARD_NS.
+        """Returns True if the peer still receives the samples of this site.
 
-        None before the peer's first acknowledgement, and while nothing arrives from the peer.
+        The peer does so if it acknowledged a newer sample within UNHEARD_NS before its own last
+        sample.
+
+        Returns:
+            None if the peer has not acknowledged any sample yet, or if no samples of the peer
+            arrive. Then it is not known whether the peer receives this site.
         """
         if self._acknowledged_tick < 0 or not self.is_receiving(now_ns):
             return None
         return self._received_ns - self._acknowledged_ns <= UNHEARD_NS
 
     def close_window(self, now_ns: int, slew_ns: int) -> OffsetEstimate | None:
-        """Closes the window if it is long enough, and starts to slew to the new estimate.
+        """Estimates the offset from the present window, if that is long enough.
+
+        The offset in use then moves gradually to the new estimate, and another window starts.
+        If the window contradicts earlier ones, a clock has stepped: the estimation starts again
+        with wide bounds and short windows.
 
         Args:
-            now_ns: the present, on the local clock.
-            slew_ns: instant at which the slew starts, on the local clock.
+            now_ns: Present time on the local clock, in ns.
+            slew_ns: Time from which the offset in use moves, on the local clock, in ns.
 
         Returns:
-            The new estimate; None if the window stays open, or if both sites share one clock.
+            The new estimate. None if the window is not long enough yet, or if the peer runs on
+            this machine.
         """
         estimator = self.peer.estimator
         if estimator is None:
@@ -265,13 +306,13 @@ class LinkTimingMonitor:
             return None
         self._window_start_ns = now_ns
         self._windows += 1
-        broken = estimator.broken
+        contradictions_before = estimator.broken
         estimator.add(self._ceiling, self._floor)
         estimate = estimator.estimate(now_ns)
-        if estimator.broken > broken:
+        if estimator.broken > contradictions_before:
             self.faults += 1
             self.contradicted = True
-        if estimate is None:  # no stamps, or contradictory ones: a clock has stepped
+        if estimate is None:  # there were no stamps, or they contradict each other
             estimate = self.offset.estimate.widen(self._ceiling, self._floor)
             self._windows = 0
         self._open_window()
@@ -279,65 +320,79 @@ class LinkTimingMonitor:
         return estimate
 
     def pop_measurements(self, now_ns: int) -> dict[str, int]:
-        """Returns the link's timing fields of `LinkStats` since the last call."""
+        """Returns the measurements since the last call, and starts new ones.
+
+        Returns:
+            The fields of `LinkStats` about the timing of this link. A value of -1 means that
+            nothing was measured.
+        """
         delays = sorted(self._delays)
         round_trip_ns = self._shortest_round_trip_ns
         self._delays = []
         self._shortest_round_trip_ns = _NO_DELAY_NS
+        median_us = -1
+        longest_us = -1
+        if delays:
+            median_us = delays[len(delays) // 2] // 1000
+            longest_us = delays[-1] // 1000
         return {
             "offset_us": self.offset.evaluate_ns(now_ns) // 1000,
+            # A bound is rounded up: -(-a // b) is the smallest integer that is at least a / b.
             "bound_us": -(-self.offset.error_bound_ns(now_ns) // 1000),
-            "delay_us": delays[len(delays) // 2] // 1000 if delays else -1,
-            "delay_max_us": delays[-1] // 1000 if delays else -1,
+            "delay_us": median_us,
+            "delay_max_us": longest_us,
             "rtt_us": -1 if round_trip_ns == _NO_DELAY_NS else round_trip_ns // 1000,
             "clock_faults": self.faults,
         }
 
 
 FAULT_EVERY_NS = 1_000_000_000
-"""Shortest time between two notices of clock faults of one peer, in ns."""
+"""Shortest time between two events about clock faults of one peer, in ns."""
 UNHEARD_NS = 200_000_000
 """Time without a new acknowledgement after which a peer counts as not receiving this site.
 
-The peer itself must be received meanwhile.
+The condition applies only while samples of the peer itself arrive.
 """
 FIRST_BOUND_NS = 2_000_000
-"""Error of a joining site's clock that is allowed for besides the stated bound, in ns."""
+"""Margin that is added to the clock error that a joining site states, in ns."""
 
 
 ClockNotice = dict[str, Any]
-"""The fields of an event about a clock, or about a peer that does not receive this site."""
+"""Fields of an event about a peer's clock, or about a peer that does not receive this site."""
 
 
 def find_turn_ns(index: int, sites: int, rate_hz: int) -> int:
-    """Returns how long after a tick of the schedule a site wakes up, in ns.
+    """Returns how long after the start of a period a site wakes up, in ns.
 
-    Sites on one machine that woke up at one instant would wait for one another's processors.
-    Their turns cover half of a period, so that a sample of the last site still arrives well
-    before the next tick of the first.
+    If all sites of a machine woke up at the same time, they would compete for its processors.
+    The sites are spread over half of a period. A sample of the last site thus still arrives
+    well before the next tick of the first site.
 
     Args:
-        index: index of the site among the sites on its machine.
-        sites: number of these sites.
-        rate_hz: the highest of their tick rates.
+        index: Index of the site among the sites on its machine.
+        sites: Number of these sites.
+        rate_hz: Highest tick rate of these sites.
     """
     return index * NS_PER_S // (2 * sites * rate_hz)
 
 
 class SiteTiming:
-    """Deadlines of a site, and timing of its links.
+    """Schedule of a site's ticks, and timing of the links from its peers.
+
+    The site asks for the time of its next wake-up, reports each sample that it sends, and calls
+    `update_clocks` ten times a second.
 
     Args:
-        epoch_ns: instant of tick 0 on the site's clock.
-        rate_hz: tick rate of the site.
-        peers: clocks of the peers.
-        leader: name of the site whose schedule is the session's.
-        turn_ns: delay of the wake-up after a tick of the schedule, see `find_turn_ns`.
+        epoch_ns: Time of tick 0 on the site's clock, in ns.
+        rate_hz: Tick rate of the site.
+        peers: Clocks of the peers.
+        leader: Name of the site whose schedule all sites follow.
+        turn_ns: Delay of each wake-up after the start of the period, see `find_turn_ns`.
 
     Attributes:
-        schedule: the ticks of the site.
-        turn_ns: delay of the wake-up after a tick of the schedule.
-        monitors: timing of the link from each peer.
+        schedule: Times at which the ticks are due.
+        turn_ns: Delay of each wake-up after the start of the period, in ns.
+        monitors: Timing of the link from each peer.
     """
 
     def __init__(
@@ -361,11 +416,14 @@ class SiteTiming:
         self._fault_notice_ns = [-FAULT_EVERY_NS] * len(peers)
 
     def deadline_ns(self, k: int) -> int:
-        """Returns the instant at which the site wakes up for tick `k`, on its clock, in ns."""
+        """Returns the time at which the site wakes up for tick `k`, on its clock, in ns."""
         return self.schedule.due_ns(k) + self.turn_ns
 
     def list_initial_notices(self) -> list[ClockNotice]:
-        """Returns the events about the peers' clocks before tick 0."""
+        """Lists the events that state the offsets of the peers' clocks at tick 0.
+
+        Peers on this machine have no offset and are left out.
+        """
         return [
             _describe_estimate(monitor, 0, self._epoch_ns)
             for monitor in self.monitors
@@ -377,14 +435,17 @@ class SiteTiming:
     ) -> list[ClockNotice]:
         """Starts the timing of a peer that joins, or rejoins, a running session.
 
+        The peer states when the epoch was on its own clock, with an error. The first estimate
+        of the offset follows from that, and has wide bounds.
+
         Args:
-            index: index of the peer.
-            t_ns: nominal time of the peer's first tick, since the epoch.
-            epoch_ns: instant of the epoch on the peer's clock, as the peer states it.
-            bound_ns: largest error of that instant; None if the peer shares this site's clock.
+            index: Index of the peer.
+            t_ns: Nominal time of the peer's first tick, in ns since the epoch.
+            epoch_ns: Time of the epoch on the peer's clock, as the peer states it, in ns.
+            bound_ns: Largest error of `epoch_ns`, in ns. None if the peer runs on this machine.
 
         Returns:
-            The events about the peer's clock.
+            An event that states the estimate. Empty if the peer runs on this machine.
         """
         monitor = self.monitors[index]
         clock = monitor.peer._replace(
@@ -410,14 +471,18 @@ class SiteTiming:
         return [_describe_estimate(monitor, k, due_ns)]
 
     def record_sent(self, tick: int, now_ns: int) -> int:
-        """Stores the sending time of a record, and returns it in ns since the epoch."""
+        """Stores when the sample of a tick was sent, and returns it in ns since the epoch."""
         self._sent.record(tick, now_ns)
         return now_ns - self._epoch_ns
 
     def pop_echo(self) -> list[tuple[int, int, int]]:
-        """Returns the newest sample of each peer since the last call, see `State.echo`.
+        """Returns the echoes for the next sample: the newest arrival from each peer.
 
-        Each entry is (index of the peer, tick, arrival in ns since the epoch).
+        Peers of which no sample has arrived since the last call are left out.
+
+        Returns:
+            For each peer its index, the tick of the sample, and the time of its arrival in ns
+            since the epoch.
         """
         echo = []
         for index, monitor in enumerate(self.monitors):
@@ -428,14 +493,15 @@ class SiteTiming:
         return echo
 
     def update_clocks(self, k: int, now_ns: int) -> list[ClockNotice]:
-        """Updates one offset estimate, and adjusts the schedule; called ten times a second.
+        """Updates one offset estimate, and adjusts the schedule to that of the leader.
 
         Args:
-            k: the next tick, from which on the schedule is adjusted.
-            now_ns: the present, on the site's clock.
+            k: Next tick. The adjusted schedule applies from this tick on.
+            now_ns: Present time on the site's clock, in ns.
 
         Returns:
-            The events about clocks and about peers that do not receive this site.
+            Events about new estimates, about clock faults, and about peers that do not receive
+            this site.
         """
         due_ns = self.schedule.due_ns(k)
         notices = self._update_next_estimate(k, now_ns, due_ns)
@@ -448,9 +514,10 @@ class SiteTiming:
         return notices
 
     def _update_next_estimate(self, k: int, now_ns: int, due_ns: int) -> list[ClockNotice]:
-        """Closes at most one window, since an estimate takes a considerable part of a tick.
+        """Estimates the offset of at most one peer per call, of each peer in turn.
 
-        The monitors have their turns one after another.
+        One estimate takes a considerable part of a period. Several of them would make the next
+        tick late.
         """
         for _ in self.monitors:
             self._next_estimated = (self._next_estimated + 1) % len(self.monitors)
@@ -460,7 +527,11 @@ class SiteTiming:
         return []
 
     def _find_faults(self, index: int, k: int, now_ns: int) -> list[ClockNotice]:
-        """Returns the events about one peer's clock faults and acknowledgements."""
+        """Returns the events about a peer's clock faults and about its acknowledgements.
+
+        Clock faults are reported at most once per `FAULT_EVERY_NS`. Missing acknowledgements
+        are reported when they begin and when they end.
+        """
         monitor = self.monitors[index]
         notices = []
         is_faulty = bool(monitor.worst_ns) or monitor.contradicted
@@ -469,14 +540,20 @@ class SiteTiming:
             notices.append(_describe_fault(monitor))
             monitor.worst_ns = 0
             monitor.contradicted = False
-        # None, for a silent peer, is equal to neither True nor False.
+        # The state is reported when it changes. `is_acknowledged` is None, which equals neither
+        # True nor False, while the state of the peer is not known.
         if monitor.is_unacknowledged is monitor.is_acknowledged(now_ns):
             monitor.is_unacknowledged = not monitor.is_unacknowledged
             notices.append(_describe_acknowledgement(monitor, k))
         return notices
 
     def pop_measurements(self, now_ns: int) -> dict[str, Any]:
-        """Returns the timing fields of `LinkStats` since the last call."""
+        """Returns the timing measurements of all links since the last call.
+
+        Returns:
+            The timing fields of `LinkStats`. The values of a link are in dictionaries by the
+            name of the peer.
+        """
         stats: dict[str, Any] = {
             "grid_error_us": self.schedule.error_ns // 1000,
             "slew_ppb": round(self.schedule.slew),
@@ -488,7 +565,13 @@ class SiteTiming:
 
 
 def _describe_estimate(monitor: LinkTimingMonitor, k: int, local_ns: int) -> ClockNotice:
-    """Returns the event that states the offset in use, from tick `k` at `local_ns` on."""
+    """Returns the event that states the offset and the drift of a peer's clock.
+
+    Args:
+        monitor: Timing of the link from the peer.
+        k: Tick from which on the offset is in use.
+        local_ns: Time of that tick on the local clock, in ns.
+    """
     offset = monitor.offset
     estimate = offset.estimate
     name = monitor.peer.name
@@ -510,7 +593,11 @@ def _describe_estimate(monitor: LinkTimingMonitor, k: int, local_ns: int) -> Clo
 
 
 def _describe_fault(monitor: LinkTimingMonitor) -> ClockNotice:
-    """Returns the event about impossible stamps, or about a window that contradicts others."""
+    """Returns the event that a peer's clock, or the local clock, has stepped.
+
+    The evidence is a sample that seems to have arrived before it was sent, or a window of time
+    stamps that contradicts earlier windows.
+    """
     name = monitor.peer.name
     early_ns = monitor.worst_ns
     bound_ns = monitor.offset.bound_ns
@@ -529,7 +616,12 @@ def _describe_fault(monitor: LinkTimingMonitor) -> ClockNotice:
 
 
 def _describe_acknowledgement(monitor: LinkTimingMonitor, k: int) -> ClockNotice:
-    """Returns the event that a peer has stopped, or resumed, to acknowledge samples."""
+    """Returns the event that a peer has stopped, or resumed, to acknowledge samples.
+
+    Args:
+        monitor: Timing of the link from the peer.
+        k: Present tick.
+    """
     name = monitor.peer.name
     if monitor.is_unacknowledged:
         timeout_ms = UNHEARD_NS // 1_000_000
@@ -539,15 +631,20 @@ def _describe_acknowledgement(monitor: LinkTimingMonitor, k: int) -> ClockNotice
 
 
 _LINK_COUNTS = ("accepted", "late", "duplicate", "refused", "lost", "superseded", "copies")
+"""Counts of a link that the kernel keeps, and that `LinkStats` contains for each peer."""
 
 
 class LoopStats:
-    """Counters of a site's loop, since the last statistics and since the start.
+    """Statistics of a site's control loop and its links, published ten times a second.
+
+    Args:
+        site: The site in the simulation kernel, which counts the samples of each link.
+        boot: Boot of this process.
 
     Attributes:
-        dropped: messages that were dropped, by reason, since the start.
-        overruns: ticks whose work began after the next tick was due, or that were skipped,
-            since the start.
+        dropped: Number of messages that were dropped since the start, by reason.
+        overruns: Number of ticks since the start that began after the next tick was due, or
+            that were skipped.
     """
 
     def __init__(self, site: Site, boot: int) -> None:
@@ -562,12 +659,12 @@ class LoopStats:
         self.overruns = 0
 
     def count_tick(self, late_us: int, busy_us: int, skipped: int = 0) -> None:
-        """Counts one tick.
+        """Updates the statistics with one tick.
 
         Args:
-            late_us: lateness of the tick.
-            busy_us: computing time of the previous tick.
-            skipped: number of ticks that were skipped before this one.
+            late_us: Time by which the tick began late, in us.
+            busy_us: Computing time of the previous tick, in us.
+            skipped: Number of ticks that were skipped before this tick.
         """
         self.overruns += skipped
         if late_us > self._late_max_us:
@@ -577,7 +674,14 @@ class LoopStats:
         self.overruns += late_us >= self._period_us
 
     def is_due(self, k: int, skipped: int = 0) -> bool:
-        """True if statistics are published after tick `k`, or were due at a skipped tick."""
+        """Returns True if statistics are published after tick `k`.
+
+        This is so in regular intervals, also if the tick of the interval itself was skipped.
+
+        Args:
+            k: The tick.
+            skipped: Number of ticks that were skipped before it.
+        """
         return k % self._ticks_per_stats <= skipped
 
     def pop_stats(
@@ -586,19 +690,22 @@ class LoopStats:
         """Returns the statistics after a tick, and resets the largest lateness and time.
 
         Args:
-            output: the record of the tick.
-            measured: timing fields of `LinkStats`, if they were measured.
+            output: Record of the tick.
+            measured: Timing fields of `LinkStats`. None leaves them at their defaults.
         """
         peers = self._site.peers
         counts = dict(zip(peers, self._site.counts(), strict=True))
-        age_us = {
-            peer: (output.t_ns - used * NS_PER_S // rate_hz) // 1000 if used >= 0 else -1
-            for peer, used, rate_hz in zip(peers, output.used, self._peer_rates_hz, strict=True)
-        }
-        counts_by_field: dict[str, Any] = {
-            field: {peer: getattr(count, field) for peer, count in counts.items()}
-            for field in _LINK_COUNTS
-        }
+        age_us = {}  # age of the peer's sample that the tick used, -1 if there was none
+        for peer, used, rate_hz in zip(peers, output.used, self._peer_rates_hz, strict=True):
+            age_us[peer] = -1
+            if used >= 0:
+                sample_ns = used * NS_PER_S // rate_hz
+                age_us[peer] = (output.t_ns - sample_ns) // 1000
+        counts_by_field: dict[str, Any] = {}
+        for field in _LINK_COUNTS:
+            counts_by_field[field] = {
+                peer: getattr(count, field) for peer, count in counts.items()
+            }
         stats = LinkStats(
             v=VERSION,
             site=self._site.name,
