@@ -199,7 +199,7 @@ def test_trial_that_somebody_stops_is_made_again(stage: Stage) -> None:
     """A user stops one, closes the page in another; a second page of the role only watches."""
     folder = stage.folder / "out"
     # nobody dwells so long that a trial succeeds before it is stopped
-    task = REACH.replace("dwell_s = 0.2", "dwell_s = 3.0")
+    task = REACH.replace("dwell_s = 0.2", "dwell_s = 8.0")
     running = begin(stage, write_protocol(stage.folder, 1, task=task), "--out", str(folder))
     with participants(running) as people:
         other = people[0].page.context.new_page()
