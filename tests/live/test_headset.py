@@ -103,7 +103,11 @@ def leads(page: Page, hands: Controllers) -> bool:
         if not page.evaluate(HELD):
             return False
     assert page.evaluate("trilat.parts.headset.dropped") == dropped + 2
-    return True
+    arrived_s = page.evaluate(
+        "trilat.frame.t"
+    )  # the target follows with a limited speed and acceleration
+    shows(page, f"trilat.frame.t > {arrived_s + 0.5}")
+    return bool(page.evaluate(HELD))
 
 
 @pytest.mark.long
