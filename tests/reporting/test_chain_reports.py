@@ -151,14 +151,14 @@ def test_columns_and_messages_name_joints_and_links():
 @pytest.mark.long
 def test_the_page_draws_chains_from_their_joints():
     log = six()
-    drawn = charts.Charts(log, None)
-    data = drawn.data().data.to_builtins()
+    builder = charts.ChartBuilder(log, None)
+    data = builder.build().data.to_builtins()
     assert [arm["points"] for arm in data["arms"]] == [7, 7, 7]
     table = data["tables"][data["arms"][0]["table"]]
     assert len(table["columns"]) == 3 * 7 * 2
     titles = [chart["title"] for chart in data["charts"] if chart["section"] == "estimates"]
     assert titles[29] == "forearm.Izz"
-    svg = arm_poses.render_arms_svg(log, drawn.bounds_m, drawn.factor)
+    svg = arm_poses.render_arms_svg(log, builder.bounds_m, builder.units_per_m)
     box = [float(x) for x in re.search(r'viewBox="([^"]*)"', svg).group(1).split()]
     assert max(box[2:]) == pytest.approx(charts.PICTURE_SIDE, abs=2e-3)
     assert svg.count('class="shadow"') == svg.count('class="desired"') > 4

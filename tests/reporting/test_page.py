@@ -154,7 +154,7 @@ def test_the_page_tells_what_the_links_did_and_what_happened():
         "uniform 60 ± 23.1 ms, duplicates 20 %, in order<br>from 3 s: uniform 30 ± 17.3 ms"
         in html
     )
-    assert "order, taken in at tick 500 of a" in html
+    assert "command, applied at tick 500 of a" in html
     assert '<td class="words">brake</td>' in html
     assert [change["n"] for change in data["changes"]] == [1, 2, 3]
     assert {span[1] for spans in data["spans"].values() for span in spans} == {

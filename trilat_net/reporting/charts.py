@@ -1,12 +1,14 @@
-"""Data of the page's interactive charts: tables of decimated columns, and charts that refer to
-them.
+"""Build the data of the interactive charts on a report's page.
+
+`ChartBuilder` decimates the signals of a log to tables of columns, and describes charts whose
+lines refer to these columns by index. The scripts of the page draw the charts; the types of the
+data are those of `page_data`.
 
 Invariant:
-- Every spike of the log is on the page.
-- Every line of a chart has a value to draw. A chart without any line is left out, and
-  `PageCharts.missing` names it.
-- Numbers are base64 of little-endian int32 and float32, a third of their length as text.
-- What the scripts of the page get has the types of `page_data`.
+    - Every spike of the log is on the page: decimation keeps the least and the largest value.
+    - Every line of a chart has a value to draw. A chart without any line is left out, and
+      `PageCharts.missing` names it.
+    - Numbers are base64 of little-endian int32 and float32, a third of their length as text.
 """
 
 import base64
@@ -50,21 +52,27 @@ from .page_data import (
     TimeChart,
 )
 
+Values = NDArray[Any]
+"""Numbers of any type."""
+
 BUCKET_BUDGET = 48_000
-"""Buckets of all columns together: what keeps a page near a megabyte, however many sites there
-are.
-"""
-_FRAMES = 400
-"""Instants at which the page knows where the joints of a chain are."""
+"""Buckets of all columns together, which keep a page near 1 MB for any number of sites."""
+_MIN_BUCKETS = 100
+_MAX_BUCKETS = 1200
+"""Smallest and largest number of buckets of a column."""
+_BOX_INSTANTS = 60
+"""Number of instants at which the box around the motion of the arms is measured."""
+_CHAIN_INSTANTS = 400
+"""Largest number of instants for which the page has the joint positions of a chain."""
 PICTURE_SIDE = 4.0
-"""Width of a picture of a chain, in the units in which the page's lines have their widths."""
+"""Longer side of a picture of a chain, in the unit of the line widths of the page."""
 
 
 class PageCharts(NamedTuple):
     """The charts of a page.
 
     Attributes:
-        data: what the scripts of the page draw.
+        data: the data that the scripts of the page draw.
         missing: by section, the titles of charts that are left out because the log has no value
             for them.
     """
@@ -73,90 +81,198 @@ class PageCharts(NamedTuple):
     missing: dict[str, list[str]]
 
 
-class Charts:
-    """The charts of a log; `twin` is the same experiment without operators, or None.
+class ChartBuilder:
+    """Builds the charts of a log.
+
+    Args:
+        log: the log.
+        twin: the log of the same run without operators, or None.
 
     Attributes:
         bounds_m: left, right, bottom and top of a box around the motion of all arms, m.
-        factor: units per m of pictures of the arms: 1 for planar arms, whatever their size.
+        units_per_m: scale of the pictures of the arms, in units of the picture per m; 1 for
+            planar arms of any size.
     """
 
     def __init__(self, log: Log, twin: Log | None) -> None:
         self._log = log
         self._twin = twin
-        times = np.linspace(0.0, recorded_end_s(log), 60)
-        poses = [arm_poses.find_pose(log, site, t) for site in log.sites for t in times]
-        self.bounds_m = left, right, bottom, top = arm_poses.compute_pose_box_m(poses)
-        planar = all(arm.chain is None for arm in log.scenario.arms.values())
-        self.factor = 1.0 if planar else PICTURE_SIDE / max(right - left, top - bottom)
         self._changes = list_changes(log)
         self._end_s = recorded_end_s(log)
         self._tables: list[ColumnTable] = []
-        self._known: list[list[bool]] = []  # per table and column, whether there is any value
-        self._titles = [
-            f"joint {title.removeprefix('joint ')}" for title in style.name_joints(log)
-        ]
-        counts = max(arm.counts for arm in log.scenario.arms.values())
-        self._small = counts.joints > 2
-        columns_per_site = 9 * counts.joints + counts.parameters + len(log.sites)
-        self._buckets = max(
-            100, min(1200, BUCKET_BUDGET // (columns_per_site * len(log.sites)))
-        )
+        self._has_values: list[list[bool]] = []  # by table and column
 
-    def data(self) -> PageCharts:
-        """Returns the data of the page, and which charts are left out."""
+        times_s = np.linspace(0.0, self._end_s, _BOX_INSTANTS)
+        poses = [arm_poses.find_pose(log, site, t_s) for site in log.sites for t_s in times_s]
+        self.bounds_m = arm_poses.compute_pose_box_m(poses)
+        self.units_per_m = 1.0
+        arms = log.scenario.arms.values()
+        if any(arm.chain is not None for arm in arms):
+            left, right, bottom, top = self.bounds_m
+            longer_side_m = max(right - left, top - bottom)
+            self.units_per_m = PICTURE_SIDE / longer_side_m
+
+        self._joint_titles = []
+        for title in style.name_joints(log):
+            self._joint_titles.append(f"joint {title.removeprefix('joint ')}")
+
+        counts = max(arm.counts for arm in arms)
+        # a bucket keeps the rows of the extremes of all columns of its table, so that a table
+        # of many columns is larger than a table per column
+        self._has_table_per_column = counts.joints > 2
+        columns_per_site = 9 * counts.joints + counts.parameters + len(log.sites)
+        buckets = BUCKET_BUDGET // (columns_per_site * len(log.sites))
+        self._buckets = max(_MIN_BUCKETS, min(_MAX_BUCKETS, buckets))
+
+    def build(self) -> PageCharts:
+        """Returns the data of the page, and the titles of the charts that are left out."""
         log = self._log
-        drawn: list[Chart] = []
+        charts: list[Chart] = []
         missing: dict[str, list[str]] = {}
-        for chart in [*self._motion(), *self._timing()]:
+        for chart in [*self._build_motion_charts(), *self._build_timing_charts()]:
             if chart.series:
-                drawn.append(chart)
+                charts.append(chart)
             else:
                 missing.setdefault(chart.section, []).append(chart.title)
+
+        arms = []
+        spans = {}
+        for index, site in enumerate(log.sites):
+            if len(log[site]):
+                arms.append(self._build_arm(index, site))
+            intervals = find_mode_intervals(log[site])
+            spans[site] = [ModeSpan(index, *interval) for interval in intervals]
+        changes = []
+        for number, applied in enumerate(self._changes, 1):
+            change = applied.change
+            changes.append(MarkedChange(number, change.at_s, applied.site, change.link))
+        light = list_site_colours(log.scenario)
+        dark = list_site_colours(log.scenario, DARK_SITE_COLOURS)
         data = PageData(
             end_s=self._end_s,
-            colours=Palettes(
-                list_site_colours(log.scenario),
-                list_site_colours(log.scenario, DARK_SITE_COLOURS),
-            ),
-            arms=[
-                self._arm(index, site) for index, site in enumerate(log.sites) if len(log[site])
-            ],
+            colours=Palettes(light, dark),
+            arms=arms,
             tables=self._tables,
-            charts=drawn,
-            changes=[
-                MarkedChange(n, applied.change.at_s, applied.site, applied.change.link)
-                for n, applied in enumerate(self._changes, 1)
-            ],
-            spans={
-                site: [
-                    ModeSpan(index, *interval) for interval in find_mode_intervals(log[site])
-                ]
-                for index, site in enumerate(log.sites)
-            },
-            bounds_m=[self.factor * bound for bound in self.bounds_m],
+            charts=charts,
+            changes=changes,
+            spans=spans,
+            bounds_m=[self.units_per_m * bound for bound in self.bounds_m],
         )
         return PageCharts(data, missing)
 
-    def _table(self, site: str, tick: Ints, t_s: Array, values: NDArray[Any]) -> int:
-        trace = decimate(tick, t_s, values, self._buckets)
-        return self._store(site, trace.tick, trace.values)
+    def _build_motion_charts(self) -> Iterator[TimeChart]:
+        """Yields the charts of torques, positions, errors, estimates and displacements."""
+        log = self._log
+        operated = site_signals.sites_with_operator(log)
+        if operated:
+            series = self._add_signal(site_signals.external_torques, operated)
+            title = "operator torque on the arm"
+            yield from self._chart_joints("torques", title, "N m", series)
+        yield from self._chart_positions()
 
-    def _store(self, site: str, tick: Ints, values: NDArray[Any]) -> int:
-        columns = [_packed(column, "<f4") for column in values.T]
+        errors = self._add_signal(site_signals.joint_errors)
+        axes = self._joint_titles
+        if site_signals.follows_in_task_space(log):
+            axes = style.name_shared(log)
+        yield from self._chart_joints(
+            section="errors",
+            title="tracking error",
+            unit=site_signals.shared_unit(log),
+            series_by_site=errors,
+            titles=axes,
+        )
+        yield from self._chart_estimates()
+
+        if self._twin is not None:
+            series = {}
+            for site in log.sites:
+                tick, t_s, moved = site_signals.operator_displacement(log, self._twin, site)
+                series[site] = self._add_columns(site, tick, t_s, moved)
+            yield from self._chart_joints("moved", "moved by the operators", "rad", series)
+
+        torques = self._add_signal(site_signals.controller_torques)
+        yield from self._chart_joints("control", "control torque", "N m", torques)
+
+    def _build_timing_charts(self) -> Iterator[Chart]:
+        """Yields the charts of ages, delays, lateness and computing time."""
+        log = self._log
+        yield from self._chart_ages()
+        if age_and_lateness.has_varying_delay(log):
+            yield from self._chart_distributions()
+        if not age_and_lateness.explain_missing_loop_times(log):
+            lateness = self._add_signal(_lateness_ms)
+            yield self._make_chart(
+                section="timing",
+                title="wake-up after the deadline",
+                unit="ms",
+                series=[columns[0] for columns in lateness.values()],
+                zero=True,
+            )
+            yield from self._chart_histograms()
+
+    def _add_table(self, site: str, tick: Ints, values: Values) -> int:
+        """Adds a table of values, shape (P, C), at ticks, shape (P,), and returns its index."""
+        columns = [_encode(column, "<f4") for column in values.T]
         rate_hz = self._log.scenario.sites[site].rate_hz
-        self._tables.append(ColumnTable(rate_hz, _packed(tick, "<i4"), columns))
-        self._known.append(np.isfinite(values).any(axis=0).tolist())
+        table = ColumnTable(rate_hz=rate_hz, tick=_encode(tick, "<i4"), columns=columns)
+        self._tables.append(table)
+        is_finite = np.isfinite(values)
+        self._has_values.append(is_finite.any(axis=0).tolist())
         return len(self._tables) - 1
 
-    def _site_table(self, site: str, values: NDArray[Any]) -> int:
-        return self._table(site, self._log[site].tick, self._log[site].t_s, values)
+    def _add_decimated(self, site: str, tick: Ints, t_s: Array, values: Values) -> int:
+        """Adds a table of decimated values, and returns its index.
 
-    def _series(self, site: str, table: int, column: int, label: str = "") -> TableSeries:
+        Args:
+            site: name of the site.
+            tick: ticks of the values, shape (K,).
+            t_s: times of the values, s, shape (K,).
+            values: the values, shape (K, C).
+        """
+        trace = decimate(tick, t_s, values, self._buckets)
+        return self._add_table(site, trace.tick, trace.values)
+
+    def _add_records(self, site: str, values: Values) -> int:
+        """Adds a table of decimated values over all records of a site; returns its index."""
+        records = self._log[site]
+        return self._add_decimated(site, records.tick, records.t_s, values)
+
+    def _add_signal(
+        self, signal: Callable[[SiteLog], Values], sites: Sequence[str] = ()
+    ) -> dict[str, list[TableSeries]]:
+        """Adds tables of a signal, and returns by site a line per column.
+
+        Args:
+            signal: function of a site's records that returns values, shape (K, C).
+            sites: the sites of the signal; by default all sites.
+        """
+        series = {}
+        for site in sites or self._log.sites:
+            records = self._log[site]
+            values = signal(records)
+            series[site] = self._add_columns(site, records.tick, records.t_s, values)
+        return series
+
+    def _add_columns(
+        self, site: str, tick: Ints, t_s: Array, values: Values
+    ) -> list[TableSeries]:
+        """Adds tables of values, shape (K, C), and returns a line per column."""
+        if self._has_table_per_column:
+            tables = [
+                self._add_decimated(site, tick, t_s, column[:, np.newaxis])
+                for column in values.T
+            ]
+            return [self._make_series(site, table, column=0) for table in tables]
+        table = self._add_decimated(site, tick, t_s, values)
+        columns = range(values.shape[1])
+        return [self._make_series(site, table, column) for column in columns]
+
+    def _make_series(self, site: str, table: int, column: int, label: str = "") -> TableSeries:
+        """Returns a line in the colour of a site; by default its label is the site's name."""
         colour = self._log.sites.index(site)
         return TableSeries(label=label or site, colour=colour, table=table, column=column)
 
-    def _chart(
+    def _make_chart(
         self,
         section: str,
         title: str,
@@ -165,248 +281,292 @@ class Charts:
         sites: Sequence[str] = (),
         **options: Any,
     ) -> TimeChart:
-        """Returns a chart over time of those series that have a value; `sites`: by default all."""
-        known = [line for line in series if self._known[line.table][line.column]]
-        marked = list(sites or self._log.sites)
+        """Returns a chart over time, without the lines that have no value to draw.
+
+        Args:
+            section: key of the section in `report.toml`.
+            title: title of the chart.
+            unit: unit of the values.
+            series: the lines.
+            sites: the sites whose events are marked; by default all sites.
+            **options: further fields of `TimeChart`.
+        """
+        drawable = [line for line in series if self._has_values[line.table][line.column]]
         return TimeChart(
-            section=section, title=title, unit=unit, series=known, sites=marked, **options
+            section=section,
+            title=title,
+            unit=unit,
+            series=drawable,
+            sites=list(sites or self._log.sites),
+            **options,
         )
 
-    def _motion(self) -> Iterator[TimeChart]:
-        log = self._log
-        operated = site_signals.sites_with_operator(log)
-        if operated:
-            tables = self._tables_of(site_signals.external_torques, operated)
-            yield from self._per_joint("torques", "operator torque on the arm", "N m", tables)
-        yield from self._positions()
-        tables = self._tables_of(site_signals.joint_errors)
-        unit = site_signals.shared_unit(log)
-        axes = (
-            style.name_shared(log) if site_signals.follows_in_task_space(log) else self._titles
-        )
-        yield from self._per_joint(
-            section="errors", title="tracking error", unit=unit, tables=tables, titles=axes
-        )
-        yield from self._estimates()
-        if self._twin is not None:
-            moved = {
-                s: site_signals.operator_displacement(log, self._twin, s) for s in log.sites
-            }
-            tables = {s: self._columns(s, *columns) for s, columns in moved.items()}
-            yield from self._per_joint("moved", "moved by the operators", "rad", tables)
-        tables = self._tables_of(site_signals.controller_torques)
-        yield from self._per_joint("control", "control torque", "N m", tables)
-
-    def _tables_of(
-        self, signal: Callable[[SiteLog], NDArray[Any]], sites: list[str] | None = None
-    ) -> dict[str, list[TableSeries]]:
-        parts = {site: self._log[site] for site in sites or self._log.sites}
-        return {
-            s: self._columns(s, part.tick, part.t_s, signal(part)) for s, part in parts.items()
-        }
-
-    def _columns(
-        self, site: str, tick: Ints, t_s: Array, values: NDArray[Any]
-    ) -> list[TableSeries]:
-        count = values.shape[1]
-        if not self._small:
-            table = self._table(site, tick, t_s, values)
-            return [self._series(site, table, column) for column in range(count)]
-        return [
-            self._series(site, self._table(site, tick, t_s, one[:, np.newaxis]), 0)
-            for one in values.T
-        ]
-
-    def _per_joint(
+    def _chart_joints(
         self,
         section: str,
         title: str,
         unit: str,
-        tables: dict[str, list[TableSeries]],
+        series_by_site: dict[str, list[TableSeries]],
         titles: Sequence[str] = (),
     ) -> Iterator[TimeChart]:
-        for joint, name in enumerate(titles or self._titles):
-            series = [columns[joint] for columns in tables.values() if joint < len(columns)]
-            yield self._chart(section, f"{title}, {name}", unit, series)
+        """Yields a chart per joint, with a line per site.
 
-    def _positions(self) -> Iterator[TimeChart]:
+        Args:
+            section: key of the section in `report.toml`.
+            title: name of the quantity.
+            unit: unit of the quantity.
+            series_by_site: for each site a line per joint.
+            titles: names of the joints, or of the axes of the task; by default the joints.
+        """
+        for joint, name in enumerate(titles or self._joint_titles):
+            series = [lines[joint] for lines in series_by_site.values() if joint < len(lines)]
+            yield self._make_chart(section, f"{title}, {name}", unit, series)
+
+    def _chart_positions(self) -> Iterator[TimeChart]:
+        """Yields a chart per site and joint, with the actual and the desired angle."""
         for site in self._log.sites:
-            part = self._log[site]
-            both = np.stack(
-                [site_signals.joint_angles(part), site_signals.reference_angles(part)], axis=2
-            )
-            for joint, name in enumerate(self._titles[: both.shape[1]]):
-                table = self._site_table(site, both[:, joint])
-                desired = TableSeries(
+            records = self._log[site]
+            actual = site_signals.joint_angles(records)
+            desired = site_signals.reference_angles(records)
+            for joint, name in enumerate(self._joint_titles[: actual.shape[1]]):
+                angles = np.stack([actual[:, joint], desired[:, joint]], axis=1)
+                table = self._add_records(site, angles)
+                actual_line = self._make_series(site, table, column=0)
+                desired_line = TableSeries(
                     label="desired", colour="limit", table=table, column=1, dash=True
                 )
-                series = [self._series(site, table, 0), desired]
-                yield self._chart("positions", f"{site}, {name}", "rad", series, sites=[site])
+                yield self._make_chart(
+                    section="positions",
+                    title=f"{site}, {name}",
+                    unit="rad",
+                    series=[actual_line, desired_line],
+                    sites=[site],
+                )
 
-    def _estimates(self) -> Iterator[TimeChart]:
+    def _chart_estimates(self) -> Iterator[TimeChart]:
+        """Yields a chart per inertial parameter, with dashed lines at the true values."""
         log = self._log
-        tables = self._tables_of(site_signals.parameter_estimates)
-        arm = max(log.scenario.arms.values(), key=lambda each: each.counts)
-        for index, (name, unit) in enumerate(arm.parameters):
-            series = [columns[index] for columns in tables.values() if index < len(columns)]
-            every = [log.scenario.arms[site].theta for site in log.sites]
-            truths = [float(theta[index]) for theta in every if index < len(theta)]
-            lines = [StatedLine(truth, n, 0.0, self._end_s) for n, truth in enumerate(truths)]
-            if len(set(truths)) == 1:
-                lines = [StatedLine(truths[0], "limit", 0.0, self._end_s)]
-            title = name if arm.chain else f"estimate of θ{'₁₂₃₄₅'[index]}"
-            yield self._chart("estimates", title, style.typeset_unit(unit), series, lines=lines)
+        estimates = self._add_signal(site_signals.parameter_estimates)
+        arms = log.scenario.arms
+        largest_arm = max(arms.values(), key=lambda arm: arm.counts)
+        thetas = [arms[site].theta for site in log.sites]
+        for index, (name, unit) in enumerate(largest_arm.parameters):
+            series = [lines[index] for lines in estimates.values() if index < len(lines)]
+            truths = [float(theta[index]) for theta in thetas if index < len(theta)]
+            title = name if largest_arm.chain else f"estimate of θ{'₁₂₃₄₅'[index]}"
+            yield self._make_chart(
+                section="estimates",
+                title=title,
+                unit=style.typeset_unit(unit),
+                series=series,
+                lines=self._draw_truths(truths),
+            )
 
-    def _timing(self) -> Iterator[Chart]:
-        log = self._log
-        yield from self._ages()
-        if age_and_lateness.has_varying_delay(log):
-            yield from self._distributions()
-        if not age_and_lateness.explain_missing_loop_times(log):
-            tables = self._tables_of(lambda part: part.late_us[:, np.newaxis] * 1e-3)
-            series = [columns[0] for columns in tables.values()]
-            yield self._chart("timing", "wake-up after the deadline", "ms", series, zero=True)
-            yield from self._histograms()
+    def _draw_truths(self, truths: Sequence[float]) -> list[StatedLine]:
+        """Returns a line at each true value of a parameter; a single line for equal values."""
+        if len(set(truths)) == 1:
+            return [self._draw_limit(truths[0])]
+        lines = []
+        for colour, truth in enumerate(truths):
+            lines.append(StatedLine(value=truth, colour=colour, from_s=0.0, to_s=self._end_s))
+        return lines
 
-    def _ages(self) -> Iterator[TimeChart]:
+    def _draw_limit(self, value: float) -> StatedLine:
+        """Returns a line at a value over the whole run, in the colour of no site."""
+        return StatedLine(value=value, colour="limit", from_s=0.0, to_s=self._end_s)
+
+    def _chart_ages(self) -> Iterator[TimeChart]:
+        """Yields a chart per site of the ages of its samples, with the stated delays."""
         log = self._log
         for site in log.sites:
-            age_ms = site_signals.sample_ages_ms(log, site)
-            peers = log[site].peers
-            table = self._site_table(site, age_ms)
+            ages_ms = site_signals.sample_ages_ms(log, site)
+            table = self._add_records(site, ages_ms)
             series = [
-                self._series(peer, table, n, f"{peer} → {site}") for n, peer in enumerate(peers)
+                self._make_series(peer, table, column, label=f"{peer} → {site}")
+                for column, peer in enumerate(log[site].peers)
             ]
-            lines = self._stated(site)
-            drawn = np.concatenate([age_ms.ravel(), [line.value for line in lines]])
-            yield self._chart(
-                "ages",
-                f"age of the samples that {site} uses",
-                "ms",
-                series,
+            lines = self._list_stated_delays(site)
+            stated_ms = [line.value for line in lines]
+            shown_ms = np.concatenate([ages_ms.ravel(), stated_ms])
+            yield self._make_chart(
+                section="ages",
+                title=f"age of the samples that {site} uses",
+                unit="ms",
+                series=series,
                 sites=[site],
                 lines=lines,
                 links=True,
-                log=age_and_lateness.needs_log_axis(drawn),
+                log=age_and_lateness.needs_log_axis(shown_ms),
                 margin=0.025,
             )
 
-    def _stated(self, site: str) -> list[StatedLine]:
+    def _list_stated_delays(self, site: str) -> list[StatedLine]:
+        """Returns the stated mean delays to a site, ms: a line per peer and link model.
+
+        A single line stands for all of them if the delays are equal.
+        """
         log = self._log
         lines: list[StatedLine] = []
         for peer in log[site].peers:
+            colour = log.sites.index(peer)
             states = list_stated_models(log, f"{peer}->{site}", self._changes)
             t_s, mean_ms = age_and_lateness.trace_stated_delay(log, states)
-            for start, end, value in zip(t_s[::3], t_s[1::3], mean_ms[::3], strict=True):
-                if np.isfinite(value):
-                    colour = log.sites.index(peer)
-                    lines.append(StatedLine(float(value), colour, float(start), float(end)))
-        if len({line.value for line in lines}) == 1:
-            return [StatedLine(lines[0].value, "limit", 0.0, self._end_s)]
+            # each model has three points: its start, its end, and a gap
+            models = zip(t_s[::3], t_s[1::3], mean_ms[::3], strict=True)
+            for start_s, end_s, delay_ms in models:
+                if np.isfinite(delay_ms):
+                    line = StatedLine(
+                        value=float(delay_ms),
+                        colour=colour,
+                        from_s=float(start_s),
+                        to_s=float(end_s),
+                    )
+                    lines.append(line)
+        delays_ms = {line.value for line in lines}
+        if len(delays_ms) == 1:
+            return [self._draw_limit(lines[0].value)]
         return lines
 
-    def _distributions(self) -> Iterator[DistributionChart]:
+    def _chart_distributions(self) -> Iterator[DistributionChart]:
+        """Yields a chart per receiver with the distributions of ages and delays."""
         measured = age_and_lateness.measure_delay_distributions(self._log)
         x_ms = age_and_lateness.choose_delay_axis_ms(measured)
         for site in self._log.sites:
             series = []
-            for link in (link for link in measured if link.site == site):
+            for link in measured:
+                if link.site != site:
+                    continue
                 colour = self._log.sites.index(link.peer)
-                for name, values, dash in (
-                    ("age", link.age_ms, False),
-                    ("delay", link.delay_ms, True),
-                ):
-                    percent = age_and_lateness.compute_cumulative_percent(values, x_ms)
-                    if np.isfinite(percent).any():
-                        label = f"{name}, {link.peer}"
-                        series.append(
-                            DistributionSeries(label, colour, dash, _packed(percent, "<f4"))
-                        )
+                curves = (("age", link.age_ms, False), ("delay", link.delay_ms, True))
+                for quantity, values_ms, dash in curves:
+                    percent = age_and_lateness.compute_cumulative_percent(values_ms, x_ms)
+                    if not np.isfinite(percent).any():
+                        continue
+                    curve = DistributionSeries(
+                        label=f"{quantity}, {link.peer}",
+                        colour=colour,
+                        dash=dash,
+                        values=_encode(percent, "<f4"),
+                    )
+                    series.append(curve)
             yield DistributionChart(
                 section="delays",
                 title=f"delay and age on the way to {site}",
                 unit="ms",
                 series=series,
-                x=_packed(x_ms, "<f4"),
+                x=_encode(x_ms, "<f4"),
                 log=bool(x_ms[0] > 0.0),
             )
 
-    def _histograms(self) -> Iterator[HistogramChart]:
+    def _chart_histograms(self) -> Iterator[HistogramChart]:
+        """Yields the histograms of the loops' lateness and computing time."""
         log = self._log
-        edges = age_and_lateness.choose_bin_edges_us(log)
-        periods = sorted({1e6 / log.scenario.sites[site].rate_hz for site in log.sites})
+        edges_us = age_and_lateness.choose_bin_edges_us(log)
+        rates_hz = {log.scenario.sites[site].rate_hz for site in log.sites}
+        periods_us = sorted(1e6 / rate_hz for rate_hz in rates_hz)
         titles = {
             "late_us": "wake-up after the deadline",
             "busy_us": "computing time of a tick",
         }
         for field, title in titles.items():
-            series = [
-                HistogramSeries(
-                    site,
-                    colour,
-                    age_and_lateness.bin_loop_times(getattr(log[site], field), edges).tolist(),
-                )
-                for colour, site in enumerate(log.sites)
-                if len(log[site])
-            ]
+            series = []
+            for colour, site in enumerate(log.sites):
+                if len(log[site]):
+                    times_us = getattr(log[site], field)
+                    counts = age_and_lateness.bin_loop_times(times_us, edges_us)
+                    series.append(HistogramSeries(site, colour, counts.tolist()))
             yield HistogramChart(
                 section="timing",
                 title=f"{title}, histogram",
                 unit="µs",
                 series=series,
-                edges=edges.tolist(),
-                periods=periods,
+                edges=edges_us.tolist(),
+                periods=periods_us,
             )
 
-    def _arm(self, index: int, site: str) -> PlanarArm | ChainArm:
-        part = self._log[site]
+    def _build_arm(self, index: int, site: str) -> PlanarArm | ChainArm:
+        """Adds the motion of a site's arm and of its bodies, and returns the arm.
+
+        Args:
+            index: index of the site.
+            site: name of the site, which has at least one record.
+        """
         arm = self._log.scenario.arms[site]
         if arm.chain is not None:
-            return self._projected(index, site)
-        values = np.hstack(
-            [site_signals.joint_angles(part), site_signals.reference_angles(part)]
-        )
-        edges = self._edges(site, np.arange(len(part)))
-        table = self._site_table(site, np.hstack([values, *edges]))
+            return self._build_chain(index, site)
+        records = self._log[site]
+        actual = site_signals.joint_angles(records)
+        desired = site_signals.reference_angles(records)
+        bodies = self._trace_bodies(site, np.arange(len(records)))
+        table = self._add_records(site, np.hstack([actual, desired, *bodies]))
         return PlanarArm(
-            site=site, colour=index, table=table, bodies=len(edges), links_m=list(arm.lengths_m)
+            site=site,
+            colour=index,
+            table=table,
+            bodies=len(bodies),
+            links_m=list(arm.lengths_m),
         )
 
-    def _edges(self, site: str, rows: NDArray[np.int64]) -> list[NDArray[np.float64]]:
-        """Returns the edges of the bodies of a site's plant in some records, shape (K, 2 P)
-        each.
+    def _build_chain(self, index: int, site: str) -> ChainArm:
+        """Adds the motion of a chain as points of its picture, and returns the chain.
+
+        The page cannot compute forward kinematics of chains. It gets the joint positions of the
+        actual arm, of the reference and of the shadow at `_CHAIN_INSTANTS` records.
+        """
+        records = self._log[site]
+        arm = self._log.scenario.arms[site]
+        last = len(records) - 1
+        instants = np.linspace(0, last, _CHAIN_INSTANTS).astype(np.int64)
+        rows = np.unique(instants)
+
+        desired_q = site_signals.reference_angles(records)
+        actual_m = joint_positions_m(arm, records.q[rows])
+        desired_m = joint_positions_m(arm, desired_q[rows])
+        pictures = (
+            arm_poses.project_arm_m(arm, actual_m),
+            arm_poses.project_arm_m(arm, desired_m),
+            arm_poses.project_arm_m(arm, actual_m, onto_floor=True),
+        )
+        # the first point is the base, which does not move
+        moving_points_m = [picture[:, 1:] for picture in pictures]
+        points = np.stack(moving_points_m, axis=1) * self.units_per_m
+        bodies = self._trace_bodies(site, rows)
+        values = np.hstack([points.reshape(len(rows), -1), *bodies])
+        table = self._add_table(site, records.tick[rows], values)
+        return ChainArm(
+            site=site,
+            colour=index,
+            table=table,
+            bodies=len(bodies),
+            points=points.shape[2],
+        )
+
+    def _trace_bodies(self, site: str, rows: NDArray[np.int64]) -> list[NDArray[np.float64]]:
+        """Returns the edges of each body of a site's plant in the picture.
+
+        Args:
+            site: name of the site.
+            rows: indices of K records.
+
+        Returns:
+            Per body the coordinates of its P corners along all edges, shape (K, 2 P), in units
+            of the picture.
         """
         sizes_m = self._log.scenario.bodies_m(site).values()
-        arm = self._log.scenario.arms[site]
         if not sizes_m:
             return []
-        traced = arm_poses.trace_bodies_m(arm, sizes_m, self._log[site].bodies[rows])
-        return [self.factor * path.reshape(len(rows), -1) for path in traced]
-
-    def _projected(self, index: int, site: str) -> ChainArm:
-        part = self._log[site]
         arm = self._log.scenario.arms[site]
-        rows = np.unique(np.linspace(0, max(len(part) - 1, 0), _FRAMES).astype(np.int64))[
-            : len(part)
-        ]
-        actual, desired = (
-            joint_positions_m(arm, q[rows])
-            for q in (part.q, site_signals.reference_angles(part))
-        )
-        pictures = (
-            arm_poses.project_arm_m(arm, actual),
-            arm_poses.project_arm_m(arm, desired),
-            arm_poses.project_arm_m(arm, actual, onto_floor=True),
-        )
-        points = np.stack([picture[:, 1:] for picture in pictures], axis=1) * self.factor
-        edges = self._edges(site, rows)
-        table = self._store(
-            site, part.tick[rows], np.hstack([points.reshape(len(rows), -1), *edges])
-        )
-        return ChainArm(
-            site=site, colour=index, table=table, bodies=len(edges), points=points.shape[2]
-        )
+        poses = self._log[site].bodies[rows]
+        paths_m = arm_poses.trace_bodies_m(arm, sizes_m, poses)
+        return [self.units_per_m * path.reshape(len(rows), -1) for path in paths_m]
 
 
-def _packed(column: NDArray[Any], kind: str) -> str:
-    return base64.b64encode(np.ascontiguousarray(column.astype(kind)).tobytes()).decode()
+def _lateness_ms(records: SiteLog) -> Values:
+    """Returns the lateness of each tick, ms, shape (K, 1)."""
+    return records.late_us[:, np.newaxis] * 1e-3
+
+
+def _encode(column: Values, kind: str) -> str:
+    """Returns numbers as base64 of a NumPy type, such as "<f4"."""
+    numbers = np.ascontiguousarray(column.astype(kind))
+    return base64.b64encode(numbers.tobytes()).decode()

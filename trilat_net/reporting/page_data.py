@@ -1,15 +1,16 @@
-"""The data of a report's page, as its scripts `report.js` and `arms.js` read them.
+"""Types of the data that the scripts of a report's page, `report.js` and `arms.js`, read.
+
+The page holds one `PageData` as JSON. Long columns of numbers are encoded as base64. The tests
+of pages in browsers (`tests/page/whole_pages.py`) report every field that a script reads and
+that was not sent.
 
 Invariant:
-- These types are the contract between the program and the scripts. A script reads no field that
-  is not declared here.
-- Every field is sent, whether or not it has its default value. A script never has to guess what
-  an absent field means.
-- The field `kind` names the kind of a chart or an arm. A script never infers the kind from
-  other fields.
-
-The tests of pages in browsers (`tests/page/whole_pages.py`) report every field that a script
-reads and that was not sent.
+    - These types are the contract between the program and the scripts. A script reads no field
+      that is not declared here.
+    - Every field is sent, whether or not it has its default value. A script never has to guess
+      the meaning of an absent field.
+    - The field `kind` names the kind of a chart or an arm. A script never infers the kind from
+      other fields.
 """
 
 from typing import Any, Literal
@@ -17,18 +18,19 @@ from typing import Any, Literal
 import msgspec
 
 Colour = int | Literal["limit"]
-"""Index of a site in the palette of the page, or "limit" for references, true values and
-limits.
+"""Index of a site in the palette of the page, or "limit".
+
+The lines of references, true values and limits have the colour "limit".
 """
 
 
 class ColumnTable(msgspec.Struct, frozen=True):
-    """Columns of numbers over the ticks of one site.
+    """Columns of numbers over the ticks of a site.
 
     Attributes:
         rate_hz: rate of the ticks.
-        tick: base64 of the ticks, little-endian int32.
-        columns: base64 of each column, little-endian float32; NaN where there is no value.
+        tick: the ticks, as base64 of little-endian int32.
+        columns: the columns, each as base64 of little-endian float32; NaN for a missing value.
     """
 
     rate_hz: int
@@ -37,7 +39,15 @@ class ColumnTable(msgspec.Struct, frozen=True):
 
 
 class TableSeries(msgspec.Struct, frozen=True, kw_only=True):
-    """A line of a chart over time: a column of a table, both by their index."""
+    """A line of a chart over time, which draws a column of a table.
+
+    Attributes:
+        label: name of the line.
+        colour: colour of the line.
+        table: index of the table in `PageData.tables`.
+        column: index of the column in the table.
+        dash: true for a dashed line.
+    """
 
     label: str
     colour: Colour
@@ -47,7 +57,13 @@ class TableSeries(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class HistogramSeries(msgspec.Struct, frozen=True):
-    """A line of a histogram: how many ticks lie in each bin."""
+    """A line of a histogram.
+
+    Attributes:
+        label: name of the line.
+        colour: colour of the line.
+        counts: the number of ticks in each bin.
+    """
 
     label: str
     colour: Colour
@@ -55,8 +71,13 @@ class HistogramSeries(msgspec.Struct, frozen=True):
 
 
 class DistributionSeries(msgspec.Struct, frozen=True):
-    """A line of a distribution: base64 of the percentages at the chart's `x`, little-endian
-    float32.
+    """A line of a cumulative distribution.
+
+    Attributes:
+        label: name of the line.
+        colour: colour of the line.
+        dash: true for a dashed line.
+        values: the percentages at the chart's `x`, as base64 of little-endian float32.
     """
 
     label: str
@@ -66,7 +87,14 @@ class DistributionSeries(msgspec.Struct, frozen=True):
 
 
 class StatedLine(msgspec.Struct, frozen=True, rename={"from_s": "from", "to_s": "to"}):
-    """A horizontal dashed line at a value that is stated, between two times, s."""
+    """A horizontal dashed line at a stated value, such as a mean delay.
+
+    Attributes:
+        value: the value, in the unit of the chart.
+        colour: colour of the line.
+        from_s: start of the line, s; "from" in JSON.
+        to_s: end of the line, s; "to" in JSON.
+    """
 
     value: float
     colour: Colour
@@ -79,9 +107,12 @@ class TimeChart(msgspec.Struct, frozen=True, kw_only=True, tag="time", tag_field
 
     Attributes:
         section: key of the section in `report.toml`.
+        title: title of the chart.
+        unit: unit of the values.
+        series: the lines of the chart.
         sites: sites whose modes and changes are marked in the chart.
-        links: true if changes of links are marked as well, and if stated lines lie above the
-            series.
+        lines: horizontal lines at stated values.
+        links: true if changes of links are also marked, and stated lines lie above the series.
         log: true for a logarithmic axis of values.
         zero: true if the axis of values begins at 0.
         margin: least space above the values, as a share of the largest value.
@@ -105,7 +136,11 @@ class HistogramChart(
     """Counts of ticks over bins of equal width on a logarithmic axis.
 
     Attributes:
-        edges: edges of the bins, one more than there are counts.
+        section: key of the section in `report.toml`.
+        title: title of the chart.
+        unit: unit of the edges.
+        series: the lines of the chart.
+        edges: edges of the B bins, B + 1 numbers.
         periods: periods of the sites' loops, in the unit of the edges.
     """
 
@@ -120,11 +155,15 @@ class HistogramChart(
 class DistributionChart(
     msgspec.Struct, frozen=True, kw_only=True, tag="distribution", tag_field="kind"
 ):
-    """Cumulative percentages.
+    """Cumulative distributions of samples or ticks, in percent.
 
     Attributes:
-        x: base64 of the values on the axis, little-endian float32.
-        log: true for a logarithmic axis of values.
+        section: key of the section in `report.toml`.
+        title: title of the chart.
+        unit: unit of `x`.
+        series: the lines of the chart.
+        x: the values on the horizontal axis, as base64 of little-endian float32.
+        log: true if the horizontal axis is logarithmic.
     """
 
     section: str
@@ -142,8 +181,10 @@ class PlanarArm(msgspec.Struct, frozen=True, kw_only=True, tag="planar", tag_fie
     """An arm of two links in the picture of the arms.
 
     Attributes:
-        table: table of the actual and the desired angles of both joints, rad, and of the edges
-            of the bodies.
+        site: name of the site.
+        colour: index of the site.
+        table: index of the table with the actual and the desired angles of both joints, rad,
+            and with the edges of the bodies.
         bodies: number of bodies of the site's plant.
         links_m: lengths of the links, m.
     """
@@ -159,10 +200,12 @@ class ChainArm(msgspec.Struct, frozen=True, kw_only=True, tag="chain", tag_field
     """A chain in the picture of the arms.
 
     Attributes:
-        table: table of the coordinates of the actual, the desired and the shadow's points in
-            the picture, and of the edges of the bodies.
+        site: name of the site.
+        colour: index of the site.
+        table: index of the table with the coordinates, in the picture, of the points of the
+            actual arm, of the reference and of the shadow, and of the edges of the bodies.
         bodies: number of bodies of the site's plant.
-        points: number of joints, with the end effector and without the base.
+        points: number of points: the joints without the base, and the end effector.
     """
 
     site: str
@@ -177,9 +220,9 @@ class MarkedChange(msgspec.Struct, frozen=True):
 
     Attributes:
         n: number in the table of changes.
-        t: time from which the change holds, s.
-        site: site that takes the change in.
-        link: link that is changed; "" for a change of another kind.
+        t: time from which the change applies, s.
+        site: site that applies the change.
+        link: the changed link; "" for a change of another kind.
     """
 
     n: int
@@ -189,12 +232,13 @@ class MarkedChange(msgspec.Struct, frozen=True):
 
 
 class ModeSpan(msgspec.Struct, frozen=True, array_like=True):
-    """A time in which a site does not follow its peers; sent as a list.
+    """An interval in which a site does not follow its peers; sent as a list.
 
     Attributes:
         colour: index of the site.
         mode: mode of the site.
-        from_s, to_s: beginning and end, s.
+        from_s: start of the interval, s.
+        to_s: end of the interval, s.
     """
 
     colour: int
@@ -204,19 +248,28 @@ class ModeSpan(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Palettes(msgspec.Struct, frozen=True):
-    """Colours of the sites, as CSS has them, for the light and for the dark scheme."""
+    """Colours of the sites in the notation of CSS.
+
+    Attributes:
+        light: colours for light screens.
+        dark: colours for dark screens.
+    """
 
     light: list[str]
     dark: list[str]
 
 
 class PageData(msgspec.Struct, frozen=True, kw_only=True):
-    """All that the scripts of a report read.
+    """The whole data of a page.
 
     Attributes:
         end_s: end of the time axis, s.
-        spans: per site, the times in which the site does not follow its peers.
-        arms: arms of the sites that have a record.
+        colours: colours of the sites.
+        tables: tables of numbers, to which charts and arms refer by index.
+        charts: the charts, in the order of the page.
+        changes: the changes during the run.
+        spans: by site, the intervals in which the site does not follow its peers.
+        arms: the arms of the sites that have records.
         bounds_m: left, right, bottom and top of the pictures of the arms, in the units of these
             pictures.
     """
@@ -231,6 +284,6 @@ class PageData(msgspec.Struct, frozen=True, kw_only=True):
     bounds_m: list[float]
 
     def to_builtins(self) -> dict[str, Any]:
-        """Returns the data as dictionaries, lists and plain values, ready for JSON."""
+        """Returns the data as dictionaries, lists and plain values for JSON."""
         plain: dict[str, Any] = msgspec.to_builtins(self)
         return plain
