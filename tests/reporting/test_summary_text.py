@@ -45,7 +45,7 @@ def test_what_happened_is_told_once():
     lines = format_run_lines(logs.busy().log)
     link = "the link c->a was set to uniform 30 +- 17.3 ms, from 3 s on"
     shares = "the shares of c were set to a 0.9, b 0.1 within 1 s, from 4 s on"
-    assert f"change: {link} (taken in at tick 500)" in lines
+    assert f"change: {link} (applied at tick 500)" in lines
     assert f"change: {shares} (by the scenario)" in lines
     assert "b: braked 2.200-3.053 s, returned 3.053-3.553 s" in lines
     (link,) = (line for line in lines if line.startswith("link b->a"))

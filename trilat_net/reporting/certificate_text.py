@@ -32,7 +32,7 @@ _SOURCE_NAMES = {
 }
 """Texts of the sources of energy other than links, by their names in a balance."""
 
-_HOLDS = {True: "holds", False: "fails", None: "not told"}
+_HOLDS = {True: "holds", False: "fails", None: "undecided"}
 
 
 def compose_certificate(certificate: Certificate) -> Iterator[Block]:

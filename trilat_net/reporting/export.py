@@ -1,8 +1,12 @@
-"""Export of a log for other tools, in one of the formats of the folder `exports`.
+"""Export a log for other tools, in one of the formats of the folder `exports`.
 
-Invariant: a number read back is the same, bit for bit. An export describes itself: unit,
-meaning and source of every column, and its session. What can be refused is refused before
-anything is read or written.
+Each format is a module of that folder with a constant `FORMAT`. `Exporter` finds the format,
+checks its settings and its path, and writes the export.
+
+Invariant:
+    - Numbers that are read back from an export equal those of the log, bit for bit.
+    - An export describes itself: its session, and the unit, meaning and source of every column.
+    - An export is refused, if at all, before a log is read and before anything is written.
 """
 
 import inspect
@@ -21,26 +25,28 @@ from ..log.data_tables import Column, Table
 from ..log.log_layout import SCENARIO, collect_provenance
 from ..log.log_reader import Log
 from ..log.mcap_reader import Progress
+from ..results import JsonObject
 from . import exports
 
 EXPORT_MANIFEST = "about.json"
-"""File of an exported folder; it distinguishes such a folder from any other."""
+"""Name of the file that describes an exported folder and marks the folder as an export."""
 Written = Callable[[int], None]
-"""Called with the number of records just written."""
+"""Function that is called with the number of records written since its last call."""
 
 
 class ExportFormat(NamedTuple):
-    """A format of exports, `FORMAT` of a file in the folder `exports`.
+    """A format of exports, the constant `FORMAT` of a module in the folder `exports`.
 
     Attributes:
-        write: writes a log to a file, or into a folder, tells how many records it has written
-            since, and returns what else is to be said, or None; its keyword-only parameters are
-            settings.
-        ending: of the default path, after the name of the log.
-        folder: whether it writes a folder.
-        extra: the module that it imports, the optional dependency that has it, and what needs
-            it; or ().
-        many: whether it takes any number of logs, which `write` then gets as a list.
+        write: function that writes a log. Its arguments are the log (with `many` a list of
+            logs), the file or folder to write, and a function of type `Written` to report
+            progress. Its keyword-only parameters are the settings of the format. The function
+            returns a summary for the user, or None.
+        ending: end of the default path, which begins with the name of the log.
+        folder: True if the format writes a folder.
+        extra: the arguments of `import_extra` if the format needs an optional package: the
+            module, the extra that installs it, and the features that need it; or ().
+        many: True if the format accepts several logs.
     """
 
     write: Callable[..., str | None]
@@ -51,14 +57,21 @@ class ExportFormat(NamedTuple):
 
 
 class Exporter:
-    """An export to a file, or to a folder, which is refused before a log is read.
+    """An export of logs to a file or a folder.
+
+    Args:
+        form: name of the format.
+        path: the file or folder; None for a path next to the log, named after it.
+        force: True to replace an earlier export.
+        log: path of the log, or of its first part.
+        settings: settings of the format by name, as a mapping or as pairs.
 
     Attributes:
         path: the file or folder.
 
     Raises:
-        UsageError: no such format or setting, the place is taken and `force` is false, a
-            package is missing.
+        UsageError: there is no such format or setting, the path exists and `force` is False,
+            or a package is missing.
     """
 
     def __init__(
@@ -70,14 +83,12 @@ class Exporter:
         log: Path = Path(),
         settings: Any = (),
     ) -> None:
-        """Without a path it is next to the log, or its first part, and named after it;
-        `settings` by name.
-        """
         names = exports.list_export_formats()
         if form not in names:
             raise UsageError(f"--to is one of {', '.join(names)}, not {form!r}")
-        self._format: ExportFormat = import_module(f"{exports.__name__}.{form}").FORMAT
-        self._settings = _read_settings(form, self._format.write, dict(settings))
+        module = import_module(f"{exports.__name__}.{form}")
+        self._format: ExportFormat = module.FORMAT
+        self._settings = _parse_settings(form, self._format.write, dict(settings))
         name = log.name.removesuffix(".active").removesuffix(".mcap")
         self.path = path or log.parent / (name + self._format.ending)
         self._force = force
@@ -87,43 +98,62 @@ class Exporter:
             import_extra(*self._format.extra)
 
     def export(self, *logs: Log, progress: Progress = lambda _done, _total: None) -> str:
-        """Exports a log, or several, and returns what the format says of it; `progress` is of
-        records.
+        """Writes logs to the path of this export.
+
+        Args:
+            *logs: the logs; a single log for most formats.
+            progress: called with the numbers of written and of all records.
+
+        Returns:
+            The summary of the format, or "".
 
         Raises:
             LogError: a record cannot be read.
             LogRefused: the disk is full.
-            UsageError: the place cannot be written to, or the format takes one log alone.
+            UsageError: the path is not writable, or the format accepts a single log only.
         """
         if len(logs) > 1 and not self._format.many:
             raise UsageError(
-                f"an export of this form is of one log; here are {len(logs)}, of other sessions"
+                f"this format exports a single log, not {len(logs)} logs of different sessions"
             )
         total = sum(len(log[site]) for log in logs for site in log.sites)
         done = 0
 
-        def written(records: int) -> None:
+        def report_written(records: int) -> None:
             nonlocal done
             done += records
             progress(done, total)
 
+        source = list(logs) if self._format.many else logs[0]
         with stage_output(self.path, force=self._force, manifest=self._manifest) as path:
-            what = list(logs) if self._format.many else logs[0]
-            return self._format.write(what, path, written, **self._settings) or ""
+            summary = self._format.write(source, path, report_written, **self._settings)
+        return summary or ""
 
 
-def _read_settings(
-    form: str, write: Callable[..., Any], given: dict[str, Any]
+def _parse_settings(
+    form: str, write: Callable[..., Any], settings: dict[str, Any]
 ) -> dict[str, Any]:
-    """Returns settings as the keyword-only parameters of `write` take them."""
-    parameters = inspect.signature(write).parameters.values()
-    known = {one.name: type(one.default) for one in parameters if one.kind is one.KEYWORD_ONLY}
-    if strange := [name for name in given if name not in known]:
+    """Returns the settings of a format, converted to the types of its parameters.
+
+    Args:
+        form: name of the format.
+        write: function whose keyword-only parameters, with their defaults, are the settings.
+        settings: the values by name, as numbers or texts.
+
+    Raises:
+        UsageError: there is no such setting, or its value has another type.
+    """
+    types = {}
+    for parameter in inspect.signature(write).parameters.values():
+        if parameter.kind is parameter.KEYWORD_ONLY:
+            types[parameter.name] = type(parameter.default)
+    unknown = [name for name in settings if name not in types]
+    if unknown:
         raise UsageError(
-            f"{form} has no setting {strange[0]!r}; it has {', '.join(known) or 'none'}"
+            f"{form} has no setting {unknown[0]!r}; it has {', '.join(types) or 'none'}"
         )
     try:
-        return {name: known[name](str(value)) for name, value in given.items()}
+        return {name: types[name](str(value)) for name, value in settings.items()}
     except ValueError as error:
         raise UsageError(f"a setting of {form} cannot be read: {error}") from None
 
@@ -131,22 +161,27 @@ def _read_settings(
 def store_tables(
     log: Log,
     written: Written,
-    place: Callable[[Table], str],
+    choose_name: Callable[[Table], str],
     store: Callable[[Table, str], Any],
 ) -> str:
-    """Stores every table at its place, and returns the description of the export as JSON."""
+    """Stores every table of a log, and returns the description of the export as JSON.
+
+    Args:
+        log: the log.
+        written: called with the number of records of each table of records.
+        choose_name: function that returns the name of a table in the export.
+        store: function that stores a table under a name.
+    """
     tables = {}
     for table in log.tables():
-        where = place(table)
-        store(table, where)
-        columns = {
-            c.name: {"unit": c.unit, "meaning": c.meaning, "source": c.source}
-            for c in table.columns
-        }
-        tables[where] = {"row": table.about, "rows": len(table), "columns": columns}
-        written(len(table) if table.kind == "state" else 0)
+        name = choose_name(table)
+        store(table, name)
+        tables[name] = _describe_table(table)
+        is_state = table.kind == "state"
+        written(len(table) if is_state else 0)
+    version = collect_provenance()["version_trilat-net"]
     facts = {
-        "exported_by": f"trilat-net {collect_provenance()['version_trilat-net']}",
+        "exported_by": f"trilat-net {version}",
         "session": log.session,
         "complete": log.complete,
         "records_missing": {site: log.missing(site) for site in log.sites},
@@ -156,19 +191,42 @@ def store_tables(
     return json.dumps(facts, indent=2, ensure_ascii=False) + "\n"
 
 
+def _describe_table(table: Table) -> JsonObject:
+    """Returns the meaning of a table's rows and of its columns."""
+    columns = {}
+    for column in table.columns:
+        columns[column.name] = {
+            "unit": column.unit,
+            "meaning": column.meaning,
+            "source": column.source,
+        }
+    return {"row": table.about, "rows": len(table), "columns": columns}
+
+
 def describe_folder(log: Log, folder: Path, about: str) -> None:
-    """Writes the description of an exported folder into it, and the scenario."""
+    """Writes the description of an exported folder, and the scenario, into the folder.
+
+    Args:
+        log: the log.
+        folder: the exported folder.
+        about: the description, from `store_tables`.
+    """
     (folder / EXPORT_MANIFEST).write_bytes(about.encode())
     (folder / SCENARIO).write_bytes(log.scenario_text.encode())
 
 
 def name_inside(table: Table, name: str, separator: str) -> str:
-    """Returns the place of a table in a file: its name, and its kind if it is not the records
-    of a site.
+    """Returns the name of a table inside an exported file.
+
+    Args:
+        table: the table.
+        name: the name of the table's site, or of a table without a site.
+        separator: text between the name and the kind of the table. Tables of records have no
+            kind in their names.
     """
     return name if table.kind in ("", "state") else f"{name}{separator}{table.kind}"
 
 
 def read_texts(column: Column) -> NDArray[Any]:
-    """Returns the texts of a column."""
+    """Returns the texts of a column as an array of NumPy strings, shape (K,)."""
     return np.array(column.values.tolist(), dtype=np.str_)

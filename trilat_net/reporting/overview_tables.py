@@ -1,11 +1,15 @@
-"""The contents of a log as text: session, missing records, sites, links, channels, accounts,
-files.
+"""Text of the contents of log files: session, sites, links, channels, accounts and files.
 
-Invariant: text from the file passes `sanitize`.
+`compose_overview` composes the text of `trilat log info` from the facts of a `FileOverview`.
+The text begins with the session if the files hold a trilat-net log, and ends with a line per
+file.
+
+Invariant:
+    - Texts from a file pass `sanitize` or are cells of a table, which `result_text` sanitizes.
 """
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from ..analysis.file_overview import FileOverview
 from ..errors import count_nouns
@@ -14,14 +18,17 @@ from ..results import JsonObject
 from .result_text import Block, MarkedText, TextTable
 from .terminal_output import sanitize
 
-_MOST_GAPS = 4
-_VIEWS = "/viz/"
-_TROUBLE = re.compile(r"(missing|duplicate|reordered|refilled|overflowed) [1-9]")
+_MAX_GAPS = 4
+"""Largest number of listed gaps of a channel, and of listed damaged parts of a file."""
+_VIEW_PREFIX = "/viz/"
+"""First part of the names of standard channels for other tools."""
+_FAULTY_ACCOUNT = re.compile(r"(missing|duplicate|reordered|refilled|overflowed) [1-9]")
+_SIZE_UNITS = {"GB": 10**9, "MB": 10**6, "kB": 10**3}
 
 
-def compose_overview(found: FileOverview) -> Iterator[Block]:
-    """Yields what a file holds."""
-    facts = found.facts
+def compose_overview(overview: FileOverview) -> Iterator[Block]:
+    """Yields the contents of log files: session, tables, accounts, origin and files."""
+    facts = overview.facts
     session: JsonObject | None = facts["session"]
     if session is not None:
         yield from _compose_session(facts, session)
@@ -29,15 +36,16 @@ def compose_overview(found: FileOverview) -> Iterator[Block]:
         yield from _compose_links(facts["links"])
     elif facts["problem"]:
         yield MarkedText("[red]cannot be opened:[/red]", sanitize(facts["problem"]))
-    channels: dict[str, JsonObject] = facts["channels"]
-    views = {topic: channel for topic, channel in channels.items() if topic.startswith(_VIEWS)}
-    own = {topic: channel for topic, channel in channels.items() if topic not in views}
-    yield from _compose_channels(own, session)
-    if views:
-        rows = [
-            (topic, *_counts(v), v["schema"].rpartition("/")[2]) for topic, v in views.items()
-        ]
-        yield from _table(("view, for other tools", "messages", "rate Hz", "size", "as"), rows)
+
+    views: dict[str, JsonObject] = {}
+    channels: dict[str, JsonObject] = {}
+    for topic, channel in facts["channels"].items():
+        is_view = topic.startswith(_VIEW_PREFIX)
+        group = views if is_view else channels
+        group[topic] = channel
+    yield from _compose_channels(channels, session)
+    yield from _compose_views(views)
+
     if session is not None:
         yield from _compose_accounts(session)
         yield from _compose_origin(session)
@@ -45,188 +53,259 @@ def compose_overview(found: FileOverview) -> Iterator[Block]:
         yield from _compose_file(file)
 
 
-def _rows(*rows: tuple[str, str]) -> Iterator[Block]:
-    for head, text in rows:
-        if text:
-            yield MarkedText(f"[bold]{head:<9}[/bold]", sanitize(text))
-
-
-def _table(
-    headers: Sequence[str], rows: Iterable[Sequence[object]], words: int = 1
-) -> Iterator[Block]:
-    """Yields an empty line and a table; its first columns hold words, the others numbers."""
-    cells = [["-" if value is None else str(value) for value in row] for row in rows]
-    yield ""
-    yield TextTable(headers, cells, "l" * words + "r")
-
-
 def _compose_session(facts: JsonObject, session: JsonObject) -> Iterator[Block]:
+    """Yields the session, its scenario and duration, and the state of its records."""
     scenario: JsonObject = session["scenario"]
-    sites: dict[str, JsonObject] = facts["sites"]
-    missing = sum(site["missing"] for site in sites.values())
-    records = sum(site["records"] for site in sites.values())
-    began = f", began {session['began_utc']} UTC" if session["began_utc"] else ""
-    changed = "" if scenario["as_named"] else "; NOT the text whose hash the session names"
-    finished = (
-        "finished" if all(file["finished"] for file in facts["files"]) else "not finished"
-    )
-    damaged = sum(len(file["damaged"]) for file in facts["files"])
-    places = f"; damaged in {damaged} place{'s' * (damaged > 1)}" if damaged else ""
-    silent: list[str] = session["unknown_ends"]
-    tails = f"; {describe_unknown_ends(silent)}" if silent else ""
+    name = f"{session['session']}, {session['driver']}"
+    if session["began_utc"]:
+        name += f", began {session['began_utc']} UTC"
     title = f": {scenario['title']}" if scenario["title"] else ""
-    yield from _rows(
-        ("session", f"{session['session']}, {session['driver']}{began}"),
-        ("scenario", scenario["name"] + title),
-        ("", f"seed {scenario['seed']}, sha256 {scenario['sha256'][:16]}{changed}"),
-        *(("", f"note: {note}") for note in scenario.get("arms", ())),
-        ("duration", f"{session['recorded_s']:.3f} s of {scenario['duration_s']:g} s"),
-        ("records", f"{records}, {missing or 'none'} missing{tails}; {finished}{places}"),
-    )
+    source = f"seed {scenario['seed']}, sha256 {scenario['sha256'][:16]}"
+    if not scenario["as_named"]:
+        source += "; NOT the text whose hash the session names"
+    duration = f"{session['recorded_s']:.3f} s of {scenario['duration_s']:g} s"
+
+    yield from _compose_line("session", name)
+    yield from _compose_line("scenario", scenario["name"] + title)
+    yield from _compose_line("", source)
+    for note in scenario.get("arms", ()):
+        yield from _compose_line("", f"note: {note}")
+    yield from _compose_line("duration", duration)
+    yield from _compose_line("records", _describe_records(facts, session))
 
 
-def _compose_sites(sites: dict[str, JsonObject]) -> Iterator[Block]:
+def _describe_records(facts: JsonObject, session: JsonObject) -> str:
+    """Returns the numbers of recorded and missing records, and the state of the files."""
+    sites: dict[str, JsonObject] = facts["sites"]
+    records = sum(site["records"] for site in sites.values())
+    missing = sum(site["missing"] for site in sites.values())
+    text = f"{records}, {missing or 'none'} missing"
+    unknown_ends: list[str] = session["unknown_ends"]
+    if unknown_ends:
+        text += f"; {describe_unknown_ends(unknown_ends)}"
+
+    files = facts["files"]
+    is_finished = all(file["finished"] for file in files)
+    text += "; finished" if is_finished else "; not finished"
+    damaged = sum(len(file["damaged"]) for file in files)
+    if damaged:
+        text += f"; damaged in {count_nouns(damaged, 'place')}"
+    return text
+
+
+def _compose_sites(sites: Mapping[str, JsonObject]) -> Iterator[Block]:
+    """Yields a table of the sites' records, and a table of their loops if these were timed."""
     rows = []
     for name, site in sites.items():
-        ticks = site["expected_ticks"] if site["made_ticks"] is None else site["made_ticks"]
-        of = (site["records"], ticks, site["missing"], site["overruns"])
-        rows.append((name, site["role"], site["rate_hz"], *of))
-    yield from _table(
-        ("site", "role", "rate Hz", "records", "of", "missing", "overruns"), rows, words=2
-    )
-    if any(site["late_us"] for site in sites.values()):
-        loops = [
-            (name, *_three(s["late_us"]), *_three(s["busy_us"])) for name, s in sites.items()
+        executed = site["made_ticks"]
+        ticks = site["expected_ticks"] if executed is None else executed
+        row = [
+            name,
+            site["role"],
+            site["rate_hz"],
+            site["records"],
+            ticks,
+            site["missing"],
+            site["overruns"],
         ]
-        yield from _table(
-            ("loop", "late us p50", "p99", "max", "busy us p50", "p99", "max"), loops
-        )
+        rows.append(row)
+    headers = ("site", "role", "rate Hz", "records", "of", "missing", "overruns")
+    yield from _tabulate(headers, rows, text_columns=2)
+
+    if any(site["late_us"] for site in sites.values()):
+        loops = []
+        for name, site in sites.items():
+            late = _format_percentiles(site["late_us"])
+            busy = _format_percentiles(site["busy_us"])
+            loops.append([name, *late, *busy])
+        headers = ("loop", "late us p50", "p99", "max", "busy us p50", "p99", "max")
+        yield from _tabulate(headers, loops)
 
 
-def _compose_links(links: dict[str, JsonObject]) -> Iterator[Block]:
-    measured = any(link["one_way_ms"] for link in links.values())
-    clocks = any(link["clock_bound_us"] for link in links.values())
+def _compose_links(links: Mapping[str, JsonObject]) -> Iterator[Block]:
+    """Yields a table of the links, with one-way delays and clocks if they were measured."""
+    has_delays = any(link["one_way_ms"] for link in links.values())
+    has_clocks = any(link["clock_bound_us"] for link in links.values())
     headers = ["link", "age ms p50", "p99", "max"]
-    headers += ["one way ms p50", "p99", "max"] if measured else []
-    headers += ["clock us", "+-"] if clocks else []
+    if has_delays:
+        headers += ["one way ms p50", "p99", "max"]
+    if has_clocks:
+        headers += ["clock us", "+-"]
+    headers += ["late", "lost", "duplicate"]
+
     rows = []
     for name, link in links.items():
-        row = [name, *_three(link["age_ms"])]
-        row += _three(link["one_way_ms"]) if measured else []
-        row += [link["clock_offset_us"], link["clock_bound_us"]] if clocks else []
-        rows.append([*row, link["late"], link["lost"], link["duplicate"]])
-    yield from _table([*headers, "late", "lost", "twice"], rows)
+        row = [name, *_format_percentiles(link["age_ms"])]
+        if has_delays:
+            row += _format_percentiles(link["one_way_ms"])
+        if has_clocks:
+            row += [link["clock_offset_us"], link["clock_bound_us"]]
+        row += [link["late"], link["lost"], link["duplicate"]]
+        rows.append(row)
+    yield from _tabulate(headers, rows)
 
 
 def _compose_channels(
-    channels: dict[str, JsonObject], session: JsonObject | None
+    channels: Mapping[str, JsonObject], session: JsonObject | None
 ) -> Iterator[Block]:
+    """Yields a table of the channels, and the missing ranges of each channel with gaps.
+
+    Args:
+        channels: the channels by topic.
+        session: the session, whose topics are shortened; None if the files hold no session.
+    """
     if not channels:
         return
     prefix = f"/trilat/{session['session']}/" if session else ""
     rows = []
     for topic, channel in channels.items():
         name = topic.removeprefix(prefix) or "(none)"
-        rows.append(
-            (name, *_counts(channel), channel["missing"], *_three(channel["between_ms"]))
-        )
-    yield from _table(
-        ("channel", "messages", "rate Hz", "size", "missing", "apart ms p50", "p99", "max"),
-        rows,
+        counts = _format_counts(channel)
+        intervals = _format_percentiles(channel["between_ms"])
+        rows.append([name, *counts, channel["missing"], *intervals])
+    headers = (
+        "channel",
+        "messages",
+        "rate Hz",
+        "size",
+        "missing",
+        "interval ms p50",
+        "p99",
+        "max",
     )
+    yield from _tabulate(headers, rows)
+
     for topic, channel in channels.items():
-        if gaps := channel["gaps"]:
-            words = ", ".join(f"{a}-{b}" if b > a else str(a) for a, b in gaps[:_MOST_GAPS])
-            more = (
-                f" and {count_nouns(len(gaps) - _MOST_GAPS, 'more range')}"
-                if len(gaps) > _MOST_GAPS
-                else ""
-            )
-            yield f"{topic.removeprefix(prefix)} lacks {words}{more}"
+        gaps = channel["gaps"]
+        if gaps:
+            yield f"{topic.removeprefix(prefix)} lacks {_list_gaps(gaps)}"
+
+
+def _list_gaps(gaps: Sequence[tuple[int, int]]) -> str:
+    """Returns ranges of missing numbers, given by first and last number, as text."""
+    ranges = []
+    for first, last in gaps[:_MAX_GAPS]:
+        ranges.append(f"{first}-{last}" if last > first else str(first))
+    text = ", ".join(ranges)
+    if len(gaps) > _MAX_GAPS:
+        text += f" and {count_nouns(len(gaps) - _MAX_GAPS, 'more range')}"
+    return text
+
+
+def _compose_views(views: Mapping[str, JsonObject]) -> Iterator[Block]:
+    """Yields a table of the standard channels that other tools read, if there are any."""
+    if not views:
+        return
+    rows = []
+    for topic, channel in views.items():
+        message_type = channel["schema"].rpartition("/")[2]
+        rows.append([topic, *_format_counts(channel), message_type])
+    headers = ("view, for other tools", "messages", "rate Hz", "size", "as")
+    yield from _tabulate(headers, rows)
 
 
 def _compose_accounts(session: JsonObject) -> Iterator[Block]:
+    """Yields the number of channels without a fault, and the account of each other channel."""
     accounts: dict[str, str] = session["accounts"]
     prefix = f"/trilat/{session['session']}/"
     yield ""
     if not accounts:
-        yield "no accounts: the recording did not come to its end"
+        yield "no accounts: the recording was not finished"
         return
     faulty = {
-        topic: text for topic, text in accounts.items() if _TROUBLE.search(text) or ":" in topic
+        topic: account
+        for topic, account in accounts.items()
+        if _FAULTY_ACCOUNT.search(account) or ":" in topic
     }
-    if len(accounts) > len(faulty):
-        yield (
-            f"the recorder accounts for {count_nouns(len(accounts) - len(faulty), 'channel')} without a fault"
-        )
-    for topic, text in faulty.items():
-        yield f"{topic.removeprefix(prefix)}: {sanitize(text)}"
+    intact = len(accounts) - len(faulty)
+    if intact:
+        yield f"the recorder accounts for {count_nouns(intact, 'channel')} without a fault"
+    for topic, account in faulty.items():
+        yield f"{topic.removeprefix(prefix)}: {sanitize(account)}"
 
 
 def _compose_origin(session: JsonObject) -> Iterator[Block]:
-    versions: dict[str, str] = session["versions"]
-    dirty = {"true": " with changes", "false": ""}.get(
-        session["commit_dirty"] or "", " (changes unknown)"
-    )
-    version = versions.get("trilat-net", "unknown")
-    others = ", ".join(
-        f"{name} {version}" for name, version in versions.items() if name != "trilat-net"
-    )
+    """Yields the versions of the software and the platform that produced the log."""
+    versions: dict[str, str] = dict(session["versions"])
+    version = versions.pop("trilat-net", "unknown")
+    libraries = [f"{name} {library}" for name, library in versions.items()]
+    commit = (session["commit"] or "unknown")[:12]
+    change_notes = {"true": " with changes", "false": ""}
+    changes = change_notes.get(session["commit_dirty"] or "", " (changes unknown)")
+    platform = f"{session['platform']}, {session['python']}"
+
     yield ""
-    yield from _rows(
-        (
-            "made by",
-            f"trilat-net {version}, commit {(session['commit'] or 'unknown')[:12]}{dirty}",
-        ),
-        (
-            "on",
-            f"{session['platform']}, {session['python']}, arithmetic {session['fingerprint']}",
-        ),
-        ("with", others),
-        ("schema", f"version {session['schema_version']}"),
-    )
+    yield from _compose_line("made by", f"trilat-net {version}, commit {commit}{changes}")
+    yield from _compose_line("on", f"{platform}, arithmetic {session['fingerprint']}")
+    yield from _compose_line("with", ", ".join(libraries))
+    yield from _compose_line("schema", f"version {session['schema_version']}")
 
 
 def _compose_file(file: JsonObject) -> Iterator[Block]:
-    chunks = (
-        ", ".join(
-            f"{count_nouns(count, 'chunk')} {name}"
-            for name, count in file["compression"].items()
-        )
-        or "no chunks"
-    )
-    ratio = file["unpacked_bytes"] / file["packed_bytes"] if file["packed_bytes"] else 1.0
-    end = "finished" if file["finished"] else f"cut off at byte {file['cut_off_at_byte']}"
-    part = f", part {file['part'].get('index', '?')}" if file["part"] else ""
-    size = _size(file["size_bytes"])
-    yield from _rows(
-        ("file", f"{file['path']}{part}: {size}, {chunks} ({ratio:.1f} : 1), {end}")
-    )
-    for damage in file["damaged"][:_MOST_GAPS]:
-        yield from _rows(
-            (
-                "",
-                f"byte {damage['offset']}, {count_nouns(damage['length'], 'byte')}: {damage['problem']}",
-            )
-        )
+    """Yields a line on a file, and a line on each of its damaged parts."""
+    name = file["path"]
+    if file["part"]:
+        name += f", part {file['part'].get('index', '?')}"
+
+    chunks = []
+    for compression, count in file["compression"].items():
+        chunks.append(f"{count_nouns(count, 'chunk')} {compression}")
+    ratio = 1.0
+    if file["packed_bytes"]:
+        ratio = file["unpacked_bytes"] / file["packed_bytes"]
+    size = f"{_format_size(file['size_bytes'])}, {', '.join(chunks) or 'no chunks'}"
+
+    end = "finished"
+    if not file["finished"]:
+        end = f"cut off at byte {file['cut_off_at_byte']}"
+    yield from _compose_line("file", f"{name}: {size} ({ratio:.1f} : 1), {end}")
+    for damage in file["damaged"][:_MAX_GAPS]:
+        span = f"byte {damage['offset']}, {count_nouns(damage['length'], 'byte')}"
+        yield from _compose_line("", f"{span}: {damage['problem']}")
 
 
-def _counts(channel: JsonObject) -> tuple[int, str | None, str]:
-    return channel["messages"], _number(channel["rate_hz"]), _size(channel["bytes"])
+def _compose_line(heading: str, text: str) -> Iterator[Block]:
+    """Yields a text behind a bold heading; nothing for an empty text."""
+    if text:
+        yield MarkedText(f"[bold]{heading:<9}[/bold]", sanitize(text))
 
 
-def _three(spread: JsonObject | None) -> list[str | None]:
-    return [None if spread is None else _number(spread[key]) for key in ("p50", "p99", "max")]
+def _tabulate(
+    headers: Sequence[str], rows: Iterable[Sequence[object]], text_columns: int = 1
+) -> Iterator[Block]:
+    """Yields an empty line and a table.
+
+    Args:
+        headers: a text per column.
+        rows: rows of values; None is shown as a dash.
+        text_columns: number of first columns that hold texts; the others hold numbers.
+    """
+    cells = [["-" if value is None else str(value) for value in row] for row in rows]
+    yield ""
+    yield TextTable(headers, cells, align="l" * text_columns + "r")
 
 
-def _number(value: float | None) -> str | None:
-    if value is None:
-        return None
+def _format_counts(channel: JsonObject) -> list[object]:
+    """Returns number, rate and size of the messages of a channel, as three cells."""
+    rate_hz = channel["rate_hz"]
+    rate = None if rate_hz is None else _format_number(rate_hz)
+    return [channel["messages"], rate, _format_size(channel["bytes"])]
+
+
+def _format_percentiles(percentiles: JsonObject | None) -> list[str | None]:
+    """Returns median, 99th percentile and maximum as three cells; three None without values."""
+    if percentiles is None:
+        return [None, None, None]
+    return [_format_number(percentiles[key]) for key in ("p50", "p99", "max")]
+
+
+def _format_number(value: float) -> str:
     return f"{value:.0f}" if abs(value) >= 1000.0 else f"{value:.4g}"
 
 
-def _size(count: int) -> str:
-    for unit, size in (("GB", 10**9), ("MB", 10**6), ("kB", 10**3)):
-        if count >= size:
-            return f"{count / size:.3g} {unit}"
-    return f"{count} B"
+def _format_size(size_bytes: int) -> str:
+    """Returns a size with three digits and the largest unit that fits."""
+    for unit, unit_bytes in _SIZE_UNITS.items():
+        if size_bytes >= unit_bytes:
+            return f"{size_bytes / unit_bytes:.3g} {unit}"
+    return f"{size_bytes} B"

@@ -114,7 +114,7 @@ def format_change_lines(log: Log) -> list[str]:
     lines = []
     for changed in list_changes(log):
         tick = changed.taken_at_tick
-        origin = "by the scenario" if tick is None else f"taken in at tick {tick}"
+        origin = "by the scenario" if tick is None else f"applied at tick {tick}"
         lines.append(f"change: {changed.sentence} ({origin})")
     return _first(lines)
 
