@@ -201,7 +201,7 @@ def test_a_bag_shows_the_reference_beside_the_joints(
         "/lab/m/joint_states/effort",
         "/lab/m/tau_x",
     ]
-    assert views[2][0].curves[0].shown == (True, True, False, False)
+    assert views[2][0].curves[0].visible == (True, True, False, False)
     assert of["bag"][1].lines == "/lab/log"
 
 

@@ -1,12 +1,15 @@
-"""Display of a log in the Rerun viewer, which the extra `view` installs, in a layout of its
-own.
+"""Show a log in the Rerun viewer, which the extra `view` installs.
 
-The layout: pages, a column per site, a row per quantity; saved as a blueprint.
+`open_rerun` passes the log to Rerun together with a layout: pages of plots with a column per
+site and a row per quantity. Rerun reads the layout from a file, its "blueprint".
 
-Invariant: a finished file with standard channels is opened itself. Any other log is exported as
-a ROS 2 bag into a temporary folder first. A plot has one unit, and every curve a name.
-Quantities that a log lacks take no space. All views, names and colors are set here, none by the
-viewer, so that two logs look alike.
+Invariant:
+    - A finished file with standard channels is opened itself. Any other log is first exported
+      as a ROS 2 bag into a temporary folder.
+    - A plot has a single unit, and every curve has a name.
+    - Quantities that a log lacks take no space.
+    - All views, names and colors are set in this module and none by the viewer, so that any two
+      logs look alike.
 """
 
 import os
@@ -15,7 +18,7 @@ import socket
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import cycle, product
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -38,17 +41,21 @@ from ..log.ros2.topic_names import DIAGNOSTICS
 from .exports.ros2 import export_ros2
 
 RunCommand = Callable[[list[str], Mapping[str, str]], int]
-"""Runs a command with an environment, and returns its exit code."""
+"""Function that runs a command with an environment, and returns the exit code."""
 
 _PROGRAM = (sys.executable, "-m", "rerun")
-_OWN = "127.0.0.1"
-_QUIET = {"RERUN_ANALYTICS_ENABLED": "false", "RUST_LOG": "warn"}
-"""No telemetry, unless the user's own settings ask for it."""
+_LOOPBACK = "127.0.0.1"
+_QUIET_ENVIRONMENT = {"RERUN_ANALYTICS_ENABLED": "false", "RUST_LOG": "warn"}
+"""Variables that turn telemetry off, unless the user's environment sets them otherwise."""
 
 
 class ViewerOptions(NamedTuple):
-    """How to show a log: every record instead of decimated channels, in a browser, or into a
-    file, `.rrd`.
+    """How a log is shown.
+
+    Attributes:
+        full: True to show every record instead of the decimated standard channels.
+        web: True to serve the viewer to a browser.
+        save: path of an .rrd file to write instead of opening the viewer, or None.
     """
 
     full: bool = False
@@ -56,46 +63,64 @@ class ViewerOptions(NamedTuple):
     save: Path | None = None
 
 
+def _run_process(command: list[str], environment: Mapping[str, str]) -> int:
+    return subprocess.run(command, env=environment).returncode
+
+
 def open_rerun(
     paths: Sequence[Path],
-    opened: Callable[[], Log],
-    show: ViewerOptions,
-    say: Callable[[str], None],
-    run: RunCommand = lambda command, environment: (
-        subprocess.run(command, env=environment).returncode
-    ),
+    read_log: Callable[[], Log],
+    options: ViewerOptions,
+    print_line: Callable[[str], None],
+    run_command: RunCommand = _run_process,
 ) -> None:
-    """Shows a log in its file or parts, until its viewer is closed.
+    """Shows a log, and returns when the viewer is closed.
 
-    The log is opened by `opened` if it has to be read; `say` prints a line, and `run` runs
-    Rerun.
+    Args:
+        paths: the file of the log, or its parts.
+        read_log: function that reads the log; called only if the log has to be exported.
+        options: how the log is shown.
+        print_line: function that prints a line for the user.
+        run_command: function that runs Rerun.
 
     Raises:
         UsageError: Rerun is not installed, or there is no display.
         LogError: the log cannot be read.
-        RunFailed: Rerun ended badly.
+        RunFailed: Rerun ended with an error.
     """
     import_extra("rerun", "view", "viewers")
-    displays = {"DISPLAY", "WAYLAND_DISPLAY"} & {*os.environ}
-    if show.save is None and not show.web and sys.platform == "linux" and not displays:
-        raise UsageError(
-            "there is no display here; show it in a browser with --web, or keep it with --save"
-        )
+    _require_display(options)
     with tempfile.TemporaryDirectory(prefix="trilat-view-") as folder:
         path = paths[0]
-        named = Path(folder) / f"{make_application_id(paths[0])}.mcap"
-        if show.full or len(paths) > 1 or not read_ros2_channels(path):
-            say("making standard channels of every record ...")
-            export_ros2(opened(), named)
-            path = named
-        elif path.name != named.name:
-            named.symlink_to(path.resolve())
-            path = named
-        layout = Path(folder) / "layout.rbl"
-        save_blueprint(build_plot_layout(read_ros2_channels(path)), path.stem, layout)
-        for command in _commands(show, path, layout, say):
-            if code := run([*_PROGRAM, *command], {**_QUIET, **os.environ}):
-                raise RunFailed(f"Rerun ended with exit code {code}")
+        # Rerun names a recording after its file, and a layout has to name the same recording
+        named_path = Path(folder) / f"{make_application_id(path)}.mcap"
+        if options.full or len(paths) > 1 or not read_ros2_channels(path):
+            print_line("making standard channels of every record ...")
+            export_ros2(read_log(), named_path)
+            path = named_path
+        elif path.name != named_path.name:
+            named_path.symlink_to(path.resolve())
+            path = named_path
+
+        layout = build_plot_layout(read_ros2_channels(path))
+        layout_path = Path(folder) / "layout.rbl"
+        save_blueprint(layout, path.stem, layout_path)
+        environment = {**_QUIET_ENVIRONMENT, **os.environ}
+        for arguments in _list_commands(options, path, layout_path, print_line):
+            exit_code = run_command([*_PROGRAM, *arguments], environment)
+            if exit_code:
+                raise RunFailed(f"Rerun ended with exit code {exit_code}")
+
+
+def _require_display(options: ViewerOptions) -> None:
+    """Raises UsageError if the viewer would open a window and there is no display."""
+    opens_window = options.save is None and not options.web
+    has_display = "DISPLAY" in os.environ or "WAYLAND_DISPLAY" in os.environ
+    if opens_window and sys.platform == "linux" and not has_display:
+        raise UsageError(
+            "there is no display here; show the log in a browser with --web, or write a file "
+            "for another machine with --save"
+        )
 
 
 def make_application_id(path: Path) -> str:
@@ -104,63 +129,77 @@ def make_application_id(path: Path) -> str:
     return re.sub(r"[^A-Za-z0-9_-]", "-", stem).lstrip("-") or "log"
 
 
-def _commands(
-    show: ViewerOptions, log: Path, layout: Path, say: Callable[[str], None]
+def _list_commands(
+    options: ViewerOptions, log: Path, layout: Path, print_line: Callable[[str], None]
 ) -> list[list[str]]:
-    """Returns the arguments of one call of Rerun after the other; it listens on this machine
-    alone.
+    """Returns the arguments of successive calls of Rerun.
+
+    A viewer listens on this machine alone. The address of a viewer for browsers is printed.
+
+    Args:
+        options: how the log is shown.
+        log: the file of the log.
+        layout: the file of the layout.
+        print_line: function that prints a line for the user.
     """
-    if show.save is not None:
-        # Rerun's own `--save` of several files ends with the first that was read; the rest of the others is
-        # missing (measured with 0.41: up to all of a log)
-        recording = layout.with_name("log.rrd")
-        return [
-            [
-                "mcap",
-                "convert",
-                str(log),
-                "--application-id",
-                log.stem,
-                "--output",
-                str(recording),
-            ],
-            ["rrd", "merge", str(recording), str(layout), "--output", str(show.save)],
-        ]
-    port = _free_port()
-    command = [str(log), str(layout), "--bind", _OWN, "--port", str(port)]
-    if show.web:
-        page = _free_port()
-        say(
-            f"open http://{_OWN}:{page}/?url=rerun%2Bhttp%3A%2F%2F{_OWN}%3A{port}%2Fproxy; Ctrl-C ends it"
-        )
-        return [[*command, "--serve-web", "--web-viewer-port", str(page)]]
-    return [command]
+    if options.save is not None:
+        return _list_save_commands(log, layout, options.save)
+    port = str(_find_free_port())
+    command = [str(log), str(layout), "--bind", _LOOPBACK, "--port", port]
+    if not options.web:
+        return [command]
+    page_port = str(_find_free_port())
+    data_address = f"rerun%2Bhttp%3A%2F%2F{_LOOPBACK}%3A{port}%2Fproxy"
+    page_address = f"http://{_LOOPBACK}:{page_port}/?url={data_address}"
+    print_line(f"open {page_address}; Ctrl-C ends it")
+    return [[*command, "--serve-web", "--web-viewer-port", page_port]]
 
 
-def _free_port() -> int:
+def _list_save_commands(log: Path, layout: Path, output: Path) -> list[list[str]]:
+    """Returns the arguments of two calls of Rerun that write log and layout to a file."""
+    # Rerun's own `--save` of several files ends with the file that was read first, and drops
+    # the rest of the others (measured with 0.41: up to the whole log)
+    recording = str(layout.with_name("log.rrd"))
+    convert = ["mcap", "convert", str(log), "--application-id", log.stem]
+    merge = ["rrd", "merge", recording, str(layout)]
+    return [[*convert, "--output", recording], [*merge, "--output", str(output)]]
+
+
+def _find_free_port() -> int:
+    """Returns a TCP port of this machine that is free at present."""
     with socket.socket() as probe:
-        probe.bind((_OWN, 0))
+        probe.bind((_LOOPBACK, 0))
         port: int = probe.getsockname()[1]
         return port
 
 
 Ros2Channels = Mapping[str, Ros2Channel]
-_SESSION_TOPICS = (EVENTS, LINES, FRAMES, DIAGNOSTICS)
-"""Last parts of the names of topics that are of no site."""
+"""Standard channels by topic."""
+_SESSION_CHANNELS = (EVENTS, LINES, FRAMES, DIAGNOSTICS)
+"""Names, the last parts of topics, of the channels of a session instead of a site."""
 
 
 class PlotCurves(NamedTuple):
-    """Curves of one channel: where Rerun puts its numbers, their names in order, and which of
-    them show.
+    """The curves of a channel in a plot.
+
+    Attributes:
+        entity: path at which Rerun stores the numbers of the channel.
+        names: names of all numbers, in order.
+        visible: for each number, True if the plot shows its curve.
     """
 
     entity: str
     names: tuple[str, ...]
-    shown: tuple[bool, ...]
+    visible: tuple[bool, ...]
 
 
 class CurvePlot(NamedTuple):
-    """One plot: its title, with the unit, and its curves."""
+    """A plot.
+
+    Attributes:
+        title: title of the plot, with its unit.
+        curves: the curves of each of its channels.
+    """
 
     title: str
     curves: tuple[PlotCurves, ...]
@@ -169,49 +208,14 @@ class CurvePlot(NamedTuple):
 PlotPage = list[list[CurvePlot]]
 """Rows of plots."""
 
-_PAGES = {
-    "Motion": (
-        (
-            "joint angles and reference",
-            "rad",
-            (("joint_states", "position"), ("reference", "position")),
-        ),
-        ("error", "rad", (("error", ""),)),
-        ("torque, and exogenous torque", "N m", (("joint_states", "effort"), ("tau_x", ""))),
-    ),
-    "Speeds, estimates": (
-        (
-            "joint velocities",
-            "rad/s",
-            (("joint_states", "velocity"), ("reference", "velocity")),
-        ),
-        ("estimate", "kg m^2, kg m", (("theta_hat", ""),)),
-        ("estimated masses", "kg", (("theta_hat", "m"),)),
-        ("estimated first moments", "kg m", (("theta_hat", "mc"),)),
-        ("estimated moments of inertia", "kg m^2", (("theta_hat", "I"),)),
-        (
-            "mode: run 1, diverged 2, hold 3, brake 4, return 5",
-            "",
-            (("mode", ""), ("mode_number", "")),
-        ),
-    ),
-    "Links, timing": (
-        ("age of samples in use, by peer", "ms", (("link_age", ""),)),
-        ("one-way delay, by peer", "ms", (("link_delay", ""),)),
-        ("clock offset, by peer", "ms", (("link_offset", ""),)),
-        ("largest in 100 ms", "us", (("timing", ""),)),
-    ),
-}
-"""Per page its rows: quantity, unit, and parts: channel, and of joint states one of their
-lists, of the ten parameters of each link of a chain one kind.
-"""
-_MOST_NAMES = 20
-"""Curves that a legend names; of more, the pointer does."""
-
 
 class PlotLayout(NamedTuple):
-    """All pages by name, the topic of the event lines, "" without any, and whether arms are to
-    be seen.
+    """The layout of all views of a log.
+
+    Attributes:
+        pages: the pages of plots by name.
+        lines: topic of the event lines; "" if the log has no such topic.
+        arms: True if the arms are shown in space.
     """
 
     pages: dict[str, PlotPage]
@@ -219,108 +223,239 @@ class PlotLayout(NamedTuple):
     arms: bool = False
 
 
-def build_plot_layout(channels: Ros2Channels) -> PlotLayout:
-    """Returns the plots of standard channels: `<root>/<site>/<name>`, and of the session
-    `<root>/log`.
+class _PlotRow(NamedTuple):
+    """A quantity with a plot per site.
+
+    Attributes:
+        quantity: name of the quantity.
+        unit: unit of the quantity; "" for a number.
+        sources: the channels of the quantity: each a name, the last part of a topic, and a
+            field. The field of joint states is one of their lists. The field of estimates is
+            a kind of inertial parameter, such as "m", or "" for planar arms. The field of
+            other channels is "".
     """
-    session = [topic for topic in channels if topic.rpartition("/")[2] in _SESSION_TOPICS]
-    roots = list(
-        dict.fromkeys(topic.rpartition("/")[0] for topic in channels if topic not in session)
-    )
-    pages = {
-        name: [plots for what in rows if (plots := [*_row(channels, roots, *what)])]
-        for name, rows in _PAGES.items()
-    }
-    sent = {  # in the order in which a law declares it
-        name: (channel.about["content"], channel.about["unit"].strip("-"))
-        for topic, channel in channels.items()
-        if (name := topic.rpartition("/")[2]).startswith(SENT_PREFIX)
-    }
-    rows = [
-        [*_row(channels=channels, roots=roots, what=what, unit=unit, parts=((name, ""),))]
-        for name, (what, unit) in sent.items()
+
+    quantity: str
+    unit: str
+    sources: tuple[tuple[str, str], ...]
+
+
+_PAGES: dict[str, tuple[_PlotRow, ...]] = {
+    "Motion": (
+        _PlotRow(
+            quantity="joint angles and reference",
+            unit="rad",
+            sources=(("joint_states", "position"), ("reference", "position")),
+        ),
+        _PlotRow("error", "rad", (("error", ""),)),
+        _PlotRow(
+            quantity="torque, and exogenous torque",
+            unit="N m",
+            sources=(("joint_states", "effort"), ("tau_x", "")),
+        ),
+    ),
+    "Speeds, estimates": (
+        _PlotRow(
+            quantity="joint velocities",
+            unit="rad/s",
+            sources=(("joint_states", "velocity"), ("reference", "velocity")),
+        ),
+        _PlotRow("estimate", "kg m^2, kg m", (("theta_hat", ""),)),
+        _PlotRow("estimated masses", "kg", (("theta_hat", "m"),)),
+        _PlotRow("estimated first moments", "kg m", (("theta_hat", "mc"),)),
+        _PlotRow("estimated moments of inertia", "kg m^2", (("theta_hat", "I"),)),
+        _PlotRow(
+            quantity="mode: run 1, diverged 2, hold 3, brake 4, return 5",
+            unit="",
+            sources=(("mode", ""), ("mode_number", "")),
+        ),
+    ),
+    "Links, timing": (
+        _PlotRow("age of samples in use, by peer", "ms", (("link_age", ""),)),
+        _PlotRow("one-way delay, by peer", "ms", (("link_delay", ""),)),
+        _PlotRow("clock offset, by peer", "ms", (("link_offset", ""),)),
+        _PlotRow("largest in 100 ms", "us", (("timing", ""),)),
+    ),
+}
+"""The rows of each page."""
+_MAX_LEGEND_NAMES = 20
+"""Largest number of curves in a legend. The names of more curves appear under the pointer."""
+
+
+def build_plot_layout(channels: Ros2Channels) -> PlotLayout:
+    """Returns the layout of the plots of standard channels.
+
+    Args:
+        channels: the channels by topic: `<root>/<site>/<name>`, and `<root>/log` and others of
+            the session.
+    """
+    session_topics = [
+        topic for topic in channels if _get_channel_name(topic) in _SESSION_CHANNELS
     ]
-    pages["Sent by laws"] = rows
-    lines = next((topic for topic in session if topic.endswith(f"/{LINES}")), "")
-    arms = any(channel.kind == TRANSFORMS for channel in channels.values())
-    return PlotLayout({name: page for name, page in pages.items() if page}, lines, arms)
+    # a dictionary keeps the order of the sites
+    roots: dict[str, None] = {}
+    for topic in channels:
+        if topic not in session_topics:
+            roots[topic.rpartition("/")[0]] = None
+
+    rows_by_page = {**_PAGES, "Sent by laws": _list_sent_rows(channels)}
+    pages = {}
+    for name, rows in rows_by_page.items():
+        plots = [_build_row(channels, list(roots), row) for row in rows]
+        page = [row_plots for row_plots in plots if row_plots]
+        if page:
+            pages[name] = page
+
+    line_topics = [topic for topic in session_topics if topic.endswith(f"/{LINES}")]
+    lines = line_topics[0] if line_topics else ""
+    has_arms = any(channel.kind == TRANSFORMS for channel in channels.values())
+    return PlotLayout(pages, lines, has_arms)
 
 
-def _row(
-    channels: Ros2Channels,
-    roots: list[str],
-    what: str,
-    unit: str,
-    parts: tuple[tuple[str, str], ...],
-) -> Iterator[CurvePlot]:
+def _get_channel_name(topic: str) -> str:
+    """Returns the last part of a topic."""
+    return topic.rpartition("/")[2]
+
+
+def _list_sent_rows(channels: Ros2Channels) -> tuple[_PlotRow, ...]:
+    """Returns a row per quantity that laws send, in the order of their declarations."""
+    rows = {}
+    for topic, channel in channels.items():
+        name = _get_channel_name(topic)
+        if name.startswith(SENT_PREFIX):
+            quantity = channel.about["content"]
+            unit = channel.about["unit"].strip("-")
+            rows[name] = _PlotRow(quantity, unit, ((name, ""),))
+    return tuple(rows.values())
+
+
+def _build_row(channels: Ros2Channels, roots: Sequence[str], row: _PlotRow) -> list[CurvePlot]:
+    """Returns the plots of a quantity: a plot for each site that has its channels.
+
+    Args:
+        channels: the channels by topic.
+        roots: first parts of the sites' topics, up to the name of the channel.
+        row: the quantity.
+    """
+    plots = []
     for root in roots:
-        found = [
-            _curves(f"{root}/{name}", field, channels.get(f"{root}/{name}"))
-            for name, field in parts
-        ]
-        if curves := tuple(one for one in found if one is not None):
-            site = root.rpartition("/")[2]
-            yield CurvePlot(f"{site}: {what}" + (f" ({unit})" if unit else ""), curves)
+        curves = []
+        for name, field in row.sources:
+            topic = f"{root}/{name}"
+            channel = channels.get(topic)
+            selected = None if channel is None else _select_curves(topic, field, channel)
+            if selected is not None:
+                curves.append(selected)
+        if curves:
+            title = f"{_get_channel_name(root)}: {row.quantity}"
+            if row.unit:
+                title += f" ({row.unit})"
+            plots.append(CurvePlot(title, tuple(curves)))
+    return plots
 
 
-def _curves(topic: str, field: str, channel: Ros2Channel | None) -> PlotCurves | None:
-    if channel is None or channel.kind == STRING:
+def _select_curves(topic: str, field: str, channel: Ros2Channel) -> PlotCurves | None:
+    """Returns the curves of a channel, or None if the channel has no such curves.
+
+    Args:
+        topic: topic of the channel.
+        field: field of the channel, see `_PlotRow`.
+        channel: the channel.
+    """
+    if channel.kind == STRING:
         return None
-    axes = (axis.split(" ") for axis in channel.about.get("names", "").split("; "))
-    names = tuple(" ".join(filter(None, one)) for one in product(*axes))
-    if topic.endswith("/theta_hat"):
-        kinds = [
-            name.rpartition(".")[2].rstrip("xyz_") if "." in name else "" for name in names
-        ]
-        return (
-            PlotCurves(topic, names, tuple(kind == field for kind in kinds))
-            if field in kinds
-            else None
-        )
-    if channel.kind != JOINT_STATE:
-        prefix = f"{topic.rpartition('/')[2]} " if topic.endswith("/tau_x") else ""
-        return PlotCurves(
-            topic, tuple(f"{prefix}{name}" for name in names), (True,) * len(names)
-        )
-    reference = all(name.endswith("_ref") for name in names) or topic.endswith("/reference")
-    if field == "effort" and reference:
+    names = _name_curves(channel)
+    channel_name = _get_channel_name(topic)
+    if channel_name == "theta_hat":
+        return _select_estimates(topic, field, names)
+    if channel.kind == JOINT_STATE:
+        return _select_joint_states(topic, field, names)
+    if channel_name == "tau_x":
+        # this quantity shares a plot with the torque of the same joints
+        names = [f"tau_x {name}" for name in names]
+    return PlotCurves(topic, tuple(names), (True,) * len(names))
+
+
+def _name_curves(channel: Ros2Channel) -> list[str]:
+    """Returns the names of a channel's numbers, which combine the names along its axes."""
+    axes = [axis.split(" ") for axis in channel.about.get("names", "").split("; ")]
+    return [" ".join(filter(None, parts)) for parts in product(*axes)]
+
+
+def _select_estimates(topic: str, kind: str, names: Sequence[str]) -> PlotCurves | None:
+    """Returns the curves of the estimates of a kind of parameter, such as "m" of "upper.m"."""
+    visible = []
+    for name in names:
+        _, dot, parameter = name.rpartition(".")
+        # planar arms have parameters without a link, and without a kind
+        parameter_kind = parameter.rstrip("xyz_") if dot else ""
+        visible.append(parameter_kind == kind)
+    if not any(visible):
         return None
-    if reference:
-        names = tuple(name.removesuffix("_ref") + "_ref" for name in names)
-    shown = tuple(
-        reference or field == "position" or not name.endswith("_ref") for name in names
-    )
-    return PlotCurves(f"{topic}/{field}", names, shown)
+    return PlotCurves(topic, tuple(names), tuple(visible))
 
 
-_COLORS = [(31, 119, 180), (214, 96, 20), (44, 160, 44), (148, 103, 189), (150, 120, 30)]
-_COLORS += [(215, 95, 175), (110, 110, 110)]
-_PALE = [(150, 190, 225), (245, 175, 120)]
-"""Of references, beside the joints that follow them."""
+def _select_joint_states(topic: str, field: str, names: Sequence[str]) -> PlotCurves | None:
+    """Returns the curves of a list of joint states: "position", "velocity" or "effort".
+
+    A channel holds the states of the joints, of the reference with the suffix "_ref", or of
+    both. If it holds both, the reference is shown among the positions only.
+    """
+    is_reference = all(name.endswith("_ref") for name in names)
+    is_reference = is_reference or topic.endswith("/reference")
+    if is_reference and field == "effort":
+        return None
+    if is_reference:
+        names = [name.removesuffix("_ref") + "_ref" for name in names]
+    shows_all = is_reference or field == "position"
+    visible = [shows_all or not name.endswith("_ref") for name in names]
+    return PlotCurves(f"{topic}/{field}", tuple(names), tuple(visible))
+
+
+_COLORS = [
+    (31, 119, 180),
+    (214, 96, 20),
+    (44, 160, 44),
+    (148, 103, 189),
+    (150, 120, 30),
+    (215, 95, 175),
+    (110, 110, 110),
+]
+_PALE_COLORS = [(150, 190, 225), (245, 175, 120)]
+"""Colors of references, paler than those of the joints that follow them."""
 _TIMELINE = "message_publish_time"
 
 
-def save_blueprint(board: PlotLayout, application: str, path: Path) -> None:
-    """Writes a layout as a blueprint file; `application` is Rerun's name of the recordings that
-    it is for.
+def save_blueprint(layout: PlotLayout, application: str, path: Path) -> None:
+    """Writes a layout as a blueprint of Rerun.
+
+    Args:
+        layout: the layout.
+        application: Rerun's name of the recordings to which the layout applies.
+        path: the file.
 
     Raises:
         UsageError: Rerun is not installed.
     """
     rrb = import_extra("rerun.blueprint", "view", "viewers")
-    pages = [
-        rrb.Vertical(
-            *(rrb.Horizontal(*(_view(rrb, plot) for plot in plots)) for plots in page),
-            name=name,
-        )
-        for name, page in board.pages.items()
-    ]
-    if board.arms:
+    views = []
+    for name, page in layout.pages.items():
+        rows = []
+        for plots in page:
+            row = [_make_plot_view(rrb, plot) for plot in plots]
+            rows.append(rrb.Horizontal(*row))
+        views.append(rrb.Vertical(*rows, name=name))
+    if layout.arms:
         frame = rrb.SpatialInformation(target_frame=WORLD)
-        pages.append(rrb.Spatial3DView(name="Arms", origin="/", spatial_information=frame))
-    events = [rrb.TextLogView(origin=board.lines, name="events")] if board.lines else []
+        arms_view = rrb.Spatial3DView(name="Arms", origin="/", spatial_information=frame)
+        views.append(arms_view)
+
+    parts = [rrb.Tabs(*views)]
+    if layout.lines:
+        parts.append(rrb.TextLogView(origin=layout.lines, name="events"))
+    shares = [6, 1]
     blueprint = rrb.Blueprint(
-        rrb.Vertical(rrb.Tabs(*pages), *events, row_shares=[6, 1][: 1 + len(events)]),
+        rrb.Vertical(*parts, row_shares=shares[: len(parts)]),
         rrb.TimePanel(state="collapsed", timeline=_TIMELINE),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
@@ -330,27 +465,39 @@ def save_blueprint(board: PlotLayout, application: str, path: Path) -> None:
     blueprint.save(application, path)
 
 
-def _view(rrb: Any, plot: CurvePlot) -> Any:
-    """Returns a plot; each of its channels has colors of its own."""
-    many = max(len(curves.names) for curves in plot.curves) > _MOST_NAMES
-    overrides = {curves.entity: _lines(curves, 2 * n) for n, curves in enumerate(plot.curves)}
+def _make_plot_view(rrb: Any, plot: CurvePlot) -> Any:
+    """Returns Rerun's view of a plot, in which each channel has its own colors."""
+    styles = {}
+    for index, curves in enumerate(plot.curves):
+        styles[curves.entity] = _style_curves(curves, first_color=2 * index)
+    most_names = max(len(curves.names) for curves in plot.curves)
+    legend = rrb.PlotLegend(
+        corner=rrb.Corner2D.RightTop,
+        visible=False if most_names > _MAX_LEGEND_NAMES else None,
+    )
     return rrb.TimeSeriesView(
         name=plot.title,
         origin="/",
         contents=[curves.entity for curves in plot.curves],
-        overrides=overrides,
-        plot_legend=rrb.PlotLegend(
-            corner=rrb.Corner2D.RightTop, visible=False if many else None
-        ),
+        overrides=styles,
+        plot_legend=legend,
     )
 
 
-def _lines(curves: PlotCurves, first: int) -> Any:
-    """Returns the style of curves, from a color on; references are paler than the joints."""
+def _style_curves(curves: PlotCurves, first_color: int) -> Any:
+    """Returns the names and colors of curves, with references in pale colors.
+
+    Args:
+        curves: the curves.
+        first_color: index of the color of the first curve; further curves have the next colors.
+    """
     rr = import_extra("rerun", "view", "viewers")
-    pale = cycle(_PALE)
-    strong = cycle(_COLORS[first:] + _COLORS[:first])
-    colors = [next(pale) if name.endswith("_ref") else next(strong) for name in curves.names]
+    pale = cycle(_PALE_COLORS)
+    strong = cycle(_COLORS[first_color:] + _COLORS[:first_color])
+    colors = []
+    for name in curves.names:
+        palette = pale if name.endswith("_ref") else strong
+        colors.append(next(palette))
     return rr.SeriesLines(
-        names=list(curves.names), colors=colors, visible_series=list(curves.shown)
+        names=list(curves.names), colors=colors, visible_series=list(curves.visible)
     )
