@@ -1,22 +1,23 @@
-"""The bridge between a session and the graph of ROS 2.
+"""The bridge between a running session and the graph of ROS 2.
 
-Orders are services; topics of ROS can be hands and robots.
+The bridge publishes the records of the sites as standard messages, and offers the orders of the
+session as services. In the other direction, a topic of ROS can hold an arm like a person's
+hand, change the dominance factors, or be the robot that is a site's external arm.
 
 Invariant:
-    - ROS never sits in a control loop. Its messages enter only as those of a hand, which the
-      site limits, fades and records, or as measurements of an external arm. A log is therefore
-      verified without ROS.
-    - A topic with two publishers moves nothing. A target that falls silent for 200 ms releases
-      the arm.
-    - A robot without a valid torque receives its safe command repeatedly; it never just
-      receives nothing.
-    - No message of ROS ends the bridge: it is refused and counted by reason, and the first
-      refusal of each reason is printed.
+    - ROS is never part of a control loop. A message of ROS enters the session only as the goal
+      of a hand, which the site limits, fades and records, or as a measurement of an external
+      arm. A log is therefore verified without ROS.
+    - A topic with two publishers moves nothing.
+    - A target that falls silent for 200 ms releases the arm.
+    - A robot without a valid torque receives its safe command, again and again.
+    - No message of ROS ends the bridge. A message that cannot be used is refused and counted by
+      reason, and the first refusal of each reason is printed.
 """
 
 import math
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
 
@@ -42,20 +43,23 @@ from .ros2_topics import RELIABLE, BridgeEnds, SiteTopics
 from .running_session import RunningSession, open_hand
 
 POLL_NS = 1_000_000
-"""Smallest time between two polls of the session's messages."""
+"""Smallest time between two polls of the session's messages, in ns."""
+POLLS_PER_RECORD = 5.0
+"""How many polls there are in the time between two published records."""
 LOOK_PERIOD_NS = 200_000_000
-"""Time between two checks of the connection to the router."""
+"""Time between two checks of the connection to the router, in ns."""
 SILENCE_NS = 200_000_000
-"""Time after which a target that is not repeated releases the arm."""
+"""Time after which a target that is not repeated releases the arm, in ns."""
 SENDER_TIMEOUT_NS = NS_PER_S
-"""A publisher counts as present for this long after its last message."""
+"""Time for which a publisher counts as present after its last message, in ns."""
 SAFE_PERIOD_NS = 10_000_000
-"""Time between two safe commands to a robot."""
+"""Time between two safe commands to a robot, in ns."""
 DRIVE_PERIOD_S = 0.001
-"""Time between two checks for a new torque."""
+"""Time between two checks for a new torque, in s."""
 REQUEST_PERIOD_S = 0.05
-"""Time between two checks for newly requested shares."""
+"""Time between two checks for newly requested shares, in s."""
 TRIGGER = "std_srvs/srv/Trigger"
+"""Type of the services: a request without content."""
 
 
 class SingleSender:
@@ -63,29 +67,31 @@ class SingleSender:
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
-        self._gid = b""
+        self._publisher = b""
         self._received_ns = clock.monotonic_ns() - SENDER_TIMEOUT_NS
-        self._mixed_ns = self._received_ns
+        # Time of the last message whose publisher differed from the one before.
+        self._conflict_ns = self._received_ns
 
-    def admit(self, gid: bytes) -> int:
+    def admit(self, publisher: bytes) -> int:
         """Accepts a message of a publisher.
 
         Args:
-            gid: the identity of the publisher.
+            publisher: the publisher's identity in the graph of ROS.
 
         Returns:
-            The time since the previous message, ns.
+            The time since the previous message, in ns.
 
         Raises:
             ValueError: two publishers send.
         """
         now_ns = self._clock.monotonic_ns()
         silent_ns = now_ns - self._received_ns
-        if self._gid not in (b"", gid) and silent_ns < SENDER_TIMEOUT_NS:
-            self._mixed_ns = now_ns
-        self._gid = gid
+        is_other_publisher = self._publisher not in (b"", publisher)
+        if is_other_publisher and silent_ns < SENDER_TIMEOUT_NS:
+            self._conflict_ns = now_ns
+        self._publisher = publisher
         self._received_ns = now_ns
-        if now_ns - self._mixed_ns < SENDER_TIMEOUT_NS:
+        if now_ns - self._conflict_ns < SENDER_TIMEOUT_NS:
             raise ValueError(
                 "has two publishers: neither moves the arm until the other is gone"
             )
@@ -97,8 +103,8 @@ class TargetTopic:
 
     Args:
         hand: the hand at the arm.
-        read: returns the goal of a message; raises ValueError.
-        apply: sends a goal to the site by the hand.
+        read: returns the goal in a message; raises ValueError.
+        apply: sends a goal to the site as the command of the hand.
         clock: the clock of this process.
     """
 
@@ -115,10 +121,11 @@ class TargetTopic:
         self._clock = clock
         self._sender = SingleSender(clock)
         self._lock = threading.Lock()
+        # Time of the newest target; None while the topic does not hold the arm.
         self._received_ns: int | None = None
 
     def receive(self, data: bytes, attachment: Attachment) -> None:
-        """Applies a message; called in a thread of Zenoh.
+        """Applies the target of a message; called in a thread of Zenoh.
 
         Raises:
             ValueError: the message cannot be read, or there are two publishers.
@@ -130,7 +137,8 @@ class TargetTopic:
             except ValueError:
                 self._release_hand()
                 raise
-            self._apply(*self._read(data))
+            goal = self._read(data)
+            self._apply(*goal)
             self._received_ns = self._clock.monotonic_ns()
 
     def watch(self) -> None:
@@ -138,24 +146,26 @@ class TargetTopic:
         with self._lock:
             if self._received_ns is None:
                 return
-            if self._clock.monotonic_ns() - self._received_ns > SILENCE_NS:
+            silent_ns = self._clock.monotonic_ns() - self._received_ns
+            if silent_ns > SILENCE_NS:
                 self._release_hand()
 
     def _release_hand(self) -> None:
+        """Releases the arm if the topic holds it."""
         if self._received_ns is not None:
             self._received_ns = None
             self.hand.release()
 
 
 class DominanceTopic:
-    """A topic of ROS that sets the shares of a site in its peers, `set_dominance`.
+    """A topic of ROS that sets a site's shares of its peers, `set_dominance`.
 
-    The newest message wins. Messages that repeat the last request are ignored, unless nothing
-    has arrived for a second.
+    A newer message replaces an older one that has not been sent to the site yet. Messages that
+    repeat the last request are ignored, unless no message has arrived for a second.
 
     Args:
         peers: the peers, in the order of a message's numbers.
-        change: requests shares from the site, and waits until it accepts.
+        change: requests shares from the site, and waits until the site accepts them.
         clock: the clock of this process.
     """
 
@@ -178,7 +188,8 @@ class DominanceTopic:
         if len(shares) != len(self._peers):
             size = count_nouns(len(shares), "number")
             raise ValueError(f"has {size}; the peers are {', '.join(self._peers)}")
-        if self._sender.admit(attachment.gid) > SENDER_TIMEOUT_NS:
+        silent_ns = self._sender.admit(attachment.gid)
+        if silent_ns > SENDER_TIMEOUT_NS:
             self._sent_request = None
         self._requested = dict(zip(self._peers, shares, strict=True))
 
@@ -228,33 +239,21 @@ class RobotArm:
         self._client = make_client()
         self._joints = joints
         controller = robot.controller or [names[0] for names in joints]
-        self._joint_order = [
-            index for name in controller for index, names in enumerate(joints) if name in names
-        ]
-        self._safe = robot.safe or [0.0] * len(joints)
-        count = len(joints)
-        is_complete = (
-            sorted(self._joint_order) == list(range(count)) and len(controller) == count
-        )
-        is_safe_valid = len(self._safe) == count and all(map(math.isfinite, self._safe))
-        if not is_complete or not is_safe_valid:
-            known = ", ".join(names[0] for names in joints)
-            raise UsageError(
-                f"--names: `controller` and `safe` have one of each joint: {known}"
-            )
+        self._safe_command = robot.safe or [0.0] * len(joints)
+        self._joint_order = _order_joints(joints, controller, self._safe_command)
         self._pack = cdr.make_float_array_packer((" ".join(controller), len(controller)))
         self._commands = commands
         self._clock = clock
         self._sender = SingleSender(clock)
         self._lock = threading.Lock()
         # Boot and tick of the record whose torque was published last.
-        self._sent_tick: tuple[int, int] | None = None
+        self._published_tick: tuple[int, int] | None = None
         self._safe_ns = clock.monotonic_ns() - SAFE_PERIOD_NS
 
     def receive(self, data: bytes, attachment: Attachment) -> None:
-        """Sends the site the joint states of a message; called in a thread of Zenoh.
+        """Sends the joint states of a message to the site; called in a thread of Zenoh.
 
-        A message of another robot, which has none of the joints, is ignored.
+        A message that contains none of the joints is that of another robot, and is ignored.
 
         Raises:
             ValueError: the message cannot be read, or there are two publishers.
@@ -275,28 +274,59 @@ class RobotArm:
             self._client.send(q, qd, stamp_ns=state.stamp_ns)
 
     def send_command(self) -> None:
-        """Publishes the torque of the newest record once, or the safe command."""
-        if self._client.over:  # the site may rejoin with another boot
+        """Publishes the torque of the newest record if it is new, or the safe command."""
+        # The site may have rejoined with another boot, which needs another client.
+        if self._client.over:
             with self._lock:
                 self._client = self._make_client()
         record = self._client.record
-        torque = self._client.torque()  # of that record, or of a newer one
-        if (
-            not self.armed
-            or torque is None
-            or record is None
-            or len(torque) != len(self._joint_order)
-        ):
+        # The torque is that of `record`, or of a newer record.
+        torque = self._client.torque()
+        if record is None or torque is None or not self._may_apply(torque):
             if self._clock.monotonic_ns() - self._safe_ns >= SAFE_PERIOD_NS:
                 self.send_safe_command()
-        elif self._sent_tick != (record.boot, record.tick):
-            self._sent_tick = (record.boot, record.tick)
-            self._commands.put(self._pack(*(torque[index] for index in self._joint_order)))
+            return
+        tick = (record.boot, record.tick)
+        if tick != self._published_tick:
+            self._published_tick = tick
+            ordered_torque = [torque[index] for index in self._joint_order]
+            self._commands.put(self._pack(*ordered_torque))
+
+    def _may_apply(self, torque: Sequence[float]) -> bool:
+        """Returns True if the robot is armed and the torque has a number for each joint."""
+        return self.armed and len(torque) == len(self._joint_order)
 
     def send_safe_command(self) -> None:
         """Publishes the safe command."""
         self._safe_ns = self._clock.monotonic_ns()
-        self._commands.put(self._pack(*self._safe))
+        self._commands.put(self._pack(*self._safe_command))
+
+
+def _order_joints(
+    joints: Sequence[Sequence[str]], controller: Sequence[str], safe_command: Sequence[float]
+) -> list[int]:
+    """Returns the index in the scenario of each joint of a robot's controller.
+
+    Args:
+        joints: the names that each joint may have, in the scenario's order.
+        controller: the names of the joints, in the controller's order.
+        safe_command: the command to the controller while the arm brakes.
+
+    Raises:
+        UsageError: the controller or the safe command does not have one entry for each joint.
+    """
+    count = len(joints)
+    joint_order: list[int] = []
+    for controller_name in controller:
+        for index, names in enumerate(joints):
+            if controller_name in names:
+                joint_order.append(index)
+    is_complete = sorted(joint_order) == list(range(count)) and len(controller) == count
+    is_safe_valid = len(safe_command) == count and all(map(math.isfinite, safe_command))
+    if not is_complete or not is_safe_valid:
+        known = ", ".join(names[0] for names in joints)
+        raise UsageError(f"--names: `controller` and `safe` have one of each joint: {known}")
+    return joint_order
 
 
 def find_joint_indices(joints: Sequence[Sequence[str]], state: cdr.RosJoints) -> list[int]:
@@ -313,8 +343,7 @@ def find_joint_indices(joints: Sequence[Sequence[str]], state: cdr.RosJoints) ->
         name_count = count_nouns(len(state.names), "name")
         position_count = count_nouns(len(state.position), "position")
         raise ValueError(f"has {name_count} and {position_count}")
-    indices = {name: index for index, name in enumerate(state.names)}
-    missing = [names[0] for names in joints if not indices.keys() & set(names)]
+    missing = [names[0] for names in joints if set(names).isdisjoint(state.names)]
     if missing:
         present = ", ".join(state.names[:9]) or "no names"
         raise ValueError(f"lacks {', '.join(missing)}; it has {present}")
@@ -322,11 +351,19 @@ def find_joint_indices(joints: Sequence[Sequence[str]], state: cdr.RosJoints) ->
         for name in names:
             if state.names.count(name) > 1:
                 raise ValueError(f"has {name} twice")
-    return [next(indices[name] for name in names if name in indices) for names in joints]
+    indices: list[int] = []
+    for names in joints:
+        present_name = next(name for name in names if name in state.names)
+        indices.append(state.names.index(present_name))
+    return indices
 
 
 def read_joint_target(joints: Sequence[Sequence[str]], data: bytes) -> list[float]:
-    """Returns the angles of a `JointState` in the order of an arm's joints, rad.
+    """Returns the angles in a `JointState`, in rad and in the order of an arm's joints.
+
+    Args:
+        joints: the names that each joint may have, in the arm's order.
+        data: the message.
 
     Raises:
         ValueError: the message cannot be read, or lacks a joint.
@@ -337,18 +374,19 @@ def read_joint_target(joints: Sequence[Sequence[str]], data: bytes) -> list[floa
 
 
 def _check_finite(numbers: Sequence[float]) -> list[float]:
+    """Returns the numbers; raises ValueError if a number is not finite."""
     if not all(map(math.isfinite, numbers)):
         raise ValueError("has a number that is not finite")
     return list(numbers)
 
 
 def read_vector_target(frame: str, axes: int, count: int, data: bytes) -> list[float]:
-    """Returns the position of a `PoseStamped`, m, or the force of a `WrenchStamped`, N.
+    """Returns the position in a `PoseStamped`, in m, or the force in a `WrenchStamped`, in N.
 
     Args:
         frame: the frame in which the arm expects the vector.
         axes: the number of coordinates to return.
-        count: how many numbers the message has: 7 of a pose, 6 of a wrench.
+        count: how many numbers the message has: 7 in a pose, 6 in a wrench.
         data: the message.
 
     Raises:
@@ -367,7 +405,7 @@ class Bridge:
     Args:
         ends: the graph and the session.
         scenario: the scenario of the session.
-        epoch_unix_ns: the session's epoch in Unix time.
+        epoch_unix_ns: the session's epoch in Unix time, in ns.
 
     Attributes:
         targets: the topics that hold an arm, by name.
@@ -375,58 +413,72 @@ class Bridge:
     """
 
     def __init__(self, ends: BridgeEnds, scenario: Scenario, epoch_unix_ns: int) -> None:
-        graph, bus, clock, session, _ = ends
+        graph = ends.graph
+        bus = ends.bus
+        session = ends.session
         self._ends = ends
+        self._scenario = scenario
+        self._epoch_unix_ns = epoch_unix_ns
         self._records = bus.inbox(topics.key(session, "*", topics.STATE), 4096)
         self._events = bus.inbox(topics.key(session, "*", topics.EVENT), 4096)
         self._links = bus.inbox(topics.key(session, "*", topics.LINK), 4096)
         self._presence = bus.presence(topics.presence_key(session, "*"))
         self._present = set[topics.KeyParts]()
-        self._has_met_site = False
-        self._epoch_unix_ns = epoch_unix_ns
+        self._has_seen_site = False
         frames = graph.publisher(FRAMES, COMMON_TOPICS[FRAMES].kind, RELIABLE)
         self._diagnostics = graph.publisher(
             DIAGNOSTICS, COMMON_TOPICS[DIAGNOSTICS].kind, RELIABLE
         )
-        self._lines = {
-            name: graph.publisher(f"{session}/{name}", channel.kind, RELIABLE)
-            for name, channel in SESSION_CHANNELS.items()
-        }
-        self._sites = {
-            name: SiteTopics(
+        self._lines: dict[str, TopicPublisher] = {}
+        for name, channel in SESSION_CHANNELS.items():
+            self._lines[name] = graph.publisher(f"{session}/{name}", channel.kind, RELIABLE)
+        self._sites: dict[str, SiteTopics] = {}
+        for site in scenario.names:
+            self._sites[site] = SiteTopics(
                 ends=ends,
                 scenario=scenario,
-                site=name,
+                site=site,
                 epoch_unix_ns=epoch_unix_ns,
                 frames=frames,
             )
-            for name in scenario.names
-        }
         running = RunningSession(session, Connection(), bus)
-        self.targets = dict[str, TargetTopic]()
-        self.dominance = dict[str, DominanceTopic]()
-        for name, site_topics in self._sites.items():
-            for event in list_past_events(bus, clock, session, name):
-                site_topics.shares.add_change(event.command)
-            topic = ends.topic(name, "set_dominance")
-            change = partial(running.set_dominance, name)
-            self.dominance[topic] = DominanceTopic(scenario.peers(name), change, clock)
-            graph.subscribe(topic, cdr.FLOAT64_ARRAY, self.dominance[topic].receive)
-        for name in scenario.open_hands:
-            hand = open_hand(
-                bus=bus,
-                clock=clock,
-                session=session,
-                site=name,
-                scenario=scenario,
-                source="ros2",
-            )
-            frame = self._sites[name].frame
-            topic_name, kind, read, apply = describe_target(scenario, name, hand, frame)
-            topic = ends.topic(name, topic_name)
-            self.targets[topic] = TargetTopic(hand, read, apply, clock)
-            graph.subscribe(topic, kind, self.targets[topic].receive)
+        self.targets: dict[str, TargetTopic] = {}
+        self.dominance: dict[str, DominanceTopic] = {}
+        for site in scenario.names:
+            self._subscribe_dominance(site, running)
+        for site in scenario.open_hands:
+            self._subscribe_target(site)
         serve_orders(graph, running, scenario.names)
+
+    def _subscribe_dominance(self, site: str, running: RunningSession) -> None:
+        """Receives the topic that sets the shares of a site."""
+        ends = self._ends
+        # The changes before the bridge was started determine the site's present shares.
+        for event in list_past_events(ends.bus, ends.clock, ends.session, site):
+            self._sites[site].shares.add_change(event.command)
+        topic = ends.topic(site, "set_dominance")
+        change = partial(running.set_dominance, site)
+        dominance = DominanceTopic(self._scenario.peers(site), change, ends.clock)
+        self.dominance[topic] = dominance
+        ends.graph.subscribe(topic, cdr.FLOAT64_ARRAY, dominance.receive)
+
+    def _subscribe_target(self, site: str) -> None:
+        """Receives the topic that holds the arm of a site."""
+        ends = self._ends
+        hand = open_hand(
+            bus=ends.bus,
+            clock=ends.clock,
+            session=ends.session,
+            site=site,
+            scenario=self._scenario,
+            source="ros2",
+        )
+        frame = self._sites[site].frame
+        topic_name, kind, read, apply = describe_target(self._scenario, site, hand, frame)
+        topic = ends.topic(site, topic_name)
+        target = TargetTopic(hand, read, apply, ends.clock)
+        self.targets[topic] = target
+        ends.graph.subscribe(topic, kind, target.receive)
 
     def run(
         self, rate_hz: float, stopped: Callable[[], bool], say: Callable[[str], None]
@@ -434,7 +486,7 @@ class Bridge:
         """Publishes the session until it ends or `stopped` returns True.
 
         Args:
-            rate_hz: the rate at which the newest records are published, 1/s.
+            rate_hz: the rate at which the newest records are published, in 1/s.
             stopped: returns True to end the call.
             say: prints a line for the user.
 
@@ -447,8 +499,8 @@ class Bridge:
         wake_ns = now_ns
         checked_ns = now_ns
         diagnosed_ns = now_ns
-        poll_ns = max(POLL_NS, int(NS_PER_S / (5.0 * rate_hz)))
-        while not (stopped() or (self._has_met_site and not self._present)):
+        poll_ns = max(POLL_NS, int(NS_PER_S / (POLLS_PER_RECORD * rate_hz)))
+        while not stopped() and not self._have_sites_left():
             if self._publish_messages(rate_hz):
                 return True
             for target in self.targets.values():
@@ -463,10 +515,14 @@ class Bridge:
                     say(f"the router of ROS {state}")
             if now_ns - diagnosed_ns > NS_PER_S:
                 diagnosed_ns = now_ns
-                self._diagnose()
+                self._publish_diagnostics()
             wake_ns = max(wake_ns + poll_ns, now_ns)
             clock.sleep_until(wake_ns)
         return False
+
+    def _have_sites_left(self) -> bool:
+        """Returns True if sites were present and none is present any more."""
+        return self._has_seen_site and not self._present
 
     def _publish_messages(self, rate_hz: float) -> bool:
         """Publishes the messages that have arrived from the session.
@@ -476,45 +532,57 @@ class Bridge:
         """
         for record in read_records(self._records):
             if record.site in self._sites:
-                self._sites[record.site].show(record, rate_hz)
+                self._sites[record.site].publish(record, rate_hz)
         has_new_epoch = False
         for event in read_messages(self._events, Event):
             if event.kind == "epoch" and event.epoch_unix_ns != self._epoch_unix_ns:
                 has_new_epoch = True
             if event.member in self._sites:
                 self._sites[event.member].shares.add_change(event.command)
-            for name, data in pack_event(event, self._ends.clock.unix_ns()):
+            stamp_ns = self._ends.clock.unix_ns()
+            for name, data in pack_event(event, stamp_ns):
                 self._lines[name].put(data)
         for stats in read_messages(self._links, LinkStats):
             if stats.site in self._sites:
-                self._sites[stats.site].show_statistics(stats)
-        for parts, alive in topics.read_presence(self._presence):
+                self._sites[stats.site].publish_statistics(stats)
+        for parts, is_present in topics.read_presence(self._presence):
             if parts.member in self._sites:
-                (self._present.add if alive else self._present.discard)(parts)
-                self._has_met_site = True
+                self._has_seen_site = True
+                if is_present:
+                    self._present.add(parts)
+                else:
+                    self._present.discard(parts)
         return has_new_epoch
 
-    def _diagnose(self) -> None:
+    def _publish_diagnostics(self) -> None:
         """Publishes the diagnostics of all sites, if somebody listens."""
+        if not self._diagnostics.has_subscribers:
+            return
         newest = [site_topics.newest for site_topics in self._sites.values()]
         records = [record for record in newest if record is not None]
-        if self._diagnostics.has_subscribers:
-            data = pack_session_diagnostics(self._ends.session, self._epoch_unix_ns, records)
-            self._diagnostics.put(data)
+        data = pack_session_diagnostics(self._ends.session, self._epoch_unix_ns, records)
+        self._diagnostics.put(data)
 
 
 def describe_target(
     scenario: Scenario, site: str, hand: Hand, frame: str
 ) -> tuple[str, str, Callable[[bytes], Sequence[float]], Callable[..., int]]:
-    """Returns how the live hand of a site is moved by a topic.
+    """Returns the topic that commands the live hand of a site, and how its messages are used.
+
+    Args:
+        scenario: the scenario of the session.
+        site: the site, which has an open live hand.
+        hand: the hand.
+        frame: the frame of the positions and forces in the messages.
 
     Returns:
-        The topic's name and type, a function that reads the goal of a message, and the method
+        The topic's name and type, a function that reads the goal in a message, and the method
         of the hand that sends the goal.
     """
     live = scenario.sites[site].find_live_hand(is_open=True)
     assert live is not None
-    axes = len(scenario.arms[site].end_effector(scenario.sites[site].q0_rad))
+    end_effector = scenario.arms[site].end_effector(scenario.sites[site].q0_rad)
+    axes = len(end_effector)
     if live.mode == "joint":
         read = partial(read_joint_target, list_joint_names(scenario, site))
         return "target_joint", cdr.JOINT_STATE, read, hand.turn
@@ -526,7 +594,7 @@ def describe_target(
 
 
 def list_joint_names(scenario: Scenario, site: str) -> list[tuple[str, ...]]:
-    """Returns the names of each joint of a site: that of its topics, and the scenario's."""
+    """Returns the names of each joint of a site: in topics, and in the scenario."""
     topic_names = Ros2SiteChannels(scenario, site).joints
     pairs = zip(topic_names, scenario.arms[site].joint_names, strict=True)
     return [tuple(dict.fromkeys(pair)) for pair in pairs]
@@ -539,8 +607,9 @@ def serve_orders(graph: Ros2Graph, running: RunningSession, sites: Sequence[str]
     """
 
     def serve(order: Callable[..., list[str]], *site: str) -> None:
+        """Offers an order to one site, or to all sites, as a service."""
         name = "/".join([running.name, *site, order.__name__])
-        graph.serve(name, TRIGGER, lambda _: _answer(order, *site))
+        graph.serve(name, TRIGGER, lambda _request: _send_order(order, *site))
 
     for order in (running.stop, running.enable, running.reset):
         serve(order)
@@ -549,11 +618,13 @@ def serve_orders(graph: Ros2Graph, running: RunningSession, sites: Sequence[str]
     serve(running.end)
 
 
-def _answer(order: Callable[..., list[str]], *sites: str) -> bytes:
+def _send_order(order: Callable[..., list[str]], *sites: str) -> bytes:
+    """Sends an order to sites, and returns the response of the service with their replies."""
     try:
-        return cdr.pack_trigger_response(success=True, text="; ".join(order(*sites)))
+        replies = order(*sites)
     except TrilatError as error:
         return cdr.pack_trigger_response(success=False, text=str(error))
+    return cdr.pack_trigger_response(success=True, text="; ".join(replies))
 
 
 @contextmanager
@@ -588,16 +659,17 @@ def serve_ros2(
 ) -> None:
     """Publishes a session in the graph of ROS 2 until it ends or `stopped` returns True.
 
-    It waits for a router of ROS and for the session.
+    The function waits for a router of ROS and for the session. If another session begins under
+    the same name, the function connects to the graph again and publishes that session.
 
     Args:
         running: the session.
         open_graph: connects to the graph of ROS 2.
-        rate_hz: the rate at which records are published, 1/s.
+        rate_hz: the rate at which records are published, in 1/s.
         table: the names of the topics, and the robots.
         stopped: returns True to end the call.
         say: prints a line for the user.
-        timeout_s: longest wait for the first site or its router, s.
+        timeout_s: longest wait for the first site or its router, in s.
 
     Raises:
         UsageError: there is no router, or the settings of a robot do not fit the session.
@@ -619,15 +691,21 @@ def serve_ros2(
                 ends = BridgeEnds(
                     graph=graph, bus=bus, clock=clock, session=running.name, table=table
                 )
-                has_new_epoch = show_session(ends, rate_hz, stopped, say)
+                has_new_epoch = publish_session(ends, rate_hz, stopped, say)
 
 
-def show_session(
+def publish_session(
     ends: BridgeEnds, rate_hz: float, stopped: Callable[[], bool], say: Callable[[str], None]
 ) -> bool:
     """Waits for a session, and publishes it until it ends or `stopped` returns True.
 
-    The robots are connected before, because the session begins only with their arms.
+    The robots are connected before the session begins, because it begins only with their arms.
+
+    Args:
+        ends: the graph and the session.
+        rate_hz: the rate at which records are published, in 1/s.
+        stopped: returns True to end the call.
+        say: prints a line for the user.
 
     Returns:
         True if another session has begun under the same name.
@@ -635,7 +713,9 @@ def show_session(
     with ExitStack() as stack:
         robots: dict[str, RobotArm] = {}
         for site, robot in ends.table.robots.items():
-            if robot.joints:  # such a robot can start before any site replies
+            # A robot whose joints are named needs no scenario, and can start before any site
+            # replies.
+            if robot.joints:
                 robots[site] = stack.enter_context(open_robot(ends, site, robot))
         say(f"waiting for session {ends.session!r} to begin")
         info = await_site(ends, stopped, running=False)
@@ -647,7 +727,8 @@ def show_session(
             if site not in robots:
                 robot = ends.table.robots.get(site, RobotTable())
                 names = list_joint_names(scenario, site)
-                robots[site] = stack.enter_context(open_robot(ends, site, robot, names))
+                robot_context = open_robot(ends, site, robot, names)
+                robots[site] = stack.enter_context(robot_context)
             robots[site].armed = True
         running_info = await_site(ends, stopped, running=True)
         if running_info is None:
@@ -656,36 +737,55 @@ def show_session(
         for target in bridge.targets.values():
             stack.enter_context(target.hand)
         for topic, dominance in bridge.dominance.items():
+            # A request waits for the site's reply, and must not delay the records.
             send_request = ends.graph.refusals.guard(topic, dominance.send_request)
             stack.enter_context(_repeat_in_thread(REQUEST_PERIOD_S, send_request))
-        inputs = [f"; /{topic} holds an arm" for topic in bridge.targets]
-        for site in robots:
-            topic = ends.topic(site, "robot_states")
-            inputs.append(f"; /{topic} measures the arm of {site}")
-        say(
-            f"session {ends.session} is in the graph of ROS 2: "
-            f"/{ends.session}/...{''.join(inputs)}"
-        )
+        session_text = f"session {ends.session} is in the graph of ROS 2: /{ends.session}/..."
+        say(session_text + _describe_inputs(ends, bridge, robots))
         return bridge.run(rate_hz, stopped, say)
+
+
+def _describe_inputs(ends: BridgeEnds, bridge: Bridge, robots: Iterable[str]) -> str:
+    """Returns the topics that the bridge receives, as the end of a line for the user.
+
+    Args:
+        ends: the graph and the session.
+        bridge: the bridge of the session.
+        robots: the sites whose arm is a robot of ROS.
+    """
+    inputs = [f"; /{topic} holds an arm" for topic in bridge.targets]
+    for site in robots:
+        topic = ends.topic(site, "robot_states")
+        inputs.append(f"; /{topic} measures the arm of {site}")
+    return "".join(inputs)
 
 
 @contextmanager
 def open_robot(
     ends: BridgeEnds, site: str, robot: RobotTable, joints: Sequence[Sequence[str]] = ()
 ) -> Iterator[RobotArm]:
-    """Yields the robot of a site, which is received and commanded meanwhile.
+    """Yields the robot of a site; states and commands are exchanged until the context ends.
 
     At the end, the robot receives its safe command.
+
+    Args:
+        ends: the graph and the session.
+        site: the site whose arm is the robot.
+        robot: the settings of the robot.
+        joints: the names that each joint may have, in the scenario's order; by default the
+            names in `robot`.
     """
-    commands = ends.graph.publisher(
-        ends.topic(site, "robot_commands"), cdr.FLOAT64_ARRAY, RELIABLE
-    )
-    make_client = partial(ArmClient, ends.bus, ends.clock, ends.session, site)
-    names = joints or [(name,) for name in robot.joints]
+    commands_topic = ends.topic(site, "robot_commands")
+    states_topic = ends.topic(site, "robot_states")
+    commands = ends.graph.publisher(commands_topic, cdr.FLOAT64_ARRAY, RELIABLE)
     arm = RobotArm(
-        make_client=make_client, joints=names, robot=robot, commands=commands, clock=ends.clock
+        make_client=partial(ArmClient, ends.bus, ends.clock, ends.session, site),
+        joints=joints or [(name,) for name in robot.joints],
+        robot=robot,
+        commands=commands,
+        clock=ends.clock,
     )
-    ends.graph.subscribe(ends.topic(site, "robot_states"), cdr.JOINT_STATE, arm.receive)
+    ends.graph.subscribe(states_topic, cdr.JOINT_STATE, arm.receive)
     with _repeat_in_thread(DRIVE_PERIOD_S, arm.send_command, arm.send_safe_command):
         yield arm
 
@@ -715,6 +815,8 @@ def await_site(ends: BridgeEnds, stopped: Callable[[], bool], *, running: bool) 
     """
     replies = find_members(ends.bus, ends.clock, ends.session, stopped=stopped, timeout_s=None)
     for info in replies:
-        if info.scenario and (info.running or not running):
+        # Members without a scenario, such as the recorder, are no sites.
+        is_site = bool(info.scenario)
+        if is_site and (info.running or not running):
             return info
     return None

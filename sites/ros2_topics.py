@@ -81,10 +81,11 @@ class SiteTopics:
         self._publishers["robot_description"].put(self._messages.description)
         self.newest: State | None = None
 
-    def _is_heard(self, topic: str) -> bool:
+    def _has_listener(self, topic: str) -> bool:
+        """Returns True if somebody listens to a topic of the site."""
         return self._publishers[topic].has_subscribers
 
-    def show(self, record: State, rate_hz: float) -> None:
+    def publish(self, record: State, rate_hz: float) -> None:
         """Publishes a record on the topics with listeners, at most `rate_hz` records a second.
 
         Records older than the newest published one of the same boot are ignored.
@@ -97,14 +98,14 @@ class SiteTopics:
                 return
         self.newest = record
         shares = self.shares.advance_to(record.t_ns)
-        for topic, data in self._messages.pack_record(record, shares, self._is_heard):
+        for topic, data in self._messages.pack_record(record, shares, self._has_listener):
             self._publishers[topic].put(data)
         if self._frames.has_subscribers:
             for data in self._messages.pack_frames(record):
                 self._frames.put(data)
 
-    def show_statistics(self, stats: LinkStats) -> None:
+    def publish_statistics(self, stats: LinkStats) -> None:
         """Publishes statistics of the site on the topics with listeners."""
         for topic, data in self._messages.pack_statistics(stats):
-            if self._is_heard(topic):
+            if self._has_listener(topic):
                 self._publishers[topic].put(data)

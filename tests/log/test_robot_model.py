@@ -31,7 +31,7 @@ def scenario(arm: str = "arm6", down: str = "[0.0, 0.0, -1.0]") -> Scenario:
 def end_of(model: RobotModel, q) -> tuple:
     """The last frame in that of the base, by what is sent."""
     at, turned = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
-    for origin, own in model.transforms(q)[1:]:
+    for origin, own in model.compute_transforms(q)[1:]:
         at = tuple(a + b for a, b in zip(at, rotate_vector(turned, origin), strict=True))
         turned = multiply_quaternions(turned, own)
     return at, turned
@@ -61,7 +61,7 @@ def reference_tip(arm: str) -> str:
 )
 def test_bases_stand_apart_and_gravity_points_down(down):
     models = [RobotModel(scenario(down=str([*down])), site) for site in ("m", "s")]
-    (m, turned), (s, _) = (model.transforms(POSES["arm6"])[0] for model in models)
+    (m, turned), (s, _) = (model.compute_transforms(POSES["arm6"])[0] for model in models)
     assert math.dist(m, s) == SPACING_M
     assert rotate_vector(turned, tuple(np.array(down) / math.hypot(*down))) == pytest.approx(
         (0, 0, -1)
@@ -76,7 +76,9 @@ def test_a_message_is_read_by_the_decoder_of_ros():
     q = POSES["arm6"]
     message = DecoderFactory().decoder_for("cdr", schema)(model.pack(5_000_000_007, q))
     assert [(t.header.frame_id, t.child_frame_id) for t in message.transforms] == model.frames
-    for one, (origin, turned) in zip(message.transforms, model.transforms(q), strict=True):
+    for one, (origin, turned) in zip(
+        message.transforms, model.compute_transforms(q), strict=True
+    ):
         t, r = one.transform.translation, one.transform.rotation
         assert ((t.x, t.y, t.z), (r.x, r.y, r.z, r.w)) == (origin, turned)
         assert (one.header.stamp.sec, one.header.stamp.nanosec) == (5, 7)
@@ -103,7 +105,7 @@ def test_end_of_every_unlike_arm_is_where_its_site_says():
     for n, (site, spec) in enumerate(unlike.sites.items()):
         model = RobotModel(unlike, site)
         at, turned = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
-        for origin, own in model.transforms(spec.q0_rad):
+        for origin, own in model.compute_transforms(spec.q0_rad):
             at = np.add(at, rotate_vector(turned, origin))
             turned = multiply_quaternions(turned, own)
         wanted = unlike.arms[site].shared_pose(spec.q0_rad)

@@ -60,7 +60,7 @@ class Desk:
 
     def take(self, messages: Iterable[Any], key: str = KEY) -> None:
         for n, message in enumerate(messages):
-            self.views.takers[key](message, n)
+            self.views.receivers[key](message, n)
 
     def finish(self) -> None:
         self.views.finish(max((seen.log_ns for seen in self.seen), default=0))
@@ -245,9 +245,9 @@ def test_what_waits_is_bounded_by_bucket_and_not_by_silence() -> None:
     """A sender that counts its ticks in leaps, back and forth, leaves nothing behind."""
     desk = Desk(100.0)
     desk.take(record((k * 7919) % 100_000, [0.0] * 17) for k in range(3000))
-    (site,) = [buckets for buckets in desk.views._buckets if buckets._first]
-    assert len(site._open) + len(site._late) <= 2 * BUCKET
-    assert len(site._slow_open) <= SLOW // BUCKET * 2
+    (site,) = [buckets for buckets in desk.views._buckets if buckets._first_tick]
+    assert len(site._records) + len(site._late_records) <= 2 * BUCKET
+    assert len(site._slow_rows) <= SLOW // BUCKET * 2
 
 
 def stats(**facts: Any) -> LinkStats:
@@ -300,7 +300,7 @@ def test_virtual_time_has_no_clocks_and_no_network_to_show() -> None:
 def test_event_is_text_and_line_with_level(kind: str, level: int) -> None:
     desk = Desk(100.0, epoch_ns=EPOCH_NS)
     event = Event(member="m", boot=1, kind=kind, text="ü happened", t_ns=5)
-    desk.views.takers["trilat/lab/recorder/event"](event, EPOCH_NS + 9)
+    desk.views.receivers["trilat/lab/recorder/event"](event, EPOCH_NS + 9)
     text, line = desk.seen
     assert (text.topic, _decoder(text.message[0])(text.message[1]).data) == (
         "/viz/events",
@@ -319,7 +319,7 @@ def test_event_is_text_and_line_with_level(kind: str, level: int) -> None:
 
 def test_event_before_epoch_has_time_of_its_arrival() -> None:
     desk = Desk(100.0, epoch_ns=EPOCH_NS)
-    desk.views.takers["trilat/lab/m/event"](
+    desk.views.receivers["trilat/lab/m/event"](
         Event(member="m", boot=1, kind="epoch", text=""), EPOCH_NS - 9
     )
     kind, data = desk.seen[1].message

@@ -231,7 +231,7 @@ def list_live_topics(log: Log, motions: dict[str, Motion], _folder: Path) -> Ite
     for site in motions:
         shown = SiteTopics(ends, log.scenario, site, 0, graph.published["tf"])  # type: ignore[arg-type]
         for record in log[site].states:
-            shown.show(record, 1000.0)
+            shown.publish(record, 1000.0)
     kind = "geometry_msgs/msg/PoseStamped"
     poses = {
         topic: [ROS.deserialize_cdr(data, kind) for data in messages]

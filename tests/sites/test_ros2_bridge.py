@@ -26,10 +26,10 @@ from sites.ros2_bridge import (
     DominanceTopic,
     RobotArm,
     TargetTopic,
+    publish_session,
     read_joint_target,
     read_vector_target,
     refuse_other_robots,
-    show_session,
 )
 from sites.ros2_topics import BridgeEnds, SiteTopics
 from sites.running_session import ShareHistory
@@ -314,7 +314,7 @@ def test_the_pose_of_the_tip_is_in_the_transforms(name: str) -> None:
         graph = Listener()
         ends: Any = BridgeEnds(graph, None, None, "t", read_topic_table("crisp"))  # type: ignore[arg-type]
         shown = SiteTopics(ends, log.scenario, site, 0, graph.came["tf"])  # type: ignore[arg-type]
-        shown.show(log[site].states[-1], 1000.0)
+        shown.publish(log[site].states[-1], 1000.0)
         messages = [
             ROS.deserialize_cdr(data, "tf2_msgs/msg/TFMessage") for data in graph.came["tf"]
         ]
@@ -632,7 +632,7 @@ class Sites:
         over = threading.Event()
 
         def show() -> None:
-            self.anew.append(show_session(self._ends, 100.0, over.is_set, self.said.append))
+            self.anew.append(publish_session(self._ends, 100.0, over.is_set, self.said.append))
 
         bridge = threading.Thread(target=show)
         self.graph.came.clear()  # before the bridge takes its topics from it

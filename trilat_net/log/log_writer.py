@@ -28,7 +28,7 @@ from . import log_layout
 from .log_file import LogFile
 from .mcap_writer import McapWriter, Sink
 from .ros2.ros2_messages import StandardChannels
-from .ros2.viz_channels import TakeMessage, VizChannels
+from .ros2.viz_channels import ReceiveMessage, VizChannels
 from .running_digest import ALGORITHM, DIGESTS_KEY, PREVIOUS_DIGEST_KEY
 
 Decoded = State | TickRecord | LinkStats | Event | None
@@ -83,7 +83,9 @@ class LogWriter:
                 views_hz=views_hz,
                 put=self._add_view_message,
             )
-        self._view_receivers: dict[str, TakeMessage] = self._views.takers if self._views else {}
+        self._view_receivers: dict[str, ReceiveMessage] = (
+            self._views.receivers if self._views else {}
+        )
         self._last_log_ns = 0
         self._file = McapWriter(
             stream, f"trilat-net {log_layout.collect_provenance()['version_trilat-net']}"

@@ -1,3 +1,1 @@
-"""Standard ROS 2 messages of a session: their encoding, their content, and the channels for
-viewers.
-"""
+"""Standard ROS 2 messages of a session: encoding, content, and channels for viewers."""

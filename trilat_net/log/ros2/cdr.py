@@ -1,11 +1,13 @@
-"""Packer and reader of standard ROS 2 messages, which needs no ROS installation.
+"""Pack and read standard ROS 2 messages without a ROS installation.
 
-The encoding is little-endian CDR: fields are aligned to their size, counted from the end of the
-four-byte header. Padding is zero.
+A message is encoded as little-endian CDR, the Common Data Representation of OMG. It begins with
+a header of four bytes. Each field is aligned to its size, counted from the end of the header;
+the padding before it is zero. A string or list begins with its length, a number of 32 bits.
 
 Invariant:
-    - The bytes equal those of any other serializer.
-    - The constant layout of a message is computed once, so that packing is one `struct` call.
+    - The bytes of a message equal those of any other serializer.
+    - The layout of a message that sites publish at a high rate is computed once, so that
+      packing is one call of `struct`.
 """
 
 import math
@@ -32,39 +34,54 @@ DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 _HEAD = b"\x00\x01\x00\x00"
 """Header of a message: plain CDR, little-endian, no options."""
 _LAST_S = (1 << 31) - 1
-"""Latest stamp of ROS 2, in s: seconds are signed numbers of 32 bits."""
+"""Latest stamp of ROS 2, in s: a stamp has its seconds as a signed number of 32 bits."""
+_POSE_BYTES = 7 * 8
+"""Size of a transform: position and quaternion, seven floats of 8 bytes."""
 
 DEFINITIONS = resources.files("trilat_net.log.ros2") / "definitions"
 """Text files of ROS: message types, the quality of service of a bag, and the planar arm."""
-ROS2_SCHEMAS = {
-    name: (DEFINITIONS / f"{name.rpartition('/')[2]}.msg").read_bytes()
-    for name in (
-        JOINT_STATE,
-        FLOAT64_ARRAY,
-        STRING,
-        TRANSFORMS,
-        LOG,
-        POSE,
-        TWIST,
-        WRENCH,
-        DIAGNOSTICS,
-    )
-}
+_PACKED_TYPES = (
+    JOINT_STATE,
+    FLOAT64_ARRAY,
+    STRING,
+    TRANSFORMS,
+    LOG,
+    POSE,
+    TWIST,
+    WRENCH,
+    DIAGNOSTICS,
+)
+
+
+def _read_definition(type_name: str) -> bytes:
+    """Returns the text of a message type, such as "std_msgs/msg/String"."""
+    short_name = type_name.rpartition("/")[2]
+    return (DEFINITIONS / f"{short_name}.msg").read_bytes()
+
+
+ROS2_SCHEMAS = {type_name: _read_definition(type_name) for type_name in _PACKED_TYPES}
 """Complete definitions of the packed message types, by name."""
 
 
 def _pack_fields(offset: int, *values: int | str) -> bytes:
-    """Returns uint32 numbers and strings, packed for a position `offset` bytes after the head.
+    """Returns packed uint32 numbers and strings, for a position `offset` bytes after the head.
 
     A string is packed as its length with the terminating zero, then its bytes.
     """
     data = b""
     for value in values:
-        text = value.encode() + b"\0" if isinstance(value, str) else b""
-        number = value if isinstance(value, int) else len(text)
-        padding = b"\0" * (-(offset + len(data)) % 4)
-        data += padding + struct.pack("<I", number) + text
+        data += b"\0" * _count_padding(offset + len(data), 4)
+        if isinstance(value, int):
+            data += struct.pack("<I", value)
+        else:
+            text = value.encode() + b"\0"
+            data += struct.pack("<I", len(text)) + text
     return data
+
+
+def _count_padding(offset: int, size: int) -> int:
+    """Returns how many bytes of padding align a field of `size` bytes at `offset`."""
+    return -offset % size
 
 
 def _split_stamp(stamp_ns: int) -> tuple[int, int]:
@@ -73,13 +90,20 @@ def _split_stamp(stamp_ns: int) -> tuple[int, int]:
     return min(seconds, _LAST_S), rest_ns
 
 
+def _pack_stamp(stamp_ns: int) -> bytes:
+    """Returns a ROS 2 stamp of a time in Unix ns."""
+    seconds, rest_ns = _split_stamp(stamp_ns)
+    return struct.pack("<iI", seconds, rest_ns)
+
+
 def _format_floats(offset: int, count: int) -> tuple[str, int]:
     """Returns the `struct` format of a list of floats that begins at `offset`, and its end."""
-    padding = -offset % 4
-    start = offset + padding + 4
+    length_padding = _count_padding(offset, 4)
+    length_end = offset + length_padding + 4
     # An empty list has no float to align.
-    gap = -start % 8 if count else 0
-    return f"{padding}xI{gap}x{count}d", start + gap + 8 * count
+    float_padding = _count_padding(length_end, 8) if count else 0
+    end = length_end + float_padding + 8 * count
+    return f"{length_padding}xI{float_padding}x{count}d", end
 
 
 class JointStatePacker:
@@ -95,8 +119,12 @@ class JointStatePacker:
         self, names: Sequence[str], *, velocity: bool = True, effort: bool = True
     ) -> None:
         # The names follow the stamp of 8 bytes and an empty frame.
-        self._names = _pack_fields(8, "", len(names), *names)
-        self._counts = [len(names) * present for present in (True, velocity, effort)]
+        frame = ""
+        self._names = _pack_fields(8, frame, len(names), *names)
+        joint_count = len(names)
+        velocity_count = joint_count if velocity else 0
+        effort_count = joint_count if effort else 0
+        self._counts = (joint_count, velocity_count, effort_count)
         struct_format = f"<4siI{len(self._names)}s"
         offset = 8 + len(self._names)
         for count in self._counts:
@@ -137,14 +165,17 @@ class TransformPacker:
     """Packer of `tf2_msgs/msg/TFMessage` for frames given as pairs of parent and child."""
 
     def __init__(self, frames: Sequence[tuple[str, str]]) -> None:
-        self._names = []
+        self._names: list[bytes] = []
         struct_format = "<4sI"
+        # The number of transforms takes the first 4 bytes.
         offset = 4
         for parent, child in frames:
-            names = _pack_fields(offset + 8, parent, child)
-            gap = -(offset + 8 + len(names)) % 8
-            struct_format += f"iI{len(names)}s{gap}x7d"
-            offset += 8 + len(names) + gap + 56
+            names_offset = offset + 8
+            names = _pack_fields(names_offset, parent, child)
+            names_end = names_offset + len(names)
+            padding = _count_padding(names_end, 8)
+            struct_format += f"iI{len(names)}s{padding}x7d"
+            offset = names_end + padding + _POSE_BYTES
             self._names.append(names)
         self._pack = struct.Struct(struct_format).pack
 
@@ -155,10 +186,12 @@ class TransformPacker:
             stamp_ns: Unix time of the message, in ns, 0 or more.
             numbers: for each frame, x, y, z in m and a quaternion x, y, z, w.
         """
+        seconds, rest_ns = _split_stamp(stamp_ns)
         fields: list[object] = []
         for frame_index, names in enumerate(self._names):
-            pose = numbers[7 * frame_index : 7 * frame_index + 7]
-            fields += (*_split_stamp(stamp_ns), names, *pose)
+            start = 7 * frame_index
+            pose = numbers[start : start + 7]
+            fields += [seconds, rest_ns, names, *pose]
         return self._pack(_HEAD, len(self._names), *fields)
 
 
@@ -175,7 +208,7 @@ def make_float_array_packer(*dimensions: tuple[str, int]) -> Callable[..., bytes
     layout: list[int | str] = []
     for index, (label, size) in enumerate(dimensions):
         stride = math.prod(sizes[index:])
-        layout += label, size, stride
+        layout += [label, size, stride]
     data_offset = 0
     shape = _pack_fields(0, len(dimensions), *layout, data_offset)
     list_format, _ = _format_floats(len(shape), count)
@@ -205,9 +238,11 @@ def pack_log(stamp_ns: int, level: RosLogLevel, name: str, text: str) -> bytes:
         name: name of the member that logs.
         text: content of the line.
     """
-    # The fields follow stamp and level, 9 bytes; file, function and line number are empty.
-    fields = _pack_fields(9, name, text, "", "", 0)
-    return _HEAD + struct.pack("<iIB", *_split_stamp(stamp_ns), level) + fields
+    seconds, rest_ns = _split_stamp(stamp_ns)
+    head = struct.pack("<iIB", seconds, rest_ns, level)
+    # The file, the function and the line number of the source are empty.
+    fields = _pack_fields(len(head), name, text, "", "", 0)
+    return _HEAD + head + fields
 
 
 def pack_frame_vectors(stamp_ns: int, frame: str, *numbers: float) -> bytes:
@@ -220,13 +255,14 @@ def pack_frame_vectors(stamp_ns: int, frame: str, *numbers: float) -> bytes:
             in m/s and the angular velocity in rad/s; of a wrench the force in N and the torque
             in N m.
     """
-    head = struct.pack("<iI", *_split_stamp(stamp_ns)) + _pack_fields(8, frame)
-    padding = b"\0" * (-len(head) % 8)
-    return _HEAD + head + padding + struct.pack(f"<{len(numbers)}d", *numbers)
+    data = _pack_stamp(stamp_ns) + _pack_fields(8, frame)
+    data += b"\0" * _count_padding(len(data), 8)
+    data += struct.pack(f"<{len(numbers)}d", *numbers)
+    return _HEAD + data
 
 
 def pack_trigger_response(*, success: bool, text: str) -> bytes:
-    """Returns the response of `std_srvs/srv/Trigger`."""
+    """Returns the response of the service `std_srvs/srv/Trigger`."""
     return _HEAD + bytes([success]) + _pack_fields(1, text)
 
 
@@ -246,13 +282,23 @@ class Diagnosis(NamedTuple):
     values: Mapping[str, str]
 
 
-def pack_diagnostics(stamp_ns: int, parts: Sequence[Diagnosis]) -> bytes:
-    """Returns a `diagnostic_msgs/msg/DiagnosticArray`."""
-    data = struct.pack("<iI", *_split_stamp(stamp_ns)) + _pack_fields(8, "", len(parts))
-    for part in parts:
-        data += bytes([part.level])
-        fields = [text for pair in part.values.items() for text in pair]
-        data += _pack_fields(len(data), part.name, part.text, "", len(part.values), *fields)
+def pack_diagnostics(stamp_ns: int, diagnoses: Sequence[Diagnosis]) -> bytes:
+    """Returns a `diagnostic_msgs/msg/DiagnosticArray`.
+
+    Args:
+        stamp_ns: Unix time of the message, in ns, 0 or more.
+        diagnoses: the statuses.
+    """
+    frame = ""
+    hardware_id = ""
+    data = _pack_stamp(stamp_ns) + _pack_fields(8, frame, len(diagnoses))
+    for diagnosis in diagnoses:
+        data += bytes([diagnosis.level])
+        fields: list[str | int] = [diagnosis.name, diagnosis.text, hardware_id]
+        fields.append(len(diagnosis.values))
+        for key, value in diagnosis.values.items():
+            fields += [key, value]
+        data += _pack_fields(len(data), *fields)
     return _HEAD + data
 
 
@@ -272,7 +318,7 @@ class CdrReader:
     def numbers(self, code: str, count: int = 1) -> tuple[Any, ...]:
         """Returns the next `count` numbers of the `struct` format `code`."""
         size = struct.calcsize(f"<{code}")
-        padding = -self._position % size if count else 0
+        padding = _count_padding(self._position, size) if count else 0
         start = self._position + padding
         self._position = start + count * size
         if self._position > len(self._data):
@@ -280,8 +326,9 @@ class CdrReader:
         return struct.unpack_from(f"<{count}{code}", self._data, start)
 
     def count(self) -> int:
-        """Returns the length of the next list, whose entries have one byte at least."""
+        """Returns the length of the next list, whose entries have at least one byte each."""
         (count,) = self.numbers("I")
+        # A wrong length must not make the reader reserve memory for entries that do not exist.
         if count > len(self._data) - self._position:
             raise ValueError("ends in the middle of a field")
         return int(count)
@@ -289,7 +336,9 @@ class CdrReader:
     def text(self) -> str:
         """Returns the next string."""
         length = self.count()
-        (data,) = self.numbers("s", length) if length else (b"",)
+        if not length:
+            return ""
+        (data,) = self.numbers("s", length)
         return bytes(data).removesuffix(b"\0").decode()
 
     def floats(self) -> tuple[float, ...]:
@@ -346,6 +395,7 @@ def read_float_array(payload: bytes) -> tuple[float, ...]:
         ValueError: the message cannot be read.
     """
     reader = CdrReader(payload)
+    # Each dimension has a label, a size and a stride; the offset of the data follows.
     for _ in range(reader.count()):
         reader.text()
         reader.numbers("I", 2)
@@ -354,7 +404,7 @@ def read_float_array(payload: bytes) -> tuple[float, ...]:
 
 
 def read_frame_vectors(payload: bytes, count: int) -> tuple[str, tuple[float, ...]]:
-    """Returns frame and numbers of a `PoseStamped` or `WrenchStamped`.
+    """Returns the frame and the numbers of a `PoseStamped` or `WrenchStamped`.
 
     Args:
         payload: bytes of the message.

@@ -1,6 +1,8 @@
-"""Topics, types and messages of a session in ROS 2, for the live bridge and for bags.
+"""The topics of a session in ROS 2, and their messages, for the live bridge and for bags.
 
-A bag has a message for every record; the live bridge publishes a part of these messages.
+`trilat ros2` publishes a running session in the graph of ROS 2, and the export `ros2` converts
+a log to a bag. Both call this module. A bag has a message for every record; the live bridge
+publishes a part of these messages.
 
 Invariant:
     - The live bridge and a bag have the same topics with the same types and the same numbers,
@@ -24,6 +26,9 @@ from .topic_names import DIAGNOSTICS, FRAMES, TopicTable
 Topics = dict[str, Ros2Channel]
 """Topics by name: trilat-net's own names for one site, full names for a session."""
 
+IsWanted = Callable[[str], bool]
+"""Returns True if the message of a topic, by trilat-net's own name, is needed."""
+
 _OK = 0
 _WARNING = 1
 _ERROR = 2
@@ -31,6 +36,7 @@ _LEVELS = {"run": _OK, "fault": _ERROR, "diverged": _ERROR}
 """Levels of `/diagnostics` by mode; other modes have the level `_WARNING`."""
 _QUATERNION_TEXT = "unit quaternion, each nearest to the one before"
 _NO_ROTATION = (0.0, 0.0, 0.0)
+"""Angular part of a velocity or force that a site shares without a rotation."""
 
 COMMON_TOPICS = {
     FRAMES: Ros2Channel(
@@ -50,7 +56,8 @@ def list_topics(scenario: Scenario, session: str, table: TopicTable) -> Topics:
     for name, channel in SESSION_CHANNELS.items():
         topics[f"{session}/{name}"] = channel
     for site in scenario.names:
-        for name, channel in SiteMessages(scenario, site, 0).topics.items():
+        site_topics = SiteMessages(scenario, site, epoch_unix_ns=0).topics
+        for name, channel in site_topics.items():
             topics[table.find(session, site, name)] = channel
     return topics
 
@@ -74,21 +81,25 @@ class SiteMessages:
         self._arm = scenario.arms[site]
         self._epoch_unix_ns = epoch_unix_ns
         spec = scenario.sites[site]
+        # Sites share positions in units of 1 / scale metres.
         self._scale = spec.task.scale
-        self._channels = channels = Ros2SiteChannels(scenario, site)
+        channels = Ros2SiteChannels(scenario, site)
+        self._channels = channels
         self._robot = RobotModel(scenario, site)
-        self._signs = {name: QuaternionSigns() for name in ("tip_pose", "reference_pose")}
+        self._signs = {"tip_pose": QuaternionSigns(), "reference_pose": QuaternionSigns()}
         self._link_signs = [QuaternionSigns() for _ in self._robot.frames]
+        # Mode and dominance are published when they change.
         self._mode = ""
         self._shares = tuple[float, ...]()
+
         self.description = cdr.pack_string(self._robot.description)
-        self.frame = self._robot.frames[0][1]
-        self._pack_shared: Callable[..., bytes] | None = None
+        _, self.frame = self._robot.frames[0]
+        self._pack_shared_frame: Callable[..., bytes] | None = None
         # With a displaced base, the poses are in the frame that the sites share.
         if any((*spec.arm.base_xyz_m, *spec.arm.base_rpy_rad)):
             self.frame = f"{site}/shared"
-            self._pack_shared = cdr.TransformPacker([(WORLD, self.frame)]).pack
-        self._pack_states = cdr.JointStatePacker(channels.joints).pack
+            self._pack_shared_frame = cdr.TransformPacker([(WORLD, self.frame)]).pack
+        self._pack_joint_states = cdr.JointStatePacker(channels.joints).pack
         self._pack_reference = cdr.JointStatePacker(channels.joints, effort=False).pack
         peers = scenario.peers(site)
         self._pack_shares = cdr.make_float_array_packer((" ".join(peers), len(peers)))
@@ -99,48 +110,56 @@ class SiteMessages:
         channels = self._channels
         topics: Topics = {"joint_states": channels.joint_states(channels.joints)}
         if self._arm.shares_pose:
-            for topic, subject in (
-                ("tip", "the end effector"),
-                ("reference", "its reference, Eq. (6)"),
-            ):
-                pose = {
-                    "content": f"pose of {subject}",
-                    "unit": "m",
-                    "orientation": _QUATERNION_TEXT,
-                }
-                twist = {"content": f"velocity of {subject}", "unit": "m/s, rad/s"}
-                topics[f"{topic}_pose"] = Ros2Channel(cdr.POSE, {**pose, "frame": self.frame})
-                topics[f"{topic}_twist"] = Ros2Channel(
-                    cdr.TWIST, {**twist, "frame": self.frame}
-                )
+            topics["tip_pose"] = self._describe_pose("the end effector")
+            topics["tip_twist"] = self._describe_twist("the end effector")
+            topics["reference_pose"] = self._describe_pose("its reference, Eq. (6)")
+            topics["reference_twist"] = self._describe_twist("its reference, Eq. (6)")
             wrench = {
                 "content": "force of operator and environment ON the end effector",
                 "unit": "N, N m",
+                "frame": self.frame,
             }
-            topics["tip_wrench"] = Ros2Channel(cdr.WRENCH, {**wrench, "frame": self.frame})
+            topics["tip_wrench"] = Ros2Channel(cdr.WRENCH, wrench)
         else:
             topics["reference"] = channels.joint_states(channels.joints, effort=False)
-            pose = {
-                "content": "pose of the end effector",
-                "unit": "m",
-                "orientation": _QUATERNION_TEXT,
-            }
-            topics["tip_pose"] = Ros2Channel(cdr.POSE, {**pose, "frame": self.frame})
+            topics["tip_pose"] = self._describe_pose("the end effector")
         topics["mode"] = Ros2Channel(cdr.STRING, {"content": "mode of the site"}, latched=True)
         shares = {"content": "shares of its peers in its reference", "names": " ".join(peers)}
         topics["dominance"] = Ros2Channel(cdr.FLOAT64_ARRAY, shares, latched=True)
         robot = {"content": "URDF, with links named after their site"}
         topics["robot_description"] = Ros2Channel(cdr.STRING, robot, latched=True)
-        arrays = {
-            _name_array_topic(name): array.channel for name, array in channels.arrays.items()
+        return topics | self._list_array_topics()
+
+    def _describe_pose(self, subject: str) -> Ros2Channel:
+        """Returns the topic of a pose of the end effector or its reference."""
+        about = {
+            "content": f"pose of {subject}",
+            "unit": "m",
+            "orientation": _QUATERNION_TEXT,
+            "frame": self.frame,
         }
+        return Ros2Channel(cdr.POSE, about)
+
+    def _describe_twist(self, subject: str) -> Ros2Channel:
+        """Returns the topic of a velocity of the end effector or its reference."""
+        about = {
+            "content": f"velocity of {subject}",
+            "unit": "m/s, rad/s",
+            "frame": self.frame,
+        }
+        return Ros2Channel(cdr.TWIST, about)
+
+    def _list_array_topics(self) -> Topics:
+        """Returns the topics of the site's arrays."""
+        topics: Topics = {}
+        for name, array in self._channels.arrays.items():
+            topics[_name_array_topic(name)] = array.channel
         if self._arm.counts.shared == POSE and self._arm.shares_pose:
-            about = {
-                **arrays["error"].about,
-                "orientation": "rotation vector of the law's error, at most half a turn long",
-            }
-            arrays["error"] = arrays["error"]._replace(about=about)
-        return topics | arrays
+            error = topics["error"]
+            rotation_text = "rotation vector of the law's error, at most half a turn long"
+            about = {**error.about, "orientation": rotation_text}
+            topics["error"] = error._replace(about=about)
+        return topics
 
     def stamp_ns(self, record: State) -> int:
         """Returns the nominal time of a record, in Unix ns."""
@@ -150,7 +169,7 @@ class SiteMessages:
         self,
         record: State,
         shares: Sequence[float],
-        is_wanted: Callable[[str], bool] = lambda _topic: True,
+        is_wanted: IsWanted = lambda _topic: True,
     ) -> Iterator[tuple[str, bytes]]:
         """Yields topic and message for the messages of a record.
 
@@ -163,10 +182,12 @@ class SiteMessages:
         """
         stamp_ns = self.stamp_ns(record)
         if is_wanted("joint_states"):
-            yield "joint_states", self._pack_states(stamp_ns, record.q, record.qd, record.tau)
-        if not self._arm.shares_pose and is_wanted("reference"):
-            yield "reference", self._pack_reference(stamp_ns, record.q_des, record.qd_des)
-        yield from self._pack_tip(record, stamp_ns, is_wanted)
+            data = self._pack_joint_states(stamp_ns, record.q, record.qd, record.tau)
+            yield "joint_states", data
+        if self._arm.shares_pose:
+            yield from self._pack_shared_motion(record, stamp_ns, is_wanted)
+        else:
+            yield from self._pack_joint_reference(record, stamp_ns, is_wanted)
         if record.mode != self._mode:
             self._mode = record.mode
             yield "mode", cdr.pack_string(record.mode)
@@ -176,34 +197,50 @@ class SiteMessages:
             yield "dominance", self._pack_shares(*new_shares)
         yield from self._pack_arrays(record, is_wanted)
 
-    def _pack_tip(
-        self, record: State, stamp_ns: int, is_wanted: Callable[[str], bool]
+    def _pack_joint_reference(
+        self, record: State, stamp_ns: int, is_wanted: IsWanted
     ) -> Iterator[tuple[str, bytes]]:
-        """Yields the poses, twists and wrench of the end effector and its reference."""
-        poses = {"tip_pose": (record.x, record.xd)}
-        if self._arm.shares_pose:
-            poses["reference_pose"] = record.q_des, record.qd_des
-        for topic, (pose, rate) in poses.items():
-            if is_wanted(topic):
-                rotation_vector = self._compute_rotation_vector(record, pose)
-                # Only packed quaternions are aligned: the sign is continuous from message to
-                # message.
-                quaternion = self._signs[topic].align(compute_quaternion(rotation_vector))
-                position = self._compute_position(record, pose)
-                yield (
-                    topic,
-                    cdr.pack_frame_vectors(stamp_ns, self.frame, *position, *quaternion),
-                )
-            twist = topic.replace("pose", "twist")
-            if self._arm.shares_pose and is_wanted(twist):
+        """Yields the reference of the joints and the pose of the end effector.
+
+        The sites share joint angles and no pose: the pose follows from the angles.
+        """
+        if is_wanted("reference"):
+            data = self._pack_reference(stamp_ns, record.q_des, record.qd_des)
+            yield "reference", data
+        if is_wanted("tip_pose"):
+            yield "tip_pose", self._pack_pose("tip_pose", record, record.x, stamp_ns)
+
+    def _pack_shared_motion(
+        self, record: State, stamp_ns: int, is_wanted: IsWanted
+    ) -> Iterator[tuple[str, bytes]]:
+        """Yields the messages of a shared pose, of its reference, and of the wrench."""
+        motions = [("tip", record.x, record.xd), ("reference", record.q_des, record.qd_des)]
+        for subject, pose, rate in motions:
+            pose_topic = f"{subject}_pose"
+            if is_wanted(pose_topic):
+                yield pose_topic, self._pack_pose(pose_topic, record, pose, stamp_ns)
+            twist_topic = f"{subject}_twist"
+            if is_wanted(twist_topic):
                 linear = [speed / self._scale for speed in rate[:POSITION]]
-                angular = [*rate[POSITION:], *_NO_ROTATION][:POSITION]
-                yield twist, cdr.pack_frame_vectors(stamp_ns, self.frame, *linear, *angular)
-        if self._arm.shares_pose and is_wanted("tip_wrench"):
+                angular = _fill_rotation(rate)
+                data = cdr.pack_frame_vectors(stamp_ns, self.frame, *linear, *angular)
+                yield twist_topic, data
+        if is_wanted("tip_wrench"):
+            # A record has the wrench that Eq. (8) subtracts, the reaction of this wrench.
             force = [-self._scale * component for component in record.wrench[:POSITION]]
-            shared_torque = [*record.wrench[POSITION:], *_NO_ROTATION][:POSITION]
-            torque = [-component for component in shared_torque]
-            yield "tip_wrench", cdr.pack_frame_vectors(stamp_ns, self.frame, *force, *torque)
+            torque = [-component for component in _fill_rotation(record.wrench)]
+            data = cdr.pack_frame_vectors(stamp_ns, self.frame, *force, *torque)
+            yield "tip_wrench", data
+
+    def _pack_pose(
+        self, topic: str, record: State, pose: Sequence[float], stamp_ns: int
+    ) -> bytes:
+        """Returns the message of a shared pose, which is empty in joint space."""
+        rotation_vector = self._compute_rotation_vector(record, pose)
+        # Only packed quaternions are aligned: the sign is continuous from message to message.
+        quaternion = self._signs[topic].align(compute_quaternion(rotation_vector))
+        position = self._compute_position(record, pose)
+        return cdr.pack_frame_vectors(stamp_ns, self.frame, *position, *quaternion)
 
     def _compute_position(self, record: State, pose: Sequence[float]) -> Sequence[float]:
         """Returns the position of a shared pose, in m.
@@ -212,7 +249,9 @@ class SiteMessages:
         """
         if pose:
             return [coordinate / self._scale for coordinate in pose[:POSITION]]
-        return [*self._arm.end_effector(record.q), 0.0][:POSITION]
+        # The end effector of a planar arm has two coordinates; the third is 0.
+        end_effector = [*self._arm.end_effector(record.q), 0.0]
+        return end_effector[:POSITION]
 
     def _compute_rotation_vector(
         self, record: State, pose: Sequence[float]
@@ -225,17 +264,17 @@ class SiteMessages:
             return pose[POSITION], pose[POSITION + 1], pose[POSITION + 2]
         return self._arm.end_effector_orientation(record.q)
 
-    def _pack_arrays(
-        self, record: State, is_wanted: Callable[[str], bool]
-    ) -> Iterator[tuple[str, bytes]]:
+    def _pack_arrays(self, record: State, is_wanted: IsWanted) -> Iterator[tuple[str, bytes]]:
         """Yields the wanted arrays of a record."""
         channels = self._channels
-        if not any(is_wanted(_name_array_topic(name)) for name in channels.record_arrays):
+        topics = [_name_array_topic(name) for name in channels.record_arrays]
+        if not any(is_wanted(topic) for topic in topics):
             return
-        row = [column[0] for column in stack_signals([record])]
+        row = [curve[0] for curve in stack_signals([record])]
         if is_wanted("error"):
-            yield "error", channels.arrays["error"].pack(*row[channels.error_row])
-        for name, data in channels.slow(row[channels.slow_row]):
+            error_row = row[channels.error_row]
+            yield "error", channels.arrays["error"].pack(*error_row)
+        for name, data in channels.pack_slow_arrays(row[channels.slow_row]):
             topic = _name_array_topic(name)
             if is_wanted(topic):
                 yield topic, data
@@ -243,16 +282,18 @@ class SiteMessages:
     def pack_frames(self, record: State) -> Iterable[bytes]:
         """Yields the messages of a record on `/tf`."""
         stamp_ns = self.stamp_ns(record)
-        transforms = zip(self._link_signs, self._robot.transforms(record.q), strict=True)
-        aligned = [(origin, signs.align(rotation)) for signs, (origin, rotation) in transforms]
+        transforms = self._robot.compute_transforms(record.q)
+        aligned: list[tuple[Sequence[float], Sequence[float]]] = []
+        for signs, (origin, rotation) in zip(self._link_signs, transforms, strict=True):
+            aligned.append((origin, signs.align(rotation)))
         yield self._robot.pack_transforms(stamp_ns, aligned)
-        if self._pack_shared is not None:
+        if self._pack_shared_frame is not None:
             origin, rotation = self._robot.shared
-            yield self._pack_shared(stamp_ns, [*origin, *rotation])
+            yield self._pack_shared_frame(stamp_ns, [*origin, *rotation])
 
     def pack_statistics(self, stats: LinkStats) -> Iterator[tuple[str, bytes]]:
         """Yields topic, by trilat-net's own name, and message of link statistics."""
-        yield from self._channels.statistics(stats)
+        yield from self._channels.pack_statistics(stats)
 
 
 def _name_array_topic(name: str) -> str:
@@ -260,15 +301,32 @@ def _name_array_topic(name: str) -> str:
     return "mode_number" if name == "mode" else name
 
 
+def _fill_rotation(values: Sequence[float]) -> list[float]:
+    """Returns the angular part of a shared velocity or wrench, zeros if it has none."""
+    angular = [*values[POSITION:], *_NO_ROTATION]
+    return angular[:POSITION]
+
+
 def pack_session_diagnostics(
     session: str, epoch_unix_ns: int, records: Sequence[State]
 ) -> bytes:
-    """Returns a message for `/diagnostics`, made from the newest record of each site."""
+    """Returns a message for `/diagnostics`.
+
+    Args:
+        session: the session's name.
+        epoch_unix_ns: Unix time of tick 0, in ns; 0 in virtual time.
+        records: the newest record of each site that has published one.
+    """
     newest_ns = max((record.t_ns for record in records), default=0)
-    parts: list[cdr.Diagnosis] = []
+    diagnoses: list[cdr.Diagnosis] = []
     for record in records:
-        values = {"tick": record.tick, "late_us": record.late_us, "busy_us": record.busy_us}
-        texts = {key: str(value) for key, value in values.items()}
+        values = {
+            "tick": str(record.tick),
+            "late_us": str(record.late_us),
+            "busy_us": str(record.busy_us),
+        }
         level = _LEVELS.get(record.mode, _WARNING)
-        parts.append(cdr.Diagnosis(level, f"{session}/{record.site}", record.mode, texts))
-    return cdr.pack_diagnostics(max(0, epoch_unix_ns + newest_ns), parts)
+        name = f"{session}/{record.site}"
+        diagnoses.append(cdr.Diagnosis(level, name, record.mode, values))
+    stamp_ns = max(0, epoch_unix_ns + newest_ns)
+    return cdr.pack_diagnostics(stamp_ns, diagnoses)

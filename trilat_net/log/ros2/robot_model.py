@@ -1,9 +1,13 @@
-"""An arm for viewers: its URDF with names of its own, and the frames of its links at every
-time.
+"""The model of a site's arm for viewers: its URDF, and the pose of each link at given angles.
 
-Invariant: the frame of a link is called "<site>/<link>", in the URDF as in the transforms, so
-that arms of one file stand beside each other below `WORLD`. A file without shapes gets plain
-ones; none is opened.
+A viewer draws the arms of a session in one scene. The arms stand in a row, `SPACING_M` apart,
+below a common frame `WORLD` whose z axis points up. A URDF without shapes gets plain ones, so
+that the arm can be seen; meshes are never opened.
+
+Invariant:
+    - The frame of a link is named "<site>/<link>", in the URDF as well as in the transforms, so
+      that arms with the same URDF can be shown together.
+    - The transforms place the end effector where the site computes it.
 """
 
 import math
@@ -17,28 +21,50 @@ from ...scenario.arms import read_arm
 from .cdr import DEFINITIONS, TransformPacker
 
 WORLD = "world"
+"""Name of the frame in which all arms of a session stand."""
 SPACING_M = 1.5
-"""From the base of a site to that of the next."""
+"""Distance between the bases of neighbouring sites, in m."""
 _RADIUS_M = 0.035
+"""Radius of the plain shape of a link, in m."""
 _SHAPE_COLOURS = ("0 0.27 0.53 1", "0.73 0.33 0.4 1", "0.87 0.67 0.2 1", "0.4 0.4 0.4 1")
+"""Colours of the plain shapes, site by site: red, green, blue and opacity, from 0 to 1."""
 
 Vector = tuple[float, float, float]
+"""A vector x, y, z."""
 Quaternion = tuple[float, float, float, float]
-"""x, y, z, w."""
+"""A unit quaternion x, y, z, w."""
+Transform = tuple[Vector, Quaternion]
+"""The pose of a frame in its parent: origin in m, and rotation."""
+
+_X_AXIS = (1.0, 0.0, 0.0)
+_Y_AXIS = (0.0, 1.0, 0.0)
+_Z_AXIS = (0.0, 0.0, 1.0)
+_NO_VECTOR = (0.0, 0.0, 0.0)
+_PLANAR_DOWN = (0.0, -1.0, 0.0)
+"""Direction of gravity in the frame of a planar arm's base."""
 
 
 class _JointFrame(NamedTuple):
-    """A joint: where its link is, and which number of q moves it; -1 for none, as of fingers."""
+    """A joint of the arm, which places the frame of its child link.
+
+    Attributes:
+        origin_m: origin of the link's frame in the parent link's frame, at joint position 0.
+        rotation: rotation of the link's frame, at joint position 0.
+        axis: axis of the joint in the frame of the link, a unit vector.
+        is_prismatic: True if the joint slides along its axis instead of turning about it.
+        q_index: index of the joint's position in q; -1 for a joint that does not move, such as
+            a finger of a gripper.
+    """
 
     origin_m: Vector
-    turned: Quaternion
+    rotation: Quaternion
     axis: Vector
-    slides: bool
-    place: int
+    is_prismatic: bool
+    q_index: int
 
 
 def multiply_quaternions(a: Quaternion, b: Quaternion) -> Quaternion:
-    """Returns the rotation b followed by a."""
+    """Returns the product a b: the rotation b followed by the rotation a."""
     ax, ay, az, aw = a
     bx, by, bz, bw = b
     return (
@@ -49,184 +75,243 @@ def multiply_quaternions(a: Quaternion, b: Quaternion) -> Quaternion:
     )
 
 
-def rotate_vector(q: Quaternion, a: Vector) -> Vector:
-    """Returns a vector turned by a quaternion."""
-    x, y, z, w = q
+def rotate_vector(rotation: Quaternion, vector: Vector) -> Vector:
+    """Returns a vector v after a rotation q, which is q v q*."""
+    x, y, z, w = rotation
     conjugate = (-x, -y, -z, w)
-    bx, by, bz, _ = multiply_quaternions(multiply_quaternions(q, (*a, 0.0)), conjugate)
-    return bx, by, bz
+    half_product = multiply_quaternions(rotation, (*vector, 0.0))
+    rotated_x, rotated_y, rotated_z, _ = multiply_quaternions(half_product, conjugate)
+    return rotated_x, rotated_y, rotated_z
 
 
-def _about(axis: Vector, angle: float) -> Quaternion:
-    s = math.sin(angle / 2.0)
-    return axis[0] * s, axis[1] * s, axis[2] * s, math.cos(angle / 2.0)
+def _rotate_about(axis: Vector, angle: float) -> Quaternion:
+    """Returns the rotation by an angle in rad about a unit vector."""
+    sine = math.sin(angle / 2.0)
+    cosine = math.cos(angle / 2.0)
+    return axis[0] * sine, axis[1] * sine, axis[2] * sine, cosine
 
 
-def compute_quaternion(turn: Vector) -> Quaternion:
-    """Returns the rotation by a rotation vector, rad."""
-    angle = math.hypot(*turn)
-    x, y, z = (one / angle for one in turn) if angle else (1.0, 0.0, 0.0)
-    return _about((x, y, z), angle)
+def compute_quaternion(rotation_vector: Vector) -> Quaternion:
+    """Returns the rotation by a rotation vector, in rad."""
+    angle = math.hypot(*rotation_vector)
+    if not angle:
+        return _rotate_about(_X_AXIS, angle)
+    x, y, z = (component / angle for component in rotation_vector)
+    return _rotate_about((x, y, z), angle)
 
 
-def _upright(down: Sequence[float]) -> Quaternion:
-    size = math.hypot(*down)
-    x, y, z = (each / size for each in down)
+def _rotate_upright(down: Sequence[float]) -> Quaternion:
+    """Returns the shortest rotation that turns the direction `down` to -z."""
+    length = math.hypot(*down)
+    x, y, z = (component / length for component in down)
+    # The direction is opposite to -z: any half turn about a horizontal axis will do.
     if z > 1.0 - 1e-12:
         return 1.0, 0.0, 0.0, 0.0
-    # the axis is the product of both directions, (-y, x, 0), and w is 1 plus their cosine
-    length = math.sqrt(x * x + y * y + (1.0 - z) ** 2)
-    return -y / length, x / length, 0.0, (1.0 - z) / length
+    # For unit vectors a and b, the shortest rotation is (a x b, 1 + a . b), normalized. With
+    # b = -z the cross product is (-y, x, 0) and the scalar part 1 - z.
+    norm = math.sqrt(x * x + y * y + (1.0 - z) ** 2)
+    return -y / norm, x / norm, 0.0, (1.0 - z) / norm
+
+
+def _convert_rpy(rpy: Sequence[float]) -> Quaternion:
+    """Returns the rotation by roll, pitch and yaw in rad about the fixed x, y and z axes."""
+    roll, pitch, yaw = rpy
+    yaw_rotation = _rotate_about(_Z_AXIS, yaw)
+    pitch_rotation = _rotate_about(_Y_AXIS, pitch)
+    roll_rotation = _rotate_about(_X_AXIS, roll)
+    yaw_pitch_rotation = multiply_quaternions(yaw_rotation, pitch_rotation)
+    return multiply_quaternions(yaw_pitch_rotation, roll_rotation)
 
 
 _PLANAR = (DEFINITIONS / "planar.urdf").read_text(encoding="utf-8")
-"""The planar arm as a chain."""
+"""URDF of the planar arm, with the lengths of its links as placeholders."""
 
 
 class RobotModel:
-    """The arm of one site that is a chain: that of its URDF, or the planar one.
+    """The arm of one site as a chain of links: the arm of a URDF, or the planar arm.
 
     Attributes:
-        description: the URDF, with the names of its links after the site.
-        frames: pairs of frames: parent and child, from `WORLD` on.
-        shared: where in `WORLD` the frame is in which the base of the arm is placed.
+        description: the URDF, with the site's name in the names of the links.
+        frames: pairs of parent and child frame, from `WORLD` to the last link.
+        shared: pose in `WORLD` of the frame in which the scenario places the arm's base.
     """
 
     def __init__(self, scenario: Scenario, site: str) -> None:
         spec = scenario.sites[site].arm
-        names = scenario.arms[site].joint_names
+        site_number = scenario.names.index(site)
         base = "base"
-        text = _PLANAR.format(l1_m=spec.l1_m, l2_m=spec.l2_m)
+        urdf = _PLANAR.format(l1_m=spec.l1_m, l2_m=spec.l2_m)
         if spec.urdf:
             base = read_arm(spec, scenario.urdf).base
-            text = scenario.urdf[spec.urdf]
-        x, y, z = spec.down if spec.urdf else (0.0, -1.0, 0.0)
-        root = ElementTree.fromstring(text)
-        below: dict[str, list[Element]] = {}
-        for joint in root.findall("joint"):
-            below.setdefault(_link_of(joint, "parent"), []).append(joint)
+            urdf = scenario.urdf[spec.urdf]
+        root = ElementTree.fromstring(urdf)
         self.frames = [(WORLD, f"{site}/{base}")]
         self._joints: list[_JointFrame] = []
-        reached = [base]
-        for link in reached:  # it grows
-            for joint in below.get(link, ()):
-                child = _link_of(joint, "child")
-                reached.append(child)
-                self.frames.append((f"{site}/{link}", f"{site}/{child}"))
-                self._joints.append(_read_frame(joint, names))
-        own = _turned(spec.base_rpy_rad)
-        upright = _upright(rotate_vector(own, (x, y, z)))
-        x, y, z = spec.base_xyz_m
-        x, y, z = rotate_vector(upright, (x, y, z))
-        beside_m = SPACING_M * scenario.names.index(site)
-        self.shared = ((0.0, beside_m, 0.0), upright)
-        place = (x, y + beside_m, z)
-        self._base = (place, multiply_quaternions(upright, own))
-        self.description = _describe(root, site, scenario.names.index(site))
+        joint_names = scenario.arms[site].joint_names
+        for joint in _list_joints(root, base):
+            parent = _get_link(joint, "parent")
+            child = _get_link(joint, "child")
+            self.frames.append((f"{site}/{parent}", f"{site}/{child}"))
+            self._joints.append(_read_joint_frame(joint, joint_names))
         self._packer = TransformPacker(self.frames)
 
-    def transforms(self, q: Sequence[float]) -> list[tuple[Vector, Quaternion]]:
-        """Returns where each frame is in its parent: its origin, m, and its rotation."""
-        found = [self._base]
-        for origin, turned, axis, slides, place in self._joints:
-            moved = q[place] if place >= 0 else 0.0
-            if slides:
-                x, y, z = rotate_vector(turned, axis)
-                origin = (origin[0] + moved * x, origin[1] + moved * y, origin[2] + moved * z)
-            elif moved:
-                turned = multiply_quaternions(turned, _about(axis, moved))
-            found.append((origin, turned))
-        return found
+        base_rotation = _convert_rpy(spec.base_rpy_rad)
+        down_x, down_y, down_z = spec.down if spec.urdf else _PLANAR_DOWN
+        down = rotate_vector(base_rotation, (down_x, down_y, down_z))
+        upright = _rotate_upright(down)
+        base_x, base_y, base_z = spec.base_xyz_m
+        x, y, z = rotate_vector(upright, (base_x, base_y, base_z))
+        site_y = SPACING_M * site_number
+        self.shared = ((0.0, site_y, 0.0), upright)
+        base_origin = (x, y + site_y, z)
+        self._base = (base_origin, multiply_quaternions(upright, base_rotation))
+        # The description is made last, because the links of `root` are renamed for it.
+        self.description = _describe_robot(root, site, site_number)
+
+    def compute_transforms(self, q: Sequence[float]) -> list[Transform]:
+        """Returns the pose of each frame in its parent, in the order of `frames`.
+
+        Args:
+            q: positions of the joints, in rad or m.
+        """
+        transforms: list[Transform] = [self._base]
+        for joint in self._joints:
+            origin = joint.origin_m
+            rotation = joint.rotation
+            position = q[joint.q_index] if joint.q_index >= 0 else 0.0
+            if joint.is_prismatic:
+                x, y, z = rotate_vector(rotation, joint.axis)
+                origin = (
+                    origin[0] + position * x,
+                    origin[1] + position * y,
+                    origin[2] + position * z,
+                )
+            elif position:
+                rotation = multiply_quaternions(rotation, _rotate_about(joint.axis, position))
+            transforms.append((origin, rotation))
+        return transforms
 
     def pack(self, stamp_ns: int, q: Sequence[float]) -> bytes:
-        """Returns the transforms of a time (Unix ns, not below 0) at positions q as one
-        message.
+        """Returns the poses of all frames as one message of `/tf`.
+
+        Args:
+            stamp_ns: Unix time of the message, in ns, 0 or more.
+            q: positions of the joints, in rad or m.
         """
-        return self.pack_transforms(stamp_ns, self.transforms(q))
+        return self.pack_transforms(stamp_ns, self.compute_transforms(q))
 
     def pack_transforms(
         self, stamp_ns: int, transforms: Iterable[tuple[Sequence[float], Sequence[float]]]
     ) -> bytes:
-        """Returns the transforms of a time as one message: origins, m, and quaternions x, y, z,
-        w.
+        """Returns computed poses as one message of `/tf`.
+
+        Args:
+            stamp_ns: Unix time of the message, in ns, 0 or more.
+            transforms: origin in m and quaternion x, y, z, w of each of `frames`.
         """
-        numbers = [x for origin, turned in transforms for x in (*origin, *turned)]
+        numbers: list[float] = []
+        for origin, rotation in transforms:
+            numbers += [*origin, *rotation]
         return self._packer.pack(stamp_ns, numbers)
 
 
-def _turned(rpy: Sequence[float]) -> Quaternion:
-    roll, pitch, yaw = rpy
-    turned = multiply_quaternions(_about((0.0, 0.0, 1.0), yaw), _about((0.0, 1.0, 0.0), pitch))
-    return multiply_quaternions(turned, _about((1.0, 0.0, 0.0), roll))
+def _list_joints(root: Element, base: str) -> list[Element]:
+    """Returns the joints of a URDF that hang on the link `base`, parents before children."""
+    joints_of_parent: dict[str, list[Element]] = {}
+    for joint in root.findall("joint"):
+        parent = _get_link(joint, "parent")
+        joints_of_parent.setdefault(parent, []).append(joint)
+    joints: list[Element] = []
+    links = [base]
+    # The list of links grows while the loop runs: breadth-first search.
+    for link in links:
+        for joint in joints_of_parent.get(link, ()):
+            joints.append(joint)
+            links.append(_get_link(joint, "child"))
+    return joints
 
 
-def _link_of(joint: Element, end: str) -> str:
-    found = joint.find(end)
-    return "" if found is None else found.get("link", "")
+def _get_link(joint: Element, end: str) -> str:
+    """Returns the name of the link at an end of a joint: "parent" or "child"."""
+    element = joint.find(end)
+    return "" if element is None else element.get("link", "")
 
 
-def _vector(element: Element | None, key: str, absent: Vector) -> Vector:
-    """Returns three numbers; what is none in a branch that is no part of the arm counts as
-    absent.
+def _parse_vector(element: Element | None, key: str, default: Vector) -> Vector:
+    """Returns three numbers of an attribute.
+
+    Returns the default if the attribute does not hold three finite numbers. That occurs only in
+    branches of the URDF that are not part of the arm, because `read_urdf` checks the arm.
     """
+    text = "" if element is None else element.get(key, "")
     try:
-        x, y, z = map(float, ("" if element is None else element.get(key, "")).split())
+        x, y, z = map(float, text.split())
     except ValueError:
-        return absent
-    return (x, y, z) if math.isfinite(x + y + z) else absent
+        return default
+    return (x, y, z) if math.isfinite(x + y + z) else default
 
 
-def _read_frame(joint: Element, names: Sequence[str]) -> _JointFrame:
-    """Returns a joint as `read_urdf` has taken it."""
+def _read_joint_frame(joint: Element, joint_names: Sequence[str]) -> _JointFrame:
+    """Returns the frame of a joint, with the same defaults as `read_urdf`.
+
+    Args:
+        joint: the joint's element in the URDF.
+        joint_names: names of the joints in the order of q.
+    """
     name = joint.get("name", "")
     origin = joint.find("origin")
-    turned = _turned(_vector(origin, "rpy", (0.0, 0.0, 0.0)))
-    axis = _vector(joint.find("axis"), "xyz", (1.0, 0.0, 0.0))
-    size = math.hypot(*axis) or 1.0
-    unit = (axis[0] / size, axis[1] / size, axis[2] / size)
-    place = names.index(name) if name in names else -1
+    axis = _parse_vector(joint.find("axis"), "xyz", _X_AXIS)
+    length = math.hypot(*axis) or 1.0
     return _JointFrame(
-        origin_m=_vector(origin, "xyz", (0.0, 0.0, 0.0)),
-        turned=turned,
-        axis=unit,
-        slides=joint.get("type") == "prismatic",
-        place=place,
+        origin_m=_parse_vector(origin, "xyz", _NO_VECTOR),
+        rotation=_convert_rpy(_parse_vector(origin, "rpy", _NO_VECTOR)),
+        axis=(axis[0] / length, axis[1] / length, axis[2] / length),
+        is_prismatic=joint.get("type") == "prismatic",
+        q_index=joint_names.index(name) if name in joint_names else -1,
     )
 
 
-def _describe(root: Element, site: str, number: int) -> str:
-    """Returns a robot as text, with the names of its links after the site; it is changed to
-    that.
+def _describe_robot(root: Element, site: str, site_number: int) -> str:
+    """Returns the URDF of a site's arm as text.
+
+    The function changes `root`: the names of the links get the site's name in front, and links
+    get plain shapes if the URDF has none.
     """
-    plain = root.find("link/visual") is None
-    colour = _SHAPE_COLOURS[number % len(_SHAPE_COLOURS)]
+    has_shapes = root.find("link/visual") is not None
+    colour = _SHAPE_COLOURS[site_number % len(_SHAPE_COLOURS)]
     links = {link.get("name", ""): link for link in root.findall("link")}
     for joint in root.findall("joint"):
-        if plain and (parent := links.get(_link_of(joint, "parent"))) is not None:
-            _add_shape(
-                parent, _vector(joint.find("origin"), "xyz", (0.0, 0.0, 0.0)), colour, site
-            )
+        parent = links.get(_get_link(joint, "parent"))
+        if parent is not None and not has_shapes:
+            joint_origin_m = _parse_vector(joint.find("origin"), "xyz", _NO_VECTOR)
+            _add_shape(parent, joint_origin_m, colour, site)
         for end in ("parent", "child"):
-            if (found := joint.find(end)) is not None:
-                found.set("link", f"{site}/{found.get('link', '')}")
+            element = joint.find(end)
+            if element is not None:
+                link_name = element.get("link", "")
+                element.set("link", f"{site}/{link_name}")
     for name, link in links.items():
         link.set("name", f"{site}/{name}")
     return ElementTree.tostring(root, encoding="unicode")
 
 
-def _add_shape(link: Element, to: Vector, colour: str, site: str) -> None:
+def _add_shape(link: Element, end_m: Vector, colour: str, site: str) -> None:
+    """Adds a cylinder from the origin of a link to `end_m`, or a sphere if both are equal."""
+    length_m = math.hypot(*end_m)
+    centre_text = " ".join(f"{coordinate / 2.0:.9g}" for coordinate in end_m)
+    # A cylinder of URDF lies along z: it is tilted from z, and then turned about z.
+    tilt = math.atan2(math.hypot(end_m[0], end_m[1]), end_m[2])
+    azimuth = math.atan2(end_m[1], end_m[0])
+    rpy_text = f"0 {tilt:.9g} {azimuth:.9g}"
     visual = ElementTree.SubElement(link, "visual")
-    length = math.hypot(*to)
-    middle = " ".join(f"{x / 2.0:.9g}" for x in to)
-    tilt = math.atan2(math.hypot(to[0], to[1]), to[2])
-    turn = math.atan2(to[1], to[0])
-    ElementTree.SubElement(visual, "origin", xyz=middle, rpy=f"0 {tilt:.9g} {turn:.9g}")
+    ElementTree.SubElement(visual, "origin", xyz=centre_text, rpy=rpy_text)
     geometry = ElementTree.SubElement(visual, "geometry")
-    if length > 0.0:
-        ElementTree.SubElement(
-            geometry, "cylinder", radius=f"{_RADIUS_M:g}", length=f"{length:.9g}"
-        )
+    if length_m > 0.0:
+        radius_text = f"{_RADIUS_M:g}"
+        length_text = f"{length_m:.9g}"
+        ElementTree.SubElement(geometry, "cylinder", radius=radius_text, length=length_text)
     else:
-        ElementTree.SubElement(geometry, "sphere", radius=f"{1.2 * _RADIUS_M:g}")
+        radius_text = f"{1.2 * _RADIUS_M:g}"
+        ElementTree.SubElement(geometry, "sphere", radius=radius_text)
     material = ElementTree.SubElement(visual, "material", name=f"{site}_plain")
     ElementTree.SubElement(material, "color", rgba=colour)

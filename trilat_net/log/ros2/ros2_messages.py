@@ -1,10 +1,15 @@
-"""Mapping of a session's messages to standard ROS 2 messages: channels, units, names.
+"""The standard ROS 2 messages that stand for a session's own messages.
+
+A log contains the session's own messages, which only trilat-net can read. Beside them it has
+channels of standard ROS 2 messages for general viewers such as Foxglove and PlotJuggler. This
+module defines the channels with their units and names, and converts the messages.
 
 Invariant:
-    - Only units are converted, as the metadata of the channel state.
+    - Numbers are copied. Only times are converted, to the unit that the channel's metadata
+      states.
     - A value that was not measured is NaN.
-    - The name of a curve is where viewers look for it: a joint's name is in the message, other
-      names are in the label of the dimension.
+    - Viewers find the name of each curve: the name of a joint is in the message, any other name
+      is in the label of the array's dimension.
 """
 
 import math
@@ -18,7 +23,7 @@ from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
 from ...core.task_space import POSITION
-from ...core.ticks import TickRecord
+from ...core.ticks import Mode, TickRecord
 from ...files import reading
 from ...net.messages import MODE_WORDS, Event, LinkStats, State
 from ...scenario import Scenario
@@ -30,14 +35,16 @@ from . import cdr
 from .robot_model import RobotModel
 
 EVENTS = "events"
+"""Channel of the session's events as plain text."""
 LINES = "log"
-"""Channels of a whole session: events as plain text, and as log lines with time and level."""
+"""Channel of the session's events as log lines, with time and level."""
 SENT_PREFIX = "sent_"
 """Prefix of the arrays with the vectors that a law sends: "sent_E", "sent_u_to_m2"."""
 
 ROBOT = "robot_description"
+"""Channel with the URDF of an arm."""
 FRAMES = "tf"
-"""Channels of an arm with a URDF: the URDF text, and the frames of the links."""
+"""Channel with the frames of an arm's links."""
 
 
 class Ros2Channel(NamedTuple):
@@ -71,16 +78,23 @@ class StandardChannels:
         self._channel_numbers: dict[str, int] = {}
 
     def __getitem__(self, topic: str) -> int:
+        """Returns the number of a topic's channel, and registers the channel if necessary."""
         if topic not in self._channel_numbers:
-            kind, about, _ = self._known[topic]
-            if kind not in self._schema_numbers:
-                self._schema_numbers[kind] = self._file.register_schema(
-                    kind, cdr.SCHEMA_ENCODING, cdr.ROS2_SCHEMAS[kind]
-                )
+            channel = self._known[topic]
+            schema_number = self._get_schema_number(channel.kind)
             self._channel_numbers[topic] = self._file.register_channel(
-                topic, cdr.ENCODING, self._schema_numbers[kind], about
+                topic, cdr.ENCODING, schema_number, channel.about
             )
         return self._channel_numbers[topic]
+
+    def _get_schema_number(self, kind: str) -> int:
+        """Returns the number of a message type, and registers the type if necessary."""
+        if kind not in self._schema_numbers:
+            definition = cdr.ROS2_SCHEMAS[kind]
+            self._schema_numbers[kind] = self._file.register_schema(
+                kind, cdr.SCHEMA_ENCODING, definition
+            )
+        return self._schema_numbers[kind]
 
 
 SESSION_CHANNELS = {
@@ -92,12 +106,21 @@ ROBOT_CHANNELS = {
     FRAMES: Ros2Channel(cdr.TRANSFORMS, {"content": "frames of the links", "unit": "m"}),
 }
 _LEVELS = {
-    **dict.fromkeys(("diverged", "failed"), cdr.RosLogLevel.ERROR),
-    **dict.fromkeys(
-        ("lost", "left", "unheard", "waiting", "refused", "clock fault"), cdr.RosLogLevel.WARN
-    ),
+    "diverged": cdr.RosLogLevel.ERROR,
+    "failed": cdr.RosLogLevel.ERROR,
+    "lost": cdr.RosLogLevel.WARN,
+    "left": cdr.RosLogLevel.WARN,
+    "unheard": cdr.RosLogLevel.WARN,
+    "waiting": cdr.RosLogLevel.WARN,
+    "refused": cdr.RosLogLevel.WARN,
+    "clock fault": cdr.RosLogLevel.WARN,
 }
-_MODES = {name: float(mode) for mode, word in MODE_WORDS.items() for name in (mode, word)}
+"""Level of an event by its kind; events of other kinds are informative."""
+_MODE_NUMBERS: dict[Mode | str, float] = {
+    **{mode: float(mode) for mode in MODE_WORDS},
+    **{word: float(mode) for mode, word in MODE_WORDS.items()},
+}
+"""Number of a mode, which is a `Mode` in a `TickRecord` and a word in a `State`."""
 
 
 def pack_event(event: Event, stamp_ns: int) -> Iterator[tuple[str, bytes]]:
@@ -120,23 +143,25 @@ class ArrayChannel:
         content: description of the numbers.
         unit: unit of the numbers.
         axes: names of the entries along each axis.
+
+    Attributes:
+        channel: the channel and its metadata.
+        size: how many numbers an array has.
+        pack: returns the message of an array, from its numbers row by row.
     """
 
     def __init__(self, content: str, unit: str, *axes: Sequence[str]) -> None:
-        self.channel = Ros2Channel(
-            cdr.FLOAT64_ARRAY,
-            {
-                "content": content,
-                "unit": unit,
-                "names": "; ".join(" ".join(axis) for axis in axes),
-            },
-        )
-        labels = [" ".join(axis) for axis in axes]
+        names = [" ".join(axis) for axis in axes]
+        about = {"content": content, "unit": unit, "names": "; ".join(names)}
+        self.channel = Ros2Channel(cdr.FLOAT64_ARRAY, about)
+        # The first label also names the content, and the last label the unit.
+        labels = [*names]
         labels[0] = f"{content}: {labels[0]}"
         labels[-1] += f" ({unit})"
         lengths = [len(axis) for axis in axes]
         self.size = math.prod(lengths)
-        self.pack = cdr.make_float_array_packer(*zip(labels, lengths, strict=True))
+        dimensions = zip(labels, lengths, strict=True)
+        self.pack = cdr.make_float_array_packer(*dimensions)
 
 
 class Ros2SiteChannels:
@@ -155,39 +180,60 @@ class Ros2SiteChannels:
 
     def __init__(self, scenario: Scenario, site: str) -> None:
         arm = scenario.arms[site]
-        self._peers = scenario.peers(site)
         self._arm = arm
+        self._peers = scenario.peers(site)
         n = arm.counts.joints
-        peers = self._peers
         shared = arm.counts.shared
-        axes = TASK_AXES[: arm.counts.shared]
+        # A row begins with q, q_des, qd and tau, n numbers each; then come the shared errors.
         self.error_row = slice(4 * n, 4 * n + shared)
         self.slow_row = slice(4 * n + shared, None)
         self.robot = RobotModel(scenario, site) if arm.chain is not None else None
-        self.joints = (
-            [*arm.joint_names] if self.robot else [f"{site}_{name}" for name in arm.joint_names]
-        )
-        labels = ["_".join(name.split()) for name in self.joints]
-        parameters = ["_".join(name.split()) for name, _ in arm.parameters]
-        spread = ("median", "max")
-        estimate = ("estimate of Eq. (24)", "kg m^2, kg m^2, kg m^2, kg m, kg m")
-        if arm.chain is not None:
-            estimate = ("estimate", "kg, kg m, kg m^2")
-        sent = _make_sent_channels(scenario, site)
-        self._slow = ("tau_x", "theta_hat", *sent, "mode")
-        self.record_arrays = ("error", *self._slow)
+        self.joints = [*arm.joint_names]
+        if self.robot is None:
+            self.joints = [f"{site}_{name}" for name in arm.joint_names]
+        sent_arrays = _make_sent_arrays(scenario, site)
+        self._slow_names = ("tau_x", "theta_hat", *sent_arrays, "mode")
+        self.record_arrays = ("error", *self._slow_names)
         self.arrays = {
-            "error": ArrayChannel("x - x_des", "m or rad", axes)
-            if arm.shares_pose
-            else ArrayChannel("q - q_des", self._unit("rad"), labels),
+            "error": self._make_error_array(),
             "tau_x": ArrayChannel(
-                "exogenous torque, as Eq. (8) subtracts it", self._unit("N m"), labels
+                "exogenous torque, as Eq. (8) subtracts it",
+                self._join_units("N m"),
+                self._list_joint_labels(),
             ),
-            "theta_hat": ArrayChannel(*estimate, parameters),
-            **sent,
+            "theta_hat": self._make_estimate_array(),
+            **sent_arrays,
             "mode": ArrayChannel("run 1, diverged 2, hold 3, brake 4, return 5", "-", ["mode"]),
+            **self._make_statistics_arrays(),
+        }
+
+    def _list_joint_labels(self) -> list[str]:
+        """Returns the names of the joints without spaces, which separate names in a label."""
+        return [_replace_spaces(name) for name in self.joints]
+
+    def _make_error_array(self) -> ArrayChannel:
+        """Returns the array of the error of a shared pose, or of the joints."""
+        if self._arm.shares_pose:
+            axes = TASK_AXES[: self._arm.counts.shared]
+            return ArrayChannel("x - x_des", "m or rad", axes)
+        return ArrayChannel("q - q_des", self._join_units("rad"), self._list_joint_labels())
+
+    def _make_estimate_array(self) -> ArrayChannel:
+        """Returns the array of the estimated parameters of the arm."""
+        parameters = [_replace_spaces(name) for name, _ in self._arm.parameters]
+        if self._arm.chain is not None:
+            return ArrayChannel("estimate", "kg, kg m, kg m^2", parameters)
+        units = "kg m^2, kg m^2, kg m^2, kg m, kg m"
+        return ArrayChannel("estimate of Eq. (24)", units, parameters)
+
+    def _make_statistics_arrays(self) -> dict[str, ArrayChannel]:
+        """Returns the arrays that are made from link statistics."""
+        peers = self._peers
+        return {
             "link_age": ArrayChannel("age of the sample in use", "ms", peers),
-            "link_delay": ArrayChannel("one-way delay, last 100 ms", "ms", peers, spread),
+            "link_delay": ArrayChannel(
+                "one-way delay, last 100 ms", "ms", peers, ("median", "max")
+            ),
             "link_offset": ArrayChannel(
                 "the peer's clock minus the own one", "ms", peers, ("offset", "bound")
             ),
@@ -205,63 +251,75 @@ class Ros2SiteChannels:
     def joint_states(self, names: Sequence[str], *, effort: bool = True) -> Ros2Channel:
         """Returns a channel of joint states for joints with these names."""
         revolute_units = ["rad", "rad/s", "N m"] if effort else ["rad", "rad/s"]
-        units = ", ".join(self._unit(unit) for unit in revolute_units)
+        units = ", ".join(self._join_units(unit) for unit in revolute_units)
         # The names are separated by spaces and cannot contain any.
-        joined_names = " ".join("_".join(name.split()) for name in names)
+        joined_names = " ".join(_replace_spaces(name) for name in names)
         return Ros2Channel(cdr.JOINT_STATE, {"unit": units, "names": joined_names})
 
-    def _unit(self, unit: str) -> str:
-        """Returns the units of all joints, where `unit` is that of a revolute joint."""
-        return " or ".join(dict.fromkeys(self._arm.joint_units(unit)))
+    def _join_units(self, revolute_unit: str) -> str:
+        """Returns the units of all joints as text, such as "rad or m".
 
-    def slow(self, row: Sequence[float]) -> Iterator[tuple[str, bytes]]:
+        Args:
+            revolute_unit: unit of the quantity at a revolute joint.
+        """
+        different_units = dict.fromkeys(self._arm.joint_units(revolute_unit))
+        return " or ".join(different_units)
+
+    def pack_slow_arrays(self, row: Sequence[float]) -> Iterator[tuple[str, bytes]]:
         """Yields name and message of a record's arrays, from the numbers of its `slow_row`."""
         start = 0
-        for name in self._slow:
+        for name in self._slow_names:
             array = self.arrays[name]
-            yield name, array.pack(*row[start : start + array.size])
-            start += array.size
+            end = start + array.size
+            yield name, array.pack(*row[start:end])
+            start = end
 
-    def statistics(self, stats: LinkStats) -> Iterator[tuple[str, bytes]]:
+    def pack_statistics(self, stats: LinkStats) -> Iterator[tuple[str, bytes]]:
         """Yields name and message of the arrays of link statistics.
 
         The arrays of delays, clock offsets and timing exist in a live session only.
         """
-        arrays = self.arrays
         peers = self._peers
         if not peers:
             return
         ages_ms = [_convert_to_ms(stats.age_us.get(peer, -1)) for peer in peers]
-        yield "link_age", arrays["link_age"].pack(*ages_ms)
+        yield "link_age", self.arrays["link_age"].pack(*ages_ms)
         # Virtual time has no measured delays and no clock offsets.
         if not stats.delay_us:
             return
         delays_ms: list[float] = []
         offsets_ms: list[float] = []
         for peer in peers:
-            delays_ms.append(_convert_to_ms(stats.delay_us.get(peer, -1)))
-            delays_ms.append(_convert_to_ms(stats.delay_max_us.get(peer, -1)))
-            offsets_ms.append(stats.offset_us.get(peer, math.nan) / 1e3)
-            offsets_ms.append(stats.bound_us.get(peer, math.nan) / 1e3)
-        yield "link_delay", arrays["link_delay"].pack(*delays_ms)
-        yield "link_offset", arrays["link_offset"].pack(*offsets_ms)
-        yield "timing", arrays["timing"].pack(stats.late_max_us, stats.busy_max_us)
+            median_us = stats.delay_us.get(peer, -1)
+            maximum_us = stats.delay_max_us.get(peer, -1)
+            delays_ms += [_convert_to_ms(median_us), _convert_to_ms(maximum_us)]
+            offset_us = stats.offset_us.get(peer, math.nan)
+            bound_us = stats.bound_us.get(peer, math.nan)
+            offsets_ms += [offset_us / 1e3, bound_us / 1e3]
+        yield "link_delay", self.arrays["link_delay"].pack(*delays_ms)
+        yield "link_offset", self.arrays["link_offset"].pack(*offsets_ms)
+        timing = self.arrays["timing"].pack(stats.late_max_us, stats.busy_max_us)
+        yield "timing", timing
 
 
-def _make_sent_channels(scenario: Scenario, site: str) -> dict[str, ArrayChannel]:
-    """Returns a channel for each vector that a site's law sends, in the order of its record."""
-    channels: dict[str, ArrayChannel] = {}
+def _replace_spaces(name: str) -> str:
+    """Returns a name with underscores in place of spaces."""
+    return "_".join(name.split())
+
+
+def _make_sent_arrays(scenario: Scenario, site: str) -> dict[str, ArrayChannel]:
+    """Returns an array for each vector that a site's law sends, in the order of its record."""
+    arrays: dict[str, ArrayChannel] = {}
     for vector, peer, index in scenario.channel(site).entries(scenario.peers(site)):
         # A vector has several entries; the first entry stands for the whole vector.
         if index:
             continue
         suffix = f"_to_{peer}" if peer else ""
-        channels[f"{SENT_PREFIX}{vector.name}{suffix}"] = ArrayChannel(
-            f"{vector.name} that the law sends to {peer or 'all'}",
-            vector.unit or "-",
-            [f"{vector.name}{number}" for number in range(1, vector.length + 1)],
-        )
-    return channels
+        content = f"{vector.name} that the law sends to {peer or 'all'}"
+        entries = [f"{vector.name}{number}" for number in range(1, vector.length + 1)]
+        array = ArrayChannel(content, vector.unit or "-", entries)
+        arrays[f"{SENT_PREFIX}{vector.name}{suffix}"] = array
+    return arrays
 
 
 def _convert_to_ms(us: int) -> float:
@@ -284,54 +342,66 @@ def read_ros2_channels(path: Path) -> dict[str, Ros2Channel]:
             summary = None
     if summary is None:
         return {}
-    return {
-        channel.topic: Ros2Channel(
-            summary.schemas[channel.schema_id].name, dict(channel.metadata)
-        )
-        for channel in sorted(summary.channels.values(), key=lambda channel: channel.id)
-        if channel.message_encoding == cdr.ENCODING and channel.schema_id in summary.schemas
-    }
+    channels: dict[str, Ros2Channel] = {}
+    for _, channel in sorted(summary.channels.items()):
+        schema = summary.schemas.get(channel.schema_id)
+        if channel.message_encoding == cdr.ENCODING and schema is not None:
+            channels[channel.topic] = Ros2Channel(schema.name, dict(channel.metadata))
+    return channels
 
 
 Record = State | TickRecord
+"""A record as a site publishes it, or as the kernel returns it."""
 SignalRow = Sequence[float]
+"""Values of all curves at one time, or values of one curve at all times."""
 
 
 def stack_signals(records: Sequence[Record]) -> list[SignalRow]:
-    """Returns the numbers of records, a column per curve.
+    """Returns the values of each curve in some records.
 
-    The columns are q, q_des, qd, tau, e, tau_x, theta_hat, ch and mode. The column of the mode
-    has a single number if all records have the same mode. In task space the joints have no
-    reference: the columns of q_des hold q, and e is x - x_des.
+    The curves are q, q_des, qd, tau, e, tau_x, theta_hat, the numbers that the law sends, and
+    the mode. The mode has a single value if all records have the same mode. In task space the
+    joints have no reference: the curves of q_des repeat q, and e is x - x_des.
     """
-    is_task_space = bool(records[0].x)
+    first = records[0]
+    is_task_space = bool(first.x)
     rows: list[tuple[float, ...]] = []
     for record in records:
         joint_reference = record.q if is_task_space else record.q_des
         kinematics = (*record.q, *joint_reference, *record.qd)
         torques = (*record.tau, *record.tau_x)
         rows.append((*kinematics, *torques, *record.theta_hat, *record.ch))
-    columns: list[SignalRow] = [*zip(*rows, strict=True)]
-    n = len(records[0].q)
-    actual = columns[:n]
+    curves: list[SignalRow] = [*zip(*rows, strict=True)]
+
+    joint_count = len(first.q)
+    actual = curves[:joint_count]
     if is_task_space:
         actual = [*zip(*(record.x for record in records), strict=True)]
     desired = [*zip(*(record.q_des for record in records), strict=True)]
-    error = [
-        [value - reference for value, reference in zip(*curves, strict=True)]
-        for curves in zip(actual, desired, strict=True)
-    ]
+    errors = _compute_errors(actual, desired)
     # A pose has an orientation, whose error is not a difference of numbers.
-    if len(error) > POSITION and is_task_space:
+    if is_task_space and len(errors) > POSITION:
         x = np.array(actual).T
         x_des = np.array(desired).T
-        error = compute_task_errors(x, x_des, [1.0] * len(error)).T.tolist()
+        errors = compute_task_errors(x, x_des, [1.0] * len(errors)).T.tolist()
+    error_start = 4 * joint_count
+    return [*curves[:error_start], *errors, *curves[error_start:], _list_modes(records)]
+
+
+def _compute_errors(
+    actual: Sequence[SignalRow], desired: Sequence[SignalRow]
+) -> list[list[float]]:
+    """Returns the differences of actual and desired curves."""
+    errors: list[list[float]] = []
+    for actual_curve, desired_curve in zip(actual, desired, strict=True):
+        pairs = zip(actual_curve, desired_curve, strict=True)
+        errors.append([value - reference for value, reference in pairs])
+    return errors
+
+
+def _list_modes(records: Sequence[Record]) -> list[float]:
+    """Returns the mode of each record as a number, or one number if all modes are equal."""
     modes = [record.mode for record in records]
     if modes.count(modes[0]) == len(modes):
         del modes[1:]
-    return [
-        *columns[: 4 * n],
-        *error,
-        *columns[4 * n :],
-        [_MODES.get(mode, 0.0) for mode in modes],
-    ]
+    return [_MODE_NUMBERS.get(mode, 0.0) for mode in modes]

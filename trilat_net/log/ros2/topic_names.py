@@ -20,6 +20,7 @@ from ...files import open_regular
 from ...net.ros2_names import check_ros_name
 
 NAMINGS = ("crisp", "crtk")
+"""The two built-in namings: CRISP's, and that of the Collaborative Robotics Toolkit (CRTK)."""
 TOPICS = {
     "joint_states": ("joint_states", "measured_js"),
     "reference": ("reference", "setpoint_js"),
@@ -48,17 +49,17 @@ TOPICS = {
 }
 """Name of each topic below `/<session>/<site>`, in each of `NAMINGS`, by trilat-net's own name.
 
-The two namings are those of CRISP and of the Collaborative Robotics Toolkit (CRTK) of the da
-Vinci Research Kit. A vector that a law sends is named "sent_" and the name of the vector in
-both.
+CRISP is a set of ROS 2 controllers; CRTK is the convention of the da Vinci Research Kit. A
+vector that a law sends has the same name in both: "sent_" and the name of the vector.
 """
 FRAMES = "tf"
+"""Topic of all frames, with the name that tools of ROS expect."""
 DIAGNOSTICS = "diagnostics"
-"""Topics that all sessions share, with the names at which tools of ROS expect them."""
+"""Topic of all diagnostics, with the name that tools of ROS expect."""
 
 
 class RobotTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Description of the robot that is the arm of a site, as a names file gives it.
+    """The settings of a names file for the robot that is the arm of a site.
 
     Attributes:
         joints: the robot's names of the joints, in the scenario's order; if empty, the names of
@@ -91,7 +92,9 @@ class TopicTable(NamedTuple):
         """Returns the full name, without the first /, of a site's topic."""
         common_name = self.names.get(topic, topic)
         name = self.of_site.get(site, {}).get(topic, common_name)
-        return name[1:] if name.startswith("/") else f"{session}/{site}/{name}"
+        if name.startswith("/"):
+            return name[1:]
+        return f"{session}/{site}/{name}"
 
 
 def make_session_name(text: str) -> str:
@@ -112,34 +115,35 @@ def read_topic_table(source: str) -> TopicTable:
     Raises:
         UsageError: the file cannot be read, or a name in it is not valid.
     """
-    naming_index = NAMINGS.index(source) if source in NAMINGS else 0
-    default_names = {topic: names[naming_index] for topic, names in TOPICS.items()}
     if source in NAMINGS:
-        return TopicTable(default_names)
-    names, site_names, robots = _read_names_file(source)
-    for table in (names, *site_names.values()):
-        for topic, name in table.items():
-            if topic not in TOPICS:
-                suggestion = suggest_nearest(topic, list(TOPICS))
-                raise UsageError(f"{source}: no topic {topic!r}{suggestion}")
-            check_ros_name(str(name), f"{source}: {topic}")
-    topic_table = TopicTable(default_names | names, site_names, robots)
-    _check_unique_names(source, topic_table)
-    return topic_table
+        return TopicTable(_list_names(source))
+    changes = _read_names_file(source)
+    _check_names(source, changes.names)
+    for site_names in changes.of_site.values():
+        _check_names(source, site_names)
+    all_names = {**_list_names("crisp"), **changes.names}
+    table = changes._replace(names=all_names)
+    _check_unique_names(source, table)
+    return table
 
 
-def _read_names_file(
-    source: str,
-) -> tuple[dict[str, Any], dict[str, dict[str, Any]], dict[str, RobotTable]]:
-    """Returns the common names, the names by site, and the robots by site of a names file."""
+def _list_names(naming: str) -> dict[str, str]:
+    """Returns the name of each topic in a built-in naming."""
+    naming_index = NAMINGS.index(naming)
+    return {topic: names[naming_index] for topic, names in TOPICS.items()}
+
+
+def _read_names_file(source: str) -> TopicTable:
+    """Returns the content of a names file: changed names, and robots by site."""
     try:
         with open_regular(Path(source)) as stream:
             names = tomllib.loads(stream.read().decode())
         site_names = msgspec.convert(names.pop("sites", {}), dict[str, dict[str, Any]])
-        robot_fields = {
-            site: {key: table.pop(key) for key in RobotTable.__struct_fields__ if key in table}
-            for site, table in site_names.items()
-        }
+        robot_fields: dict[str, dict[str, Any]] = {}
+        # A table of a site holds names of topics as well as the fields of the site's robot.
+        for site, table in site_names.items():
+            field_names = [key for key in RobotTable.__struct_fields__ if key in table]
+            robot_fields[site] = {key: table.pop(key) for key in field_names}
         robots = msgspec.convert(robot_fields, dict[str, RobotTable])
     except OSError as error:
         raise UsageError(
@@ -147,16 +151,27 @@ def _read_names_file(
         ) from None
     except (ValueError, msgspec.ValidationError) as error:
         raise UsageError(f"{source}: is no TOML of names: {error}") from None
-    return names, site_names, robots
+    return TopicTable(names, site_names, robots)
+
+
+def _check_names(source: str, names: Mapping[str, object]) -> None:
+    """Raises UsageError if a topic does not exist, or its name is not valid in ROS 2."""
+    for topic, name in names.items():
+        if topic not in TOPICS:
+            suggestion = suggest_nearest(topic, list(TOPICS))
+            raise UsageError(f"{source}: no topic {topic!r}{suggestion}")
+        check_ros_name(str(name), f"{source}: {topic}")
 
 
 def _check_unique_names(source: str, table: TopicTable) -> None:
     """Raises UsageError if two topics have the same full name."""
     # The states of several arms may be in one message, so `robot_states` may repeat.
     topics = [topic for topic in TOPICS if topic != "robot_states"]
-    # Two sites without names of their own show whether a full name is common to all sites.
-    sites = (*table.of_site, "*", "**")
-    full_names = [table.find("", site, topic) for site in sites for topic in topics]
+    # Two invented sites stand for the sites without changed names. They show whether a full
+    # name, which begins with /, is used by several sites.
+    full_names: list[str] = []
+    for site in (*table.of_site, "*", "**"):
+        full_names += [table.find("", site, topic) for topic in topics]
     if len(set(full_names)) < len(full_names):
         raise UsageError(
             f"{source}: two topics have one name; one that begins with / is for one site"

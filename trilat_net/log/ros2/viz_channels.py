@@ -1,10 +1,18 @@
-"""Decimated ROS 2 channels of a log, for general viewers, with every extreme kept.
+"""Decimated ROS 2 channels of a log, from which general viewers draw its curves.
 
-Invariant: the file holds the exact minimum and maximum of every curve in every bucket of a
-site's records, in the order in which they came. Buckets have equal length on the tick grid. A
-bucket's first message bears the time of its first record and is written at the bucket's end;
-the second bears that of its middle record and is written half a bucket later. Records that
-arrive after their bucket was closed form a bucket of their own.
+A site publishes about 1000 records a second, more than a viewer can draw smoothly. The records
+of a site are therefore collected in buckets of equal length on the tick grid. A bucket becomes
+two messages, which hold the minimum and the maximum of each curve in the bucket, in the order
+in which the two occurred. The joints and their error have `views_hz` messages a second; the
+exogenous torque, the estimate and the mode are decimated once more, to `SLOW_VIZ_HZ`.
+
+Invariant:
+    - The file holds the exact minimum and maximum of every curve in every bucket.
+    - The first message of a bucket has the time of the bucket's first record, and is written at
+      the end of the bucket.
+    - The second message has the time of the bucket's middle record, and is written half a
+      bucket later.
+    - Records that arrive after their bucket was closed form a bucket of their own.
 """
 
 import math
@@ -20,230 +28,296 @@ from ...scenario import Scenario
 from ..log_layout import VIZ_ROOT
 from . import ros2_messages
 from .cdr import JointStatePacker, pack_string
+from .ros2_messages import Record, SignalRow
 
 VIZ_HZ = 100.0
-"""Messages a second by default, of the joints and their error."""
+"""Default rate of the joints and their error, in messages per second."""
 SLOW_VIZ_HZ = 10.0
-"""Of exogenous torque, estimate and mode; but all of them if the joints are at full rate."""
+"""Rate of exogenous torque, estimate and mode, in messages per second.
+
+If the joints have a message per record, so have these channels.
+"""
 FULL_RATE_HZ = math.inf
-"""A message per record."""
+"""Rate of the joints that stands for a message per record."""
 
 MAX_PENDING_BYTES = 1 << 13
-"""Most bytes that the channels of a site have still to write, per two joints of its arm."""
+"""Largest size of the messages that a site has still to write, for two joints of its arm."""
 SENT_PENDING_BYTES = 512
-"""And per number that its law sends, which may be an array of its own."""
+"""Additional size for each number that the site's law sends, which may be an array alone."""
 
 PutMessage = Callable[[str, bytes, int, int], None]
-"""Writes one message: topic, bytes, publish time and log time, Unix ns."""
-TakeMessage = Callable[[Any, int], None]
-"""Takes one message of the log's own, and its log time, Unix ns."""
-StampedRow = tuple[int, ros2_messages.SignalRow]
-"""A stamp, Unix ns, and its signals."""
+"""Writes one message: topic, bytes, publish time and log time, both in Unix ns."""
+ReceiveMessage = Callable[[Any, int], None]
+"""Receives one message of the log, and its log time in Unix ns."""
+StampedRow = tuple[int, SignalRow]
+"""Values of curves, and their time in Unix ns."""
 
-_tick = attrgetter("tick")
+_get_tick = attrgetter("tick")
 
 
 class _BucketOutput:
-    """Output of buckets: the first row at once, the second by `flush` or before the next
-    bucket.
+    """Writes the two rows of a bucket: the first at once, the second half a bucket later.
 
-    `write` takes stamp, signals and log time.
+    The second row is written by `flush`, or before the first row of the next bucket.
+
+    Args:
+        write: writes a row: time, values, and log time in Unix ns.
     """
 
-    def __init__(self, write: Callable[[int, ros2_messages.SignalRow, int], None]) -> None:
+    def __init__(self, write: Callable[[int, SignalRow, int], None]) -> None:
         self._write = write
-        self._waiting: Sequence[StampedRow] = ()
+        self._waiting_rows: Sequence[StampedRow] = ()
 
     def add(self, rows: Sequence[StampedRow], log_ns: int) -> None:
+        """Writes the first row of a bucket, and keeps the second row."""
         self.flush(log_ns)
-        self._write(*rows[0], log_ns)
-        self._waiting = rows[1:]
+        stamp_ns, row = rows[0]
+        self._write(stamp_ns, row, log_ns)
+        self._waiting_rows = rows[1:]
 
     def flush(self, log_ns: int) -> None:
-        self.add_late(self._waiting, log_ns)
-        self._waiting = ()
+        """Writes the row that waits, if there is one."""
+        self.write_all(self._waiting_rows, log_ns)
+        self._waiting_rows = ()
 
-    def add_late(self, rows: Sequence[StampedRow], log_ns: int) -> None:
-        for row in rows:
-            self._write(*row, log_ns)
+    def write_all(self, rows: Sequence[StampedRow], log_ns: int) -> None:
+        """Writes all rows of a bucket at once, as for records that arrived late."""
+        for stamp_ns, row in rows:
+            self._write(stamp_ns, row, log_ns)
 
 
 class _SiteBuckets:
-    """Buckets of one site of a scenario, at `views_hz` messages a second of the joints.
+    """The buckets of one site.
 
-    `channels` are those of the site, by topic.
+    A fast bucket holds records, and yields two messages of the joints. A slow bucket holds the
+    messages of several fast buckets, and yields two messages of the slower curves.
+
+    Args:
+        scenario: the scenario that runs.
+        site: the site.
+        views_hz: rate of the joints, in messages per second.
+        epoch_unix_ns: Unix time of tick 0, in ns; 0 in virtual time.
+        put: writes a message.
+
+    Attributes:
+        channels: the channels of the site, by topic.
+        max_pending_bytes: largest size of the messages that are still to be written.
     """
 
     def __init__(
-        self, scenario: Scenario, site: str, views_hz: float, epoch_ns: int, put: PutMessage
+        self,
+        scenario: Scenario,
+        site: str,
+        views_hz: float,
+        epoch_unix_ns: int,
+        put: PutMessage,
     ) -> None:
-        self._rate_hz = rate_hz = scenario.sites[site].rate_hz
         self._put = put
-        self._epoch_unix_ns = epoch_ns
-        self._shapes = shapes = ros2_messages.Ros2SiteChannels(scenario, site)
-        names = [*shapes.joints, *(f"{name}_ref" for name in shapes.joints)]
-        self._states = JointStatePacker(names)
-        joints = len(shapes.joints)
-        sent = scenario.channel(site).record_size
-        self.most_pending_bytes = (
-            MAX_PENDING_BYTES * -(-joints // 2) + SENT_PENDING_BYTES * sent
+        self._epoch_unix_ns = epoch_unix_ns
+        rate_hz = scenario.sites[site].rate_hz
+        self._rate_hz = rate_hz
+        site_channels = ros2_messages.Ros2SiteChannels(scenario, site)
+        self._site_channels = site_channels
+        joint_count = len(site_channels.joints)
+        joint_pairs = -(-joint_count // 2)
+        sent_numbers = scenario.channel(site).record_size
+        self.max_pending_bytes = (
+            MAX_PENDING_BYTES * joint_pairs + SENT_PENDING_BYTES * sent_numbers
         )
-        self._none = [math.nan] * joints  # velocity, effort of a reference: size is dear
-        own = {"joint_states": shapes.joint_states(names), **shapes.channels}
-        self._topics = {name: f"{VIZ_ROOT}{site}/{name}" for name in own}
-        self.channels = {topic: own[name] for name, topic in self._topics.items()}
-        self._described = shapes.robot is None
-        self._half = max(1, int(rate_hz // views_hz))  # ticks of half a bucket
-        self._ratio = (
-            1 if views_hz == FULL_RATE_HZ else max(1, round(rate_hz / self._half / SLOW_VIZ_HZ))
-        )
-        self._fast = _BucketOutput(self._write_fast)
-        self._slow = _BucketOutput(self._write_slow)
-        self._bucket = self._first = self._half_end = (
-            0  # the open bucket, its first tick, the end of a half
-        )
-        self._open: list[ros2_messages.Record] = []
-        self._slow_open: list[StampedRow] = []
-        self._late: list[ros2_messages.Record] = []
 
-    def _write_fast(self, stamp_ns: int, row: ros2_messages.SignalRow, log_ns: int) -> None:
-        """Writes the joint states, the angles of the reference as joints of their own; and the
-        error.
-        """
-        none = self._none
-        n = len(self._none)
-        velocity = [*row[2 * n : 3 * n], *none]
-        effort = [*row[3 * n : 4 * n], *none]
-        data = self._states.pack(stamp_ns, row[: 2 * n], velocity, effort)
+        # The reference of a joint is a joint of its own, named after the joint. Only its angle
+        # is written: with velocity and effort the messages would be twice as large.
+        references = [f"{name}_ref" for name in site_channels.joints]
+        joint_names = [*site_channels.joints, *references]
+        self._joint_state_packer = JointStatePacker(joint_names)
+        self._not_measured = [math.nan] * joint_count
+        joint_channel = site_channels.joint_states(joint_names)
+        channels = {"joint_states": joint_channel, **site_channels.channels}
+        self._topics = {name: f"{VIZ_ROOT}{site}/{name}" for name in channels}
+        self.channels = {self._topics[name]: channel for name, channel in channels.items()}
+        self._is_robot_described = site_channels.robot is None
+
+        self._half_ticks = max(1, int(rate_hz // views_hz))
+        self._bucket_ticks = 2 * self._half_ticks
+        # Number of fast buckets in a slow bucket.
+        self._slow_ratio = 1
+        if views_hz != FULL_RATE_HZ:
+            messages_hz = rate_hz / self._half_ticks
+            self._slow_ratio = max(1, round(messages_hz / SLOW_VIZ_HZ))
+        self._fast_output = _BucketOutput(self._write_fast)
+        self._slow_output = _BucketOutput(self._write_slow)
+        # The open bucket: its number on the tick grid, its first tick, and the end of its half
+        # that is being filled.
+        self._bucket = 0
+        self._first_tick = 0
+        self._half_end_tick = 0
+        self._records: list[Record] = []
+        self._slow_rows: list[StampedRow] = []
+        # Records of one closed bucket, which arrived late.
+        self._late_records: list[Record] = []
+
+    def _write_fast(self, stamp_ns: int, row: SignalRow, log_ns: int) -> None:
+        """Writes the joint states, their error and, for an arm with a URDF, its frames."""
+        n = len(self._not_measured)
+        velocity = [*row[2 * n : 3 * n], *self._not_measured]
+        effort = [*row[3 * n : 4 * n], *self._not_measured]
+        data = self._joint_state_packer.pack(stamp_ns, row[: 2 * n], velocity, effort)
         self._put(self._topics["joint_states"], data, stamp_ns, log_ns)
-        error = self._shapes.arrays["error"].pack(*row[self._shapes.error_row])
+        error_row = row[self._site_channels.error_row]
+        error = self._site_channels.arrays["error"].pack(*error_row)
         self._put(self._topics["error"], error, stamp_ns, log_ns)
-        robot = self._shapes.robot
-        if robot is not None:
-            if not self._described:
-                self._described = True
-                self._put(
-                    self._topics[ros2_messages.ROBOT],
-                    pack_string(robot.description),
-                    stamp_ns,
-                    log_ns,
-                )
-            self._put(
-                self._topics[ros2_messages.FRAMES],
-                robot.pack(stamp_ns, row[:n]),
-                stamp_ns,
-                log_ns,
-            )
+        robot = self._site_channels.robot
+        if robot is None:
+            return
+        if not self._is_robot_described:
+            self._is_robot_described = True
+            topic = self._topics[ros2_messages.ROBOT]
+            self._put(topic, pack_string(robot.description), stamp_ns, log_ns)
+        frames = robot.pack(stamp_ns, row[:n])
+        self._put(self._topics[ros2_messages.FRAMES], frames, stamp_ns, log_ns)
 
-    def _write_slow(self, stamp_ns: int, row: ros2_messages.SignalRow, log_ns: int) -> None:
-        for name, data in self._shapes.slow(row):
+    def _write_slow(self, stamp_ns: int, row: SignalRow, log_ns: int) -> None:
+        """Writes the exogenous torque, the estimate, the vectors of the law, and the mode."""
+        for name, data in self._site_channels.pack_slow_arrays(row):
             self._put(self._topics[name], data, stamp_ns, log_ns)
 
-    def record(self, message: ros2_messages.Record, log_ns: int) -> None:
-        tick = message.tick
-        # its bucket is closed: with others of that bucket it waits for the next close
-        if tick < self._first:
-            length = 2 * self._half
-            if self._late and self._late[0].tick // length != tick // length:
-                self._flush_late(log_ns)
-            self._late.append(message)
+    def add_record(self, record: Record, log_ns: int) -> None:
+        """Adds a record to its bucket, and writes the messages that are then complete."""
+        tick = record.tick
+        if tick < self._first_tick:
+            self._add_late_record(record, log_ns)
             return
-        if tick >= self._half_end:
-            half = tick // self._half
-            self._fast.flush(log_ns)
-            if half // 2 != self._bucket:
-                self._close(half // 2, log_ns)
-            self._half_end = (half + 1) * self._half
-        self._open.append(message)
+        if tick >= self._half_end_tick:
+            half = tick // self._half_ticks
+            bucket = half // 2
+            self._fast_output.flush(log_ns)
+            if bucket != self._bucket:
+                self._close_bucket(bucket, log_ns)
+            self._half_end_tick = (half + 1) * self._half_ticks
+        self._records.append(record)
 
-    def statistics(self, stats: LinkStats, log_ns: int) -> None:
+    def _add_late_record(self, record: Record, log_ns: int) -> None:
+        """Keeps a record of a closed bucket until the next record of another closed bucket."""
+        bucket = record.tick // self._bucket_ticks
+        if self._late_records:
+            late_bucket = self._late_records[0].tick // self._bucket_ticks
+            if late_bucket != bucket:
+                self._flush_late_records(log_ns)
+        self._late_records.append(record)
+
+    def add_statistics(self, stats: LinkStats, log_ns: int) -> None:
+        """Writes link statistics, which are not decimated."""
         stamp_ns = max(0, self._epoch_unix_ns + stats.t_ns)
-        for name, data in self._shapes.statistics(stats):
+        for name, data in self._site_channels.pack_statistics(stats):
             self._put(self._topics[name], data, stamp_ns, log_ns)
 
     def finish(self, log_ns: int) -> None:
-        self._close(self._bucket + 2 * self._ratio, log_ns)
-        self._fast.flush(log_ns)
-        self._slow.flush(log_ns)
+        """Writes everything that waits."""
+        # Two slow buckets further on, both the fast and the slow bucket are closed.
+        self._close_bucket(self._bucket + 2 * self._slow_ratio, log_ns)
+        self._fast_output.flush(log_ns)
+        self._slow_output.flush(log_ns)
 
-    def _close(self, bucket: int, log_ns: int) -> None:
-        self._flush_late(log_ns)
-        if self._open:
-            rows = self._decimate(self._open)
-            self._fast.add(rows, log_ns)
-            self._slow_open += [
-                (stamp_ns, row[self._shapes.slow_row]) for stamp_ns, row in rows
-            ]
-            self._open = []
-        half = 2 * bucket // self._ratio
-        was = 2 * self._bucket // self._ratio
-        if half != was:
-            self._slow.flush(log_ns)
-        if half // 2 != was // 2 and self._slow_open:
-            stamps_ns, signals = zip(*self._slow_open, strict=True)
-            self._slow.add(_stamp_extremes(stamps_ns, zip(*signals, strict=True)), log_ns)
-            self._slow_open = []
-        self._bucket = bucket
-        self._first = 2 * self._half * bucket
+    def _close_bucket(self, next_bucket: int, log_ns: int) -> None:
+        """Writes the first message of the open bucket, and opens the bucket `next_bucket`."""
+        self._flush_late_records(log_ns)
+        if self._records:
+            rows = self._decimate(self._records)
+            self._fast_output.add(rows, log_ns)
+            self._slow_rows += self._select_slow_columns(rows)
+            self._records = []
+        slow_half = 2 * self._bucket // self._slow_ratio
+        next_slow_half = 2 * next_bucket // self._slow_ratio
+        if next_slow_half != slow_half:
+            self._slow_output.flush(log_ns)
+        if next_slow_half // 2 != slow_half // 2 and self._slow_rows:
+            stamps_ns, rows_of_curves = zip(*self._slow_rows, strict=True)
+            curves = zip(*rows_of_curves, strict=True)
+            self._slow_output.add(_stamp_extremes(stamps_ns, curves), log_ns)
+            self._slow_rows = []
+        self._bucket = next_bucket
+        self._first_tick = self._bucket_ticks * next_bucket
 
-    def _flush_late(self, log_ns: int) -> None:
-        if self._late:
-            rows = self._decimate(self._late)
-            self._fast.add_late(rows, log_ns)
-            self._slow.add_late(
-                [(stamp_ns, row[self._shapes.slow_row]) for stamp_ns, row in rows], log_ns
-            )
-            self._late = []
+    def _flush_late_records(self, log_ns: int) -> None:
+        """Writes the extremes of the records that arrived late, on all channels."""
+        if self._late_records:
+            rows = self._decimate(self._late_records)
+            self._fast_output.write_all(rows, log_ns)
+            self._slow_output.write_all(self._select_slow_columns(rows), log_ns)
+            self._late_records = []
 
-    def _decimate(self, records: list[ros2_messages.Record]) -> list[StampedRow]:
-        records.sort(key=_tick)  # they nearly always are
-        stamps_ns = [
-            max(0, self._epoch_unix_ns + record.tick * NS_PER_S // self._rate_hz)
-            for record in (records[0], records[len(records) // 2])
-        ]
-        return _stamp_extremes(stamps_ns[: len(records)], ros2_messages.stack_signals(records))
+    def _select_slow_columns(self, rows: Iterable[StampedRow]) -> list[StampedRow]:
+        """Returns the values of the slower curves in each row."""
+        slow_row = self._site_channels.slow_row
+        return [(stamp_ns, row[slow_row]) for stamp_ns, row in rows]
+
+    def _decimate(self, records: list[Record]) -> list[StampedRow]:
+        """Returns the extremes of a bucket's records, which it sorts by time.
+
+        Returns two rows, or one row for a single record.
+        """
+        # Records nearly always arrive in order, so that sorting costs little.
+        records.sort(key=_get_tick)
+        stamps_ns: list[int] = []
+        for record in (records[0], records[len(records) // 2]):
+            t_ns = record.tick * NS_PER_S // self._rate_hz
+            stamps_ns.append(max(0, self._epoch_unix_ns + t_ns))
+        curves = ros2_messages.stack_signals(records)
+        return _stamp_extremes(stamps_ns[: len(records)], curves)
 
 
 def parse_viz_rate(text: str) -> float:
-    """Returns the messages a second of the option `--views`: a number from 1 on, or "off" or
-    "full".
+    """Returns the rate that the option `--views` requests, in messages per second.
+
+    Args:
+        text: a number from 1 on, "off" or "full".
 
     Raises:
-        UsageError: it is none of them.
+        UsageError: the text is neither a number in range nor a keyword.
     """
-    words = {"off": 0.0, "full": FULL_RATE_HZ}
+    keywords = {"off": 0.0, "full": FULL_RATE_HZ}
+    if text in keywords:
+        return keywords[text]
     try:
-        rate_hz = words[text] if text in words else float(text)
+        rate_hz = float(text)
     except ValueError:
         rate_hz = math.nan
-    if text not in words and not 1.0 <= rate_hz <= 1e6:
+    if not 1.0 <= rate_hz <= 1e6:
         raise UsageError(f"--views is off, full, or messages a second from 1 on, not {text!r}")
     return rate_hz
 
 
-def _stamp_extremes(
-    stamps_ns: Sequence[int], columns: Iterable[ros2_messages.SignalRow]
-) -> list[StampedRow]:
-    """Returns the extremes of columns at the first and the middle of their stamps; a single row
-    as it is.
+def _stamp_extremes(stamps_ns: Sequence[int], curves: Iterable[SignalRow]) -> list[StampedRow]:
+    """Returns the extremes of curves, stamped with the first and the middle time.
+
+    Args:
+        stamps_ns: times of the values, in Unix ns.
+        curves: values of each curve, in the order of the times.
+
+    Returns:
+        Two rows, or one row for a single time.
     """
-    chosen = (stamps_ns[0], stamps_ns[len(stamps_ns) // 2])[: len(stamps_ns)]
-    return list(zip(chosen, decimate_min_max(columns)))  # noqa: B905 - of a single row both are the same
+    stamps = (stamps_ns[0], stamps_ns[len(stamps_ns) // 2])
+    rows = decimate_min_max(curves)
+    # For a single time, the minimum and the maximum are equal, and one row is enough.
+    row_count = min(2, len(stamps_ns))
+    return list(zip(stamps[:row_count], rows[:row_count], strict=True))
 
 
 class VizChannels:
-    """The standard channels of a log while it is written.
+    """The decimated channels of a log while the log is written.
 
     Args:
         scenario: the scenario that runs.
         session: the session's name.
-        epoch_unix_ns: Unix time of tick 0; 0 in virtual time.
-        views_hz: messages a second of the joints; `FULL_RATE_HZ` for one per record.
+        epoch_unix_ns: Unix time of tick 0, in ns; 0 in virtual time.
+        views_hz: rate of the joints, in messages per second; `FULL_RATE_HZ` for one message per
+            record.
         put: writes a message.
 
     Attributes:
         channels: all channels that may occur, by topic.
-        takers: functions that take the log's own messages, by their key.
+        receivers: functions that receive the messages of the log, by the key of the messages.
     """
 
     def __init__(
@@ -260,53 +334,65 @@ class VizChannels:
             f"{VIZ_ROOT}{name}": channel
             for name, channel in ros2_messages.SESSION_CHANNELS.items()
         }
-        self.takers: dict[str, TakeMessage] = {
-            topics.key(session, member, topics.EVENT): self._event
-            for member in (*scenario.names, topics.RECORDER)
-        }
+        self.receivers: dict[str, ReceiveMessage] = {}
+        for member in (*scenario.names, topics.RECORDER):
+            self.receivers[topics.key(session, member, topics.EVENT)] = self._add_event
         self._buckets: list[_SiteBuckets] = []
         for site in scenario.names:
             buckets = _SiteBuckets(
-                scenario=scenario, site=site, views_hz=views_hz, epoch_ns=epoch_unix_ns, put=put
+                scenario=scenario,
+                site=site,
+                views_hz=views_hz,
+                epoch_unix_ns=epoch_unix_ns,
+                put=put,
             )
             self._buckets.append(buckets)
             self.channels |= buckets.channels
-            self.takers[topics.key(session, site, topics.STATE)] = buckets.record
-            self.takers[topics.key(session, site, topics.LINK)] = buckets.statistics
+            self.receivers[topics.key(session, site, topics.STATE)] = buckets.add_record
+            self.receivers[topics.key(session, site, topics.LINK)] = buckets.add_statistics
 
-    def _event(self, event: Event, log_ns: int) -> None:
-        stamp_ns = max(0, self._epoch_unix_ns + event.t_ns) if event.t_ns >= 0 else log_ns
+    def _add_event(self, event: Event, log_ns: int) -> None:
+        """Writes an event; an event before the session's epoch gets its log time."""
+        stamp_ns = log_ns
+        if event.t_ns >= 0:
+            stamp_ns = max(0, self._epoch_unix_ns + event.t_ns)
         for name, data in ros2_messages.pack_event(event, stamp_ns):
             self._put(f"{VIZ_ROOT}{name}", data, log_ns, log_ns)
 
     def finish(self, log_ns: int) -> None:
-        """Writes all that is open; `log_ns` is the log time of the last message, Unix ns."""
+        """Writes everything that waits.
+
+        Args:
+            log_ns: log time of the last message, in Unix ns.
+        """
         for buckets in self._buckets:
             buckets.finish(log_ns)
 
     @property
     def most_bytes(self) -> int:
-        """Most bytes that are still to be written."""
-        return sum(buckets.most_pending_bytes for buckets in self._buckets)
+        """Largest size of the messages that are still to be written."""
+        return sum(buckets.max_pending_bytes for buckets in self._buckets)
 
 
-def decimate_min_max(
-    columns: Iterable[ros2_messages.SignalRow],
-) -> tuple[list[float], list[float]]:
-    """Returns the smallest and the largest number of each column, the one that came first in
-    the first list.
+def decimate_min_max(curves: Iterable[SignalRow]) -> tuple[list[float], list[float]]:
+    """Returns the minimum and the maximum of each curve, in the order of their times.
 
-    Each column has one finite number at least, in the order in which they came.
+    Args:
+        curves: the values of each curve by time, at least one and all finite.
+
+    Returns:
+        The earlier extreme of each curve, and the later extreme of each curve.
     """
-    first = []
-    second = []
-    for column in columns:
-        # smooth curves are nearly in order: a third of what min and max take
-        ordered = sorted(column)
-        low = ordered[0]
-        high = ordered[-1]
-        start = column[0]
-        rises = start == low or (start != high and column.index(low) < column.index(high))
-        first.append(low if rises else high)
-        second.append(high if rises else low)
-    return first, second
+    earlier: list[float] = []
+    later: list[float] = []
+    for values in curves:
+        # Smooth curves are nearly sorted: sorting takes a third of the time of min and max.
+        ordered = sorted(values)
+        minimum = ordered[0]
+        maximum = ordered[-1]
+        is_minimum_first = values[0] == minimum
+        if not is_minimum_first and values[0] != maximum:
+            is_minimum_first = values.index(minimum) < values.index(maximum)
+        earlier.append(minimum if is_minimum_first else maximum)
+        later.append(maximum if is_minimum_first else minimum)
+    return earlier, later
