@@ -1,13 +1,15 @@
-"""Which connections the page's server keeps: strangers without a role, and pages by their role.
+"""Limits on the connections that the page's server keeps open.
+
+A new connection is a stranger until the server knows its role. Then it is a page of that role.
+Both kinds are limited in number, so that nobody can keep others out by opening many of them.
 
 Invariant:
-    - Connections whose role is not known yet (silent or slow ones, downloads) are bounded in
-      number. The oldest one is closed for a new one, so that nobody who holds many of them
-      keeps others out.
+    - The number of strangers is limited: silent or slow connections, and downloads. The oldest
+      stranger is closed for a new connection.
     - The number of pages is limited for each role. Watchers do not use up the places of other
       roles.
     - A page of an experimenter or a user is always accepted. If there are too many, the oldest
-      page of that role is closed; among experimenters, those that do not take part first.
+      page of that role is closed. An experimenter's page that takes part is closed last.
 """
 
 from collections import Counter
@@ -25,18 +27,19 @@ MAX_PAGES = {"experimenter": 4, "user": 2, "watcher": 12}
 
 
 class Strangers:
-    """The connections whose role is not known yet, the oldest first.
+    """The connections whose role is not known yet.
 
     Args:
         refused: counts refusals by reason.
     """
 
     def __init__(self, refused: Counter[str]) -> None:
+        # The keys of a dictionary keep their order: the oldest connection is first.
         self._connections: dict[ServerConnection, None] = {}
         self._refused = refused
 
     def add(self, connection: ServerConnection) -> None:
-        """Adds a new connection; closes the oldest one if there are too many."""
+        """Adds a new connection, and closes the oldest connection if there are too many."""
         if len(self._connections) >= MAX_STRANGERS:
             oldest = next(iter(self._connections))
             self.remove(oldest)
@@ -50,36 +53,46 @@ class Strangers:
 
 
 class SeatedPage(Protocol):
-    """A page that counts towards the limit of its role."""
+    """A page that counts towards the limit of its role.
+
+    Attributes:
+        role: the role of the page's user.
+        number: the number of the page; newer pages have larger numbers.
+        takes_part: whether the page holds arms and gives orders.
+    """
 
     role: Role
     number: int
     takes_part: bool
 
 
-P = TypeVar("P", bound=SeatedPage)
+Page = TypeVar("Page", bound=SeatedPage)
 
 
 def is_full(pages: Iterable[SeatedPage], role: Role) -> bool:
     """Returns whether there are as many pages of a role as allowed."""
-    return len(_list_pages_like(pages, role)) >= MAX_PAGES[role.kind]
+    role_pages = _list_pages_of_role(pages, role)
+    return len(role_pages) >= MAX_PAGES[role.kind]
 
 
-def choose_page_to_close(pages: Iterable[P], role: Role) -> P | None:
+def choose_page_to_close(pages: Iterable[Page], role: Role) -> Page | None:
     """Returns the page to close for a new page of a role; None if there is room."""
-    candidates = _list_pages_like(pages, role)
-    if len(candidates) < MAX_PAGES[role.kind]:
+    role_pages = _list_pages_of_role(pages, role)
+    if len(role_pages) < MAX_PAGES[role.kind]:
         return None
-    return min(
-        candidates,
-        key=lambda page: (role.kind == "experimenter" and page.takes_part, page.number),
-    )
+    oldest_first = sorted(role_pages, key=lambda page: page.number)
+    if role.kind == "experimenter":
+        for page in oldest_first:
+            if not page.takes_part:
+                return page
+    return oldest_first[0]
 
 
-def _list_pages_like(pages: Iterable[P], role: Role) -> list[P]:
-    """Returns the pages of a role; for users, those of the same site."""
-
-    def group_of(role: Role) -> tuple[str, str]:
-        return role.kind, role.site if role.kind == "user" else ""
-
-    return [page for page in pages if group_of(page.role) == group_of(role)]
+def _list_pages_of_role(pages: Iterable[Page], role: Role) -> list[Page]:
+    """Returns the pages of a role; for a user, the pages of users of the same site."""
+    role_pages: list[Page] = []
+    for page in pages:
+        is_same_site = page.role.site == role.site
+        if page.role.kind == role.kind and (role.kind != "user" or is_same_site):
+            role_pages.append(page)
+    return role_pages

@@ -22,17 +22,20 @@ _KINDS = {
     "svg": "image/svg+xml",
     "LICENSE": "text/plain; charset=utf-8",
 }
+"""Media types of files, by the end of their names."""
 _REPORT_POLICY = (
     "sandbox allow-scripts allow-downloads allow-popups; default-src 'none'; "
     "script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:"
 )
+"""Content security policy of a report and a log."""
 MAX_FILE_BYTES = 256 << 20
-"""A larger log is not sent to a page; the user opens it in its folder."""
+"""Largest log that is sent to a page; the user opens a larger log in its folder."""
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; "
     "img-src 'self' data: blob:; connect-src 'self'; base-uri 'none'; "
     "form-action 'none'; frame-ancestors 'none'"
 )
+"""Content security policy of the page's own files."""
 
 
 class PageFiles:
@@ -83,6 +86,14 @@ def _list_assets() -> dict[str, tuple[str, bytes]]:
 
 
 def _make_response(kind: str, content: bytes, policy: str, cache: str) -> Response:
+    """Returns the response that sends a file.
+
+    Args:
+        kind: media type of the file.
+        content: bytes of the file.
+        policy: content security policy of the file.
+        cache: whether browsers may store the file, as in the header `Cache-Control`.
+    """
     headers = {
         "Content-Type": kind,
         "Content-Length": str(len(content)),

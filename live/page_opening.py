@@ -1,4 +1,4 @@
-"""Opens a browser at a link whose token no other user of the machine may see.
+"""Open a browser at a link whose token no other user of the machine may see.
 
 Invariant:
     - The token is in no command line, since every user of the machine can list those.

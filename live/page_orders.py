@@ -1,14 +1,18 @@
 """The messages that a page may send, the roles of its users, and how orders reach the sites.
 
+The page's server reads each message with `read_page_message`, checks with `Role.may` that the
+page's user has the right to send the message, and passes it on: `PageHands` moves the arms that
+a page holds, and `OrderDesk` sends the other orders to the sites and receives their replies.
+
 Invariant:
-    - A message has one of the types below, with finite numbers in range and names of the
-      session, and comes no more often than its kind allows. Otherwise it is counted and
-      dropped.
+    - A valid message has one of the types below, finite numbers in range, and names of the
+      session. Messages of a kind may not arrive more often than its rate allows. Any other
+      message is counted and dropped.
     - The sites decide whether they accept an order.
-    - Only the newest order for a link or a row of shares waits. One query at a time is open at
-      each site, besides that for a stop.
-    - A token grants a role and, to a user, a site. The rest of a link may lower the role, and
-      never raises it.
+    - Only the newest order for a link or a row of shares waits to be sent.
+    - One query at a time is open at each site, besides the query that stops its arm.
+    - A token grants a role and, to a user, a site. The rest of a link may lower the role, but
+      never raise it.
     - Every link has a token, on loopback as well, because other users of the machine can
       connect there too.
     - Every role may stop the arms.
@@ -21,7 +25,7 @@ from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from functools import reduce
 from operator import or_
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 from urllib.parse import parse_qs
 
 import msgspec
@@ -36,16 +40,22 @@ from trilat_net.net.requests import ChangeReply, ChangeRequest, HandMessage
 from trilat_net.net.wire import decode, encode
 
 MAX_MESSAGE_BYTES = 4_096
+"""Largest size of a page's message."""
 REPLY_TIMEOUT_NS = 3_000_000_000
+"""Longest wait for a site's reply to an order, in ns."""
 MAX_PENDING = 256
+"""Largest number of orders that wait to be sent."""
 TOKEN_BYTES = 16
+"""Size of a link's token."""
 RELEASE = "release"
 """The subject of pending orders that let an arm follow again or end its fault."""
 MIN_RAMP_S = 0.25
-"""Duration of a change of shares that somebody drags, s."""
+"""Duration of a change of shares that somebody drags, in s."""
 
 Name = Annotated[str, Meta(max_length=64)]
 Numbers = Annotated[list[float], Meta(max_length=12)]
+Count = Annotated[int, Meta(ge=0, lt=2**53)]
+"""A number of a frame or page: JavaScript counts exactly up to 2^53."""
 
 
 class PageMessage(
@@ -55,21 +65,21 @@ class PageMessage(
 
 
 class Seen(PageMessage, frozen=True, kw_only=True, tag="seen"):
-    """The page has drawn frame `n`, so that the next one may be sent."""
+    """The page has drawn frame `n`, so that the next frame may be sent."""
 
-    n: Annotated[int, Meta(ge=0, lt=2**53)]
+    n: Count
 
 
 class TakePart(PageMessage, frozen=True, kw_only=True, tag="control"):
-    """The page wants to hold arms and give orders, or no longer."""
+    """The page begins to hold arms and to give orders, or ends it."""
 
     want: bool
 
 
 class AnswerPage(PageMessage, frozen=True, kw_only=True, tag="answer"):
-    """A page that holds an arm allows another page to take part, or not."""
+    """A page that holds an arm allows another page to take part, or refuses."""
 
-    page: Annotated[int, Meta(ge=0, lt=2**53)]
+    page: Count
     yes: bool
 
 
@@ -110,7 +120,7 @@ class MarkMoment(PageMessage, frozen=True, kw_only=True, tag="mark"):
 
 
 class ShowAges(PageMessage, frozen=True, kw_only=True, tag="ages"):
-    """Users see the age of what they are shown of their peers, or no longer."""
+    """The pages of users begin to show the age of their peers' poses, or stop showing it."""
 
     shown: bool
 
@@ -121,8 +131,8 @@ class MoveHand(PageMessage, frozen=True, kw_only=True, tag="hand"):
     Attributes:
         site: the site of the arm.
         grip: False to release the arm.
-        to: the target of the end effector, m, or of the joints, rad; for an arm that is pushed
-            the force, N.
+        to: the target of the end effector in m, or of the joints in rad; for an arm that is
+            pushed, the force in N.
     """
 
     site: Name
@@ -138,7 +148,7 @@ class DoStep(PageMessage, frozen=True, kw_only=True, tag="step"):
     """A user has completed a step of an experiment: has agreed, is ready, or has answered.
 
     Attributes:
-        key: the key of the step, as the page was shown it.
+        key: the key of the step, as the server sent it to the page.
         answers: the answers to a questionnaire, in the order of its items; None for an item
             without an answer.
     """
@@ -167,28 +177,48 @@ _RATES: dict[type[PageMessage], tuple[float, int]] = {
     DoStep: (2.0, 5),
     AbortTrial: (1.0, 3),
 }
-"""Largest mean rate of a page's messages of each kind, 1/s, and largest burst.
+"""Largest mean rate of a page's messages of each kind, in 1/s, and largest burst.
 
 `PageMessage` stands for all kinds together.
 """
+
+
+@dataclass(slots=True)
+class _TokenBucket:
+    """A bucket of tokens, one of which is removed by each message.
+
+    Attributes:
+        tokens: the tokens in the bucket.
+        filled_ns: the time of the last message, in ns; 0 before the first message.
+    """
+
+    tokens: float
+    filled_ns: int = 0
 
 
 class MessageLimits:
     """The limits of a page's message rates: token buckets for each kind and for all kinds."""
 
     def __init__(self) -> None:
-        self._buckets = {kind: (float(burst), 0) for kind, (_, burst) in _RATES.items()}
+        self._buckets = {
+            kind: _TokenBucket(float(burst)) for kind, (_, burst) in _RATES.items()
+        }
 
     def allows(self, kind: type[PageMessage], now_ns: int) -> bool:
         """Returns whether a message of a kind is allowed now, and counts the message if so."""
         if kind not in _RATES:
             return True
         rate, burst = _RATES[kind]
-        tokens, filled_ns = self._buckets[kind]
-        if filled_ns:
-            tokens = min(tokens + (now_ns - filled_ns) * 1e-9 * rate, burst)
-        self._buckets[kind] = tokens - (tokens >= 1.0), now_ns
-        return tokens >= 1.0
+        bucket = self._buckets[kind]
+        # The bucket is full before the first message.
+        if bucket.filled_ns:
+            new_tokens = (now_ns - bucket.filled_ns) * 1e-9 * rate
+            bucket.tokens = min(bucket.tokens + new_tokens, burst)
+        bucket.filled_ns = now_ns
+        is_allowed = bucket.tokens >= 1.0
+        if is_allowed:
+            bucket.tokens -= 1.0
+        return is_allowed
 
 
 def read_page_message(text: str | bytes) -> PageMessage:
@@ -210,9 +240,9 @@ class Role:
     """The rights of a page's user, and the view of the arms.
 
     Attributes:
-        kind: an experimenter may do everything, a user holds the arm of one site, a watcher
-            only stops the arms.
-        site: the site as whose user the arms are shown; "" shows them without delay.
+        kind: an experimenter may do everything, a user holds the arm of one site, and a watcher
+            may only stop the arms.
+        site: the site whose user's view is shown; "" shows all arms without delay.
     """
 
     kind: Literal["experimenter", "user", "watcher"] = "experimenter"
@@ -224,15 +254,18 @@ class Role:
             return True
         if self.kind != "user":
             return False
-        moves_arm = isinstance(message, MoveHand) and message.site == self.site
-        return moves_arm or isinstance(message, StageMessage)
+        if isinstance(message, MoveHand):
+            return message.site == self.site
+        return isinstance(message, StageMessage)
 
     @property
     def noun(self) -> str:
         """The noun for the role in the sentence of an event."""
         if self.kind == "experimenter":
             return "the experimenter"
-        return f"the user of {self.site}" if self.kind == "user" else "a watcher"
+        if self.kind == "user":
+            return f"the user of {self.site}"
+        return "a watcher"
 
     @property
     def query(self) -> str:
@@ -262,21 +295,27 @@ class RoleLinks:
         fields = parse_qs(query, keep_blank_values=True)
         token = fields.get("token", [""])[0]
         site = fields.get("as", [""])[0]
-        roles = Role(), Role("user", site), Role("watcher")
-        role = next((role for role in roles if self._is_token(token, role)), None)
-        if role is None or role.kind == "user":
-            return role
-        # An experimenter may use a lower role.
-        if role.kind == "watcher" or "watch" in fields:
+        if self._is_token(token, Role()):
+            # An experimenter may use a lower role.
+            if "watch" in fields:
+                return Role("watcher", site)
+            return Role("user", site) if site else Role()
+        if self._is_token(token, Role("user", site)):
+            return Role("user", site)
+        if self._is_token(token, Role("watcher")):
             return Role("watcher", site)
-        return Role("user", site) if site else role
+        return None
 
     def _make_token(self, role: Role) -> str:
+        """Returns the token of a role, which nobody can guess without the server's secret."""
         text = f"{role.kind} {role.site}".encode()
-        return hmac.digest(self._secret, text, "sha256")[:TOKEN_BYTES].hex()
+        digest = hmac.digest(self._secret, text, "sha256")
+        return digest[:TOKEN_BYTES].hex()
 
     def _is_token(self, token: str, role: Role) -> bool:
-        return hmac.compare_digest(token.encode(), self._make_token(role).encode())
+        """Returns whether a token is that of a role."""
+        role_token = self._make_token(role)
+        return hmac.compare_digest(token.encode(), role_token.encode())
 
 
 class PageHands:
@@ -305,20 +344,43 @@ class PageHands:
         if site not in self._senders:
             if not order.grip:
                 return
-            self._senders[site] = make_hand_sender(self._bus, self._clock, self._session, site)
-            self._senders[site].number = 0  # a page counts from 1
-        (self._held_sites.add if order.grip else self._held_sites.discard)(site)
-        goals = {"force" if pushes else "target": order.to if order.grip else []}
-        self._senders[site].send(HandMessage, source=self._source, grip=order.grip, **goals)
+            new_sender = make_hand_sender(self._bus, self._clock, self._session, site)
+            new_sender.number = 0  # the messages of a page are numbered from 1
+            self._senders[site] = new_sender
+        sender = self._senders[site]
+        if order.grip:
+            self._held_sites.add(site)
+        else:
+            self._held_sites.discard(site)
+        goal = order.to if order.grip else []
+        if pushes:
+            sender.send(HandMessage, source=self._source, grip=order.grip, force=goal)
+        else:
+            sender.send(HandMessage, source=self._source, grip=order.grip, target=goal)
 
     def release(self) -> None:
-        """Releases every arm."""
+        """Releases all arms that the page holds."""
         for site in list(self._held_sites):
             self.move(MoveHand(site=site, grip=False), pushes=False)
 
     def holds(self, site: str, source: int) -> bool:
         """Returns whether this page is the holder that a site's record names by `source`."""
-        return source != 0 and site in self._senders and self._senders[site].boot == source
+        sender = self._senders.get(site)
+        return source != 0 and sender is not None and sender.boot == source
+
+
+class _OpenQuery(NamedTuple):
+    """A request that waits for the reply of a site.
+
+    Attributes:
+        inbox: receives the reply.
+        sent_ns: the time of sending, in ns.
+        request: the request.
+    """
+
+    inbox: Inbox
+    sent_ns: int
+    request: ChangeRequest
 
 
 class OrderDesk:
@@ -336,17 +398,20 @@ class OrderDesk:
         self._bus = bus
         self._clock = clock
         self._session = session
+        # Requests that wait to be sent, by site and subject.
         self._pending: dict[tuple[str, str], ChangeRequest] = {}
-        self._open_queries: dict[tuple[str, str], tuple[Inbox, int, ChangeRequest]] = {}
+        # Requests that wait for a reply, by site and channel.
+        self._open_queries: dict[tuple[str, str], _OpenQuery] = {}
         self.replies: list[tuple[str, str, bool, str]] = []
         self.refused: Counter[str] = Counter() if refused is None else refused
 
     def queue_change(
         self, order: Order, sites: Collection[str], links: Collection[str], source: str = ""
     ) -> None:
-        """Queues a change of a link or of shares; it replaces a pending one of the same object.
+        """Queues a change of a link or of shares.
 
-        A change of an unknown site or link is refused.
+        The change replaces a pending change of the same link or row of shares. A change of an
+        unknown site or link is refused.
 
         Args:
             order: the new settings of a link, or a new row of shares.
@@ -355,19 +420,19 @@ class OrderDesk:
             source: who sends the order, for the site's event.
         """
         if isinstance(order, SetLink):
-            kind = "link"
-            site = order.link.partition("->")[2]
-            is_known = order.link in links
+            if order.link not in links:
+                self.refused["no such link"] += 1
+                return
+            # The receiver of a link delays the link's samples.
+            _, _, site = order.link.partition("->")
             request = _make_link_request(order)
         else:
-            kind = "site"
+            if order.site not in sites:
+                self.refused["no such site"] += 1
+                return
             site = order.site
-            is_known = order.site in sites
             request = ChangeRequest(dominance=site, to={**order.to}, ramp_s=MIN_RAMP_S)
-        if not is_known:
-            self.refused[f"no such {kind}"] += 1
-        else:
-            self._enqueue(site, request.link, _add_source(request, source))
+        self._enqueue(site, request.link, _add_source(request, source))
 
     def stop(self, sites: Iterable[str], source: str = "") -> None:
         """Orders sites to stop at once, ahead of all pending orders.
@@ -376,12 +441,11 @@ class OrderDesk:
             sites: the names of the sites.
             source: who sends the order, for the sites' events.
         """
+        request = _add_source(ChangeRequest(order="stop"), source)
         for site in sites:
             # A pending release would let the arm move again right after the stop.
             self._pending.pop((site, RELEASE), None)
-            self._send_request(
-                site, topics.STOP, _add_source(ChangeRequest(order="stop"), source)
-            )
+            self._send_request(site, topics.STOP, request)
 
     def release(self, order: ReleaseArms, sites: Collection[str], source: str = "") -> None:
         """Queues orders that let arms follow again, or end their faults.
@@ -391,22 +455,28 @@ class OrderDesk:
             sites: the sites of the session.
             source: who sends the order, for the sites' events.
         """
+        request = _add_source(ChangeRequest(order=order.order), source)
         for site in order.sites:
-            if site not in sites:
-                self.refused["no such site"] += 1
+            if site in sites:
+                self._enqueue(site, RELEASE, request)
             else:
-                self._enqueue(
-                    site, RELEASE, _add_source(ChangeRequest(order=order.order), source)
-                )
+                self.refused["no such site"] += 1
 
     def _enqueue(self, site: str, subject: str, request: ChangeRequest) -> None:
-        """Queues a request; it replaces a pending one of the same subject."""
-        if (site, subject) in self._pending or len(self._pending) < MAX_PENDING:
+        """Queues a request, which replaces a pending request of the same subject.
+
+        A request of a new subject is dropped if too many requests wait.
+        """
+        is_replacement = (site, subject) in self._pending
+        if is_replacement or len(self._pending) < MAX_PENDING:
             self._pending[site, subject] = request
 
     def _send_request(self, site: str, channel: str, request: ChangeRequest) -> None:
-        inbox = self._bus.query(topics.key(self._session, site, channel), encode(request))
-        self._open_queries[site, channel] = inbox, self._clock.monotonic_ns(), request
+        """Sends a request to a site, and keeps the query until the site replies."""
+        key = topics.key(self._session, site, channel)
+        inbox = self._bus.query(key, encode(request))
+        sent_ns = self._clock.monotonic_ns()
+        self._open_queries[site, channel] = _OpenQuery(inbox, sent_ns, request)
 
     def mark(self, site: str, text: str) -> None:
         """Queues a mark of this moment in a site's log."""
@@ -415,15 +485,13 @@ class OrderDesk:
     def poll(self) -> None:
         """Reads the replies of the sites, and sends each site its next pending request."""
         now_ns = self._clock.monotonic_ns()
-        for (site, channel), (inbox, sent_ns, request) in list(self._open_queries.items()):
-            if (reply := inbox.poll()) is not None:
+        for (site, channel), query in list(self._open_queries.items()):
+            reply = query.inbox.poll()
+            if reply is not None:
                 del self._open_queries[site, channel]
                 _, payload = reply
-                try:
-                    self._handle_reply(site, channel, request, decode(payload, ChangeReply))
-                except WireError as error:
-                    self.refused[error.reason] += 1
-            elif now_ns - sent_ns > REPLY_TIMEOUT_NS:
+                self._handle_reply(site, channel, query.request, payload)
+            elif now_ns - query.sent_ns > REPLY_TIMEOUT_NS:
                 del self._open_queries[site, channel]
                 self.replies.append((site, channel, False, f"{site} does not answer"))
         for (site, subject), request in list(self._pending.items()):
@@ -432,21 +500,22 @@ class OrderDesk:
                 self._send_request(site, topics.SET, request)
 
     def _handle_reply(
-        self, site: str, channel: str, request: ChangeRequest, reply: ChangeReply
+        self, site: str, channel: str, request: ChangeRequest, payload: bytes
     ) -> None:
         """Stores a reply for the pages, or repeats a refused stop without its source.
 
         A site of an older program does not know the source and refuses the whole request, but
-        its arm has to stop too.
+        its arm has to stop too. A reply that cannot be read is counted.
         """
-        if (
-            channel == topics.STOP
-            and not reply.accepted
-            and request.source is not msgspec.UNSET
-        ):
-            self._send_request(
-                site, channel, msgspec.structs.replace(request, source=msgspec.UNSET)
-            )
+        try:
+            reply = decode(payload, ChangeReply)
+        except WireError as error:
+            self.refused[error.reason] += 1
+            return
+        is_refused_stop = channel == topics.STOP and not reply.accepted
+        if is_refused_stop and request.source is not msgspec.UNSET:
+            plain_request = msgspec.structs.replace(request, source=msgspec.UNSET)
+            self._send_request(site, channel, plain_request)
         else:
             self.replies.append((site, channel, reply.accepted, reply.text))
 
@@ -460,14 +529,20 @@ def _make_link_request(order: SetLink) -> ChangeRequest:
     """Returns the request for new settings of a link.
 
     Without a preset, a delay with a deviation becomes a gamma distribution, and a delay
-    without one is constant.
+    without a deviation is constant.
     """
-    to: dict[str, Any] = dict(order.to)
-    if "preset" not in to and "delay_ms" in to:
-        jitters = all(
-            str(to.get(key, 0.0)) not in ("0.0", "-0.0") for key in ("deviation_ms", "delay_ms")
-        )
-        to["model"] = "gamma" if jitters else "constant"
-        if not jitters:
-            to.pop("deviation_ms", None)
-    return ChangeRequest(link=order.link, to=to)
+    settings: dict[str, Any] = dict(order.to)
+    if "preset" not in settings and "delay_ms" in settings:
+        has_delay = not _is_zero(settings["delay_ms"])
+        has_deviation = not _is_zero(settings.get("deviation_ms", 0.0))
+        if has_delay and has_deviation:
+            settings["model"] = "gamma"
+        else:
+            settings["model"] = "constant"
+            settings.pop("deviation_ms", None)
+    return ChangeRequest(link=order.link, to=settings)
+
+
+def _is_zero(value: float | str) -> bool:
+    """Returns whether a setting is the number 0; a text is not, the site will refuse it."""
+    return str(value) in ("0.0", "-0.0")

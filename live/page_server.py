@@ -67,7 +67,7 @@ from .page_orders import (
     TakePart,
     read_page_message,
 )
-from .session_frames import SessionFrames, show_event
+from .session_frames import SessionFrames, render_event
 from .session_view import SessionView
 
 if TYPE_CHECKING:  # an experiment's libraries are for experiments alone
@@ -803,7 +803,7 @@ class PageServer:
         limit = 100_000 if is_first else POINTS_PER_FRAME
         points = frames.points.since(page.points, limit)
         energies = frames.energies.since(page.energies, limit)
-        events = [show_event(event) for event in view.events.since(page.events, 100)]
+        events = [render_event(event) for event in view.events.since(page.events, 100)]
         page.points = frames.points.count
         page.energies = frames.energies.count
         page.events = view.events.count

@@ -1,14 +1,18 @@
-"""Frames of a session for pages: its constants, its present state, and new points of the plots.
+"""The content of the pages of a running session, as JSON objects.
+
+A page first receives the constants of the session, such as the shapes of the arms. Then it
+receives about 30 frames a second: a frame has the present state of each arm and link, and new
+points of the plots.
 
 Invariant:
-    - A frame is a function of the records since the previous frame. If a page misses some
-      frames, the next one is still complete.
-    - Extremes between two frames are kept.
-    - Forces are those ON the arm, N. The forces of people and of the law follow by the
-      transpose of the Jacobian; near a singular pose that gives the least force which explains
-      the torque.
-    - A frame for the user of one site shows of each peer only its pose at one tick: that of the
-      sample in use, or of the delayed picture (`SessionView.find_shown`).
+    - A frame is computed from the records since the previous frame. It describes the whole
+      state, so that a page may miss frames.
+    - The plots have the extremes of the records between two frames.
+    - Forces are those ON the arm, in N. The forces of people and of the law follow from their
+      torque: torque = J^T force, with the Jacobian J. Near a singular pose the force is the
+      smallest force that explains the torque.
+    - The frame for the user of a site contains the pose of each peer at one tick only: the tick
+      of the sample in use, or of the delayed picture (`SessionView.find_peer_ticks`).
 """
 
 import math
@@ -39,17 +43,19 @@ from .session_view import SessionView, SiteView, Tail
 POINTS_KEPT = 1200
 """Points of a plot that a new page receives: 40 s."""
 ENERGY_PERIOD_S = 0.025
+"""Smallest time between two points of the energies, in s."""
 COLOURS = 6
 """Number of colours for sites in `page.css`."""
 MAX_FRAME_S = 0.5
-"""Longest time whose records one frame evaluates, s."""
-_MIN_SINGULAR_VALUE = 0.05
-"""Smallest singular value of the Jacobian that is inverted, m/rad.
+"""Longest time whose records a frame evaluates, in s."""
+_MIN_SINGULAR_SHARE = 0.05
+"""Smallest singular value of the Jacobian that is inverted, as a share of the largest.
 
 Along directions in which the end effector moves less, the force counts as zero.
 """
 
 Json = dict[str, Any]
+"""A JSON object."""
 
 
 def _round(values: Array, digits: int = 5) -> list[Any]:
@@ -59,7 +65,7 @@ def _round(values: Array, digits: int = 5) -> list[Any]:
 
 
 class ArmFrames:
-    """One arm in frames: its fixed shape; its pose, reference pose and forces in some records.
+    """The part of the frames that describes one arm: shape, pose, reference pose and forces.
 
     Args:
         scenario: the scenario of the session.
@@ -79,95 +85,112 @@ class ArmFrames:
 
     def describe(self) -> Json:
         """Returns the constants of the arm."""
-        chain = self._model.chain
+        model = self._model
+        spec = self._spec
         colours = self._scenario.assign_colours(COLOURS)
-        index = self._scenario.names.index(self._site)
-        q0 = np.array([self._spec.q0_rad], dtype=np.float64)
-        start = joint_positions_m(self._model, q0)[0]
-        link_lengths_m = np.linalg.norm(np.diff(start, axis=0), axis=1)
-        shares_pose = self._model.shares_pose
+        site_number = self._scenario.names.index(self._site)
+        q0 = np.array([spec.q0_rad], dtype=np.float64)
+        start_m = joint_positions_m(model, q0)[0]
+        link_vectors_m = np.diff(start_m, axis=0)
+        link_lengths_m = np.linalg.norm(link_vectors_m, axis=1)
+        body_sizes_m = self._scenario.bodies_m(self._site).values()
         return {
-            "role": self._spec.role,
-            "colour": colours[index % len(colours)],
-            "rate_hz": self._spec.rate_hz,
-            "planar": chain is None,
-            "up": None if chain is None else _round(upright_axes(chain)),
-            "joints": len(self._spec.q0_rad),
-            "start": _round(start),
+            "role": spec.role,
+            "colour": colours[site_number % len(colours)],
+            "rate_hz": spec.rate_hz,
+            "planar": model.chain is None,
+            "up": None if model.chain is None else _round(upright_axes(model.chain)),
+            "joints": len(spec.q0_rad),
+            "start": _round(start_m),
             "reach": float(link_lengths_m.sum()),
             "tau_limit": _round(self._tau_limit),
-            "bodies": [list(size) for size in self._scenario.bodies_m(self._site).values()],
+            "bodies": [list(size) for size in body_sizes_m],
             "walls": [{"at": list(wall.a), "normal": list(wall.b)} for wall in self._walls],
-            "task": shares_pose,
-            "unit": "m" if shares_pose else "rad",
+            "task": model.shares_pose,
+            "unit": "m" if model.shares_pose else "rad",
             "hand": self._describe_hand(),
-            "stops": self._spec.on_stale.action == "glide",
-            "law": identify_law(self._spec.control),
+            "stops": spec.on_stale.action == "glide",
+            "law": identify_law(spec.control),
         }
 
     def _describe_hand(self) -> Json | None:
+        """Returns the constants of the live hand; None if the arm has none."""
         hand = self._hand
         if hand is None:
             return None
-        settings = hand.device
-        axes = settings.rows(self._model.counts.axes)
+        device = hand.device
         centre, _, outer_m, *_ = self._model.reach
-        is_bounded = outer_m < math.inf
         return {
             "mode": hand.mode,
             "limit": hand.actor.limit,
-            "device": {"rows": axes, "scale": settings.scale, "jump_m_s": settings.jump_m_s},
-            "reach": {"centre": list(centre), "most": outer_m if is_bounded else None},
+            "device": {
+                "rows": device.rows(self._model.counts.axes),
+                "scale": device.scale,
+                "jump_m_s": device.jump_m_s,
+            },
+            "reach": {
+                "centre": list(centre),
+                "most": outer_m if outer_m < math.inf else None,
+            },
         }
 
     def describe_pose(self, q: Array) -> Json:
-        """Returns the pose of the arm at joint coordinates `q`, shape (n,), rad."""
-        return {
-            "points": _round(joint_positions_m(self._model, q[np.newaxis])[0]),
-            "q": _round(q),
-        }
+        """Returns the pose of the arm at joint positions `q`, shape (n,), in rad or m."""
+        points_m = joint_positions_m(self._model, q[np.newaxis])[0]
+        return {"points": _round(points_m), "q": _round(q)}
 
     def describe_start(self) -> Json:
         """Returns the pose of the arm before tick 0, as the scenario places it."""
-        return {
-            **self.describe_pose(np.array(self._spec.q0_rad, dtype=np.float64)),
-            "tick": -1,
-            "bodies": [],
-        }
+        pose = self.describe_pose(np.array(self._spec.q0_rad, dtype=np.float64))
+        return {**pose, "tick": -1, "bodies": []}
 
     def describe_now(self, records: AlignedRecords) -> tuple[Json, list[float]]:
         """Returns the present state of the arm, and extremes since the previous frame.
 
         Args:
-            records: the records since the previous frame; the last one is the present.
+            records: the records since the previous frame; the last record is the present.
 
         Returns:
-            The state, and the largest |e|, torque, hand force and wall force.
+            The state, and the largest norm of the error, torque of a joint in N m, hand force
+            in N and wall force in N.
         """
         split = split_torque(records, self._scenario)
-        last = slice(len(records.known) - 1, None)
         hand_force = self._compute_hand_force(records, split)
         wall_force_n = self._compute_wall_force(records, split)
-        error = np.linalg.norm(records.e, axis=1)
-        tau = np.abs(records.tau)
-        if self._model.shares_pose:
-            ghost = records.q_des[-1, :3][np.newaxis] / self._spec.task.scale
-        else:
-            ghost = joint_positions_m(self._model, records.q_des[last])[0]
+        error_norm = np.linalg.norm(records.e, axis=1)
+        torque_size = np.abs(records.tau)
+        is_at_limit = torque_size >= self._tau_limit * (1.0 - 1e-12)
         state = {
             **self.describe_pose(records.q[-1]),
-            "ghost": _round(ghost),
-            "e": float(error[-1]),
+            "ghost": _round(self._place_reference(records)),
+            "e": float(error_norm[-1]),
             "tau": _round(records.tau[-1], 3),
-            "clamped": bool((tau >= self._tau_limit * (1.0 - 1e-12)).any()),
+            "clamped": bool(is_at_limit.any()),
             "hand": _round(hand_force[-1], 3),
             "pull": self._compute_pull(records, split),
             "wall": _round(wall_force_n[-1], 3),
             **self._describe_grip(records, hand_force[-1]),
         }
-        largest_hand_n = float(np.linalg.norm(hand_force, axis=1).max())
-        largest_wall_n = float(np.linalg.norm(wall_force_n, axis=1).max())
-        return state, [float(error.max()), float(tau.max()), largest_hand_n, largest_wall_n]
+        hand_force_size = np.linalg.norm(hand_force, axis=1)
+        wall_force_size = np.linalg.norm(wall_force_n, axis=1)
+        extremes = [
+            float(error_norm.max()),
+            float(torque_size.max()),
+            float(hand_force_size.max()),
+            float(wall_force_size.max()),
+        ]
+        return state, extremes
+
+    def _place_reference(self, records: AlignedRecords) -> Array:
+        """Returns the points of the reference pose in the last record, in m.
+
+        The reference of a shared pose is one point; a reference of the joints has a point for
+        each joint.
+        """
+        if self._model.shares_pose:
+            return records.q_des[-1, :3][np.newaxis] / self._spec.task.scale
+        last = slice(len(records.known) - 1, None)
+        return joint_positions_m(self._model, records.q_des[last])[0]
 
     def _describe_grip(self, records: AlignedRecords, force: Array) -> Json:
         """Returns the state of the live hand in the last record; {} without a live hand."""
@@ -177,8 +200,9 @@ class ArmFrames:
         hand = self._hand
         is_limited = False
         if hand is not None and hand.mode != "joint" and grip.source:
+            force_size_n = float(np.linalg.norm(force))
             limit_n = grip.grip * hand.force_limit_n * (1.0 - 1e-6)
-            is_limited = float(np.linalg.norm(force)) >= limit_n
+            is_limited = force_size_n >= limit_n
         has_target = hand is not None and hand.mode == "tip" and grip.grip > 0.0
         return {
             "grip": grip.grip,
@@ -188,31 +212,36 @@ class ArmFrames:
         }
 
     def _compute_hand_force(self, records: AlignedRecords, split: TorqueSplit) -> Array:
-        """Returns the force of people at the end effector, shape (K, 2) or (K, 3), N."""
+        """Returns the force of people at the end effector, shape (K, 2) or (K, 3), in N."""
         torque = split.operator
-        # Without a hand in the scenario, a tiny torque is a rounding error of the split.
-        rounding = 1e-9 * (1.0 + np.abs(records.tau_x).max())
-        if not self._spec.hands and np.abs(torque).max() < rounding:
-            return np.zeros_like(split.end_effector.position)
-        return split.end_effector.find_force(torque, _MIN_SINGULAR_VALUE)
+        if not self._spec.hands:
+            # Without a hand in the scenario, a tiny torque is a rounding error of the split.
+            rounding_nm = 1e-9 * (1.0 + np.abs(records.tau_x).max())
+            if np.abs(torque).max() < rounding_nm:
+                return np.zeros_like(split.end_effector.position)
+        return split.end_effector.find_force(torque, _MIN_SINGULAR_SHARE)
 
     def _compute_pull(self, records: AlignedRecords, split: TorqueSplit) -> list[float]:
-        """Returns the law's force on the end effector in the last record, N; a user feels it.
+        """Returns the force of the law that a user feels in the last record, in N.
 
-        It is the force of the torque beyond gravity; [] if the masses are not known.
+        The force follows from the law's torque without gravity compensation. Returns [] if the
+        masses of the arm are not known.
         """
         if not self._spec.arm.known:
             return []
-        last = EndEffectorRows(*(rows[-1:] for rows in split.end_effector))
+        motion = split.end_effector
+        last = EndEffectorRows(motion.position[-1:], motion.speed[-1:], motion.J[-1:])
         torque = records.tau[-1:] - self._rows.gravity_torque(records.q[-1:])
-        return _round(last.find_force(torque, _MIN_SINGULAR_VALUE)[0], 3)
+        force = last.find_force(torque, _MIN_SINGULAR_SHARE)[0]
+        return _round(force, 3)
 
     def _compute_wall_force(self, records: AlignedRecords, split: TorqueSplit) -> Array:
-        """Returns the force of all walls at the end effector, shape (K, 2) or (K, 3), N."""
+        """Returns the force of all walls at the end effector, shape (K, 2) or (K, 3), in N."""
         total = np.zeros_like(split.end_effector.position)
         for wall in self._walls:
-            force = wall_force(wall, records.nominal_s, split.end_effector)
-            total = total + force[:, np.newaxis] * np.array(wall.b)
+            size_n = wall_force(wall, records.nominal_s, split.end_effector)
+            normal = np.array(wall.b)
+            total = total + size_n[:, np.newaxis] * normal
         return total
 
 
@@ -224,18 +253,21 @@ class SessionFrames:
 
     Attributes:
         points: rows of the plots, in the order of `columns`.
-        energies: rows of time, s, V, J, and the energy supplied by operator and environment, J.
+        energies: rows of the energy plot: time in s, V in J, and the energy that operator and
+            environment have supplied, in J.
     """
 
     def __init__(self, view: SessionView) -> None:
         self._view = view
         self._arms: dict[str, ArmFrames] = {}
-        self._shapes: Json = {}
+        self._arm_constants: Json = {}
+        # The newest tick of each site in the previous frame.
         self._last_ticks: dict[str, int] = {}
         self.points: Tail[list[float | None]] = Tail(POINTS_KEPT)
         self.energies: Tail[list[float]] = Tail(POINTS_KEPT)
         self._energy_s = -1.0
-        self._shown_peers: dict[tuple[str, str], Json] = {}
+        # By the user's site and the peer; a site's own arm is turned under the user "".
+        self._peer_poses: dict[tuple[str, str], Json] = {}
         self._turns: defaultdict[tuple[str, str], BodyTurns] = defaultdict(BodyTurns)
 
     def describe(self) -> Json:
@@ -245,18 +277,13 @@ class SessionFrames:
         # Prepared before the session runs, because loading the compiled arms takes seconds.
         if scenario is not None and not self._arms:
             self._arms = {site: ArmFrames(scenario, site) for site in scenario.names}
-            self._shapes = {site: arm.describe() for site, arm in self._arms.items()}
+            for site, arm in self._arms.items():
+                self._arm_constants[site] = arm.describe()
         if scenario is None or not view.running:
-            names = [] if scenario is None else scenario.names
-            return {
-                "session": view.session,
-                "running": False,
-                "title": "",
-                "here": sorted(view.met),
-                "missing": [name for name in names if name not in view.met],
-            }
-        kinds = ("e", "tau", "hand", "wall")
-        columns = [f"{site}.{kind}" for site in scenario.names for kind in kinds]
+            return self._describe_waiting(scenario)
+        columns: list[str] = []
+        for site in scenario.names:
+            columns += [f"{site}.{kind}" for kind in ("e", "tau", "hand", "wall")]
         columns += [f"{link}.age" for link in scenario.links]
         return {
             "running": True,
@@ -265,31 +292,46 @@ class SessionFrames:
             "title": scenario.title or scenario.name,
             "about": scenario.about,
             "duration_s": scenario.duration_s,
-            "sites": self._shapes,
+            "sites": self._arm_constants,
             "links": {name: list(name.split("->")) for name in scenario.links},
             "shares": {site: scenario.dominance[site] for site in scenario.names},
             "columns": columns,
         }
 
+    def _describe_waiting(self, scenario: Scenario | None) -> Json:
+        """Returns the members of a session that has not begun."""
+        members = self._view.members
+        names = [] if scenario is None else scenario.names
+        return {
+            "session": self._view.session,
+            "running": False,
+            "title": "",
+            "here": sorted(members),
+            "missing": [name for name in names if name not in members],
+        }
+
     def make_frame(self) -> Json | None:
-        """Returns the present state; None until every site has a record."""
+        """Returns the present state, and adds the points of the plots.
+
+        Returns None until every site has a record.
+        """
         view = self._view
-        if not view.running or any(site.record is None for site in view.sites.values()):
+        has_all_records = all(site.record is not None for site in view.sites.values())
+        if not view.running or not has_all_records:
             return None
         if not self._arms:
             self.describe()
-        sites = {}
-        row: list[float | None] = []
+        sites: Json = {}
+        point: list[float | None] = []
         t_s = 0.0
         for name, site in view.sites.items():
             sites[name], extremes = self._describe_site(name, site)
             t_s = max(t_s, sites[name]["t"])
-            row += extremes
+            point += extremes
         links = {name: self._describe_link(name) for name in view.links}
-        row += [link["age_ms"] for link in links.values()]
+        point += [link["age_ms"] for link in links.values()]
         if any(site["new"] for site in sites.values()):
-            rounded = [None if value is None else float(f"{value:.5g}") for value in row]
-            self.points.add([round(t_s, 4), *rounded])
+            self._add_point(t_s, point)
         self._add_energies()
         return {
             "t": t_s,
@@ -301,6 +343,11 @@ class SessionFrames:
             "silent_s": 0.0 if view.ended else round(view.session_silence_s, 1),
             "dropped": sum(view.dropped.values()),
         }
+
+    def _add_point(self, t_s: float, values: list[float | None]) -> None:
+        """Adds a point to the plots, with values of five digits."""
+        rounded = [None if value is None else float(f"{value:.5g}") for value in values]
+        self.points.add([round(t_s, 4), *rounded])
 
     def _add_energies(self) -> None:
         """Adds points of V and the supplied energy, at most one per `ENERGY_PERIOD_S`."""
@@ -322,26 +369,27 @@ class SessionFrames:
         return {**constants, **hidden}
 
     def describe_as(self, frame: Json, site: str, *, ages: bool) -> Json:
-        """Returns a frame for the user of a site: the site's arm now, its peers as shown there.
+        """Returns a frame for the user of a site, with the site's view of its peers.
 
         Args:
             frame: the newest frame of `make_frame`.
             site: the site of the user.
-            ages: whether each peer has the age of the shown sample, ms.
+            ages: whether each peer has the age of the pose that is drawn, in ms.
         """
         local = frame["sites"][site]
-        ticks = self._view.find_shown(site, local["tick"], local["used"])
-        peers = {
-            name: self._describe_shown_peer(site, name, tick) for name, tick in ticks.items()
-        }
-        if ages:
-            for name, peer in peers.items():
-                rate_hz = self._view.sites[name].window.rate_hz
-                age_ms = local["t"] * 1e3 - peer["tick"] * 1e3 / rate_hz
-                peers[name] = {**peer, "age_ms": age_ms if peer["tick"] >= 0 else None}
+        ticks = self._view.find_peer_ticks(site, local["tick"], local["used"])
+        sites: Json = {}
+        for name in frame["sites"]:
+            if name not in ticks:
+                sites[name] = local
+                continue
+            peer = self._describe_peer(site, name, ticks[name])
+            if ages:
+                peer = {**peer, "age_ms": self._compute_age_ms(name, peer["tick"], local["t"])}
+            sites[name] = peer
         return {
             "t": local["t"],
-            "sites": {name: peers.get(name, local) for name in frame["sites"]},
+            "sites": sites,
             "links": {},
             "shares": {},
             "energy": "",
@@ -349,49 +397,77 @@ class SessionFrames:
             "silent_s": local["silent_s"],
         }
 
-    def _describe_shown_peer(self, site: str, peer: str, tick: int) -> Json:
-        """Returns the pose of a peer at a tick; without that record, the pose shown before."""
-        shown = self._shown_peers.get((site, peer)) or self._arms[peer].describe_start()
+    def _compute_age_ms(self, site: str, tick: int, t_s: float) -> float | None:
+        """Returns the age at `t_s` of a site's record; None before the first record."""
+        if tick < 0:
+            return None
+        rate_hz = self._view.sites[site].window.rate_hz
+        age_ms: float = t_s * 1e3 - tick * 1e3 / rate_hz
+        return age_ms
+
+    def _describe_peer(self, site: str, peer: str, tick: int) -> Json:
+        """Returns the pose of a peer at a tick, for the user of a site.
+
+        If the record of that tick is missing, the pose is that of the frame before.
+        """
+        pose = self._peer_poses.get((site, peer)) or self._arms[peer].describe_start()
         view = self._view.sites[peer]
-        if tick != shown["tick"] and view.window.has_record(tick):
+        if tick != pose["tick"] and view.window.has_record(tick):
             q = view.window.rows(tick, tick).q[0]
-            bodies = _round(self._turns[site, peer].align(view.bodies.get(tick, [])))
-            shown = {**self._arms[peer].describe_pose(q), "tick": tick, "bodies": bodies}
-        self._shown_peers[site, peer] = shown
-        return shown
+            bodies = self._turns[site, peer].align(view.bodies.get(tick, []))
+            pose = {**self._arms[peer].describe_pose(q), "tick": tick, "bodies": _round(bodies)}
+        self._peer_poses[site, peer] = pose
+        return pose
 
     def _describe_site(self, name: str, site: SiteView) -> tuple[Json, list[float]]:
         """Returns the present state of a site, and extremes since the previous frame."""
-        window = site.window
         record = site.record
         stats = site.stats
         assert record is not None
-        newest = max(window.newest, 0)
-        max_ticks = round(MAX_FRAME_S * window.rate_hz)
-        last_tick = self._last_ticks.get(name, -1)
-        first = max(min(last_tick + 1, newest), newest - max_ticks, window.first)
-        state, extremes = self._arms[name].describe_now(window.rows(first, newest))
-        self._last_ticks[name] = newest
-        account = site.reception.accounts["state"]
+        state, extremes, has_new_records = self._describe_new_records(name, site)
         has_ended = self._view.ended
         alarm = None if has_ended else site.find_alarm(self._view.session, name)
+        bodies = self._turns["", name].align(record.bodies)
+        # A view that joined late does not know how many earlier records are missing.
+        missing = site.reception.accounts["state"].missing if site.first_tick == 0 else 0
         fields = {
             **state,
-            "new": newest > last_tick,
+            "new": has_new_records,
             "t": record.t_ns / NS_PER_S,
             "tick": record.tick,
             "used": record.used,
             "mode": record.mode,
-            "bodies": _round(self._turns["", name].align(record.bodies)),
+            "bodies": _round(bodies),
             "alarm": None if alarm is None else _describe_alarm(alarm),
             "ended": site.ended or has_ended,
             "silent_s": 0.0 if has_ended else round(self._view.silence_s(site), 1),
             "holder": site.holder if state.get("source") else "",
             "late_us": stats.late_max_us if stats else 0,
             "overruns": stats.overruns if stats else 0,
-            "missing": account.missing if site.holds_from == 0 else 0,
+            "missing": missing,
         }
         return fields, extremes
+
+    def _describe_new_records(
+        self, name: str, site: SiteView
+    ) -> tuple[Json, list[float], bool]:
+        """Evaluates the records of a site since the previous frame.
+
+        Returns:
+            The state of the arm, the extremes, and whether there are new records. Without new
+            records, the newest record is evaluated again.
+        """
+        window = site.window
+        newest_tick = max(window.newest, 0)
+        previous_tick = self._last_ticks.get(name, -1)
+        self._last_ticks[name] = newest_tick
+        # After a pause, only the last `MAX_FRAME_S` are evaluated: a frame must be fast.
+        earliest_tick = newest_tick - round(MAX_FRAME_S * window.rate_hz)
+        next_tick = min(previous_tick + 1, newest_tick)
+        first_tick = max(next_tick, earliest_tick, window.first)
+        records = window.rows(first_tick, newest_tick)
+        state, extremes = self._arms[name].describe_now(records)
+        return state, extremes, newest_tick > previous_tick
 
     def _describe_link(self, name: str) -> Json:
         """Returns the present state of a link."""
@@ -400,30 +476,42 @@ class SessionFrames:
         receiving = view.sites[receiver]
         sending = view.sites[peer]
         record = receiving.record
-        used = -1 if record is None else record.used.get(peer, -1)
+        used_tick = -1
         age_ms = None
-        if record is not None and used >= 0:
-            age_ms = record.t_ns / 1e6 - used * 1e3 / sending.window.rate_hz
-        newest = sending.record.tick if sending.record else used
-        counts = {}
-        if receiving.stats is not None:
-            defaults = {"delay_us": -1, "accepted": 0, "late": 0, "lost": 0}
-            counts = {
-                key: getattr(receiving.stats, key).get(peer, default)
-                for key, default in defaults.items()
-            }
-        settings = {
+        if record is not None:
+            used_tick = record.used.get(peer, -1)
+            if used_tick >= 0:
+                age_ms = record.t_ns / 1e6 - used_tick * 1e3 / sending.window.rate_hz
+        newest_tick = sending.record.tick if sending.record else used_tick
+        samples_under_way = 0
+        if used_tick >= 0:
+            samples_under_way = max(0, min(newest_tick - used_tick, 100_000))
+        settings = view.links[name]
+        stated = {
             key: value
-            for key, value in view.links[name].items()
+            for key, value in settings.items()
             if isinstance(value, str | int | float)
         }
         return {
             "age_ms": age_ms,
-            "under_way": max(0, min(newest - used, 100_000)) if used >= 0 else 0,
-            "stated": settings,
+            "under_way": samples_under_way,
+            "stated": stated,
             "share": view.dominance.get(receiver, {}).get(peer, 0.0),
-            **counts,
+            **_count_samples(receiving, peer),
         }
+
+
+def _count_samples(receiving: SiteView, peer: str) -> Json:
+    """Returns the delay and the counts of a peer's samples; {} before the first statistics."""
+    stats = receiving.stats
+    if stats is None:
+        return {}
+    return {
+        "delay_us": stats.delay_us.get(peer, -1),
+        "accepted": stats.accepted.get(peer, 0),
+        "late": stats.late.get(peer, 0),
+        "lost": stats.lost.get(peer, 0),
+    }
 
 
 def _describe_alarm(alarm: LifeAlarm) -> Json:
@@ -435,8 +523,8 @@ def _describe_alarm(alarm: LifeAlarm) -> Json:
     return {"word": alarm.word, "reason": alarm.reason, "advice": advice, "order": alarm.order}
 
 
-def show_event(event: Event) -> Json:
-    """Returns an event as a page lists it."""
+def render_event(event: Event) -> Json:
+    """Returns an event as a line in the list of a page."""
     t_s = None if event.t_ns < 0 else event.t_ns / NS_PER_S
     text = describe_event(event.kind, event.text, event.command)
     return {"t": t_s, "member": event.member, "kind": event.kind, "text": text}

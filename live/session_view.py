@@ -1,17 +1,20 @@
-"""The present state of a session, by the messages of its sites as they arrive.
+"""The present state of a running session, as an observer knows it from the sites' messages.
+
+The pages of a session and `trilat watch` show this state. An observer receives the same
+messages as the recorder, and sends nothing to the sites except requests for missing messages.
 
 Invariant:
-    - Every record counts. Missing records are requested as a recorder requests them, from the
-      same buffers, so that energies equal those of the log. A page is shown fewer records, and
-      always the newest.
-    - A view that starts late does not request earlier records. It requests all events, because
-      they hold the changes.
-    - A site has ended if its `end` event says so, never because it is silent: on a busy machine
+    - The observer receives every record. It requests missing records from the buffers of the
+      sites, as a recorder does, so that the energies equal those of the log. Pages show fewer
+      records, always the newest.
+    - An observer that joins late does not request earlier records. It requests all events,
+      because they contain the changes.
+    - A site has ended if its `end` event says so, never because it is silent. On a busy machine
       a running site may be silent for long, and its records are used when they arrive.
 """
 
 from collections import Counter, deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Generic, TypeVar
 
 import msgspec
@@ -38,16 +41,17 @@ from trilat_net.scenario.run_changes import LinkTables, find_requester
 from trilat_net.scenario.sample_uses import PictureDelay
 
 LATE_S = 3.0
-"""A view has joined late if the first record of a site that it sees is of a later time."""
+"""An observer has joined late if the first record that it receives is of a later time, in s."""
 MIN_SILENCE_NS = 2 * NS_PER_S
-"""Silence after which a running site is shown as silent."""
+"""Silence after which a running site is reported as silent, in ns."""
 EVENTS_KEPT = 400
+"""Number of events that are kept for new pages."""
 
 T = TypeVar("T")
 
 
 class Tail(Generic[T]):
-    """The last entries of an endless sequence, for readers that come at any time.
+    """The last entries of a growing sequence, for readers that know only a part of it.
 
     Args:
         most: the largest number of entries that are kept.
@@ -68,8 +72,8 @@ class Tail(Generic[T]):
     def since(self, count: int, most: int) -> list[T]:
         """Returns the entries after the first `count`, at most the newest `most`."""
         size = len(self._entries)
-        new = min(self.count - count, most, size)
-        return [self._entries[n] for n in range(size - new, size)]
+        new_count = min(self.count - count, most, size)
+        return [self._entries[index] for index in range(size - new_count, size)]
 
 
 class SiteView:
@@ -82,14 +86,14 @@ class SiteView:
         hand: its live hand, if people can hold its arm.
         reception: which of its messages have arrived.
         window: its latest records.
-        holder: who took hold of its arm last.
-        stopped_by: who ordered its last stop, as its events say.
+        holder: the person or program that took hold of its arm last.
+        stopped_by: the person or program that ordered its last stop, as its events say.
         bodies: poses of its plant's bodies by tick, as far back as the window reaches.
         dropped: counts dropped messages by reason.
         repair: requests its missing messages.
         record: its newest record; None before the first.
         stats: its newest statistics; None before the first.
-        holds_from: the first tick that the view has seen.
+        first_tick: the tick of the first record, if the observer has joined late; else 0.
     """
 
     def __init__(
@@ -115,7 +119,7 @@ class SiteView:
         self.repair = GapRepair(bus, session, self.reception, self.dropped)
         self.record: State | None = None
         self.stats: LinkStats | None = None
-        self.holds_from = 0
+        self.first_tick = 0
 
     def find_alarm(self, session: str, name: str) -> LifeAlarm | None:
         """Returns the alarm of the site; None if there is none.
@@ -127,11 +131,9 @@ class SiteView:
         record = self.record
         if record is None or not self.glides or self.ended:
             return None
-        lost = (
-            self.layout.list_lost_peers(record.mem, self.peers)
-            if self.layout is not None
-            else ()
-        )
+        lost: Sequence[str] = ()
+        if self.layout is not None:
+            lost = self.layout.list_lost_peers(record.mem, self.peers)
         alarm = find_alarm(
             session=session,
             site=name,
@@ -157,11 +159,14 @@ class SiteView:
         """
         account = self.reception.accounts[topics.STATE]
         gap = account.find_requestable_gap()
-        return account.last if gap is None else gap[0] - 1
+        if gap is None:
+            return account.last
+        first_missing, _ = gap
+        return first_missing - 1
 
 
 class SessionView:
-    """A session as an observer sees it; `poll` receives what has arrived.
+    """A session as an observer knows it; `poll` receives the messages that have arrived.
 
     Args:
         bus: a bus that reaches the session.
@@ -171,7 +176,7 @@ class SessionView:
     Attributes:
         scenario: the scenario of the session; None until a member has sent it.
         sites: the running sites by name; {} until all of them run.
-        met: the identities of the members that have replied.
+        members: the identities of the members that have replied.
         links: the present settings of every link, as tables.
         dominance: the dominance matrix that was requested last, by site.
         energy: the running energy; None until all sites run.
@@ -185,7 +190,7 @@ class SessionView:
         self._clock = clock
         self.scenario: Scenario | None = None
         self.sites: dict[str, SiteView] = {}
-        self.met: dict[str, Info] = {}
+        self.members: dict[str, Info] = {}
         self.links = LinkTables({}, ())
         self.dominance: dict[str, dict[str, float]] = {}
         self.energy: RunningEnergy | None = None
@@ -207,59 +212,67 @@ class SessionView:
     @property
     def ended(self) -> bool:
         """True once every site has published its end, or `finish` was called."""
-        return self.running and (
-            self._finished or all(site.ended for site in self.sites.values())
-        )
+        if not self.running:
+            return False
+        return self._finished or all(site.ended for site in self.sites.values())
 
     def finish(self) -> None:
         """Marks the session as ended; called by the process that has seen all sites end."""
         self._finished = True
 
     def silence_s(self, site: SiteView) -> float:
-        """Returns for how long a running site has been silent, s.
+        """Returns for how long a running site has been silent, in s.
 
-        It is 0.0 below `MIN_SILENCE_NS`, and once the site has ended.
+        A silence shorter than `MIN_SILENCE_NS` is reported as 0.0, as is that of a site that
+        has ended.
         """
-        heard_ns = site.reception.last_received_ns
-        if heard_ns is None or site.ended:
+        received_ns = site.reception.last_received_ns
+        if received_ns is None or site.ended:
             return 0.0
-        silence_ns = self._clock.monotonic_ns() - heard_ns
+        silence_ns = self._clock.monotonic_ns() - received_ns
         return silence_ns / NS_PER_S if silence_ns >= MIN_SILENCE_NS else 0.0
 
     @property
     def session_silence_s(self) -> float:
-        """For how long all running sites have been silent, s; 0.0 while one is heard."""
+        """For how long all running sites have been silent, in s."""
         running = [site for site in self.sites.values() if not site.ended]
         return min((self.silence_s(site) for site in running), default=0.0)
 
     def poll(self) -> None:
-        """Receives what has arrived, and requests missing messages."""
+        """Receives the messages that have arrived, and requests missing messages."""
         now_ns = self._clock.monotonic_ns()
         if not self.running:
             self._connect_to_sites()
         if not self.running:
             return
-        for arrived in self._queue.drain(now_ns):
+        for message in self._queue.drain(now_ns):
             try:
-                self._receive(arrived)
+                self._receive(message)
             except WireError as error:
                 self.dropped[error.reason] += 1
         for name, site in self.sites.items():
             # Silent sites are queried too: the missing message may be their `end` event.
-            for channel, message, _ in site.repair.poll(now_ns, alive=not site.ended):
-                self._store(name, site, channel, message.content)
-        newest_ns = max(
-            (site.record.t_ns for site in self.sites.values() if site.record), default=0
-        )
-        self.links.advance_to(newest_ns)
+            repaired = site.repair.poll(now_ns, alive=not site.ended)
+            for channel, reply, _ in repaired:
+                self._store(name, site, channel, reply.content)
+        records = [site.record for site in self.sites.values()]
+        times_ns = [record.t_ns for record in records if record is not None]
+        self.links.advance_to(max(times_ns, default=0))
 
     def advance_energy(self) -> EnergyCourse | None:
         """Returns V at the ticks completed since the last call; None if there are none."""
+        if self.energy is None:
+            return None
         complete = {name: site.complete for name, site in self.sites.items()}
-        return None if self.energy is None else self.energy.compute_next(complete)
+        return self.energy.compute_next(complete)
 
-    def find_shown(self, site: str, tick: int, used: Mapping[str, int]) -> Mapping[str, int]:
-        """Returns the tick of each peer that a site's user is shown.
+    def find_peer_ticks(
+        self, site: str, tick: int, used: Mapping[str, int]
+    ) -> Mapping[str, int]:
+        """Returns the tick at which a site's user sees each peer.
+
+        That is the tick of the sample in use or, if the scenario delays the picture further,
+        of an earlier sample.
 
         Args:
             site: the site of the user.
@@ -269,13 +282,15 @@ class SessionView:
         assert self.scenario is not None
         if site not in self._pictures:
             self._pictures[site] = PictureDelay(self.scenario, site)
-        shown = self._pictures[site].advance_to(tick, used)
-        return {peer: min(last, self.sites[peer].window.newest) for peer, last in shown.items()}
+        peer_ticks: dict[str, int] = {}
+        for peer, peer_tick in self._pictures[site].advance_to(tick, used).items():
+            peer_ticks[peer] = min(peer_tick, self.sites[peer].window.newest)
+        return peer_ticks
 
     def _connect_to_sites(self) -> None:
         """Reads the replies of members; creates the sites once all of them run."""
         for info in self._query.poll():
-            self.met[info.member] = info
+            self.members[info.member] = info
             if self.scenario is None and info.scenario:
                 try:
                     self.scenario = parse_embedded(info.scenario, info.member)
@@ -283,75 +298,81 @@ class SessionView:
                     self.dropped["another scenario"] += 1
         if self.scenario is None:
             return
-        names = self.scenario.names
-        boots = {name: self.met[name].boot for name in names if name in self.met}
-        if len(boots) == len(names) and all(self.met[name].running for name in boots):
-            self._create_sites(self.scenario, boots)
+        infos = [self.members[name] for name in self.scenario.names if name in self.members]
+        have_all_replied = len(infos) == len(self.scenario.names)
+        if have_all_replied and all(info.running for info in infos):
+            self._create_sites(self.scenario)
 
-    def _create_sites(self, scenario: Scenario, boots: dict[str, int]) -> None:
+    def _create_sites(self, scenario: Scenario) -> None:
+        """Creates the views of all sites, which have replied and run."""
         windows = {name: RecordWindow(scenario, name) for name in scenario.names}
         self.links = LinkTables(scenario.links, scenario.timeline)
         self.dominance = {site: dict(scenario.dominance[site]) for site in scenario.names}
         self.energy = RunningEnergy(scenario, windows)
-        self.sites = {
-            name: SiteView(
+        for name in scenario.names:
+            self.sites[name] = SiteView(
                 bus=self.bus,
                 session=self.session,
                 scenario=scenario,
                 name=name,
-                boot=boots[name],
+                boot=self.members[name].boot,
                 window=windows[name],
             )
-            for name in scenario.names
-        }
 
-    def _receive(self, arrived: InboundMessage) -> None:
+    def _receive(self, inbound: InboundMessage) -> None:
         """Reads a message of a site, and stores its contents.
+
+        A message of a member that is not a site, such as the recorder, is ignored.
 
         Raises:
             WireError: the message cannot be read.
         """
-        parts = topics.parse_key(arrived.key)
-        if parts is None or (site := self.sites.get(parts.member)) is None:
-            return  # a message of the recorder
-        is_block = parts.channel == topics.STATE
-        payloads = split_states(arrived.payload) if is_block else (arrived.payload,)
+        parts = topics.parse_key(inbound.key)
+        site = None if parts is None else self.sites.get(parts.member)
+        if parts is None or site is None:
+            return
+        channel = parts.channel
+        # A message on the channel of records contains a block of records.
+        is_block = channel == topics.STATE
+        payloads = split_states(inbound.payload) if is_block else (inbound.payload,)
         for payload in payloads:
             try:
-                message = site.reception.read(parts.channel, payload)
+                message = site.reception.read(channel, payload)
             except WireError:
-                if parts.channel != topics.EVENT:
+                # A site that has been started again announces its new boot with an event.
+                if channel != topics.EVENT:
                     raise
                 if not self._accept_new_boot(parts.member, payload):
                     raise
-                message = site.reception.read(parts.channel, payload)
-            has_nothing = site.record is None and site.stats is None
-            if has_nothing and parts.channel != topics.EVENT:
+                message = site.reception.read(channel, payload)
+            is_first = site.record is None and site.stats is None
+            if is_first and channel != topics.EVENT:
                 self._skip_records_before(site, message.content)
-            if site.reception.accept(parts.channel, message, arrived.mono_ns):
-                self._store(parts.member, site, parts.channel, message.content)
+            if site.reception.accept(channel, message, inbound.mono_ns):
+                self._store(parts.member, site, channel, message.content)
 
     def _accept_new_boot(self, name: str, payload: bytes) -> bool:
-        """Follows another boot of a site if its event is a join; otherwise returns False."""
+        """Follows another boot of a site if the event is a join; otherwise returns False."""
         event = decode(payload, Event)
         site = self.sites[name]
-        joins = (
-            event.kind == "join"
-            and event.member == name
-            and event.boots.get(name) == event.boot
-        )
-        if not joins or self.scenario is None or not self.scenario.sites_may_return:
+        is_join = event.kind == "join" and event.member == name
+        if not is_join or event.boots.get(name) != event.boot:
+            return False
+        if self.scenario is None or not self.scenario.sites_may_return:
             return False
         site.reception = SiteReception(self.scenario, name, event.boot, site.reception)
         site.repair = GapRepair(self.bus, self.session, site.reception, site.dropped)
         return True
 
     def _skip_records_before(self, site: SiteView, content: State | LinkStats | Event) -> None:
-        """Requests no records from before a late first message, but all events of its site."""
+        """Ignores the records before the first message, if the observer has joined late.
+
+        All events of the site are still requested.
+        """
         tick = content.tick if isinstance(content, State | LinkStats) else 0
         if tick / site.window.rate_hz < LATE_S:
             return
-        site.holds_from = tick
+        site.first_tick = tick
         for channel in (topics.STATE, topics.LINK):
             site.reception.accounts[channel].abandon_below(tick)
         site.repair.probe()
@@ -361,35 +382,45 @@ class SessionView:
     ) -> None:
         """Stores the contents of a message, and applies the changes in it."""
         if isinstance(content, State):
-            if site.record is None or content.tick > site.record.tick:
-                site.record = content
-            site.window.receive(content)
-            if content.bodies:
-                site.bodies[content.tick] = content.bodies
-                while len(site.bodies) > KEPT_S * site.window.rate_hz:
-                    del site.bodies[next(iter(site.bodies))]
-            for text in content.cmd:
-                self._apply_change(name, text)
+            self._store_record(name, site, content)
         elif isinstance(content, LinkStats):
             site.stats = content
         elif channel == topics.EVENT:
-            self.events.add(content)
-            if content.kind == "hand":
-                holder, separator, _ = content.text.partition(f" {TAKEN} ")
-                if separator:
-                    site.holder = holder.removeprefix(f"{name}: ")
-            if content.kind == "change":
-                site.stopped_by = find_requester(content.text) or site.stopped_by
-                if content.command:
-                    self._apply_change(name, content.command)
+            self._store_event(name, site, content)
+
+    def _store_record(self, name: str, site: SiteView, record: State) -> None:
+        """Stores a record, and applies the changes in it."""
+        if site.record is None or record.tick > site.record.tick:
+            site.record = record
+        site.window.receive(record)
+        if record.bodies:
+            site.bodies[record.tick] = record.bodies
+            while len(site.bodies) > KEPT_S * site.window.rate_hz:
+                oldest_tick = next(iter(site.bodies))
+                del site.bodies[oldest_tick]
+        for change in record.cmd:
+            self._apply_change(name, change)
+
+    def _store_event(self, name: str, site: SiteView, event: Event) -> None:
+        """Stores an event, and reads who holds the arm or has stopped it."""
+        self.events.add(event)
+        if event.kind == "hand":
+            holder, separator, _ = event.text.partition(f" {TAKEN} ")
+            if separator:
+                site.holder = holder.removeprefix(f"{name}: ")
+        if event.kind == "change":
+            site.stopped_by = find_requester(event.text) or site.stopped_by
+            if event.command:
+                self._apply_change(name, event.command)
 
     def _apply_change(self, site: str, text: str) -> None:
-        """Applies a change to links, shares and the energy, once for each text."""
-        if (
-            (site, text) in self._applied_changes
-            or self.scenario is None
-            or self.energy is None
-        ):
+        """Applies a change to links, shares and the energy.
+
+        A change is in a record and in an event of its site, and is applied once.
+        """
+        if self.scenario is None or self.energy is None:
+            return
+        if (site, text) in self._applied_changes:
             return
         self._applied_changes.add((site, text))
         try:

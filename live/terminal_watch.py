@@ -1,6 +1,7 @@
-"""Watches a running session until it ends: `trilat watch` in a terminal, or a page elsewhere.
+"""Watch a running session until it ends, in a terminal or on a page.
 
-If standard input is a terminal, a key stops every arm.
+`watch_session` connects to the session and updates a display: the rows of `trilat watch` in a
+terminal, or the page of `trilat live`. If standard input is a terminal, a key stops every arm.
 """
 
 import os
@@ -25,7 +26,9 @@ from .page_orders import OrderDesk
 from .session_view import SessionView
 
 POLL_NS = 20_000_000
+"""Time between two updates of the display, in ns."""
 STOP_KEYS = frozenset(" sS")
+"""Keys that stop every arm."""
 
 SessionOnlooker = Callable[
     [Bus], AbstractContextManager[tuple[SessionView, Callable[[], None]]]
@@ -52,7 +55,7 @@ def watch_session(
         clock: the clock of this process.
         show: shows the session.
         say: prints a line for the user.
-        timeout_s: longest wait for a reply of a site, s.
+        timeout_s: longest wait for a reply of a site, in s.
 
     Returns:
         The exit code.
@@ -75,7 +78,7 @@ def watch_session(
                 while not (stopped() or view.ended):
                     update_display()
                     now_ns = clock.monotonic_ns()
-                    if now_ns > give_up_ns and not view.met:
+                    if now_ns > give_up_ns and not view.members:
                         raise SessionError(
                             f"no site of session {session!r} answered within {timeout_s:g} s"
                         )
@@ -87,13 +90,13 @@ def watch_session(
 
 
 class SessionWatch:
-    """The texts that show a session in a terminal.
+    """The texts that a terminal shows of a session.
 
     Args:
         bus: a bus that reaches the session.
         clock: the clock of this process.
         session: the session's name.
-        as_site: the site as whose user the session is shown; "" shows everything.
+        as_site: the site whose user's view is shown; "" shows all sites.
     """
 
     def __init__(self, bus: Bus, clock: Clock, session: str, as_site: str = "") -> None:
@@ -146,7 +149,8 @@ class SessionWatch:
     def rows(self) -> list[SiteRow]:
         """Returns the row of each site.
 
-        With `as_site`, the row of a peer holds what the user of that site is shown.
+        With `as_site`, the row of a peer has the angles and the time that the user of that site
+        sees, and nothing else.
         """
         view = self.view
         scenario = view.scenario
@@ -165,7 +169,7 @@ class SessionWatch:
         record = view.sites[as_site].record if as_site in all_rows else None
         if record is None:
             return list(all_rows.values())
-        for peer, tick in view.find_shown(as_site, record.tick, record.used).items():
+        for peer, tick in view.find_peer_ticks(as_site, record.tick, record.used).items():
             window = view.sites[peer].window
             row = dict.fromkeys(HEADS, "") | {"site": peer}
             if window.has_record(tick):
@@ -214,7 +218,8 @@ def _read_keys() -> Iterator[Callable[[], str] | None]:
         import tty
 
         keyboard = sys.stdin.fileno()
-        if os.tcgetpgrp(keyboard) != os.getpgrp():  # its keys go to another program
+        # The keys of a terminal go to its foreground process group only.
+        if os.tcgetpgrp(keyboard) != os.getpgrp():
             raise OSError
         settings = termios.tcgetattr(keyboard)
     except (ImportError, OSError, ValueError, AttributeError):
@@ -223,7 +228,8 @@ def _read_keys() -> Iterator[Callable[[], str] | None]:
         return
 
     def read() -> str:
-        with suppress(OSError):  # it has hung up
+        """Returns the keys pressed since the last call; "" if the terminal has gone."""
+        with suppress(OSError):
             if select.select([keyboard], [], [], 0.0)[0]:
                 return os.read(keyboard, 64).decode(errors="replace")
         return ""

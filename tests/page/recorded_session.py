@@ -13,7 +13,7 @@ from typing import Any
 from playwright.sync_api import Browser, Page, WebSocketRoute
 
 from live.experiment_stage import Stage
-from live.session_frames import SessionFrames, show_event
+from live.session_frames import SessionFrames, render_event
 from live.session_view import SessionView
 from sites.running_session import open_hand
 from tests.live.page_client import with_query
@@ -160,7 +160,7 @@ def _record(
             added = {
                 "points": pages.points.since(points, 10_000),
                 "energies": pages.energies.since(energies, 10_000),
-                "events": [show_event(event) for event in view.events.since(events, 100)],
+                "events": [render_event(event) for event in view.events.since(events, 100)],
             }
             points, energies, events = (
                 pages.points.count,

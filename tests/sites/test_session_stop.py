@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from live.session_frames import SessionFrames, show_event
+from live.session_frames import SessionFrames, render_event
 from live.terminal_watch import SessionWatch
 from sites.monitor import SiteRow, describe_row, frame_alarms
 from tests.net.local_bus import LocalNetwork
@@ -93,7 +93,7 @@ def test_one_arm_stops_and_goes_on_while_the_session_does(tmp_path: Path) -> Non
                 raised.extend(watch.alarms)
                 console.print(*frame_alarms(watch.alarms))
             clock.sleep_until(clock.monotonic_ns() + 50_000_000)
-        shown = [show_event(event) for event in watch.view.events.since(0, 400)]
+        shown = [render_event(event) for event in watch.view.events.since(0, 400)]
         told = [
             re.sub(r"[\d.]+ s$", "", event["text"])
             for event in shown
