@@ -1,10 +1,10 @@
-"""Computes inertia, torque, energy and end effector of an arm, over all rows of a log at once.
+"""Inertia, torque, energy and end effector of an arm, over all rows of a log at once.
 
-Torques determine some linear combinations of a chain's ten parameters per link, its base
-parameters, and nothing else, however the chain moves. Adaptation moves estimates along these
-combinations alone, so errors of estimates are stated in them. The combinations follow from the
-geometry, by a QR decomposition of the stacked regressors of many states, column by column: a
-column that depends on the columns before it adds nothing, and its parameter joins theirs.
+A chain has ten parameters per link, but its torques depend only on some linear combinations of
+them, the base parameters. Adaptation moves estimates along these combinations only, so errors
+of estimates are stated in them. The combinations follow from the geometry: the regressors of
+many random states are stacked, and a QR decomposition goes through their columns. A column that
+depends linearly on the columns before it adds no combination: its parameter joins theirs.
 
 Sources: M. Gautier, "Numerical calculation of the base inertial parameters of robots", J.
 Robotic Systems 8 (1991), for the QR decomposition; P. M. Wensing, S. Kim, J.-J. Slotine,
@@ -14,8 +14,8 @@ Robotics and Automation Letters 3 (2018), for the pseudo-inertia.
 Invariant:
     - The planar arm is written from Section IV and Eq. (12) of the paper, independently of the
       core that ran the log.
-    - A chain is computed by the core's leaves, which the tests compare with Pinocchio: a
-      kinetic term or a gradient is one recursion.
+    - A chain is computed by the core's compiled functions, which the tests compare with
+      Pinocchio.
     - Both arms have the same methods, so that few callers need to know which arm they use.
 """
 
@@ -98,25 +98,36 @@ class PlacedArm:
     def inertia_matrix(self, theta: Numbers) -> Numbers:
         """Returns M(q), shape (2, 2, ...), kg m^2, for the parameters theta, shape (5, ...)."""
         bend = theta[1] * np.cos(self.q[1])
-        coupling = theta[2] + bend
-        return np.array(
-            [[theta[0] + 2.0 * bend, coupling], [coupling, theta[2] + 0.0 * coupling]]
-        )
+        M_11 = theta[0] + 2.0 * bend
+        M_12 = theta[2] + bend
+        # 0 M_12 gives this entry as many columns as the others have
+        M_22 = theta[2] + 0.0 * M_12
+        return np.array([[M_11, M_12], [M_12, M_22]])
 
     def coriolis_matrix(self, theta: Numbers, qd: Numbers) -> Numbers:
         """Returns C(q, qd) by Christoffel symbols, shape (2, 2, ...), kg m^2/s."""
         h = -theta[1] * np.sin(self.q[1])
-        return np.array([[h * qd[1], h * (qd[0] + qd[1])], [-h * qd[0], 0.0 * h * qd[0]]])
+        qd_1, qd_2 = qd
+        C_11 = h * qd_2
+        C_12 = h * (qd_1 + qd_2)
+        C_21 = -h * qd_1
+        # zero, with as many columns as the other entries have
+        C_22 = 0.0 * h * qd_1
+        return np.array([[C_11, C_12], [C_21, C_22]])
 
     def gravity_torque(self, theta: Numbers) -> Numbers:
         """Returns G(q), shape (2, ...), N m."""
-        outer = theta[4] * self.g_m_s2 * np.cos(self.q[0] + self.q[1])
-        return np.array([theta[3] * self.g_m_s2 * np.cos(self.q[0]) + outer, outer])
+        q_1, q_2 = self.q
+        G_2 = theta[4] * self.g_m_s2 * np.cos(q_1 + q_2)
+        G_1 = theta[3] * self.g_m_s2 * np.cos(q_1) + G_2
+        return np.array([G_1, G_2])
 
     def required_torque(self, theta: Numbers, qd: Numbers, v: Numbers, a: Numbers) -> Numbers:
         """Returns M(q) a + C(q, qd) v + G(q), shape (2, ...), N m: Y theta of Eq. (12)."""
-        inertial = multiply_columns(self.inertia_matrix(theta), a)
-        coriolis = multiply_columns(self.coriolis_matrix(theta, qd), v)
+        M = self.inertia_matrix(theta)
+        C = self.coriolis_matrix(theta, qd)
+        inertial = multiply_columns(M, a)
+        coriolis = multiply_columns(C, v)
         return inertial + coriolis + self.gravity_torque(theta)
 
     def regressor_matrix(self, qd: Numbers, v: Numbers, a: Numbers) -> Numbers:
@@ -124,20 +135,24 @@ class PlacedArm:
 
         Column p is the torque for theta = e_p, the unit vector of parameter p.
         """
-        units = np.multiply.outer(np.eye(5), np.ones(self.q.shape[1:]))
-        return np.stack([self.required_torque(unit, qd, v, a) for unit in units], axis=1)
+        columns = self.q.shape[1:]
+        units = np.multiply.outer(np.eye(5), np.ones(columns))
+        torques = [self.required_torque(unit, qd, v, a) for unit in units]
+        return np.stack(torques, axis=1)
 
     def friction_torque(self, v: Numbers) -> Numbers:
         """Returns zeros: this arm has no friction in its joints."""
         return 0.0 * v
 
     def joint_acceleration(self, theta: Numbers, qd: Numbers, torque: Numbers) -> Numbers:
-        """Returns the acceleration qdd, shape (2, ...), rad/s^2.
+        """Returns the solution qdd of M qdd + C qd + G = torque, Eq. (8), in rad/s^2.
 
-        It solves M qdd + C qd + G = torque, Eq. (8).
+        Its shape is (2, ...).
         """
-        bias_torque = self.required_torque(theta, qd, qd, np.zeros_like(qd))
-        return solve_columns(self.inertia_matrix(theta), torque - bias_torque)
+        at_rest = np.zeros_like(qd)
+        bias_torque = self.required_torque(theta, qd, qd, at_rest)
+        M = self.inertia_matrix(theta)
+        return solve_columns(M, torque - bias_torque)
 
     def end_effector_position(self) -> Numbers:
         """Returns the position of the end effector from the base, shape (2, ...), m."""
@@ -149,11 +164,13 @@ class PlacedArm:
         return np.array([x, y])
 
     def position_jacobian(self) -> Numbers:
-        """Returns the Jacobian of that position, shape (2, 2, ...), m/rad: rows x and y."""
+        """Returns the Jacobian of the end effector's position, shape (2, 2, ...), m/rad."""
         x, y = self.end_effector_position()
         l2_m = self.lengths_m[1]
         outer = self.q[0] + self.q[1]
-        return np.array([[-y, -l2_m * np.sin(outer)], [x, l2_m * np.cos(outer)]])
+        row_x = [-y, -l2_m * np.sin(outer)]
+        row_y = [x, l2_m * np.cos(outer)]
+        return np.array([row_x, row_y])
 
 
 class EndEffectorRows(NamedTuple):
@@ -178,7 +195,8 @@ class EndEffectorRows(NamedTuple):
             least: directions in which the end effector moves by less than this share of the
                 largest motion are treated as directions in which it cannot move.
         """
-        inverse = np.linalg.pinv(self.J.transpose(0, 2, 1), rcond=least)
+        J_transposed = self.J.transpose(0, 2, 1)
+        inverse = np.linalg.pinv(J_transposed, rcond=least)
         force: Array = np.einsum("kij,kj->ki", inverse, torque)
         return force
 
@@ -216,16 +234,21 @@ class PlanarArmRows(NamedTuple):
 
     def multiply_inertia(self, q: Array, x: Array) -> Array:
         """Returns M(q) x, shape (K, 2)."""
-        return multiply_columns(self.place(q).inertia_matrix(self.theta), x.T).T
+        M = self.place(q).inertia_matrix(self.theta)
+        product = multiply_columns(M, x.T)
+        return product.T
 
     def law_torque(self, theta_hat: Array, q: Array, qd: Array, v: Array, a: Array) -> Array:
         """Returns Y(q, qd, v, a) theta_hat, shape (K, 2), N m; theta_hat has shape (K, 5)."""
-        return self.place(q).required_torque(theta_hat.T, qd.T, v.T, a.T).T
+        arm = self.place(q)
+        torque = arm.required_torque(theta_hat.T, qd.T, v.T, a.T)
+        return torque.T
 
     def gradient(self, q: Array, qd: Array, v: Array, a: Array, r: Array) -> Array:
         """Returns Y'r of r = qd - v, shape (K, 5)."""
-        regressor = self.place(q).regressor_matrix(qd.T, v.T, a.T)
-        gradient: Array = np.einsum("ijk,ki->kj", regressor, r)
+        arm = self.place(q)
+        Y = arm.regressor_matrix(qd.T, v.T, a.T)
+        gradient: Array = np.einsum("ijk,ki->kj", Y, r)
         return gradient
 
     def gravity_torque(self, q: Array) -> Array:
@@ -234,8 +257,10 @@ class PlanarArmRows(NamedTuple):
 
     def potential_energy(self, q: Array) -> Array:
         """Returns g (theta_4 sin q_1 + theta_5 sin(q_1 + q_2)), shape (K,), J."""
-        height = self.theta[3] * np.sin(q[:, 0]) + self.theta[4] * np.sin(q[:, 0] + q[:, 1])
-        energy: Array = self.g * height
+        q_1, q_2 = q.T
+        inner = self.theta[3] * np.sin(q_1)
+        outer = self.theta[4] * np.sin(q_1 + q_2)
+        energy: Array = self.g * (inner + outer)
         return energy
 
     def friction(self, speed: Array) -> Array:
@@ -249,16 +274,22 @@ class PlanarArmRows(NamedTuple):
     def place_end_effector(self, q: Array, qd: Array) -> EndEffectorRows:
         """Returns the end effector in the plane."""
         arm = self.place(q)
+        position = arm.end_effector_position()
         J = arm.position_jacobian()
         speed = multiply_columns(J, qd.T)
-        return EndEffectorRows(arm.end_effector_position().T, speed.T, J.transpose(2, 0, 1))
+        return EndEffectorRows(
+            position=position.T,
+            speed=speed.T,
+            J=J.transpose(2, 0, 1),
+        )
 
     def hanging_angle(self, q: Array) -> float:
         """Returns the largest angle of a link to straight down, in rad; q has shape (2,)."""
-        link_angles = np.cumsum(q)
-        return max(
-            abs(math.remainder(angle + math.pi / 2.0, math.tau)) for angle in link_angles
-        )
+        angles_to_down = []
+        for link_angle in np.cumsum(q):
+            angle = math.remainder(link_angle + math.pi / 2.0, math.tau)
+            angles_to_down.append(abs(angle))
+        return max(angles_to_down)
 
 
 @leaf
@@ -276,12 +307,14 @@ def _put_torques(
 
     theta has shape (K, 10 n), or (1, 10 n) for all rows.
     """
+    last = theta.shape[0] - 1
     for k in range(q.shape[0]):
         place_joints(chain, q[k])
         propagate_motion(chain=chain, gravity=gravity, qd=qd[k], v=v[k], a=a[k])
+        parameters = theta[min(k, last)]
         inverse_dynamics(
             chain=chain,
-            theta=theta[min(k, theta.shape[0] - 1)],
+            theta=parameters,
             v=v[k],
             a=a[k],
             torque=torque[k],
@@ -290,7 +323,13 @@ def _put_torques(
 
 @leaf
 def _put_gradients(
-    chain: RowArray, gravity: Array, q: Array, qd: Array, v: Array, a: Array, gradient: Array
+    chain: RowArray,
+    gravity: Array,
+    q: Array,
+    qd: Array,
+    v: Array,
+    a: Array,
+    gradient: Array,
 ) -> None:
     """Writes Y'r of every row, r = qd - v, shape (K, 10 n)."""
     for k in range(q.shape[0]):
@@ -312,28 +351,37 @@ def _put_end_effectors(
 ) -> None:
     """Writes the end effector's position and Jacobian, and the potential energy, of every row.
 
-    The potential energy of a link is -g'(m p + R mc), with p and R its position and
-    orientation in the base's frame. The arrays have shapes (K, 3), (K, 6, n) and (K,).
+    The potential energy of a link is -g'(m p + R mc), with its mass m and its first moment mc,
+    and its position p and orientation R in the base's frame. The arrays that are written have
+    the shapes (K, 3), (K, 6, n) and (K,).
     """
     n = chain.shape[0]
+    g = three(gravity)
     for k in range(q.shape[0]):
         place_joints(chain, q[k])
-        position[k, 0], position[k, 1], position[k, 2] = place_end_effector(chain, tip)
+        x, y, z = place_end_effector(chain, tip)
+        position[k, 0] = x
+        position[k, 1] = y
+        position[k, 2] = z
         p_x = 0.0
         p_y = 0.0
         p_z = 0.0
         energy[k] = 0.0
         for i in range(n):
             row: Row = chain[i]
-            step = three(row.p) if i == 0 else rotate(chain[i - 1].R_base, three(row.p))
+            step = three(row.p)
+            if i > 0:
+                step = rotate(chain[i - 1].R_base, step)
             p_x = p_x + step[0]
             p_y = p_y + step[1]
             p_z = p_z + step[2]
             first = LINK_PARAMETERS * i
-            mc = rotate(row.R_base, (theta[first + 1], theta[first + 2], theta[first + 3]))
-            energy[k] -= theta[first] * dot(three(gravity), (p_x, p_y, p_z)) + dot(
-                three(gravity), mc
-            )
+            mass = theta[first]
+            moment = (theta[first + 1], theta[first + 2], theta[first + 3])
+            moment_in_base = rotate(row.R_base, moment)
+            mass_term = mass * dot(g, (p_x, p_y, p_z))
+            moment_term = dot(g, moment_in_base)
+            energy[k] -= mass_term + moment_term
             for j in range(3):
                 J[k, j, i] = row.J_lin[j]
                 J[k, 3 + j, i] = row.J_ang[j]
@@ -381,7 +429,8 @@ class ChainArmRows(NamedTuple):
         The torque of this chain is linear in v and a.
         """
         bare = self._replace_in_joints(coulomb=0.0)
-        return bare._replace(chain=bare.chain._replace(gravity_m_s2=(0.0, 0.0, 0.0)))
+        weightless_chain = bare.chain._replace(gravity_m_s2=(0.0, 0.0, 0.0))
+        return bare._replace(chain=weightless_chain)
 
     def without_drives(self) -> "ChainArmRows":
         """Returns this chain without armature and friction: its torque is linear in theta."""
@@ -390,7 +439,14 @@ class ChainArmRows(NamedTuple):
     def multiply_inertia(self, q: Array, x: Array) -> Array:
         """Returns (M(q) + armature) x, shape (K, n), by one recursion without gravity."""
         still = np.zeros_like(q)
-        return self.weightless().law_torque(self.theta[np.newaxis], q, still, still, x)
+        arm = self.weightless()
+        return arm.law_torque(
+            theta_hat=self.theta[np.newaxis],
+            q=q,
+            qd=still,
+            v=still,
+            a=x,
+        )
 
     def law_torque(self, theta_hat: Array, q: Array, qd: Array, v: Array, a: Array) -> Array:
         """Returns Y(q, qd, v, a) theta_hat + armature a + friction(v), shape (K, n), N m.
@@ -430,7 +486,11 @@ class ChainArmRows(NamedTuple):
         """Returns G(q), shape (K, n), N m."""
         still = np.zeros_like(q)
         return self.law_torque(
-            theta_hat=self.theta[np.newaxis], q=q, qd=still, v=still, a=still
+            theta_hat=self.theta[np.newaxis],
+            q=q,
+            qd=still,
+            v=still,
+            a=still,
         )
 
     def _place(self, q: Array) -> tuple[Array, Array, Array]:
@@ -457,14 +517,18 @@ class ChainArmRows(NamedTuple):
         return position, J, energy
 
     def potential_energy(self, q: Array) -> Array:
-        """Returns the links' potential energy, shape (K,), J; zero in the base's origin."""
-        return self._place(q)[2]
+        """Returns the links' potential energy against the base's origin, shape (K,), J."""
+        _, _, energy = self._place(q)
+        return energy
 
     def friction(self, speed: Array) -> Array:
         """Returns the friction torque against a motion of the joints, shape (K, n), N m."""
-        x = speed / COULOMB_SPEED
         viscous = self._column("viscous") * speed
-        return viscous + self._column("coulomb") * x / np.sqrt(1.0 + x * x)
+        # a smooth sign of the speed
+        x = speed / COULOMB_SPEED
+        root = np.sqrt(1.0 + x * x)
+        coulomb = self._column("coulomb") * x / root
+        return viscous + coulomb
 
     def stop_torque(self, q: Array, qd: Array) -> Array:
         """Returns the torque of the stops ON the joints, shape (K, n), N m.
@@ -475,15 +539,19 @@ class ChainArmRows(NamedTuple):
         damping = self._column("stop_damping")
         below = np.maximum(self._column("lower") - q, 0.0)
         above = np.maximum(q - self._column("upper"), 0.0)
-        push_up = np.maximum(stiffness * below - damping * qd, 0.0)
-        push_down = np.maximum(stiffness * above + damping * qd, 0.0)
-        return np.where(below > 0.0, push_up, 0.0) - np.where(above > 0.0, push_down, 0.0)
+        damping_torque = damping * qd
+        push_up = np.maximum(stiffness * below - damping_torque, 0.0)
+        push_down = np.maximum(stiffness * above + damping_torque, 0.0)
+        lower_stop = np.where(below > 0.0, push_up, 0.0)
+        upper_stop = np.where(above > 0.0, push_down, 0.0)
+        return lower_stop - upper_stop
 
     def place_end_effector(self, q: Array, qd: Array) -> EndEffectorRows:
         """Returns the end effector in space, in the base's frame."""
         position, full_J, _ = self._place(q)
         J = np.ascontiguousarray(full_J[:, :3])
-        return EndEffectorRows(position, np.einsum("kij,kj->ki", J, qd), J)
+        speed = np.einsum("kij,kj->ki", J, qd)
+        return EndEffectorRows(position, speed, J)
 
     def jacobian_rate(self, q: Array, qd: Array) -> Array:
         """Returns the derivative of the end effector's Jacobian along qd, shape (K, 3, n).
@@ -491,13 +559,19 @@ class ChainArmRows(NamedTuple):
         Column i turns with all joints up to i. Motion of the joints after i moves the end
         effector about the axis of joint i.
         """
-        J = self._place(q)[1].transpose(0, 2, 1)
-        linear = J[:, :, :3]
-        axis = J[:, :, 3:]
-        velocity = qd[:, :, np.newaxis] * linear
-        turn = qd[:, :, np.newaxis] * axis
-        velocity_after = velocity.sum(axis=1, keepdims=True) - np.cumsum(velocity, axis=1)
-        rate: Array = np.cross(np.cumsum(turn, axis=1), linear) + np.cross(axis, velocity_after)
+        _, J, _ = self._place(q)
+        per_joint = J.transpose(0, 2, 1)
+        linear = per_joint[:, :, :3]
+        axis = per_joint[:, :, 3:]
+        joint_speed = qd[:, :, np.newaxis]
+        velocity = joint_speed * linear
+        turn = joint_speed * axis
+        turn_up_to = np.cumsum(turn, axis=1)
+        velocity_up_to = np.cumsum(velocity, axis=1)
+        velocity_after = velocity.sum(axis=1, keepdims=True) - velocity_up_to
+        turning = np.cross(turn_up_to, linear)
+        moving = np.cross(axis, velocity_after)
+        rate: Array = turning + moving
         return rate.transpose(0, 2, 1)
 
     def hanging_angle(self, q: Array) -> float:
@@ -511,11 +585,19 @@ class ChainArmRows(NamedTuple):
         """
         lowest_j = self._find_extreme_energy(q, 1.0)
         highest_j = self._find_extreme_energy(q, -1.0)
-        if highest_j - lowest_j <= _NO_WEIGHT_J:
+        range_j = highest_j - lowest_j
+        if range_j <= _NO_WEIGHT_J:
             return math.inf
-        energy_j = float(self.potential_energy(q[np.newaxis])[0])
-        share = (energy_j - lowest_j) / (highest_j - lowest_j)
-        return math.acos(min(max(1.0 - 2.0 * share, -1.0), 1.0))
+        energy_j = self._find_pose_energy(q)
+        share = (energy_j - lowest_j) / range_j
+        # a pendulum's share of its potential energy is (1 - cos(angle)) / 2
+        cosine = 1.0 - 2.0 * share
+        return math.acos(min(max(cosine, -1.0), 1.0))
+
+    def _find_pose_energy(self, q: Array) -> float:
+        """Returns the potential energy in one pose, in J; q has shape (n,)."""
+        energy = self.potential_energy(q[np.newaxis])
+        return float(energy[0])
 
     def _find_extreme_energy(self, q: Array, sign: float) -> float:
         """Returns the least (sign 1) or the largest (sign -1) potential energy, in J.
@@ -524,14 +606,17 @@ class ChainArmRows(NamedTuple):
         energy is a + b cos q + c sin q, which its values at three angles determine.
         """
         q = q.copy()
-        revolute = np.flatnonzero(~self._column("prismatic").astype(bool))
+        is_prismatic = self._column("prismatic").astype(bool)
+        revolute = np.flatnonzero(~is_prismatic)
         for joint in np.tile(revolute, _ENERGY_SWEEPS):
             poses = np.tile(q, (3, 1))
             poses[:, joint] = (0.0, 0.5 * np.pi, np.pi)
             at_0, at_90, at_180 = self.potential_energy(poses).tolist()
             mean = 0.5 * (at_0 + at_180)
-            q[joint] = math.atan2(-sign * (at_90 - mean), -sign * (at_0 - mean))
-        return float(self.potential_energy(q[np.newaxis])[0])
+            b = at_0 - mean
+            c = at_90 - mean
+            q[joint] = math.atan2(-sign * c, -sign * b)
+        return self._find_pose_energy(q)
 
 
 ArmRows = PlanarArmRows | ChainArmRows
@@ -540,12 +625,14 @@ ArmRows = PlanarArmRows | ChainArmRows
 def build_arm_rows(scenario: Scenario, site: str) -> ArmRows:
     """Returns the arm of a site, for computations over rows."""
     model = scenario.arms[site]
+    spec = scenario.sites[site]
     if model.chain is None:
-        return PlanarArmRows(model.theta, scenario.sites[site].arm.g_m_s2, model.lengths_m)
+        return PlanarArmRows(model.theta, spec.arm.g_m_s2, model.lengths_m)
     chain = model.chain
-    task = chain.task
-    if task is not None and not task.posture:
-        chain = chain._replace(task=task._replace(posture=scenario.sites[site].q0_rad))
+    if chain.task is not None and not chain.task.posture:
+        # a task without a posture prefers the start pose
+        task = chain.task._replace(posture=spec.q0_rad)
+        chain = chain._replace(task=task)
     return ChainArmRows(model.theta, chain)
 
 
@@ -559,35 +646,44 @@ def joint_positions_m(arm: ArmModel, q: Array) -> Array:
     Returns:
         Positions, shape (K, L, 2), of chains (K, L, 3).
     """
-    if arm.chain is None:
-        points = np.zeros((len(q), 1 + JOINTS, 2))
-        for pose, angles in zip(points, q, strict=True):
-            pose[1:] = forward_kinematics(arm.lengths_m, angles)
-        return points
-    rows = build_chain(arm.chain.joints)
-    tip_m = np.array(arm.chain.tip_m)
-    points = np.zeros((len(q), len(rows) + 2, 3))
+    if arm.chain is not None:
+        return _chain_positions_m(arm.chain, q)
+    points = np.zeros((len(q), 1 + JOINTS, 2))
     for pose, angles in zip(points, q, strict=True):
-        place_joints(rows, np.ascontiguousarray(angles))
-        pose[-1] = place_end_effector(rows, tip_m)
+        pose[1:] = forward_kinematics(arm.lengths_m, angles)
+    return points
+
+
+def _chain_positions_m(chain: ChainSetup, q: Array) -> Array:
+    """Returns the positions of base, joints and end effector of a chain, (K, n + 2, 3), m."""
+    joints = build_chain(chain.joints)
+    tip_m = np.array(chain.tip_m)
+    points = np.zeros((len(q), len(joints) + 2, 3))
+    for pose, angles in zip(points, q, strict=True):
+        place_joints(joints, np.ascontiguousarray(angles))
+        pose[-1] = place_end_effector(joints, tip_m)
         position = np.zeros(3)
         orientation = np.eye(3)
-        for n, row in enumerate(rows, 1):
-            position = position + orientation @ row.p
+        for n, joint in enumerate(joints, 1):
+            position = position + orientation @ joint.p
             pose[n] = position
-            orientation = row.R_base.copy()
+            orientation = joint.R_base.copy()
     return points
 
 
 def upright_axes(chain: ChainSetup) -> Array:
-    """Returns two horizontal directions and the upward one, in the base's frame, (3, 3)."""
+    """Returns two horizontal unit vectors and the upward one, in the base's frame, (3, 3)."""
     gravity = np.array(chain.gravity_m_s2)
     size = float(np.linalg.norm(gravity))
     up = -gravity / size if size else np.array([0.0, 0.0, 1.0])
-    forward = np.eye(3)[int(np.argmin(np.abs(up) > 0.9))]  # x, unless gravity acts along x
-    forward = forward - (forward @ up) * up
+    # the first axis that is not nearly vertical: x, unless gravity acts along x
+    is_vertical = np.abs(up) > 0.9
+    axis = np.eye(3)[int(np.argmin(is_vertical))]
+    vertical_part = (axis @ up) * up
+    forward = axis - vertical_part
     forward /= np.linalg.norm(forward)
-    return np.array([forward, np.cross(up, forward), up])
+    sideways = np.cross(up, forward)
+    return np.array([forward, sideways, up])
 
 
 DEPENDENT_SHARE = 1e-9
@@ -598,8 +694,8 @@ class BaseParameters(NamedTuple):
     """Combinations of parameters that torques determine: base = combination theta.
 
     Attributes:
-        kept: per combination the index of the parameter after which it is named, ascending,
-            shape (B,).
+        kept: for each combination, the index of the parameter after which the combination is
+            named, ascending, shape (B,).
         combination: factors of all parameters, 1 for the naming parameter, shape (B, P).
     """
 
@@ -615,19 +711,29 @@ def stack_regressors(arm: ChainArmRows, states: int) -> Array:
     q = random.uniform(-np.pi, np.pi, (states, n))
     qd, a = random.normal(size=(2, states, n))
     # a regressor's columns are the torques of unit parameters
-    row = np.repeat(np.arange(states), count)
+    state = np.repeat(np.arange(states), count)
     unit_parameters = np.tile(np.eye(count), (states, 1))
-    torque = arm.without_drives().law_torque(unit_parameters, q[row], qd[row], qd[row], a[row])
-    return torque.reshape(states, count, n).transpose(0, 2, 1).reshape(-1, count)
+    torque = arm.without_drives().law_torque(
+        theta_hat=unit_parameters,
+        q=q[state],
+        qd=qd[state],
+        v=qd[state],
+        a=a[state],
+    )
+    columns = torque.reshape(states, count, n)
+    regressors = columns.transpose(0, 2, 1)
+    return regressors.reshape(-1, count)
 
 
 @lru_cache(maxsize=64)
 def _find_chain_base(chain: ChainSetup, learnt: tuple[bool, ...]) -> BaseParameters:
     """Returns the base parameters of a chain by a QR decomposition (Gautier 1991)."""
     arm = ChainArmRows(np.zeros(len(learnt)), chain)
-    W = stack_regressors(arm, 4 * LINK_PARAMETERS)[:, list(learnt)]
+    regressors = stack_regressors(arm, 4 * LINK_PARAMETERS)
+    W = regressors[:, list(learnt)]
     indices = np.flatnonzero(learnt)
-    least_size = DEPENDENT_SHARE * float(np.linalg.norm(W)) / np.sqrt(W.shape[1])
+    norm = float(np.linalg.norm(W))
+    least_size = DEPENDENT_SHARE * norm / np.sqrt(W.shape[1])
     Q = np.zeros((len(W), 0))
     kept = []
     for p, column in enumerate(W.T):
@@ -639,10 +745,12 @@ def _find_chain_base(chain: ChainSetup, learnt: tuple[bool, ...]) -> BaseParamet
             Q = np.column_stack([Q, rest / size])
             kept.append(p)
     factors = np.linalg.lstsq(W[:, kept], W, rcond=None)[0]
+    contributes = np.abs(factors) > DEPENDENT_SHARE
+    kept_indices = indices[kept]
     combination = np.zeros((len(kept), len(learnt)))
-    combination[:, indices] = np.where(np.abs(factors) > DEPENDENT_SHARE, factors, 0.0)
-    combination[:, indices[kept]] = np.eye(len(kept))
-    return BaseParameters(indices[kept], combination)
+    combination[:, indices] = np.where(contributes, factors, 0.0)
+    combination[:, kept_indices] = np.eye(len(kept))
+    return BaseParameters(kept_indices, combination)
 
 
 def find_base_parameters(arm: ArmRows, learnt: NDArray[np.bool_]) -> BaseParameters:
@@ -657,7 +765,8 @@ def find_base_parameters(arm: ArmRows, learnt: NDArray[np.bool_]) -> BaseParamet
     if isinstance(arm, ChainArmRows):
         return _find_chain_base(arm.chain, tuple(learnt.tolist()))
     kept = np.flatnonzero(learnt)
-    return BaseParameters(kept, np.eye(len(learnt))[kept])
+    combination = np.eye(len(learnt))[kept]
+    return BaseParameters(kept, combination)
 
 
 def find_pseudo_inertias(theta: Array) -> Array:
@@ -666,22 +775,27 @@ def find_pseudo_inertias(theta: Array) -> Array:
     It is [[S, m c], [m c', m]] with S = tr(I) / 2 - I.
     """
     links = theta.reshape(-1, LINK_PARAMETERS)
-    pseudo_inertias = np.zeros((len(links), 4, 4))
-    pseudo_inertias[:, 3, 3] = links[:, 0]
-    pseudo_inertias[:, :3, 3] = links[:, 1:4]
-    pseudo_inertias[:, 3, :3] = links[:, 1:4]
+    mass = links[:, 0]
+    moment = links[:, 1:4]
     xx, xy, yy, xz, yz, zz = links[:, 4:].T
-    inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]).transpose(2, 0, 1)
+    inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    inertia_of_link = inertia.transpose(2, 0, 1)
     half_trace = 0.5 * (xx + yy + zz)
-    S = half_trace[:, np.newaxis, np.newaxis] * np.eye(3) - inertia
+    S = half_trace[:, np.newaxis, np.newaxis] * np.eye(3) - inertia_of_link
+
+    pseudo_inertias = np.zeros((len(links), 4, 4))
     pseudo_inertias[:, :3, :3] = S
+    pseudo_inertias[:, :3, 3] = moment
+    pseudo_inertias[:, 3, :3] = moment
+    pseudo_inertias[:, 3, 3] = mass
     return pseudo_inertias
 
 
 def find_consistent_links(theta: Array) -> list[bool]:
-    """Returns for each link whether some body has its parameters (Wensing et al. 2018).
+    """Returns for each link whether a body with its parameters can exist.
 
-    That is so if the link's pseudo-inertia is positive definite.
+    The condition is that the link's pseudo-inertia is positive definite (Wensing et al. 2018).
     """
-    eigenvalues = np.linalg.eigvalsh(find_pseudo_inertias(theta))
+    pseudo_inertias = find_pseudo_inertias(theta)
+    eigenvalues = np.linalg.eigvalsh(pseudo_inertias)
     return [bool(values.min() > 0.0) for values in eigenvalues]

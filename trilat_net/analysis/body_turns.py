@@ -1,6 +1,5 @@
-"""Aligns the orientations of a plant's bodies in a stream of frames."""
+"""Signs of the quaternions of a plant's bodies in a stream of frames, chosen without jumps."""
 
-from collections import defaultdict
 from collections.abc import Sequence
 
 import numpy as np
@@ -13,14 +12,12 @@ from ..log.orientations import QUATERNION_AXES, QuaternionSigns
 class BodyTurns:
     """Chooses the signs of the quaternions of a plant's bodies in one stream of frames.
 
-    Of the two quaternions of an orientation, the one nearer to that of the frame before is
-    chosen.
+    Two quaternions of opposite sign describe the same orientation. The quaternion that is
+    nearer to the quaternion of the frame before is chosen.
     """
 
     def __init__(self) -> None:
-        self._signs: defaultdict[int, QuaternionSigns] = defaultdict(
-            lambda: QuaternionSigns(w=0)
-        )
+        self._signs: dict[int, QuaternionSigns] = {}
 
     def align(self, bodies: Sequence[float]) -> Array:
         """Returns the poses of a frame with chosen signs, shape (7 b,).
@@ -28,7 +25,12 @@ class BodyTurns:
         Args:
             bodies: pose of each body: position x, y, z in m, and unit quaternion w, x, y, z.
         """
-        poses = np.array(bodies, dtype=np.float64).reshape(-1, POSITION + len(QUATERNION_AXES))
+        pose_length = POSITION + len(QUATERNION_AXES)
+        numbers = np.array(bodies, dtype=np.float64)
+        poses = numbers.reshape(-1, pose_length)
         for body, pose in enumerate(poses):
-            pose[POSITION:] = self._signs[body].align(pose[POSITION:].tolist())
+            if body not in self._signs:
+                self._signs[body] = QuaternionSigns(w=0)
+            quaternion = pose[POSITION:]
+            quaternion[:] = self._signs[body].align(quaternion.tolist())
         return poses.ravel()

@@ -1,9 +1,9 @@
-"""Traces the dominance of sites over time, alpha of Eq. (6), and its Lyapunov weights.
+"""Dominance of sites over time, alpha of Eq. (6), and the Lyapunov weights that belong to it.
 
 The weights of the sites' functionals are beta_i = pi_i / c_i, where pi is the left Perron
 vector of alpha, and c_i the scalar in Kd_i = c_i Kbar. Both conditions are necessary: beta'
 Upsilon <= 0 together with Upsilon 1 = 0 forces equality, so that there is no slack. pi as the
-weight of a delayed consensus is a known result (docs/errata.md); the paper uses ones.
+weight of a delayed consensus is a known result (docs/errata.md). The paper uses weights of 1.
 
 Invariant:
     - alpha is a function of time and of the applied changes alone.
@@ -44,7 +44,9 @@ class DominanceHistory(NamedTuple):
     @property
     def constant(self) -> bool:
         """True if no factor ever changes."""
-        return bool(np.all(self.alpha == self.alpha[0]) and not self.rate.any())
+        has_steps = bool(np.any(self.alpha != self.alpha[0]))
+        has_ramps = bool(self.rate.any())
+        return not has_steps and not has_ramps
 
 
 def trace_dominance(log: Log, site: str, t_s: Array) -> DominanceHistory:
@@ -61,7 +63,8 @@ def trace_dominance(log: Log, site: str, t_s: Array) -> DominanceHistory:
         LogError: a record names a change that is not valid.
     """
     start, ramps = list_ramps(log, site)
-    planned = evaluate_ramps(start, ramps, t_s, 1.0 / log.scenario.sites[site].rate_hz)
+    h_s = 1.0 / log.scenario.sites[site].rate_hz
+    planned = evaluate_ramps(start, ramps, t_s, h_s)
     present = ~find_lost_peers(log, site, t_s)
     if present.all():
         return planned
@@ -70,44 +73,54 @@ def trace_dominance(log: Log, site: str, t_s: Array) -> DominanceHistory:
     before = planned.before * present[:-1]
     total = alpha.sum(axis=1, keepdims=True)
     total_rate = rate.sum(axis=1, keepdims=True)
+    total_before = before.sum(axis=1, keepdims=True)
+    # quotient rule
+    numerator = rate * total - alpha * total_rate
     return DominanceHistory(
         alpha=alpha / total,
-        rate=(rate * total - alpha * total_rate) / total**2,
-        before=before / before.sum(axis=1, keepdims=True),
+        rate=numerator / total**2,
+        before=before / total_before,
     )
 
 
 def list_ramps(log: Log, site: str) -> tuple[Array, list[DominanceRamp]]:
     """Returns the factors of a site at the epoch, shape (P,), and all its ramps.
 
-    The ramps are those of the scenario and those that were ordered.
+    The ramps are those of the scenario and those of the recorded commands.
 
     Raises:
         LogError: a record names a change that is not valid.
     """
-    start, scripted = list_scripted_ramps(log.scenario, site)
-    changes = [change for batch in log.commands(site).values() for change in batch]
-    ordered = [change.ramp for change in changes if change.ramp is not None]
-    return start, [*scripted, *ordered]
+    start, ramps = list_scripted_ramps(log.scenario, site)
+    ramps = list(ramps)
+    for changes in log.commands(site).values():
+        ramps += [change.ramp for change in changes if change.ramp is not None]
+    return start, ramps
 
 
 def find_users(scenario: Scenario) -> tuple[str, list[str]]:
     """Returns the first slave ("" if there is none) and its users, which are all masters."""
-    slaves = [site for site, spec in scenario.sites.items() if spec.role == "slave"]
-    masters = [site for site, spec in scenario.sites.items() if spec.role == "master"]
-    return next(iter(slaves), ""), masters
+    slaves = []
+    masters = []
+    for site, spec in scenario.sites.items():
+        if spec.role == "slave":
+            slaves.append(site)
+        elif spec.role == "master":
+            masters.append(site)
+    first_slave = slaves[0] if slaves else ""
+    return first_slave, masters
 
 
 class UserShares(NamedTuple):
     """Shares of the users of a slave, over K times.
 
-    If the leader is not the user that the program holds, somebody intervenes.
+    A program holds the arm of one user. While another user leads, somebody intervenes.
 
     Attributes:
         shares: the slave's dominance factors for its U users, shape (K, U).
-        leader: index of the user with the largest share, shape (K,); that of the program if no
-            share is larger than the program's.
-        program: index of the user that a program holds.
+        leader: index of the user with the largest share, shape (K,); the program's user if no
+            share is larger.
+        program: index of the user whose arm a program holds.
     """
 
     shares: Array
@@ -121,7 +134,7 @@ def find_user_shares(scenario: Scenario, alpha: Array, program: str = "") -> Use
     Args:
         scenario: scenario of the run.
         alpha: dominance factors of the slave, shape (K, P).
-        program: the user that a program holds; by default the last user.
+        program: the user whose arm a program holds; by default the last user.
 
     Raises:
         UsageError: there is no such user.
@@ -131,15 +144,18 @@ def find_user_shares(scenario: Scenario, alpha: Array, program: str = "") -> Use
     if program not in users:
         raise UsageError(f"the program holds one of {', '.join(users)}, not {program!r}")
     peers = scenario.peers(slave)
-    shares = alpha[:, [peers.index(user) for user in users]]
+    columns = [peers.index(user) for user in users]
+    shares = alpha[:, columns]
     program_index = users.index(program)
-    program_leads = shares[:, program_index] >= shares.max(axis=1)
-    leader = np.where(program_leads, program_index, shares.argmax(axis=1))
+    program_share = shares[:, program_index]
+    program_leads = program_share >= shares.max(axis=1)
+    largest = shares.argmax(axis=1)
+    leader = np.where(program_leads, program_index, largest)
     return UserShares(shares, leader, program_index)
 
 
 def find_lost_peers(log: Log, site: str, t_s: Array) -> NDArray[np.bool_]:
-    """Returns the peers without which a site goes on, over time; see `core.lost_peers`.
+    """Returns the peers without which a site continues, over time; see `core.lost_peers`.
 
     Args:
         log: the log of a run.
@@ -156,57 +172,65 @@ def find_lost_peers(log: Log, site: str, t_s: Array) -> NDArray[np.bool_]:
         return lost
     first = part.layout.count_life_memory(peer_count)
     is_lost = part.memory(first, peer_count) != 0.0
-    rows = np.searchsorted(part.t_s, t_s + RAMP_TIME_TOLERANCE_S, side="right") - 1
+    # the newest record at each time
+    rows_after = np.searchsorted(part.t_s, t_s + RAMP_TIME_TOLERANCE_S, side="right")
+    rows = rows_after - 1
     recorded = rows >= 0
     lost[recorded] = is_lost[rows[recorded]]
     return lost
 
 
 def list_losses(log: Log) -> list[str]:
-    """Returns sentences on the times in which a site went on without a peer."""
+    """Returns a sentence for each time in which a site continued without a peer."""
     sentences = []
     for site in log.sites:
         part = log[site]
         lost = find_lost_peers(log, site, part.t_s).astype(int)
         times_s = part.t_s
         if len(part):
-            times_s = np.append(part.t_s, part.t_s[-1] + 1.0 / part.rate_hz)
+            end_s = part.t_s[-1] + 1.0 / part.rate_hz
+            times_s = np.append(part.t_s, end_s)
         for j, peer in enumerate(part.peers):
-            edges = np.diff(np.concatenate([[0], lost[:, j], [0]]))
+            # a loss begins where an edge is positive, and ends where it is negative
+            edges = np.diff(lost[:, j], prepend=0, append=0)
             starts_s = times_s[np.flatnonzero(edges > 0)]
             ends_s = times_s[np.flatnonzero(edges < 0)]
-            sentences += [
-                f"{site} without {peer} {from_s:.4g} to {to_s:.4g} s"
-                for from_s, to_s in zip(starts_s, ends_s, strict=True)
-            ]
+            for from_s, to_s in zip(starts_s, ends_s, strict=True):
+                sentence = f"{site} without {peer} {from_s:.4g} to {to_s:.4g} s"
+                sentences.append(sentence)
     return sentences
 
 
 def list_scripted_ramps(scenario: Scenario, site: str) -> tuple[Array, list[DominanceRamp]]:
     """Returns the factors of a site at the epoch, shape (P,), and the scenario's ramps."""
     factors = scenario.dominance[site]
-    start = np.array([factors.get(peer, 0.0) for peer in scenario.peers(site)])
+    peers = scenario.peers(site)
+    start = np.array([factors.get(peer, 0.0) for peer in peers])
     return start, scenario.scripted_ramps(site)
 
 
 def drop_finished_ramps(
     start: Array, ramps: Sequence[DominanceRamp], from_s: float
 ) -> tuple[Array, list[DominanceRamp]]:
-    """Returns factors and ramps with the same history from a time on, without earlier ramps.
+    """Returns a start and ramps that have the same history from a time on.
+
+    Ramps that have finished before this time are left out.
 
     Args:
         start: factors at the epoch, shape (P,).
         ramps: all ramps.
         from_s: time from which the history must be the same, in s.
     """
-    ordered = sorted(ramps, key=lambda ramp: ramp.start_ns)
-    started = sum(ramp.start_ns * 1e-9 <= from_s for ramp in ordered)
+    sorted_ramps = sorted(ramps, key=lambda ramp: ramp.start_ns)
+    started = sum(ramp.start_ns * 1e-9 <= from_s for ramp in sorted_ramps)
     if started < 2:
-        return start, ordered
-    finished = ordered[: started - 1]
-    remaining = ordered[started - 1 :]
+        return start, sorted_ramps
+    # the last ramp that has started may still be in progress
+    finished = sorted_ramps[: started - 1]
+    remaining = sorted_ramps[started - 1 :]
     turn_s = np.array([remaining[0].start_ns * 1e-9])
-    return evaluate_ramps(start, finished, turn_s, 0.0).alpha[0], remaining
+    history = evaluate_ramps(start, finished, turn_s, 0.0)
+    return history.alpha[0], remaining
 
 
 def evaluate_ramps(
@@ -232,20 +256,25 @@ def evaluate_ramps(
         share = 1.0
         if next_start_s < end_s:
             share = (next_start_s - start_s) / (end_s - start_s)
+        interpolated = before + (after - before) * share
         # exact factors at the end of a finished ramp, which interpolation would round
-        before = after if share == 1.0 else before + (after - before) * share
+        before = after if share == 1.0 else interpolated
         after = np.array(ramp.alpha)
         start_s = next_start_s
         end_s = ramp.end_ns * 1e-9
-        is_later = t_s >= start_s - RAMP_TIME_TOLERANCE_S
-        is_climbing = is_later & (t_s < end_s - RAMP_TIME_TOLERANCE_S)
-        alpha[is_later] = after
-        rate[is_later] = 0.0
+        has_started = t_s >= start_s - RAMP_TIME_TOLERANCE_S
+        has_not_ended = t_s < end_s - RAMP_TIME_TOLERANCE_S
+        is_climbing = has_started & has_not_ended
+        alpha[has_started] = after
+        rate[has_started] = 0.0
         if is_climbing.any():
-            slope = (after - before) / ((ramp.end_ns - ramp.start_ns) * 1e-9)
-            alpha[is_climbing] = before + slope * (t_s[is_climbing, np.newaxis] - start_s)
+            length_s = (ramp.end_ns - ramp.start_ns) * 1e-9
+            slope = (after - before) / length_s
+            since_start_s = t_s[is_climbing, np.newaxis] - start_s
+            alpha[is_climbing] = before + slope * since_start_s
             rate[is_climbing] = slope
-    return DominanceHistory(alpha, rate, alpha[:-1] + h_s * rate[:-1])
+    at_period_ends = alpha[:-1] + h_s * rate[:-1]
+    return DominanceHistory(alpha, rate, at_period_ends)
 
 
 KD_SHAPE_TOLERANCE = 1e-9
@@ -256,8 +285,8 @@ class LyapunovWeights(NamedTuple):
     """Lyapunov weights beta, as far as they exist.
 
     Attributes:
-        beta: weight of each site, with the sum N, so that equal shares give the paper's ones,
-            shape (N,).
+        beta: weight of each site, shape (N,). The weights have the sum N: with equal shares
+            each weight is 1, as in the paper.
         groups: the closed groups of sites, as tuples of indices: no site of a group follows a
             site outside. If there is a single group, pi is unique, though some of its entries
             may be 0.
@@ -279,8 +308,12 @@ def find_closed_groups(alpha: Array) -> tuple[tuple[int, ...], ...]:
     reach = find_reach(alpha)
     groups = []
     for site in range(len(alpha)):
-        group = tuple(np.flatnonzero(reach[site] & reach[:, site]).tolist())
-        if group[0] == site and reach[site].sum() == len(group):
+        is_mutual = reach[site] & reach[:, site]
+        group = tuple(np.flatnonzero(is_mutual).tolist())
+        # the first site of a group stands for the group
+        is_first = group[0] == site
+        is_closed = reach[site].sum() == len(group)
+        if is_first and is_closed:
             groups.append(group)
     return tuple(groups)
 
@@ -288,21 +321,23 @@ def find_closed_groups(alpha: Array) -> tuple[tuple[int, ...], ...]:
 def left_perron_vector(alpha: Array) -> Array:
     """Returns pi >= 0 with pi' alpha = pi' and sum 1, shape (N,).
 
-    pi is 0 for sites outside closed groups. If several closed groups make it ambiguous, each
-    group counts by its number of sites.
+    pi is 0 for sites outside closed groups. With several closed groups pi is not unique: each
+    group then counts by its number of sites.
     """
     pi = np.zeros(len(alpha))
     groups = find_closed_groups(alpha)
     total = sum(map(len, groups))
     for group in groups:
-        pi[list(group)] = perron_vector(alpha[np.ix_(group, group)]) * len(group) / total
+        group_alpha = alpha[np.ix_(group, group)]
+        group_pi = perron_vector(group_alpha)
+        pi[list(group)] = group_pi * len(group) / total
     return pi
 
 
 def find_kd_scales(Kd: Array) -> Array | None:
     """Returns c_i of Kd_i = c_i Kbar with c_1 = 1; None if there are no such scalars.
 
-    If every Kd is zero, nothing couples the sites, and any scale holds: ones are returned.
+    If all Kd are zero, nothing couples the sites, and any scales are right: the scales are 1.
 
     Args:
         Kd: gains, shape (N, n); NaN along an axis that a site does not follow.
@@ -315,8 +350,10 @@ def find_kd_scales(Kd: Array) -> Array | None:
         return None
     shapes = Kd / sizes[:, np.newaxis]
     # fmax and fmin ignore NaN
-    differences = np.fmax.reduce(shapes) - np.fmin.reduce(shapes)
-    if np.nan_to_num(differences).max() > KD_SHAPE_TOLERANCE:
+    largest = np.fmax.reduce(shapes)
+    least = np.fmin.reduce(shapes)
+    differences = np.nan_to_num(largest - least)
+    if differences.max() > KD_SHAPE_TOLERANCE:
         return None
     scales: Array = sizes / sizes[0]
     return scales
@@ -331,10 +368,13 @@ def compute_lyapunov_weights(alpha: Array, Kd: Array) -> LyapunovWeights:
         alpha: the dominance matrix, shape (N, N).
         Kd: gains, shape (N, n).
     """
+    pi = left_perron_vector(alpha)
     scales = find_kd_scales(Kd)
-    beta = left_perron_vector(alpha) / (1.0 if scales is None else scales)
+    beta = pi if scales is None else pi / scales
+    sites = len(beta)
+    factor = sites / beta.sum()
     return LyapunovWeights(
-        beta=beta * (len(beta) / beta.sum()),
+        beta=beta * factor,
         groups=find_closed_groups(alpha),
         scales=scales,
     )

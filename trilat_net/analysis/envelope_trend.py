@@ -1,32 +1,32 @@
 """Classifies the trend of an envelope over the second half of a record.
 
-A class states what the record shows and predicts nothing; see docs/definitions.md, "Stable".
+A class describes the record and predicts nothing; see docs/definitions.md, "Stable".
 
 The half is divided into n equal windows, with n = 16 and, if these do not decide, n = 8. A
 window counts with its largest value, at least `FLOOR_RAD`. A straight line is fitted to the
 logarithms of these maxima, with the one-sided 99.5 % bounds of its slope (Student's t, n - 2
 degrees of freedom).
 
-GROWS: the lower bound is positive; the maxima of the four quarters of the half rise by 1 % or
-more each; and the rise does not die away. It does not die away if the last of the three steps,
-in logarithms, is at least 3/4 of the first, or at least 0.45 of the first if the maxima rise
-by more than a factor of 8/5 in all (no response that starts at zero and saturates does that).
-The maxima of the four quarters of the first half must not fall by 1 % or more each: a fall
-followed by a rise is a V, and needs a longer record.
+The classes, with "quarters" for the four quarters of the second half:
 
-DECAYS: the upper bound is negative, the line falls by a factor of two or more over the half,
-and the last quarter still has half of its share in that. Or no value of the last quarter
-exceeds `FLOOR_RAD`.
+- GROWS: the lower bound is positive, the maxima rise by 1 % or more from quarter to quarter,
+  and the rise does not die away: the last of the three steps, in logarithms, is at least 3/4 of
+  the first step. At least 0.45 of the first step suffices if the maxima rise by more than a
+  factor of 8/5 in all, because no response that starts at zero and saturates does that. In the
+  first half of the record the maxima must not fall by 1 % or more from quarter to quarter: a
+  fall followed by a rise is a V, and needs a longer record.
+- DECAYS: the upper bound is negative, the line falls by a factor of two or more over the half,
+  and the last step is a fall of at least half the size that it has in a steady fall by a factor
+  of two. An envelope whose last quarter does not exceed `FLOOR_RAD` decays as well.
+- HARDLY: the line falls by 4 % or more, but the conditions of DECAYS do not hold.
+- STEADY: the bounds exclude that the envelope doubles or halves within the half.
+- UNDECIDED: the record is too short or too irregular, growth slows down, or there is a V.
 
-HARDLY: the line falls by 4 % or more, and the conditions of DECAYS do not hold.
+Every class but GROWS and UNDECIDED requires that the maximum of the last quarter is at most
+twice the maximum of the quarter before.
 
-STEADY: the bounds exclude that the envelope doubles or halves within the half.
-
-All classes require that the last quarter of the half is at most twice the quarter before it.
-
-UNDECIDED: everything else: a record that is too short or too irregular, growth that slows
-down, a V. No finite record excludes growth that starts later, or a beat longer than the run,
-whose rising flank looks like growth.
+No finite record excludes growth that starts later. A beat that is longer than the run looks
+like growth while it rises.
 """
 
 import math
@@ -49,6 +49,7 @@ They have only these digits, because the classes of published runs were made wit
 _LEAST_STEP = math.log(1.01)
 """Least rise of the maxima from quarter to quarter of an envelope that grows: 1 %."""
 _DOUBLE = math.log(2.0)
+"""Logarithm of a doubling."""
 _LARGEST_CALM_RISE = math.log(1.25)
 """Largest rise within the half that the upper bound of a calm envelope admits."""
 _LARGEST_CALM_STEP = math.log(1.5)
@@ -74,9 +75,9 @@ class EnvelopeFit(NamedTuple):
         trend: class of the trend.
         rate_per_s: slope of the logarithm of the maxima, 1/s: the envelope goes as exp(rate t);
             NaN if there are too few points.
-        calm: True if the envelope falls, or the upper bound excludes a rise by a quarter
-            within the half; and if the last quarter is at most half as high again as the
-            quarter before it.
+        calm: True if two conditions hold: the envelope falls, or the upper bound excludes a
+            rise by a quarter within the half; and the last quarter's maximum is at most 1.5
+            times the maximum of the quarter before.
     """
 
     trend: EnvelopeTrend
@@ -86,7 +87,9 @@ class EnvelopeFit(NamedTuple):
     @property
     def text(self) -> str:
         """The trend as a verb."""
-        return "shows no trend" if self.trend is EnvelopeTrend.UNDECIDED else self.trend.value
+        if self.trend is EnvelopeTrend.UNDECIDED:
+            return "shows no trend"
+        return self.trend.value
 
     @property
     def rate_text(self) -> str:
@@ -105,31 +108,37 @@ def fit_envelopes(
         t_s: ascending times, shape (K,), s.
         values: the largest |e| since the time before, shape (K, C).
         floor: floor of the envelopes, in place of `FLOOR_RAD`.
-        falls_first: an envelope that rises after a fall grows as well, because the fall is
-            known to be that of other modes.
+        falls_first: an envelope that rises after a fall counts as growing too, because other
+            modes are known to cause the fall.
     """
-    fits = [EnvelopeFit(EnvelopeTrend.UNDECIDED, math.nan)] * values.shape[1]
-    undecided = list(range(values.shape[1]))
+    envelopes = values.shape[1]
+    no_fit = EnvelopeFit(EnvelopeTrend.UNDECIDED, math.nan)
+    fits = [no_fit] * envelopes
+    undecided = list(range(envelopes))
     for windows in _T_QUANTILES:
         maxima = _find_window_maxima(t_s, values[:, undecided], windows, floor)
         if maxima is None:
             continue
-        window_s = 0.5 * (t_s[-1] - t_s[0]) / windows
-        window_fits = _fit_maxima(maxima, window_s, math.log(floor))
+        half_s = 0.5 * (t_s[-1] - t_s[0])
+        window_fits = _fit_maxima(maxima, half_s / windows, math.log(floor))
         for n, fit in zip(undecided, window_fits, strict=True):
             fits[n] = fit
         undecided = [n for n in undecided if fits[n].trend is EnvelopeTrend.UNDECIDED]
     growing = [n for n, fit in enumerate(fits) if fit.trend is EnvelopeTrend.GROWS]
     if falls_first or not growing:
         return fits
-    # growth after a fall in the first half is a V
-    first_half = _find_window_maxima(-t_s[::-1], values[::-1, growing], 4, floor)
-    if first_half is not None:
-        # time is reversed here, so that a fall shows as rising steps
-        least_steps = np.diff(np.log(first_half), axis=0).min(axis=0)
-        for n, least_step in zip(growing, least_steps, strict=True):
-            if least_step >= _LEAST_STEP:
-                fits[n] = fits[n]._replace(trend=EnvelopeTrend.UNDECIDED)
+
+    # growth after a fall in the first half is a V; in reversed time the fall is a rise
+    reversed_t_s = -t_s[::-1]
+    reversed_values = values[::-1, growing]
+    first_half = _find_window_maxima(reversed_t_s, reversed_values, 4, floor)
+    if first_half is None:
+        return fits
+    steps = np.diff(np.log(first_half), axis=0)
+    least_steps = steps.min(axis=0)
+    for n, least_step in zip(growing, least_steps, strict=True):
+        if least_step >= _LEAST_STEP:
+            fits[n] = fits[n]._replace(trend=EnvelopeTrend.UNDECIDED)
     return fits
 
 
@@ -146,12 +155,15 @@ def _find_window_maxima(t_s: Array, values: Array, windows: int, floor: float) -
     """
     if not len(t_s):
         return None
-    edges = np.linspace(0.5 * (t_s[0] + t_s[-1]), t_s[-1], windows + 1)
+    end_s = t_s[-1]
+    middle_s = 0.5 * (t_s[0] + end_s)
+    edges = np.linspace(middle_s, end_s, windows + 1)
     starts = np.searchsorted(t_s, edges[:-1])
     counts = np.diff(np.append(starts, len(t_s)))
     if np.any(counts < 2):
         return None
-    return np.maximum(np.maximum.reduceat(values, starts, axis=0), floor)
+    maxima = np.maximum.reduceat(values, starts, axis=0)
+    return np.maximum(maxima, floor)
 
 
 def _fit_maxima(maxima: Array, window_s: float, log_floor: float) -> list[EnvelopeFit]:
@@ -160,27 +172,36 @@ def _fit_maxima(maxima: Array, window_s: float, log_floor: float) -> list[Envelo
     Args:
         maxima: maxima of n equal windows, shape (n, C).
         window_s: length of a window, in s.
-        log_floor: logarithm of the floor, below which nothing moves.
+        log_floor: logarithm of the floor; an envelope below it is at rest.
     """
     n = len(maxima)
     log_maxima = np.log(maxima)
     x = np.arange(n) - 0.5 * (n - 1)
     x_squares = float(x @ x)
+    column_x = x[:, np.newaxis]
     # a sum, because the last bits of a matrix product may vary between machines
-    slopes = (x[:, np.newaxis] * log_maxima).sum(axis=0) / x_squares
-    residual = log_maxima - log_maxima.mean(axis=0) - x[:, np.newaxis] * slopes
-    slope_variance = (residual**2).sum(axis=0) / (n - 2) / x_squares
+    products = (column_x * log_maxima).sum(axis=0)
+    slopes = products / x_squares
+    residual = log_maxima - log_maxima.mean(axis=0) - column_x * slopes
+    residual_squares = (residual**2).sum(axis=0)
+    slope_variance = residual_squares / (n - 2) / x_squares
     bounds = _T_QUANTILES[n] * np.sqrt(slope_variance)
-    quarters = np.log(maxima.reshape(4, n // 4, -1).max(axis=1))
+    windows_by_quarter = maxima.reshape(4, n // 4, -1)
+    log_quarters = np.log(windows_by_quarter.max(axis=1))
+
     fits = []
-    for slope, bound, quarter in zip(slopes.tolist(), bounds.tolist(), quarters.T, strict=True):
-        steps = np.diff(quarter)
-        is_dead = float(quarter[-1]) <= log_floor
+    lines = zip(slopes.tolist(), bounds.tolist(), log_quarters.T, strict=True)
+    for slope, bound, log_quarter in lines:
+        steps = np.diff(log_quarter)
+        is_dead = float(log_quarter[-1]) <= log_floor
         trend = _classify_trend(slope * n, bound * n, steps, dead=is_dead)
         falls = trend in (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY)
-        may_stay = falls or (slope + bound) * n <= _LARGEST_CALM_RISE
-        calm = may_stay and float(steps[-1]) <= _LARGEST_CALM_STEP
-        fits.append(EnvelopeFit(trend, float(slope / window_s), bool(calm)))
+        largest_rise = (slope + bound) * n
+        may_stay = falls or largest_rise <= _LARGEST_CALM_RISE
+        last_step = float(steps[-1])
+        calm = may_stay and last_step <= _LARGEST_CALM_STEP
+        rate_per_s = float(slope / window_s)
+        fits.append(EnvelopeFit(trend, rate_per_s, bool(calm)))
     return fits
 
 
@@ -197,15 +218,22 @@ def _classify_trend(change: float, bound: float, steps: Array, *, dead: bool) ->
         return EnvelopeTrend.DECAYS
     first_step = steps[0]
     last_step = steps[-1]
-    is_not_saturating = steps.sum() > _LARGEST_RISE_FROM_ZERO and last_step >= 0.45 * first_step
+    rises_far = steps.sum() > _LARGEST_RISE_FROM_ZERO
+    is_not_saturating = rises_far and last_step >= 0.45 * first_step
     keeps_rising = last_step >= 0.75 * first_step or is_not_saturating
     if change > bound and steps.min() >= _LEAST_STEP and keeps_rising:
         return EnvelopeTrend.GROWS
+
     if last_step > _DOUBLE:
         return EnvelopeTrend.UNDECIDED
+
     if change + bound < 0.0 and change <= -4.0 * _LEAST_STEP:
-        is_clear = change <= -_DOUBLE and last_step <= -_DOUBLE / 8.0
+        halves = change <= -_DOUBLE
+        # in a steady fall to one half, each step is a quarter of the fall
+        still_falls = last_step <= -_DOUBLE / 8.0
+        is_clear = halves and still_falls
         return EnvelopeTrend.DECAYS if is_clear else EnvelopeTrend.HARDLY
+
     if abs(change) + bound <= _DOUBLE:
         return EnvelopeTrend.STEADY
     return EnvelopeTrend.UNDECIDED

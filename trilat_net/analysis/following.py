@@ -3,12 +3,11 @@
 A site follows joint by joint, or in task space with its end effector.
 
 Invariant:
-    - Everything is written with NumPy from the equations of `docs/laws.md`, independently of
-      the core.
-    - Only the rows of J and J' of the followed axes count; axes that are not followed have no
-      effect.
-    - With the reference of `find_task_reference`, J v = -Lambda e - damping y: where the pose
-      is nearly singular, the second term is missing from the desired velocity.
+    - All maps are written with NumPy from the equations of `docs/laws.md`, independently of the
+      core.
+    - Axes that are not followed have no effect: only the other axes' rows of J and J' count.
+    - With the reference of `find_task_reference`, J v = -Lambda e - damping y. Near a singular
+      pose the end effector therefore lacks the velocity damping y.
 """
 
 from collections.abc import Callable
@@ -48,13 +47,18 @@ def find_task_reference(
         error: Lambda e and Lambda ed, shape (m, ...).
     """
     psi, psi_rate = posture
-    e, ed = error
+    scaled_e, scaled_ed = error
     J_transposed = J.swapaxes(0, 1)
-    y = solve(-e - multiply_columns(J, psi))
+    Jd_transposed = Jd.swapaxes(0, 1)
+    y = solve(-scaled_e - multiply_columns(J, psi))
     v = psi + multiply_columns(J_transposed, y)
-    a = psi_rate + multiply_columns(Jd.swapaxes(0, 1), y)
-    y_rate = solve(-ed - multiply_columns(Jd, v) - multiply_columns(J, a))
-    return v, a + multiply_columns(J_transposed, y_rate)
+    # psi' + Jd' y
+    a_without_y_rate = psi_rate + multiply_columns(Jd_transposed, y)
+    Jd_v = multiply_columns(Jd, v)
+    J_a = multiply_columns(J, a_without_y_rate)
+    y_rate = solve(-scaled_ed - Jd_v - J_a)
+    a = a_without_y_rate + multiply_columns(J_transposed, y_rate)
+    return v, a
 
 
 class JointFollowing(NamedTuple):
@@ -80,7 +84,7 @@ class JointFollowing(NamedTuple):
         return force
 
     def without_posture(self) -> "JointFollowing":
-        """Returns the same maps without the motion towards a posture, which is none here."""
+        """Returns the same maps: a site that follows joint by joint has no posture."""
         return self
 
     def compute_damping_deviation(
@@ -89,7 +93,8 @@ class JointFollowing(NamedTuple):
         e: Array,
     ) -> tuple[Array, Array]:
         """Returns zeros: there are no singular poses near which motion would be damped."""
-        return np.zeros_like(e), np.zeros_like(e)
+        zeros = np.zeros_like(e)
+        return zeros, zeros
 
 
 @dataclass(frozen=True)
@@ -128,18 +133,23 @@ class TaskFollowing:
         """Returns the reference velocity v of the joints and its derivative a, shape (K, n)."""
         # `find_task_reference` has the rows on the last axis
         inverse = np.moveaxis(self.inverse[rows], 0, -1)
+        psi = self.psi[rows]
+        psi_rate = self.psi_rate[rows]
+        scaled_e = self.Lambda * e
+        scaled_ed = self.Lambda * ed
         v, a = find_task_reference(
             J=np.moveaxis(self.J[rows], 0, -1),
             Jd=np.moveaxis(self.Jd[rows], 0, -1),
             solve=partial(multiply_columns, inverse),
-            posture=(self.psi[rows].T, self.psi_rate[rows].T),
-            error=((self.Lambda * e).T, (self.Lambda * ed).T),
+            posture=(psi.T, psi_rate.T),
+            error=(scaled_e.T, scaled_ed.T),
         )
         return v.T, a.T
 
     def compute_jump_of_r(self, rows: Rows, de: Array) -> Array:
         """Returns the jump J+ Lambda de of r due to a jump de of e, shape (K, n)."""
-        return self.compute_joint_torque(rows, self._solve(rows, self.Lambda * de))
+        y = self._solve(rows, self.Lambda * de)
+        return self.compute_joint_torque(rows, y)
 
     def compute_joint_torque(self, rows: Rows, force: Array) -> Array:
         """Returns the joint torque J'f of a force f at the end effector, shape (K, n)."""
@@ -148,7 +158,8 @@ class TaskFollowing:
 
     def project_torque(self, torque: Array) -> Array:
         """Returns the force at the end effector of a joint torque, shape (K, m), N."""
-        return self._solve(slice(None), np.einsum("kij,kj->ki", self.J, torque))
+        along_axes = np.einsum("kij,kj->ki", self.J, torque)
+        return self._solve(slice(None), along_axes)
 
     def without_posture(self) -> "TaskFollowing":
         """Returns the same maps without the motion towards the posture: linear in e and ed."""
@@ -156,7 +167,7 @@ class TaskFollowing:
         return replace(self, psi=still, psi_rate=still)
 
     def compute_damping_deviation(self, rows: Rows, e: Array) -> tuple[Array, Array]:
-        """Returns the effect of the damping near singular poses; zero where no pose is damped.
+        """Returns the effect of the damping near singular poses, which is zero elsewhere.
 
         Returns:
             J r - x' - Lambda e, shape (K, m).
@@ -164,15 +175,22 @@ class TaskFollowing:
         """
         damping = self.damping[rows, np.newaxis]
         rate = self.damping_rate[rows, np.newaxis]
+        psi = self.psi[rows]
         if not (damping.any() or rate.any()):
-            return np.zeros_like(e), np.zeros_like(self.psi[rows])
-        posture_velocity = np.einsum("kij,kj->ki", self.J[rows], self.psi[rows])
+            return np.zeros_like(e), np.zeros_like(psi)
+        posture_velocity = np.einsum("kij,kj->ki", self.J[rows], psi)
         y = self._solve(rows, -self.Lambda * e - posture_velocity)
-        acceleration = self.compute_joint_torque(rows, self._solve(rows, rate * y))
+        y_of_rate = self._solve(rows, rate * y)
+        acceleration = self.compute_joint_torque(rows, y_of_rate)
         return damping * y, acceleration
 
 
 Following = JointFollowing | TaskFollowing
+
+
+def _transpose(matrices: Array) -> Array:
+    """Returns the transposes of the matrices of all rows, shape (K, b, a) of (K, a, b)."""
+    return matrices.transpose(0, 2, 1)
 
 
 def build_following(arm: ArmRows, q: Array, qd: Array, Lambda: Array) -> Following:
@@ -189,27 +207,36 @@ def build_following(arm: ArmRows, q: Array, qd: Array, Lambda: Array) -> Followi
         return JointFollowing(Lambda)
     end_effector = arm.place_end_effector(q, qd)
     axes = np.array(task.axes)[:, np.newaxis]
-    J = axes * task.scale * end_effector.J
-    Jd = axes * task.scale * arm.jacobian_rate(q, qd)
-    A = J @ J.transpose(0, 2, 1) + np.diag(1.0 - axes[:, 0])
+    scale = axes * task.scale
+    J = scale * end_effector.J
+    Jd = scale * arm.jacobian_rate(q, qd)
+    # ones on the diagonal of the axes that are not followed keep A regular
+    free_axes = np.diag(1.0 - axes[:, 0])
+    A = J @ _transpose(J) + free_axes
     eigenvalues, basis = np.linalg.eigh(A)
-    bounded = np.maximum(eigenvalues, _LEAST_EIGENVALUE)[:, np.newaxis]
-    inverse = (basis / bounded) @ basis.transpose(0, 2, 1)
+    bounded = np.maximum(eigenvalues, _LEAST_EIGENVALUE)
+    scaled_basis = basis / bounded[:, np.newaxis]
+    inverse = scaled_basis @ _transpose(basis)
+
     # 1 / trace(A^-1) is a smooth lower bound of the least eigenvalue of A
     trace = np.trace(axes * inverse, axis1=1, axis2=2)
     least_eigenvalue = 1.0 / trace
     damping = np.maximum(task.singular_value**2 - least_eigenvalue, 0.0)
-    half_A_rate = J @ Jd.transpose(0, 2, 1)
-    A_rate = half_A_rate + half_A_rate.transpose(0, 2, 1)
-    trace_rate = -np.trace(inverse @ A_rate @ inverse, axis1=1, axis2=2)
-    damping_rate = np.where(damping > 0.0, trace_rate / trace**2, 0.0)
+    half_A_rate = J @ _transpose(Jd)
+    A_rate = half_A_rate + _transpose(half_A_rate)
+    inverse_rate = inverse @ A_rate @ inverse
+    trace_rate = -np.trace(inverse_rate, axis1=1, axis2=2)
+    bound_rate = trace_rate / trace**2
+    damping_rate = np.where(damping > 0.0, bound_rate, 0.0)
     if damping.any():
-        inverse = np.linalg.inv(A + damping[:, np.newaxis, np.newaxis] * np.eye(len(axes)))
+        damping_matrix = damping[:, np.newaxis, np.newaxis] * np.eye(len(axes))
+        inverse = np.linalg.inv(A + damping_matrix)
+    from_posture = np.array(task.posture) - q
     return TaskFollowing(
         Lambda=Lambda,
         J=J,
         Jd=Jd,
-        psi=task.posture_rate * (np.array(task.posture) - q),
+        psi=task.posture_rate * from_posture,
         psi_rate=-task.posture_rate * qd,
         inverse=inverse,
         damping=damping,

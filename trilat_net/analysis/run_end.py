@@ -1,15 +1,15 @@
 """Judges a run by its end: stable, not stable, or open.
 
-The judged part is the second half of the run. It is the time after the last action of an
-operator and the last change of the loop instead, if that is shorter, and long enough. Trends
-of |e| and |qd| over the judged part are those of `envelope_trend`. A sustained oscillation of
-any size is steady. A joint that is steady while a faster joint of the coupled sites decays may
-receive its energy from that joint, since decaying modes beat; it is undecided.
+The judged part is the second half of the run. If an operator acts or the loop changes within
+this half, the time after the last action or change is judged instead, provided that it is long
+enough. `envelope_trend` defines the trends of |e| and |qd| over the judged part. A sustained
+oscillation of any size is steady. Decaying modes beat, so that a steady joint may receive its
+energy from a faster joint of the coupled sites that decays: the steady joint is then undecided.
 
 Invariant:
-    - Every command takes its judgement from here (docs/definitions.md, "Stable").
+    - All commands use the judgement of this module (docs/definitions.md, "Stable").
     - Each joint of each site is judged separately, and the worst joint decides.
-    - A judgement states what the record shows and predicts nothing.
+    - A judgement describes the record and predicts nothing.
     - Further knowledge of a whole log (V, the roots at its end pose) may make a stable run
       open, never the reverse.
 """
@@ -42,22 +42,22 @@ STATIC_SPEED_RAD_S = 2e-3
 """Largest speed in a static window, rad/s: the torques on an arm balance each other."""
 
 EQUILIBRIUM_SPEED_RAD_S = 1e-5
-"""Largest speed of the last second of a run that ends in an equilibrium, rad/s: the loop can be
-linearised there.
+"""Largest speed of the last second of a run that ends in an equilibrium, rad/s.
+
+The loop can be linearised there.
 """
 
 AGREEMENT_RAD = 2e-2
 """Sites whose angles of a joint differ by more than this do not agree, rad."""
 
 THROWN_RAD = 0.5 * math.pi
-"""Arms that nobody pushed and that end further than this from every start pose were thrown,
-rad.
-"""
+"""Arms without an operator that end further than this from all start poses were thrown, rad."""
 
 DRIFT_RAD = 0.05
 """A joint that moves by more than this in one direction over the judged half may drift, rad.
 
-For a joint that is slow enough to be at rest, `SETTLED_ERROR_RAD` leaves that undecided.
+A joint that is slow enough to be at rest, but moves by more than `SETTLED_ERROR_RAD`, is
+undecided.
 """
 
 FORCE_NM = 1e-3
@@ -68,12 +68,13 @@ HELD_SHARE = 0.02
 LEAST_JUDGED_S = 2.0
 """Least time after the last action or change for this time to be judged by itself, s."""
 LEAST_JUDGED_SHARE = 0.1
-"""It must also be at least this share of the run; otherwise the second half is judged, with the
-action or the change in it.
+"""Least share of the run that this time must have.
+
+If the time is shorter, the second half is judged, although it contains the action or change.
 """
 
 MIN_SIGN_CHANGES = 6
-"""Fewer changes of sign in the second half of a run show no period."""
+"""Least number of changes of sign in the second half of a run that show a period."""
 
 
 class Stability(StrEnum):
@@ -151,10 +152,12 @@ class RunEnd(NamedTuple):
     def stability(self) -> Stability:
         """The judgement; motion that an operator may cause is open, unless a site diverged."""
         stability = self.behaviour.stability
-        if stability is Stability.NOT_STABLE:
-            may_be_caused = self.behaviour is not EndBehaviour.DIVERGED and self.operator_acts
-            return Stability.OPEN if may_be_caused else stability
-        return Stability.OPEN if self.reasons else stability
+        if stability is not Stability.NOT_STABLE:
+            return Stability.OPEN if self.reasons else stability
+        has_diverged = self.behaviour is EndBehaviour.DIVERGED
+        if self.operator_acts and not has_diverged:
+            return Stability.OPEN
+        return stability
 
     @property
     def text(self) -> str:
@@ -195,7 +198,7 @@ class RunTrace(NamedTuple):
         buckets: for every interval of 1 / `BUCKETS_PER_S` since the epoch, the largest |e| and
             |qd| and the last q of every joint, shape (K, 3 n); -1 for an interval without a
             record. There may be columns for more joints than the site has. A site's last
-            interval may be incomplete, and enters no trend.
+            interval may be incomplete, and no trend uses it.
         tau_x: torque of operator and environment at the last record, shape (n,), N m.
         diverged_at_s: time at which the first site left its limits; None if no site did.
         pushed_until_s: time at which an operator whose action is not in the scenario last
@@ -217,8 +220,7 @@ NO_BUCKETS = np.zeros((0, 3))
 def reduce_to_buckets(bucket: Ints, e: Array, qd: Array, q: Array, into: Array) -> Array:
     """Returns buckets with further records of a site added.
 
-    In task space e has as many columns as the task; e or q is filled up with zeros to the same
-    number of columns.
+    In task space e has as many columns as the task. Missing columns of e, qd or q are zero.
 
     Args:
         bucket: index of each record's bucket, ascending, shape (K,).
@@ -230,55 +232,70 @@ def reduce_to_buckets(bucket: Ints, e: Array, qd: Array, q: Array, into: Array) 
     if not len(bucket):
         return into
     joints = max(q.shape[1], e.shape[1])
-    e, qd, q = (np.pad(x, ((0, 0), (0, joints - x.shape[1]))) for x in (e, qd, q))
+
+    def pad(x: Array) -> Array:
+        missing = joints - x.shape[1]
+        return np.pad(x, ((0, 0), (0, missing)))
+
+    magnitudes = np.abs(np.hstack([pad(e), pad(qd)]))
     if not len(into):
         into = np.zeros((0, 3 * joints))
     lacking = int(bucket[-1]) + 1 - len(into)
     if lacking > 0:
         # half as much again, so that a long run is not copied for every batch
-        extra = np.full((lacking + len(into) // 2, 3 * joints), -1.0)
+        spare = len(into) // 2
+        extra = np.full((lacking + spare, 3 * joints), -1.0)
         into = np.vstack([into, extra])
+
     starts = np.flatnonzero(np.diff(bucket, prepend=-1))
     last_records = np.append(starts[1:], len(q)) - 1
     rows = bucket[starts]
-    peaks = np.maximum.reduceat(np.abs(np.hstack([e, qd])), starts, axis=0)
-    into[rows, : 2 * joints] = np.maximum(into[rows, : 2 * joints], peaks)
-    into[rows, 2 * joints :] = q[last_records]
+    peaks = np.maximum.reduceat(magnitudes, starts, axis=0)
+    earlier_peaks = into[rows, : 2 * joints]
+    into[rows, : 2 * joints] = np.maximum(earlier_peaks, peaks)
+    into[rows, 2 * joints :] = pad(q)[last_records]
     return into
 
 
 def trace_log(log: Log) -> RunTrace:
     """Returns the data from which the end of a log's run is judged."""
-    parts = [log[site] for site in log.sites]
-    buckets = [
-        reduce_to_buckets(
+    buckets = []
+    tau_x = []
+    push_times_s = []
+    change_times_s = []
+    for site in log.sites:
+        part = log[site]
+        site_buckets = reduce_to_buckets(
             bucket=part.tick * BUCKETS_PER_S // part.rate_hz,
             e=part.e,
             qd=part.qd,
             q=part.q,
             into=NO_BUCKETS,
         )
-        for part in parts
-    ]
-    # actions of operators that the scenario does not know: on external arms, and of live hands
-    push_times_s = []
-    for part in parts:
-        if not len(part):
-            continue
-        if part.name in log.scenario.external:
-            push_times_s.append(float(part.t_s[part.tau_x.any(axis=1)].max(initial=0.0)))
-        if part.layout.hand:
-            push_times_s.append(float(part.t_s[part.hand[:, 0] > 0.0].max(initial=0.0)))
-    change_times_s = [
-        tick / log[site].rate_hz for site in log.sites for tick in log.changes(site)
-    ]
+        buckets.append(site_buckets)
+        tau_x.append(part.tau_x[-1] if len(part) else np.zeros(1))
+        push_times_s.append(_find_unscripted_push_s(log, part))
+        change_times_s += [tick / part.rate_hz for tick in log.changes(site)]
     return RunTrace(
         buckets=buckets,
-        tau_x=[part.tau_x[-1] if len(part) else np.zeros(1) for part in parts],
+        tau_x=tau_x,
         diverged_at_s=log.diverged_s,
         pushed_until_s=max(push_times_s, default=0.0),
         changed_until_s=max(change_times_s, default=0.0),
     )
+
+
+def _find_unscripted_push_s(log: Log, part: SiteLog) -> float:
+    """Returns the last time at which an operator outside the scenario pushed a site, in s.
+
+    Such operators act on external arms, or are live hands. Returns 0 if none pushed.
+    """
+    pushed = np.zeros(len(part), dtype=np.bool_)
+    if part.name in log.scenario.external:
+        pushed |= part.tau_x.any(axis=1)
+    if len(part) and part.layout.hand:
+        pushed |= part.hand[:, 0] > 0.0
+    return float(part.t_s[pushed].max(initial=0.0))
 
 
 def classify_log_end(log: Log) -> RunEnd:
@@ -286,46 +303,46 @@ def classify_log_end(log: Log) -> RunEnd:
     end = classify_run_end(log.scenario, trace_log(log))
     if end.behaviour is not EndBehaviour.BOUNDED:
         return end
-    return end._replace(frequency_hz=_find_frequency_hz([log[site] for site in log.sites]))
+    parts = [log[site] for site in log.sites]
+    return end._replace(frequency_hz=_find_frequency_hz(parts))
 
 
 def classify_run_end(scenario: Scenario, trace: RunTrace) -> RunEnd:
     """Returns the end of a run from its trace."""
-    # |e|, |qd| and q by kind and joint, shape (K, 3, n)
-    sites = []
-    for arm, buckets in zip(scenario.arms.values(), trace.buckets, strict=True):
-        joints = max(arm.counts.joints, arm.counts.shared)
-        by_kind = np.zeros((0, 3, joints))
-        if len(buckets):
-            by_kind = buckets.reshape(len(buckets), 3, -1)[:, :, :joints]
-        sites.append(by_kind)
+    sites = _split_buckets(scenario, trace)
+    # the last interval may be incomplete
     count = max(min(map(len, sites)) - 1, 0)
     recorded = np.all([site[:count, 0, 0] >= 0.0 for site in sites], axis=0)
     rows = np.flatnonzero(recorded)
     span_s = count / BUCKETS_PER_S
     all_t_s = rows / BUCKETS_PER_S
+
     acted_s = max(trace.pushed_until_s, find_last_operator_action(scenario, span_s))
     changed_s = max(trace.changed_until_s, find_last_change(scenario, span_s))
     quiet_from_s = max(acted_s, changed_s)
     first, is_disturbed = _choose_judged_part(all_t_s, quiet_from_s)
-    operator_acts = is_disturbed and _choose_judged_part(all_t_s, acted_s)[1]
+    _, operator_disturbs = _choose_judged_part(all_t_s, acted_s)
+    operator_acts = is_disturbed and operator_disturbs
     t_s = all_t_s[first:]
-    columns = [site[rows[first:]] for site in sites]
+    judged_rows = rows[first:]
+    columns = [site[judged_rows] for site in sites]
+
+    worst = _find_worst_joint(scenario, t_s, columns, sites)
     missing = [site for site, data in zip(scenario.names, sites, strict=True) if not len(data)]
-    end = _find_worst_joint(scenario, t_s, columns, sites)._replace(
+    end = worst._replace(
         missing_sites=tuple(missing),
         counts_from_s=float(t_s[0]) if len(t_s) else 0.0,
         quiet_from_s=quiet_from_s,
     )
-    if scenario.sites[scenario.names[0]].task.space == "position":
+    first_site = scenario.sites[scenario.names[0]]
+    if first_site.task.space == "position":
         end = end._replace(error_unit="m")
+
     if trace.diverged_at_s is not None:
         return end._replace(behaviour=EndBehaviour.DIVERGED, diverged_at_s=trace.diverged_at_s)
     if end.behaviour.stability is Stability.STABLE:
-        reasons = [
-            *_find_disagreement(scenario, trace, t_s, columns),
-            *_find_odd_pose(scenario, sites),
-        ]
+        reasons = list(_find_disagreement(scenario, trace, t_s, columns))
+        reasons += _find_odd_pose(scenario, sites)
         if is_disturbed and not operator_acts:
             reasons.append(f"the loop changes until {changed_s:.4g} s, within the judged part")
         return end._replace(reasons=tuple(reasons))
@@ -335,11 +352,23 @@ def classify_run_end(scenario: Scenario, trace: RunTrace) -> RunEnd:
     return end
 
 
+def _split_buckets(scenario: Scenario, trace: RunTrace) -> list[Array]:
+    """Returns |e|, |qd| and q of each site over the buckets, shape (K, 3, n) each."""
+    sites = []
+    for arm, buckets in zip(scenario.arms.values(), trace.buckets, strict=True):
+        joints = max(arm.counts.joints, arm.counts.shared)
+        by_kind = np.zeros((0, 3, joints))
+        if len(buckets):
+            all_columns = buckets.reshape(len(buckets), 3, -1)
+            by_kind = all_columns[:, :, :joints]
+        sites.append(by_kind)
+    return sites
+
+
 def _choose_judged_part(t_s: Array, acted_s: float) -> tuple[int, bool]:
     """Returns the start of the part of a run of which the second half is judged.
 
-    An operator that acts in the second half, and then lets go for long enough, shortens the
-    judged part.
+    An action in the second half shortens this part, if enough time follows the action.
 
     Args:
         t_s: times of the run, in s.
@@ -351,10 +380,14 @@ def _choose_judged_part(t_s: Array, acted_s: float) -> tuple[int, bool]:
     """
     if not len(t_s) or acted_s <= 0.5 * (t_s[0] + t_s[-1]):
         return 0, False
-    least_s = max(LEAST_JUDGED_S, LEAST_JUDGED_SHARE * (t_s[-1] - t_s[0]))
-    if t_s[-1] - acted_s < least_s:
+    end_s = t_s[-1]
+    run_s = end_s - t_s[0]
+    least_s = max(LEAST_JUDGED_S, LEAST_JUDGED_SHARE * run_s)
+    if end_s - acted_s < least_s:
         return 0, True
-    return int(np.searchsorted(t_s, 2.0 * acted_s - t_s[-1])), False
+    # the action is in the middle of the part from this time on
+    start_s = 2.0 * acted_s - end_s
+    return int(np.searchsorted(t_s, start_s)), False
 
 
 def _find_worst_joint(
@@ -370,12 +403,16 @@ def _find_worst_joint(
         columns: |e|, |qd| and q at these times by site, shape (K, 3, n) each.
         sites: |e|, |qd| and q over the whole run by site.
     """
-    signals = [site[:, kind] for site in columns for kind in (0, 1)]
-    fits = iter(fit_envelopes(t_s, np.hstack(signals)))
+    # all envelopes are fitted together: |e| and then |qd| of each site
+    envelopes = []
+    for site in columns:
+        envelopes += [site[:, 0], site[:, 1]]
+    fits = iter(fit_envelopes(t_s, np.hstack(envelopes)))
     ends = []
     for name, judged, whole in zip(scenario.names, columns, sites, strict=True):
-        last_second = whole[-BUCKETS_PER_S:, :2].max(axis=0, initial=0.0)
-        end_errors, end_speeds = last_second.tolist()
+        last_second = whole[-BUCKETS_PER_S:, :2]
+        peaks = last_second.max(axis=0, initial=0.0)
+        end_errors, end_speeds = peaks.tolist()
         error_fits = [next(fits) for _ in end_errors]
         speed_fits = [next(fits) for _ in end_speeds]
         for joint in range(len(end_errors)):
@@ -390,17 +427,26 @@ def _find_worst_joint(
             behaviour = _judge_joint(scenario, end, judged[:, :, joint], t_s)
             ends.append(end._replace(behaviour=behaviour))
     end_s = float(t_s[-1]) if len(t_s) else 0.0
-    owners = np.repeat(np.arange(len(sites)), [site.shape[2] for site in sites])
+    joint_counts = [site.shape[2] for site in sites]
+    owners = np.repeat(np.arange(len(sites)), joint_counts)
     for group in find_coupled_sites(scenario):
         for n in _find_fed_joints(ends, owners, group):
             ends[n] = ends[n]._replace(behaviour=EndBehaviour.UNDECIDED)
         coasting = _find_coasting_joints(
-            scenario=scenario, joints=ends, owners=owners, group=group, end_s=end_s
+            scenario=scenario,
+            joints=ends,
+            owners=owners,
+            group=group,
+            end_s=end_s,
         )
         for n in coasting:
             ends[n] = ends[n]._replace(behaviour=EndBehaviour.COASTS)
-    order = list(EndBehaviour)
-    worst = max(ends, key=lambda end: (order.index(end.behaviour), end.end_speed_rad_s))
+    from_best_to_worst = list(EndBehaviour)
+
+    def rank(end: RunEnd) -> tuple[int, float]:
+        return from_best_to_worst.index(end.behaviour), end.end_speed_rad_s
+
+    worst = max(ends, key=rank)
     return worst._replace(
         end_error_rad=max(end.end_error_rad for end in ends),
         end_speed_rad_s=max(end.end_speed_rad_s for end in ends),
@@ -437,8 +483,8 @@ def _judge_joint(scenario: Scenario, end: RunEnd, motion: Array, t_s: Array) -> 
 def _find_fed_joints(joints: Sequence[RunEnd], owners: Ints, group: Sequence[int]) -> list[int]:
     """Returns the steady joints of coupled sites that may receive energy from a faster joint.
 
-    Modes that decay at several frequencies beat and exchange energy, so that some joint is
-    steady for a while although all modes decay.
+    Modes that decay at several frequencies beat, so that a joint may be steady for a while
+    although all modes decay.
 
     Args:
         joints: ends of all joints.
@@ -447,7 +493,8 @@ def _find_fed_joints(joints: Sequence[RunEnd], owners: Ints, group: Sequence[int
     """
     members = np.flatnonzero(np.isin(owners, group)).tolist()
     falling = [joints[n] for n in members if joints[n].speed.trend in _FALLING]
-    fastest = max((joint.end_speed_rad_s for joint in falling), default=0.0)
+    falling_speeds = [joint.end_speed_rad_s for joint in falling]
+    fastest = max(falling_speeds, default=0.0)
     bounded = [n for n in members if joints[n].behaviour is EndBehaviour.BOUNDED]
     return [n for n in bounded if joints[n].end_speed_rad_s < fastest]
 
@@ -461,9 +508,9 @@ def _find_coasting_joints(
 ) -> list[int]:
     """Returns the drifting joints of coupled sites that nothing brakes.
 
-    That is so if the law of a site whose arm nobody holds or resists at the end has no spring
-    to a peer, and the others follow this site. It is also so if nobody holds or resists any
-    arm, and all laws take energy from the links alone.
+    An arm is free if no hand and no environment acts on it at the end. Nothing brakes the sites
+    if the law of a free arm has no spring to a peer, since the other sites follow this arm. The
+    same holds if all arms are free, and all laws take energy from the links only.
 
     Args:
         scenario: scenario of the run.
@@ -475,21 +522,26 @@ def _find_coasting_joints(
     specs = [scenario.sites[scenario.names[site]] for site in group]
     free_laws = []
     for spec in specs:
-        sources = [source.actor for source in (*spec.hands, *spec.environment)]
-        if not any(source.start_s <= end_s < source.end_s for source in sources):
+        actors = [source.actor for source in (*spec.hands, *spec.environment)]
+        if not any(actor.start_s <= end_s < actor.end_s for actor in actors):
             free_laws.append(spec.control)
-    brakeless = [
-        law for law in free_laws if law.books_energy and not any(getattr(law, "d", ()))
-    ]
-    all_have_springs = all(any(getattr(law, "K", (1.0,))) for law in free_laws)
+    brakeless = []
+    all_have_springs = True
+    for law in free_laws:
+        has_damping = any(getattr(law, "d", ()))
+        if law.books_energy and not has_damping:
+            brakeless.append(law)
+        has_spring = any(getattr(law, "K", (1.0,)))
+        all_have_springs &= has_spring
     if len(brakeless) != len(specs) and all_have_springs:
         return []
-    return [
-        n
-        for n in np.flatnonzero(np.isin(owners, group)).tolist()
-        if joints[n].behaviour is EndBehaviour.DRIFTS
-        and joints[n].speed.trend is not EnvelopeTrend.GROWS
-    ]
+    coasting = []
+    for n in np.flatnonzero(np.isin(owners, group)).tolist():
+        drifts = joints[n].behaviour is EndBehaviour.DRIFTS
+        grows = joints[n].speed.trend is EnvelopeTrend.GROWS
+        if drifts and not grows:
+            coasting.append(n)
+    return coasting
 
 
 def _classify_joint(
@@ -503,10 +555,10 @@ def _classify_joint(
 ) -> EndBehaviour:
     """Returns the behaviour of a joint by the trends of its |e| and |qd|.
 
-    Errors that grow while the joint gets no faster may start a drift, or follow from an
-    operator's last action: undecided. A speed that grows without an error is growth: arms that
-    swing in unison have no error. A motion that goes on at a small speed may go on for ever,
-    or grow.
+    Errors that grow while the joint gets no faster are undecided: a drift may start, or they
+    follow from an operator's last action. A speed that grows is growth even without an error,
+    because arms that swing in unison have no error. A motion at a small speed may last, or
+    grow.
 
     Args:
         error: trend of |e|.
@@ -514,8 +566,8 @@ def _classify_joint(
         end_error_rad: largest |e| of the last second.
         end_speed_rad_s: largest |qd| of the last second.
         still: True if the speed decays, or is at the floor.
-        rests: True if the joint is slow, and its speed falls, however little. The speed of an
-            external arm need not fall.
+        rests: True if the joint is slow, and its speed falls, even if only slightly. The speed
+            of an external arm need not fall.
     """
     if speed.trend is EnvelopeTrend.GROWS:
         return EndBehaviour.GROWS
@@ -545,10 +597,10 @@ def _refine_by_motion(
 ) -> EndBehaviour:
     """Returns the behaviour of a joint, refined by the direction of its motion.
 
-    A joint drifts if every quarter of the judged half contributes at least half of its share in
-    one direction, and if its mean speed is at least half of the largest: a joint that swings on
-    its way does not drift. A bounded oscillation changes its sign. A joint that is slow enough
-    to be at rest, but moves in one direction, is undecided.
+    A joint drifts if it moves by at least an eighth of its way in each quarter of the judged
+    half, always in one direction, and if its mean speed is at least half of its largest speed:
+    a joint that swings on its way does not drift. A bounded oscillation changes its sign. A
+    joint that is slow enough to be at rest, but moves in one direction, is undecided.
 
     Args:
         behaviour: behaviour by the trends.
@@ -560,13 +612,19 @@ def _refine_by_motion(
     may_rest = behaviour is EndBehaviour.CONVERGED and not still
     if not (behaviour in _MAY_DRIFT or may_rest) or len(t_s) < BUCKETS_PER_S:
         return behaviour
-    half = int(np.searchsorted(t_s, 0.5 * (t_s[0] + t_s[-1])))
-    marks = np.linspace(half, len(t_s) - 1, 5).round().astype(int)
-    steps = np.diff(q[marks])
-    total = abs(float(steps.sum()))
-    least_step = float((steps * np.sign(steps.sum())).min())
+    middle_s = 0.5 * (t_s[0] + t_s[-1])
+    half = int(np.searchsorted(t_s, middle_s))
+    quarters = np.linspace(half, len(t_s) - 1, 5).round().astype(int)
+    steps = np.diff(q[quarters])
+    way = steps.sum()
+    total = abs(float(way))
+    steps_along_way = steps * np.sign(way)
+    least_step = float(steps_along_way.min())
     is_one_way = least_step >= 0.125 * total
-    if is_one_way and total >= 0.5 * (t_s[-1] - t_s[half]) * speed[half:].max():
+    half_s = t_s[-1] - t_s[half]
+    largest_speed = speed[half:].max()
+    is_direct = total >= 0.5 * half_s * largest_speed
+    if is_one_way and is_direct:
         if total >= DRIFT_RAD:
             return EndBehaviour.DRIFTS
         if total >= SETTLED_ERROR_RAD and behaviour is EndBehaviour.CONVERGED:
@@ -580,7 +638,9 @@ def _refine_by_motion(
 def _count_sign_changes(values: Array) -> int:
     """Returns how often values cross their mean."""
     signs = np.sign(values - values.mean())
-    return int(np.count_nonzero(np.diff(signs[signs != 0.0])))
+    nonzero_signs = signs[signs != 0.0]
+    changes = np.diff(nonzero_signs)
+    return int(np.count_nonzero(changes))
 
 
 def find_coupled_sites(scenario: Scenario) -> list[list[int]]:
@@ -593,15 +653,18 @@ def find_coupled_sites(scenario: Scenario) -> list[list[int]]:
         for peer, share in change.to.items():
             total_shares[site, scenario.names.index(peer)] += share
     reach = find_reach(total_shares + total_shares.T)
-    # each group once, in the order of its first site
-    groups = dict.fromkeys(tuple(np.flatnonzero(row).tolist()) for row in reach)
-    return [list(group) for group in groups]
+    groups: list[list[int]] = []
+    for reached in reach:
+        group = np.flatnonzero(reached).tolist()
+        if group not in groups:
+            groups.append(group)
+    return groups
 
 
 def _find_disagreement(
     scenario: Scenario, trace: RunTrace, t_s: Array, columns: Sequence[Array]
 ) -> Iterable[str]:
-    """Yields a sentence for each group of coupled sites that end apart, but are not held.
+    """Yields a sentence for each group of coupled sites that end far apart without being held.
 
     Args:
         scenario: scenario of the run.
@@ -611,32 +674,42 @@ def _find_disagreement(
     """
     for group in find_coupled_sites(scenario):
         names = [scenario.names[n] for n in group]
-        compares_positions = any(
-            scenario.sites[name].control.compares_positions for name in names
-        )
-        shares_pose = any(scenario.arms[name].shares_pose for name in names)
-        if len(group) < 2 or compares_positions or shares_pose:
-            continue  # e itself shows whether the sites agree
+        if len(group) < 2 or _compares_sites_by_error(scenario, names):
+            continue
         q = np.array([columns[n][:, 2] for n in group])
         distance = np.ptp(q, axis=0)
         joint = int(distance[-1].argmax())
         end_distance = distance[-1, joint]
         envelope = distance.max(axis=1, keepdims=True)
-        is_approaching = fit_envelopes(t_s, envelope)[0].trend is EnvelopeTrend.DECAYS
+        (fit,) = fit_envelopes(t_s, envelope)
+        is_approaching = fit.trend is EnvelopeTrend.DECAYS
+
         largest_torque = max(np.abs(trace.tau_x[n]).max() for n in group)
         largest_error = max(columns[n][-1, 0].max() for n in group)
         is_held = largest_torque > FORCE_NM and largest_error > HELD_SHARE * end_distance
-        held_sites = _find_held_sites(scenario, trace, joint, float(t_s[-1]))[group]
-        held_q = q[held_sites, -1, joint]
-        if len(held_q) and end_distance - np.ptp(held_q) < AGREEMENT_RAD:
-            is_held = True
+        end_q = q[:, -1, joint]
+        holds = _find_held_sites(scenario, trace, joint, float(t_s[-1]))
+        held_q = end_q[holds[group]]
+        if len(held_q):
+            # the held sites are nearly as far apart as all sites
+            is_held |= bool(end_distance - np.ptp(held_q) < AGREEMENT_RAD)
+
         if end_distance > AGREEMENT_RAD and not (is_approaching or is_held):
-            lowest = names[int(np.argmin(q[:, -1, joint]))]
-            highest = names[int(np.argmax(q[:, -1, joint]))]
+            lowest = names[int(np.argmin(end_q))]
+            highest = names[int(np.argmax(end_q))]
             yield (
                 f"{lowest} and {highest} stand {end_distance:.3g} rad apart, "
                 "and nothing holds them there"
             )
+
+
+def _compares_sites_by_error(scenario: Scenario, sites: Iterable[str]) -> bool:
+    """True if |e| itself shows whether some sites agree."""
+    for site in sites:
+        compares_positions = scenario.sites[site].control.compares_positions
+        if compares_positions or scenario.arms[site].shares_pose:
+            return True
+    return False
 
 
 def _find_held_sites(
@@ -644,8 +717,9 @@ def _find_held_sites(
 ) -> NDArray[np.bool_]:
     """Returns the sites at which a joint is held at the end, by the stiffness of a source.
 
-    A hand holds its arm even without torque, at the position that it wants; an environment
-    only if it is touched. Sources of an own kind are assumed to hold.
+    A hand holds its arm even if its torque is zero, because the arm is then at the hand's
+    target. An environment holds an arm only while the arm touches it. User-written sources are
+    assumed to hold.
 
     Args:
         scenario: scenario of the run.
@@ -664,7 +738,8 @@ def _find_held_sites(
             if actor.kind == TorqueKind.HAND:
                 stiffness = actor.K[joint : joint + 1]
             is_stiff = any(stiffness) or actor.kind in OWN_KINDS
-            held[n] |= actor.start_s <= end_s < actor.end_s and is_stiff
+            acts_at_end = actor.start_s <= end_s < actor.end_s
+            held[n] |= acts_at_end and is_stiff
     return held
 
 
@@ -677,12 +752,14 @@ def _find_odd_pose(scenario: Scenario, sites: Sequence[Array]) -> Iterable[str]:
     """
     starts = [np.array(spec.q0_rad) for spec in scenario.sites.values()]
     ends = [site[-1, 2, : len(start)] for site, start in zip(sites, starts, strict=True)]
-    hanging = find_hanging_sites(scenario, dict(zip(scenario.names, ends, strict=True)))
+    end_by_site = dict(zip(scenario.names, ends, strict=True))
+    hanging = find_hanging_sites(scenario, end_by_site)
     if hanging:
         verb = "hangs" if len(hanging) == 1 else "hang"
         yield f"{', '.join(hanging)} {verb}: the arms fell"
         return
-    # per site the largest distance of a joint from the range of all start poses of such arms
+    # for each site, the largest distance of a joint from the range of the start poses of all
+    # arms with as many joints
     distances = []
     for end in ends:
         similar = np.array([q for q in starts if len(q) == len(end)])
@@ -699,7 +776,7 @@ def _find_odd_pose(scenario: Scenario, sites: Sequence[Array]) -> Iterable[str]:
 
 
 def find_hanging_sites(scenario: Scenario, ends: Mapping[str, Array]) -> list[str]:
-    """Returns the sites whose arms hang at the end, and did not at the start.
+    """Returns the sites whose arms hang at the end, but did not hang at the start.
 
     Args:
         scenario: scenario of the run.
@@ -709,7 +786,8 @@ def find_hanging_sites(scenario: Scenario, ends: Mapping[str, Array]) -> list[st
     for site, q in ends.items():
         arm = build_arm_rows(scenario, site)
         start = np.array(scenario.sites[site].q0_rad)
-        if arm.hanging_angle(q) < HANGING_RAD <= arm.hanging_angle(start):
+        hangs = arm.hanging_angle(q) < HANGING_RAD
+        if hangs and arm.hanging_angle(start) >= HANGING_RAD:
             hanging.append(site)
     return hanging
 
@@ -722,45 +800,57 @@ def find_last_operator_action(scenario: Scenario, span_s: float) -> float:
     t_s = np.arange(0.0, span_s, 1.0 / BUCKETS_PER_S)
     last_s = 0.0
     for site, spec in scenario.sites.items():
+        arm = build_arm_rows(scenario, site)
         start = np.array([spec.q0_rad])
-        J = build_arm_rows(scenario, site).place_end_effector(start, 0.0 * start).J[0]
+        at_start = arm.place_end_effector(start, 0.0 * start)
         for hand in spec.hands:
             source = hand.actor
             if source.kind in LIVE_KINDS:
                 continue
-            source_J = np.eye(len(source.a)) if source.a else J
+            source_J = np.eye(len(source.a)) if source.a else at_start.J[0]
             script = compute_operator_script(source, t_s, source_J)
-            is_change = np.abs(np.diff(script, axis=0)).max(axis=1, initial=0.0) > 0.0
+            steps = np.abs(np.diff(script, axis=0))
+            is_change = steps.max(axis=1, initial=0.0) > 0.0
             last_change_s = float(t_s[1:][is_change].max(initial=0.0))
-            edges_s = [edge_s for edge_s in (source.start_s, source.end_s) if edge_s < span_s]
-            last_s = max(last_s, *edges_s, last_change_s)
+            last_s = max(last_s, last_change_s)
+            for edge_s in (source.start_s, source.end_s):
+                if edge_s < span_s:
+                    last_s = max(last_s, edge_s)
     return last_s
 
 
 def find_last_change(scenario: Scenario, span_s: float) -> float:
     """Returns the last time before `span_s` at which the loop changed, in s; 0 if it never did.
 
-    The timeline changes the loop, and so do environments that start or end.
+    Changes are those of the timeline, and the starts and ends of environments. A change with a
+    ramp lasts until the end of its ramp.
     """
     changes = [change for change in scenario.timeline if change.at_s < span_s]
-    change_times_s = [change.at_s + change.ramp_s for change in changes]
+    change_times_s = [0.0, *(change.at_s + change.ramp_s for change in changes)]
     for spec in scenario.sites.values():
         for source in spec.environment:
             edges_s = (source.actor.start_s, source.actor.end_s)
             change_times_s += [edge_s for edge_s in edges_s if edge_s < span_s]
-    return max([0.0, *change_times_s])
+    return max(change_times_s)
 
 
 def _find_frequency_hz(parts: list[SiteLog]) -> float | None:
     """Returns the frequency of the fastest joint in the second half, by its changes of sign.
 
-    Returns None if it changes its sign too rarely.
+    Returns None if the joint changes its sign too rarely.
     """
-    halves = [(part, part.qd[len(part) // 2 :]) for part in parts]
-    part, half = max(halves, key=lambda pair: float(np.abs(pair[1]).max()))
-    fastest = int(np.abs(half).max(axis=0).argmax())
-    crossings = _count_sign_changes(half[:, fastest])
+
+    def find_speeds(part: SiteLog) -> Array:
+        second_half = part.qd[len(part) // 2 :]
+        speeds: Array = np.abs(second_half).max(axis=0)
+        return speeds
+
+    part = max(parts, key=lambda part: float(find_speeds(part).max()))
+    fastest = int(find_speeds(part).argmax())
+    middle = len(part) // 2
+    crossings = _count_sign_changes(part.qd[middle:, fastest])
     if crossings < MIN_SIGN_CHANGES:
         return None
-    span_s = float(part.tick[-1] - part.tick[len(part) // 2]) / part.rate_hz
+    ticks = float(part.tick[-1] - part.tick[middle])
+    span_s = ticks / part.rate_hz
     return 0.5 * crossings / span_s

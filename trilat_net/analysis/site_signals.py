@@ -1,8 +1,8 @@
-"""Provides a site's signals as columns over its records, and its settling time.
+"""Signals of a site as columns over its records, and the site's settling time.
 
-For plots, columns are decimated: every bucket keeps the minimum and the maximum of every
-column, so that a spike of one tick at 1 kHz stays visible. A row of NaN stands in every gap
-that is wider than a bucket.
+For plots, columns are decimated: each bucket of records keeps the minimum and the maximum of
+each column, so that a spike of one tick at 1 kHz stays visible. A gap in the records that is
+wider than a bucket becomes a row of NaN.
 
 Invariant:
     - Each signal has one definition, for figures, page, summary and metrics.
@@ -23,9 +23,7 @@ from ..log.record_columns import Ints
 from ..log.site_log import SiteLog
 
 SETTLED_ERROR_RAD = 1e-2
-"""A site has settled once no error of a joint (rad) or along an axis (m) exceeds this any
-more.
-"""
+"""A site has settled when all errors of joints (rad) or along axes (m) stay below this."""
 
 
 Signal = Callable[[SiteLog], Array]
@@ -37,19 +35,24 @@ joint_errors: Signal = attrgetter("e")
 controller_torques: Signal = attrgetter("tau")
 """tau, Eq. (13), shape (K, n), N m."""
 parameter_estimates: Signal = attrgetter("theta_hat")
-"""theta_hat, Eq. (15), shape (K, P), kg m^2 and kg m: P = 5 for the planar arm, 10 n for a
-chain.
+"""theta_hat, Eq. (15), shape (K, P), kg m^2 and kg m.
+
+P is 5 for the planar arm and 10 n for a chain.
 """
 
 
 def reference_angles(part: SiteLog) -> Array:
-    """Returns q_des, Eq. (6), shape (K, n), rad; q in task space, where joints have none."""
+    """Returns q_des, Eq. (6), shape (K, n), rad.
+
+    In task space the joints have no reference, and q is returned.
+    """
     return part.q if part.layout.task else part.q_des
 
 
 def follows_in_task_space(log: Log) -> bool:
-    """True if sites follow with their end effectors, so that errors are those along axes."""
-    return any(arm.shares_pose for arm in log.scenario.arms.values())
+    """True if sites follow with their end effectors: their errors are those along axes."""
+    arms = log.scenario.arms.values()
+    return any(arm.shares_pose for arm in arms)
 
 
 def joint_error_rates(part: SiteLog) -> Array:
@@ -58,75 +61,94 @@ def joint_error_rates(part: SiteLog) -> Array:
     In task space xd - xd_des is returned, shape (K, m).
     """
     if part.layout.task:
-        rates: Array = (part.xd - part.qd_des) * np.array(part.axes)
+        # in task space the column qd_des holds xd_des
+        velocity_error = part.xd - part.qd_des
+        followed_axes = np.array(part.axes)
+        rates: Array = velocity_error * followed_axes
         return rates
     return part.qd - part.qd_des
 
 
 def shared_unit(log: Log) -> str:
     """Returns the unit of the shared coordinates and their errors: "rad", "m" or "m, rad"."""
-    space = log.scenario.sites[log.sites[0]].task.space
-    return {"joints": "rad", "position": "m"}.get(space, "m, rad")
+    first_site = log.sites[0]
+    space = log.scenario.sites[first_site].task.space
+    if space == "joints":
+        return "rad"
+    return "m" if space == "position" else "m, rad"
 
 
 def external_torques(part: SiteLog) -> Array:
-    """Returns the torque of operator and environment ON the arm, shape (K, n), N m.
-
-    It is the negative of tau_x.
-    """
+    """Returns -tau_x, the torque of operator and environment ON the arm, shape (K, n), N m."""
     return 0.0 - part.tau_x  # 0 - 0 is 0, but -0 would be printed as -0
 
 
 def sample_ages_ms(log: Log, site: str) -> Array:
-    """Returns the age of the sample in use by peer, shape (K, N - 1), ms.
+    """Returns the age of each peer's sample in use, one column per peer, ms.
 
-    Ages before a peer's first sample are NaN.
+    Its shape is (K, N - 1). Ages before a peer's first sample are NaN.
     """
     part = log[site]
-    columns = [part.age_s(peer, log.scenario.sites[peer].rate_hz) * 1e3 for peer in part.peers]
-    return np.array(columns).reshape(len(part.peers), len(part)).T
+    columns = []
+    for peer in part.peers:
+        rate_hz = log.scenario.sites[peer].rate_hz
+        columns.append(part.age_s(peer, rate_hz) * 1e3)
+    shape = (len(part.peers), len(part))
+    return np.array(columns).reshape(shape).T
 
 
 def sites_with_operator(log: Log) -> list[str]:
-    """Returns the sites with an operator, by the scenario or by the records."""
-    specs = log.scenario.sites
-    return [site for site in log.sites if specs[site].hands or np.any(log[site].tau_x)]
+    """Returns the sites that have hands in the scenario, or external torques in the records."""
+    sites = []
+    for site in log.sites:
+        has_hands = bool(log.scenario.sites[site].hands)
+        if has_hands or np.any(log[site].tau_x):
+            sites.append(site)
+    return sites
 
 
 def largest_magnitude(values: Array) -> Array:
     """Returns the largest absolute value of each row, shape (K,)."""
-    magnitude: Array = np.abs(values).max(axis=1, initial=0.0)
-    return magnitude
+    magnitudes = np.abs(values)
+    largest: Array = magnitudes.max(axis=1, initial=0.0)
+    return largest
 
 
 def largest_remaining_error(part: SiteLog) -> Array:
     """Returns the largest error of any joint from each record to the last, shape (K,), rad."""
     largest = largest_magnitude(joint_errors(part))
-    return np.maximum.accumulate(largest[::-1])[::-1]
+    from_the_end = np.maximum.accumulate(largest[::-1])
+    return from_the_end[::-1]
 
 
 def settling_time_s(part: SiteLog) -> float | None:
     """Returns the last time at which an error exceeded `SETTLED_ERROR_RAD`, in s.
 
-    Returns 0 if no error ever exceeded it, and None if an error still does in the last record.
+    Returns 0 if no error ever exceeded the bound, and None if an error of the last record
+    exceeds it.
     """
     if not len(part):
         return None
-    above = np.flatnonzero(largest_remaining_error(part) > SETTLED_ERROR_RAD)
-    if not len(above):
+    is_above = largest_remaining_error(part) > SETTLED_ERROR_RAD
+    rows_above = np.flatnonzero(is_above)
+    if not len(rows_above):
         return 0.0
-    last = above[-1]
-    return None if last == len(part) - 1 else float(part.t_s[last])
+    last_row = rows_above[-1]
+    if last_row == len(part) - 1:
+        return None
+    return float(part.t_s[last_row])
 
 
 def settling_time_of_all_s(times_s: Sequence[float | None]) -> float | None:
     """Returns the time at which the last site has settled, in s; None if some site has not."""
     settled_s = [time_s for time_s in times_s if time_s is not None]
-    return max(settled_s) if len(settled_s) == len(times_s) else None
+    if len(settled_s) < len(times_s):
+        return None
+    return max(settled_s)
 
 
 def operator_displacement(log: Log, twin: Log, site: str) -> tuple[Ints, Array, Array]:
-    """Returns how far operators displaced a site, against a twin of the run without operators.
+    """Returns how far a site is displaced from a twin of the run without operators.
 
     Args:
         log: the log of the run.
@@ -140,15 +162,16 @@ def operator_displacement(log: Log, twin: Log, site: str) -> tuple[Ints, Array, 
     """
     part = log[site]
     twin_part = twin[site]
-    tick, rows, twin_rows = np.intersect1d(
+    common_tick, rows, twin_rows = np.intersect1d(
         part.tick, twin_part.tick, assume_unique=True, return_indices=True
     )
-    displacement = joint_angles(part)[rows] - joint_angles(twin_part)[twin_rows]
-    return tick, part.t_s[rows], displacement
+    q = joint_angles(part)[rows]
+    twin_q = joint_angles(twin_part)[twin_rows]
+    return common_tick, part.t_s[rows], q - twin_q
 
 
 class DecimatedTrace(NamedTuple):
-    """C columns over P ticks, ready to be drawn; a row of NaN stands in every visible gap.
+    """C columns over P ticks, ready to be drawn; each visible gap is a row of NaN.
 
     Attributes:
         tick: ticks, shape (P,).
@@ -164,7 +187,8 @@ class DecimatedTrace(NamedTuple):
 def extreme_rows(values: Array, buckets: int) -> Ints:
     """Returns the rows to keep: the first, the last, and each bucket's extremes per column.
 
-    Buckets are equal runs of rows. NaN is no extreme, but a bucket of NaN alone keeps a row.
+    Buckets have equal numbers of rows. NaN is never an extreme; a bucket in which a column is
+    NaN throughout keeps its first row.
 
     Args:
         values: the columns, shape (K, C).
@@ -173,23 +197,29 @@ def extreme_rows(values: Array, buckets: int) -> Ints:
     rows, columns = values.shape
     if rows <= 2 * buckets or not columns:
         return np.arange(rows)
+    # quotients are rounded up
     size = -(-rows // buckets)
+    filled_buckets = -(-rows // size)
     # the last bucket is filled up with its last row, which changes no extreme
-    filled_rows = np.arange(-(-rows // size) * size)
+    filled_rows = np.arange(filled_buckets * size)
     index = np.minimum(filled_rows, rows - 1).reshape(-1, size)
-    bucket = np.arange(len(index))
-    keep = [np.array([0, rows - 1])]
+    bucket = np.arange(filled_buckets)
+    ends = np.array([0, rows - 1])
+    keep = [ends]
     for column in range(columns):
         block = values[index, column]
         missing = np.isnan(block)
         lowest = np.where(missing, np.inf, block).argmin(1)
         highest = np.where(missing, -np.inf, block).argmax(1)
-        keep += [index[bucket, lowest], index[bucket, highest]]
+        keep.append(index[bucket, lowest])
+        keep.append(index[bucket, highest])
     return np.unique(np.concatenate(keep))
 
 
 def decimate(tick: Ints, t_s: Array, values: Array, buckets: int) -> DecimatedTrace:
-    """Returns a trace with at most 2 C + 3 points per bucket; a bucket per pixel is enough.
+    """Returns a trace of at most 2 C + 3 points per bucket, C being the number of columns.
+
+    One bucket per pixel is enough.
 
     Args:
         tick: ascending ticks, shape (K,).
@@ -200,17 +230,22 @@ def decimate(tick: Ints, t_s: Array, values: Array, buckets: int) -> DecimatedTr
     if not len(tick):
         return DecimatedTrace(tick, t_s, values)
     # narrower gaps are narrower than a pixel, and there may be thousands of them
-    bucket_ticks = max(1.0, (tick[-1] - tick[0]) / buckets)
+    ticks = tick[-1] - tick[0]
+    bucket_ticks = max(1.0, ticks / buckets)
     before_gap = np.flatnonzero(np.diff(tick) > bucket_ticks)
     after_gap = before_gap + 1
-    keep = np.union1d(extreme_rows(values, buckets), np.concatenate([before_gap, after_gap]))
-    inserted_at = np.searchsorted(keep, before_gap) + 1
-    period_s = t_s[:0]
-    if len(before_gap):
-        gap_ticks = tick[after_gap] - tick[before_gap]
-        period_s = (t_s[after_gap] - t_s[before_gap]) / gap_ticks
+    beside_gaps = np.concatenate([before_gap, after_gap])
+    keep = np.union1d(extreme_rows(values, buckets), beside_gaps)
+
+    # the row of NaN is one period after the last record before the gap
+    gap_ticks = tick[after_gap] - tick[before_gap]
+    gap_s = t_s[after_gap] - t_s[before_gap]
+    period_s = gap_s / gap_ticks
+    nan_position = np.searchsorted(keep, before_gap) + 1
+    nan_tick = tick[before_gap] + 1
+    nan_t_s = t_s[before_gap] + period_s
     return DecimatedTrace(
-        tick=np.insert(tick[keep], inserted_at, tick[before_gap] + 1),
-        t_s=np.insert(t_s[keep], inserted_at, t_s[before_gap] + period_s),
-        values=np.insert(values[keep], inserted_at, np.nan, axis=0),
+        tick=np.insert(tick[keep], nan_position, nan_tick),
+        t_s=np.insert(t_s[keep], nan_position, nan_t_s),
+        values=np.insert(values[keep], nan_position, np.nan, axis=0),
     )

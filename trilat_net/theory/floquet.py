@@ -17,7 +17,8 @@ eta_{k+1} = eta_k + h f_k.
 Scheme `digital`: theta_k = eta_k, eta_{k+1} = eta_k + h f_k, and the torque on the arm is
 tau_k.
 
-The memory of an imported law is eta too: with h f = m_k - m_{k-1} it is the law's own value.
+The memory m of an imported law is treated as an estimate with h f = m_k - m_{k-1}: eta is then
+the law's own value.
 
 Invariant:
     - No delay is averaged. Where delays and rates repeat after T, the roots are exact. Where
@@ -59,9 +60,10 @@ from .operating_point import Equilibrium, OperatingConditions
 
 
 def discretise_zero_order_hold(A: Array, B: Array, h_s: float) -> tuple[Array, Array]:
-    """Returns x' = A x + B u over a period with u held, as the matrices of x and u.
+    """Returns the matrices Phi and Gamma of x' = A x + B u over a period with u held.
 
-    They are exp(A h) and int_0^h exp(A s) ds B, computed as one matrix exponential: Van Loan,
+    The state after a period is Phi x + Gamma u, with Phi = exp(A h) and
+    Gamma = int_0^h exp(A s) ds B. Both are computed as one matrix exponential: Van Loan,
     "Computing integrals involving the matrix exponential", IEEE Trans. Automatic Control 23
     (1978).
 
@@ -109,30 +111,27 @@ def linearise_site_tick(site: SiteSetup, jacobian: SiteJacobian) -> SiteTickMap:
     is_second_order = site.scheme is Scheme.SECOND_ORDER
     uses_trapezoid = is_second_order and site.gains.law is Law.ADAPTIVE
     motion = slice(0, layout.qd.stop)
-    memory = layout.estimate  # the same slice of the arguments and of X
-    state_count = layout.states + (joints if is_second_order else 0)
-    input_count = layout.inputs.stop - layout.inputs.start
-    arguments_by_inputs = np.eye(layout.arguments, input_count, -layout.inputs.start)
-    arguments_by_X = np.eye(layout.arguments, state_count)
+    # the same slice of the arguments and of X
+    memory = layout.estimate
+    states = list(jacobian.states)
+    if is_second_order:
+        states += [f"tau{joint + 1}" for joint in range(joints)]
+    first_input = layout.inputs.start
+    input_count = layout.inputs.stop - first_input
+    arguments_by_inputs = np.eye(layout.arguments, input_count, -first_input)
+    arguments_by_X = np.eye(layout.arguments, len(states))
     arguments_by_X[layout.states :] = 0.0
-    # an imported law may use the external torque, which then acts on the arm twice
-    torque_by_external = np.eye(joints) + rates.tau[:, layout.external_torque]
-    qdd_by_external = rates.qdd[:, layout.external_torque]
-    inverse_inertia = np.linalg.solve(torque_by_external.T, qdd_by_external.T).T
-    zero = np.zeros((joints, joints))
-    free_motion = rates.qdd[:, motion] - inverse_inertia @ (rates.tau + rates.held)[:, motion]
-    Phi, Gamma = discretise_zero_order_hold(
-        np.block([[zero, np.eye(joints)], [free_motion]]),
-        np.vstack([zero, inverse_inertia]),
-        h_s,
-    )
+    Phi, Gamma = _discretise_arm(jacobian, h_s)
 
     def compute_control(arguments: Array) -> Array:
-        """Returns the controller's part of X', for arguments as a matrix of a vector."""
+        """Returns the controller's part of X'; each column holds arguments of the rates."""
         f = rates.estimate @ arguments
-        correction = 0.5 * h_s * rates.tau[:, memory] @ f if uses_trapezoid else 0.0
+        correction: Array | float = 0.0
+        if uses_trapezoid:
+            correction = 0.5 * h_s * rates.tau[:, memory] @ f
         tau = rates.tau @ arguments + correction
-        u = (1.5 if is_second_order else 1.0) * tau + rates.held @ arguments
+        factor = 1.5 if is_second_order else 1.0
+        u = factor * tau + rates.held @ arguments
         rows = [Gamma @ u, h_s * f]
         if is_second_order:
             rows.append(tau)
@@ -142,13 +141,38 @@ def linearise_site_tick(site: SiteSetup, jacobian: SiteJacobian) -> SiteTickMap:
     Q = compute_control(arguments_by_inputs)
     P[motion, motion] += Phi
     P[memory, memory] += np.eye(layout.parameters)
-    states = list(jacobian.states)
     if is_second_order:
         P[motion, memory.stop :] -= 0.5 * Gamma
-        states += [f"tau{joint + 1}" for joint in range(joints)]
-    output = np.zeros((3 * layout.coordinates, state_count))
+    output = np.zeros((3 * layout.coordinates, len(states)))
     output[:, : layout.states] = jacobian.output
-    return SiteTickMap(P, Q, output, tuple(f"{site.name}.{state}" for state in states))
+    names = tuple(f"{site.name}.{state}" for state in states)
+    return SiteTickMap(P, Q, output, names)
+
+
+def _discretise_arm(jacobian: SiteJacobian, h_s: float) -> tuple[Array, Array]:
+    """Returns the matrices of an arm over a tick under a held torque.
+
+    Args:
+        jacobian: derivatives of the site's rates.
+        h_s: length of a tick, s.
+    """
+    layout = jacobian.layout
+    rates = jacobian.rates
+    joints = layout.joints
+    motion = slice(0, layout.qd.stop)
+    external = layout.external_torque
+    # an imported law may use the external torque, which then acts on the arm twice
+    torque_by_external = np.eye(joints) + rates.tau[:, external]
+    qdd_by_external = rates.qdd[:, external]
+    inverse_inertia = np.linalg.solve(torque_by_external.T, qdd_by_external.T).T
+    # the torque that is held over the tick does not act on the free arm
+    torque = rates.tau + rates.held
+    qdd_by_torque = inverse_inertia @ torque[:, motion]
+    free_qdd = rates.qdd[:, motion] - qdd_by_torque
+    zero = np.zeros((joints, joints))
+    A = np.block([[zero, np.eye(joints)], [free_qdd]])
+    B = np.vstack([zero, inverse_inertia])
+    return discretise_zero_order_hold(A, B, h_s)
 
 
 class CoupledTicks(NamedTuple):
@@ -171,32 +195,38 @@ class CoupledTicks(NamedTuple):
 
 def couple_ticks(conditions: OperatingConditions, rest: Equilibrium) -> CoupledTicks:
     """Returns the sites over a tick, and their effects, without constant states."""
-    sites = differentiate_rates(conditions, rest)
-    maps = [
-        linearise_site_tick(site, jacobian)
-        for site, jacobian in zip(conditions.sites, sites, strict=True)
-    ]
-    owners = np.repeat(np.arange(len(maps)), [len(tick_map.P) for tick_map in maps])
-    couplings = compute_couplings(conditions, rest, sites)
+    jacobians = differentiate_rates(conditions, rest)
+    maps = []
+    for site, jacobian in zip(conditions.sites, jacobians, strict=True):
+        maps.append(linearise_site_tick(site, jacobian))
+    sizes = [len(tick_map.P) for tick_map in maps]
+    owners = np.repeat(np.arange(len(maps)), sizes)
+    names = [name for tick_map in maps for name in tick_map.names]
+
+    couplings = compute_couplings(conditions, rest, jacobians)
     effects = np.zeros((len(couplings), len(owners), len(owners)))
     for effect, ((i, j), coupling) in zip(effects, couplings.items(), strict=True):
         block = np.ix_(owners == i, owners == j)
         effect[block] = maps[i].Q @ coupling @ maps[j].output
-    changes = block_diag(*(tick_map.P for tick_map in maps)) - np.eye(len(owners))
-    names = [name for tick_map in maps for name in tick_map.names]
+
     # the moving part is found as for rates; numbers of pairs stand in for their delays
-    changes_pencil = Pencil(changes, np.arange(len(effects)), effects)
+    S = block_diag(*(tick_map.P for tick_map in maps))
+    changes = S - np.eye(len(owners))
+    pair_numbers = np.arange(len(effects))
+    changes_pencil = Pencil(changes, pair_numbers, effects)
     moving, moving_names, constant = extract_moving_part(changes_pencil, names)
     pairs = list(couplings)
-    moving_effects = {
-        pairs[int(n)]: effect for n, effect in zip(moving.delays, moving.Ad, strict=True)
-    }
+    moving_effects = {}
+    for n, effect in zip(moving.delays, moving.Ad, strict=True):
+        moving_effects[pairs[int(n)]] = effect
+    moving_states = [names.index(name) for name in moving_names]
+    omitted = sum(jacobian.omitted_states for jacobian in jacobians)
     return CoupledTicks(
         S=moving.A + np.eye(len(moving_names)),
         effects=moving_effects,
         names=moving_names,
-        owners=owners[[names.index(name) for name in moving_names]],
-        constant=constant + sum(site.omitted_states for site in sites),
+        owners=owners[moving_states],
+        constant=constant + omitted,
     )
 
 
@@ -207,12 +237,12 @@ DRAWN_SPAN_S = 30.0
 _LEAST_SPAN_S = 0.5
 """The shortest analysed span.
 
-Periods that are shorter, or shorter than twice the ages, are repeated.
+Shorter periods, and periods shorter than twice the ages, are repeated.
 """
 _SLIP = 0.05
-"""Delays that repeat within this share of a tick count as repeating.
+"""Delays count as repeating after a span if they repeat within this share of a tick.
 
-If none do, the span with the smallest slip counts, up to half a tick.
+If there is no such span, the span with the smallest slip is used, up to half a tick.
 """
 _PART_TICKS = 100
 """Ticks of the fastest site after which columns are scaled.
@@ -230,6 +260,7 @@ _LOOSE_RESIDUAL = 1e-4
 _SMALLEST = 1e-7
 """Multipliers below this share of the largest are not searched."""
 _SAME_ROOT = 1e-6
+"""Roots that differ by less than this, absolutely or relatively, count as equal."""
 
 
 class SamplesInUse(NamedTuple):
@@ -237,8 +268,8 @@ class SamplesInUse(NamedTuple):
 
     Attributes:
         span_s: length of the span, s.
-        used: by (i, j) the sample of site j at each tick of site i, counted from the sample of
-            the span's beginning.
+        used: by (i, j) the number of the sample of site j that site i uses at each of its
+            ticks, counted from the sample at the beginning of the span.
         period_s: period of delays and tick rates, which divides the span, s; None: they do not
             repeat.
     """
@@ -253,56 +284,88 @@ def _find_cycle_s(link: LinkBase) -> float:
     model = link.to_core_model()
     points = link.points
     if points is not None and model.kind == DelayKind.TRACE and len(points) > 1:
-        # the last point lasts as long as the one before
-        return float(2 * points[-1, 0] - points[-2, 0]) * 1e-6
+        # the last point lasts as long as the point before it
+        last_us = points[-1, 0]
+        end_us = 2 * last_us - points[-2, 0]
+        return float(end_us) * 1e-6
     if model.kind == DelayKind.SINE:
         return float(model.extra) * 1e-6
     return 0.0
+
+
+def _is_ending_trace(link: LinkBase) -> bool:
+    """True if a link plays a trace that does not repeat."""
+    model = link.to_core_model()
+    return model.kind == DelayKind.TRACE and model.at_end == TraceEnd.HOLD
+
+
+def _find_period_s(links: Sequence[LinkBase], rates_hz: Sequence[int]) -> float | None:
+    """Returns the period after which tick rates and delays repeat, s; None if they do not.
+
+    Args:
+        links: the links whose delays vary.
+        rates_hz: tick rate of each site.
+    """
+    common_hz = math.gcd(*rates_hz)
+    span_count = round(MAX_PERIOD_S * common_hz)
+    spans_s = np.arange(1, span_count + 1) / common_hz
+    # share of a tick by which the delays fail to repeat after each span
+    slips = np.zeros(len(spans_s))
+    for link in links:
+        cycle_s = _find_cycle_s(link)
+        if not cycle_s:
+            continue
+        cycles = np.maximum(1.0, np.round(spans_s / cycle_s))
+        difference_s = np.abs(spans_s - cycle_s * cycles)
+        slips = np.maximum(slips, difference_s * max(rates_hz))
+    limit = max(_SLIP, float(slips.min()))
+    first_match = int(np.argmax(slips <= limit))
+    for link in links:
+        if link.random or _is_ending_trace(link):
+            return None
+    if slips[first_match] > 0.5:
+        return None
+    return float(spans_s[first_match])
 
 
 def find_samples_in_use(conditions: OperatingConditions) -> SamplesInUse:
     """Returns the samples in use over the period of delays and rates, or over a drawn span."""
     rates_hz = [site.rate_hz for site in conditions.sites]
     common_hz = math.gcd(*rates_hz)
-    links = [link for link, _ in conditions.links.values()] if conditions.varying else []
-    spans_s = np.arange(1, round(MAX_PERIOD_S * common_hz) + 1) / common_hz
-    # share of a tick by which the delays fail to repeat after each span
-    slips = np.zeros(len(spans_s))
-    for link in links:
-        cycle_s = _find_cycle_s(link)
-        if cycle_s:
-            cycles = np.maximum(1.0, np.round(spans_s / cycle_s))
-            slips = np.maximum(slips, np.abs(spans_s - cycle_s * cycles) * max(rates_hz))
-    first_match = int(np.argmax(slips <= max(_SLIP, float(slips.min()))))
-    is_drawn = any(link.random for link in links)
-    models = [link.to_core_model() for link in links]
-    has_ending_trace = any(
-        model.kind == DelayKind.TRACE and model.at_end == TraceEnd.HOLD for model in models
-    )
-    repeats = not is_drawn and not has_ending_trace and slips[first_match] <= 0.5
-    period_s = float(spans_s[first_match]) if repeats else None
-    reach_ms = max((sum(link.moments()) + link.playout_ms for link in links), default=0.0)
+    links: list[LinkBase] = []
+    if conditions.varying:
+        links = [link for link, _ in conditions.links.values()]
+    period_s = _find_period_s(links, rates_hz)
+    delays_ms = [sum(link.moments()) + link.playout_ms for link in links]
+    reach_ms = max(delays_ms, default=0.0)
     if period_s is not None:
         age_s = float(conditions.age_s.max())
         least_s = max(_LEAST_SPAN_S, 2.0 * age_s, 2e-3 * reach_ms)
-        span_s = period_s * math.ceil(least_s / period_s)
+        periods = math.ceil(least_s / period_s)
+        span_s = period_s * periods
     else:
+        is_drawn = any(link.random for link in links)
         longest_s = DRAWN_SPAN_S if is_drawn else MAX_PERIOD_S
         span_s = math.ceil(longest_s * common_hz) / common_hz
     # the span starts when samples no longer depend on the start of the run
-    start_s = math.ceil((4e-3 * reach_ms + 0.1) * common_hz) / common_hz
+    settled_s = 4e-3 * reach_ms + 0.1
+    start_s = math.ceil(settled_s * common_hz) / common_hz
+
     used = {}
     for i, j in conditions.coupled_pairs:
-        ticks = np.arange(round(span_s * rates_hz[i]))
+        hz = rates_hz[i]
+        peer_hz = rates_hz[j]
+        ticks = np.arange(round(span_s * hz))
         if conditions.varying:
-            first_tick = round(start_s * rates_hz[i])
             link, key = conditions.links[i, j]
-            drawn = draw_used_samples(link, key, rates_hz[i], rates_hz[j], start_s + span_s)
-            first_sample = round(start_s * rates_hz[j])
-            used[i, j] = np.maximum(drawn[first_tick + ticks], 0) - first_sample
+            drawn = draw_used_samples(link, key, hz, peer_hz, start_s + span_s)
+            first_tick = round(start_s * hz)
+            first_sample = round(start_s * peer_hz)
+            samples = drawn[first_tick + ticks]
+            used[i, j] = np.maximum(samples, 0) - first_sample
         else:
-            sample_times_s = ticks / rates_hz[i] - conditions.age_s[i, j]
-            used[i, j] = np.rint(sample_times_s * rates_hz[j]).astype(np.int64)
+            sample_times_s = ticks / hz - conditions.age_s[i, j]
+            used[i, j] = np.rint(sample_times_s * peer_hz).astype(np.int64)
     return SamplesInUse(span_s, used, period_s)
 
 
@@ -329,7 +392,7 @@ class _SpanPart(NamedTuple):
 def _plan_parts(
     ticks: Sequence[int], used: Mapping[tuple[int, int], IntArray], count: int
 ) -> list[_SpanPart]:
-    """Returns the order of all ticks of a span, in parts.
+    """Returns an order of all ticks of a span, in parts.
 
     Args:
         ticks: number of ticks of each site.
@@ -340,19 +403,25 @@ def _plan_parts(
     computable = {}
     for (i, j), samples in used.items():
         newest = np.maximum.accumulate(samples)
-        limits = np.searchsorted(newest, np.arange(ticks[j] + 1), side="right")
+        known = np.arange(ticks[j] + 1)
+        limits = np.searchsorted(newest, known, side="right")
         computable[i, j] = limits.tolist()
-    peers = [[j for i, j in used if i == site] for site in range(len(ticks))]
+    peers: list[list[int]] = [[] for _ in ticks]
+    for i, j in used:
+        peers[i].append(j)
     done = [0] * len(ticks)
     parts = []
     for n in range(1, count + 1):
         runs = []
+        # rounded up
         stops = [-(-total * n // count) for total in ticks]
         while done != stops:
             for i, stop in enumerate(stops):
-                until = min([stop, *(computable[i, j][done[j]] for j in peers[i])])
-                if until > done[i]:
-                    runs.append(_TickRun(i, done[i], until - done[i]))
+                limits = [computable[i, j][done[j]] for j in peers[i]]
+                until = min([stop, *limits])
+                first = done[i]
+                if until > first:
+                    runs.append(_TickRun(i, first, until - first))
                     done[i] = until
         parts.append(_SpanPart(runs, stops))
     return parts
@@ -384,37 +453,69 @@ class _SpanMap:
     """
 
     def __init__(self, loop: CoupledTicks, rates_hz: Sequence[int], uses: SamplesInUse) -> None:
-        n = len(loop.names)
-        self._states = [np.flatnonzero(loop.owners == i) for i in range(len(rates_hz))]
+        sites = range(len(rates_hz))
+        self._states = [np.flatnonzero(loop.owners == i) for i in sites]
         self._P = [loop.S[np.ix_(states, states)] for states in self._states]
+        # rows of each site's track before the tick at the start of the span, and that tick
         self._rows = [2] * len(rates_hz)
         used = {}
         for i, j in loop.effects:
             samples = uses.used[i, j]
-            # at tick k the newest sample is the last one before it
-            now = -(-np.arange(len(samples)) * rates_hz[j] // rates_hz[i])
+            ticks = np.arange(len(samples))
+            # the newest sample at a tick is the last sample before it; rounded up
+            now = -(-ticks * rates_hz[j] // rates_hz[i])
             used[i, j] = np.minimum(samples, now - 1)
-            self._rows[j] = max(self._rows[j], 1 + int((now - used[i, j]).max()))
+            oldest = int((now - used[i, j]).max())
+            self._rows[j] = max(self._rows[j], 1 + oldest)
         self._peer_effects: list[list[_PeerEffect]] = [[] for _ in rates_hz]
         for (i, j), samples in used.items():
-            effect = loop.effects[i, j][np.ix_(self._states[i], self._states[j])]
+            block = np.ix_(self._states[i], self._states[j])
+            effect = loop.effects[i, j][block]
             rows = samples + self._rows[j] - 1
             self._peer_effects[i].append(_PeerEffect(j, rows, effect))
         self._ticks = [round(uses.span_s * hz) for hz in rates_hz]
-        self._parts = _plan_parts(self._ticks, used, -(-max(self._ticks) // _PART_TICKS))
+        part_count = -(-max(self._ticks) // _PART_TICKS)
+        self._parts = _plan_parts(self._ticks, used, part_count)
         self.scales: list[float] = []
-        static_map = np.eye(n) - loop.S - sum(loop.effects.values())
+        self.neutral = self._find_constant_motions(loop)
+
+    def _find_constant_motions(self, loop: CoupledTicks) -> Array:
+        """Returns an orthonormal basis of the motions that stay constant for any delays."""
+        identity = np.eye(len(loop.names))
+        static_map = identity - loop.S - sum(loop.effects.values())
         _, values, right = np.linalg.svd(static_map)
-        constant_states = right[values <= ZERO_SHARE * values[0]].T
-        self.neutral = np.linalg.qr(self.build_constant_columns(constant_states))[0]
+        is_zero = values <= ZERO_SHARE * values[0]
+        constant_states = right[is_zero].T
+        columns = self.build_constant_columns(constant_states)
+        return np.linalg.qr(columns)[0]
 
     def build_constant_columns(self, X: Array) -> Array:
-        """Returns columns of which the past states all equal X, shape (n, columns)."""
-        blocks = [
-            np.tile(X[states], (rows, 1))
-            for states, rows in zip(self._states, self._rows, strict=True)
-        ]
+        """Returns columns whose past states all equal X, shape (n, columns)."""
+        blocks = []
+        for states, rows in zip(self._states, self._rows, strict=True):
+            blocks.append(np.tile(X[states], (rows, 1)))
         return np.vstack(blocks)
+
+    def divide_out_constant(self, V: Array) -> Array:
+        """Returns columns less their constant motions."""
+        constant_part = self.neutral @ (self.neutral.T @ V)
+        return V - constant_part
+
+    def _build_tracks(self, V: Array) -> list[Array]:
+        """Returns the track of each site: past states by the columns V, and room for the span.
+
+        A track has the shape (rows + ticks, n_i, columns).
+        """
+        columns = V.shape[1]
+        tracks = []
+        first = 0
+        for states, rows, ticks in zip(self._states, self._rows, self._ticks, strict=True):
+            size = rows * len(states)
+            past = V[first : first + size].reshape(rows, len(states), columns)
+            future = np.empty((ticks, len(states), columns))
+            tracks.append(np.concatenate([past, future]))
+            first += size
+        return tracks
 
     def apply(
         self, V: Array, *, divided: bool = True, sizes: list[Array] | None = None
@@ -430,49 +531,54 @@ class _SpanMap:
             The columns after the span, and the states of each site from the start of the span
             on, shape (ticks + 1, n_i, columns) each.
         """
-        shapes = [
-            (rows, len(states), V.shape[1])
-            for rows, states in zip(self._rows, self._states, strict=True)
-        ]
-        bounds = np.cumsum([rows * n for rows, n, _ in shapes])[:-1]
-        tracks = []
-        for block, shape, ticks in zip(np.split(V, bounds), shapes, self._ticks, strict=True):
-            future = np.empty((ticks, *shape[1:]))
-            tracks.append(np.concatenate([block.reshape(shape), future]))
+        columns = V.shape[1]
+        tracks = self._build_tracks(V)
         for n, part in enumerate(self._parts):
             for run in part.runs:
                 self._run_ticks(tracks, run)
-            last_states = [
-                track[stop : stop + shape[0]]
-                for track, stop, shape in zip(tracks, part.stops, shapes, strict=True)
-            ]
-            V = np.concatenate([states.reshape(-1, V.shape[1]) for states in last_states])
+            last_states = []
+            for track, stop, rows in zip(tracks, part.stops, self._rows, strict=True):
+                last_states.append(track[stop : stop + rows])
+            V = np.concatenate([states.reshape(-1, columns) for states in last_states])
             if divided:
-                V -= self.neutral @ (self.neutral.T @ V)
+                V = self.divide_out_constant(V)
                 if n == len(self.scales):
-                    self.scales.append(1.0 / max(1e-300, float(np.abs(V).max())))
+                    size = float(np.abs(V).max())
+                    self.scales.append(1.0 / max(1e-300, size))
                 V *= self.scales[n]
-                for states, block in zip(last_states, np.split(V, bounds), strict=True):
-                    states[:] = block.reshape(states.shape)
+                _split_into(V, last_states)
             if sizes is not None:
                 sizes.append(np.linalg.norm(V, axis=0))
-        from_start = [track[rows - 1 :] for track, rows in zip(tracks, self._rows, strict=True)]
+        from_start = []
+        for track, rows in zip(tracks, self._rows, strict=True):
+            from_start.append(track[rows - 1 :])
         return V, from_start
 
     def _run_ticks(self, tracks: Sequence[Array], run: _TickRun) -> None:
         """Computes the states of one site over consecutive ticks, in its track."""
-        i = run.site
-        now = run.first + self._rows[i] - 1
-        P = self._P[i]
-        state = tracks[i][now]
-        next_states = tracks[i][now + 1 : now + 1 + run.ticks]
+        track = tracks[run.site]
+        P = self._P[run.site]
+        now = run.first + self._rows[run.site] - 1
+        state = track[now]
+        next_states = track[now + 1 : now + 1 + run.ticks]
         next_states[:] = 0.0
-        for peer, rows, effect in self._peer_effects[i]:
-            samples = tracks[peer][rows[run.first : run.first + run.ticks]]
+        end = run.first + run.ticks
+        for peer, rows, effect in self._peer_effects[run.site]:
+            used_rows = rows[run.first : end]
+            samples = tracks[peer][used_rows]
             next_states += effect @ samples
         for next_state in next_states:
             next_state += P @ state
             state = next_state
+
+
+def _split_into(V: Array, blocks: Sequence[Array]) -> None:
+    """Writes the rows of V into arrays, one after the other."""
+    first = 0
+    for block in blocks:
+        rows = block.shape[0] * block.shape[1]
+        block[:] = V[first : first + rows].reshape(block.shape)
+        first += rows
 
 
 def _find_multipliers(
@@ -489,41 +595,62 @@ def _find_multipliers(
         The multipliers by falling modulus, their vectors as columns, and which multipliers are
         exact to `_RESIDUAL`.
     """
-    start_states = np.random.default_rng(0).standard_normal((n, min(n, _COLUMNS)))
-    block = span.build_constant_columns(start_states)
-    block = np.linalg.qr(block - span.neutral @ (span.neutral.T @ block))[0]
+    random = np.random.default_rng(0)
+    start_states = random.standard_normal((n, min(n, _COLUMNS)))
+    start = span.build_constant_columns(start_states)
+    block = np.linalg.qr(span.divide_out_constant(start))[0]
     basis = block
+    # the map in the basis
     H = np.zeros((block.shape[1], 0))
     while True:
-        W = span.apply(block)[0]
-        H = np.hstack([H, np.zeros((basis.shape[1], block.shape[1]))])
+        width = block.shape[1]
+        W, _ = span.apply(block)
+        new_columns = np.zeros((basis.shape[1], width))
+        H = np.hstack([H, new_columns])
         # Gram-Schmidt twice: once loses orthogonality to rounding
         for _ in range(2):
             projection = basis.T @ W
             W -= basis @ projection
-            H[:, -block.shape[1] :] += projection
+            H[:, -width:] += projection
         left, lengths, right = np.linalg.svd(W, full_matrices=False)
         is_new = lengths > ZERO_SHARE * np.abs(H).max()
         left = left[:, is_new]
         remainder = (lengths[:, np.newaxis] * right)[is_new]
+
         mu, y = np.linalg.eig(H)
-        order = np.argsort(-np.abs(mu), kind="stable")
-        moduli = np.abs(mu[order])
-        # conjugate multipliers have the same modulus and count once
-        is_smaller = moduli[1:] < (1.0 - _SAME_ROOT) * moduli[:-1]
-        rank = np.cumsum(np.append(0, is_smaller))
-        order = order[(rank < wanted) & (moduli > _SMALLEST * moduli[0])]
-        errors = np.linalg.norm(remainder @ y[-block.shape[1] :, order], axis=0)
-        residual = errors / np.abs(mu[order])
+        order = _order_multipliers(mu, wanted)
+        mu = mu[order]
+        y = y[:, order]
+        errors = np.linalg.norm(remainder @ y[-width:], axis=0)
+        residual = errors / np.abs(mu)
         is_full = len(H) >= _MAX_COLUMNS
-        exact = residual <= (_LOOSE_RESIDUAL if is_full else _RESIDUAL)
+        limit = _LOOSE_RESIDUAL if is_full else _RESIDUAL
+        exact = residual <= limit
         if exact.all() or not is_new.any() or is_full:
-            vectors = basis @ y[:, order]
-            return mu[order].astype(np.complex128), vectors.astype(np.complex128), exact
-        zeros = np.zeros((len(remainder), len(H) - block.shape[1]))
+            vectors = basis @ y
+            return mu.astype(np.complex128), vectors.astype(np.complex128), exact
+
         block, R = np.linalg.qr(left - basis @ (basis.T @ left))
-        H = np.vstack([H, np.hstack([zeros, R @ remainder])])
+        zeros = np.zeros((len(remainder), len(H) - width))
+        new_rows = np.hstack([zeros, R @ remainder])
+        H = np.vstack([H, new_rows])
         basis = np.hstack([basis, block])
+
+
+def _order_multipliers(mu: Complex, wanted: int) -> NDArray[np.int64]:
+    """Returns the indices of the largest multipliers, by falling modulus.
+
+    Args:
+        mu: the multipliers.
+        wanted: number of distinct moduli.
+    """
+    order = np.argsort(-np.abs(mu), kind="stable")
+    moduli = np.abs(mu[order])
+    # conjugate multipliers have the same modulus and count once
+    is_smaller = moduli[1:] < (1.0 - _SAME_ROOT) * moduli[:-1]
+    rank = np.cumsum(np.append(0, is_smaller))
+    is_large = moduli > _SMALLEST * moduli[0]
+    return order[(rank < wanted) & is_large]
 
 
 def compute_sampled_spectrum(
@@ -550,28 +677,38 @@ def compute_sampled_spectrum(
     uses = uses or find_samples_in_use(conditions)
     span_s: float | None = uses.period_s or uses.span_s
     if uses.period_s is not None and uses.period_s * max(rates_hz) < 1.5:
-        span_s = None  # every tick is like the one before
+        # every tick is like the tick before
+        span_s = None
     loop = couple_ticks(conditions, rest)
     deviation_per_s = None
     if not loop.names:
         return Spectrum(
-            roots=(), zeros=loop.constant, drifting=0, dropped=0, order=0, span_s=span_s
+            roots=(),
+            zeros=loop.constant,
+            drifting=0,
+            dropped=0,
+            order=0,
+            span_s=span_s,
         )
     with limit_blas_threads():
         span = _SpanMap(loop, rates_hz, uses)
         mu, vectors, exact = _find_multipliers(span, len(loop.names), wanted + 1)
-        s = (np.log(mu) - np.log(span.scales).sum()) / uses.span_s
+        log_scale = np.log(span.scales).sum()
+        s = (np.log(mu) - log_scale) / uses.span_s
         is_still = exact & (np.abs(s) <= _STILL_PER_S)
+        # of two conjugate roots the upper one is described
         is_upper = exact & ~is_still & (s.imag >= -_SAME_ROOT)
         s = s[is_upper]
-        modes = np.hstack([vectors[:, is_upper].real, vectors[:, is_upper].imag])
+        upper_vectors = vectors[:, is_upper]
+        modes = np.hstack([upper_vectors.real, upper_vectors.imag])
         roots: list[CharacteristicRoot] = []
         if len(s):
             if uses.period_s is None:
                 rightmost = modes[:, :: len(s)]
                 deviation_per_s = _estimate_deviation(span, rightmost, uses.span_s)
-            with np.errstate(all="ignore"):  # fast modes overflow; their late ticks are unused
-                tracks = span.apply(modes, divided=False)[1]
+            # fast modes overflow; their late ticks are unused
+            with np.errstate(all="ignore"):
+                _, tracks = span.apply(modes, divided=False)
                 roots = _describe_modes(s, tracks, loop, rates_hz)
     drifting = int(is_still.sum())
     return Spectrum(
@@ -588,8 +725,8 @@ def compute_sampled_spectrum(
 def _estimate_deviation(span: _SpanMap, mode: Array, span_s: float) -> float:
     """Returns the standard deviation of a root over the parts of a span, 1/s.
 
-    The logarithm of the mode's size over the parts is taken as a random walk. The variance of
-    its Brownian bridge is a twelfth of the walk's.
+    The logarithm of the mode's size over the parts is taken as a random walk. The mean variance
+    of the walk's Brownian bridge is a twelfth of the variance of the walk's end.
 
     Args:
         span: the map.
@@ -598,8 +735,12 @@ def _estimate_deviation(span: _SpanMap, mode: Array, span_s: float) -> float:
     """
     sizes: list[Array] = []
     span.apply(mode, sizes=sizes)
-    growth = np.log(np.hypot(*np.transpose(sizes))) - np.cumsum(np.log(span.scales))
-    bridge = growth - np.linspace(growth[0], growth[-1], len(growth))
+    real_sizes, imaginary_sizes = np.transpose(sizes)
+    mode_sizes = np.hypot(real_sizes, imaginary_sizes)
+    log_scales = np.cumsum(np.log(span.scales))
+    growth = np.log(mode_sizes) - log_scales
+    steady_growth = np.linspace(growth[0], growth[-1], len(growth))
+    bridge = growth - steady_growth
     return math.sqrt(12.0) * float(np.std(bridge)) / span_s
 
 
@@ -620,27 +761,23 @@ def _describe_modes(
     """
     count = len(s)
     roots: list[CharacteristicRoot] = []
+    # 2 pi / T
     turn = 2.0 * np.pi * rates_hz[0] / (len(tracks[0]) - 1)
     first_states = [track[0, :, :count] + 1j * track[0, :, count:] for track in tracks]
     amplitudes = np.abs(np.concatenate(first_states))
-    velocities = [
-        state
-        for state, name in enumerate(loop.names)
-        if re.fullmatch(r"qd\d+", name.rpartition(".")[2])
-    ]
+    velocities = []
+    for state, name in enumerate(loop.names):
+        quantity = name.rpartition(".")[2]
+        if re.fullmatch(r"qd\d+", quantity):
+            velocities.append(state)
     for n, principal in enumerate(s):
         falling = sorted(velocities, key=lambda state: -amplitudes[state, n])
         fastest = falling[0]
         i = int(loop.owners[fastest])
-        site_state = fastest - int(np.argmax(loop.owners == i))
-        hz = rates_hz[i]
-        # beyond fifteen time constants the track consists of rounding errors
-        usable = 2 + int(15.0 * hz / max(1e-9, abs(principal.real)))
-        ticks = min(len(tracks[i]) - 1, usable)
-        track = tracks[i][:ticks, site_state]
-        velocity = track[:, n] + 1j * track[:, n + count]
-        spectrum = np.abs(np.fft.fft(velocity * np.exp(-principal * np.arange(ticks) / hz)))
-        offset = 2.0 * np.pi * np.fft.fftfreq(ticks, 1.0 / hz)[spectrum.argmax()]
+        first_state = int(np.argmax(loop.owners == i))
+        joint_track = tracks[i][:, fastest - first_state]
+        velocity = joint_track[:, n] + 1j * joint_track[:, n + count]
+        offset = _find_strongest_offset(velocity, principal, rates_hz[i])
         omega = abs(principal.imag + turn * round(offset / turn))
         root = complex(principal.real, omega if omega > _SAME_ROOT else 0.0)
         match = _find_root(roots, root)
@@ -652,6 +789,24 @@ def _describe_modes(
         names = [loop.names[state] for state in falling if amplitudes[state, n] >= least]
         roots.append(CharacteristicRoot(root, 1, tuple(names)))
     return sorted(roots, key=lambda root: -root.s.real)
+
+
+def _find_strongest_offset(velocity: Complex, principal: complex, hz: int) -> float:
+    """Returns the difference of a mode's strongest frequency from its principal value, rad/s.
+
+    Args:
+        velocity: velocity of a joint in the mode, one value per tick.
+        principal: principal value of the root, 1/s.
+        hz: tick rate of the joint's site.
+    """
+    # beyond fifteen time constants the track consists of rounding errors
+    usable = 2 + int(15.0 * hz / max(1e-9, abs(principal.real)))
+    ticks = min(len(velocity) - 1, usable)
+    decay = np.exp(-principal * np.arange(ticks) / hz)
+    spectrum = np.abs(np.fft.fft(velocity[:ticks] * decay))
+    frequencies_hz = np.fft.fftfreq(ticks, 1.0 / hz)
+    offset: float = 2.0 * np.pi * frequencies_hz[spectrum.argmax()]
+    return offset
 
 
 def _find_root(roots: Sequence[CharacteristicRoot], s: complex) -> int | None:

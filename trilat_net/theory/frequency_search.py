@@ -1,11 +1,11 @@
 """Adaptive frequency grids, minima of curves over frequency, and bands below a level.
 
-A grid is refined where the response changes by more than a tenth between two points, and about
-every minimum until the deepest changes by less than 1 %.
+A grid is refined where the response changes by more than a tenth between two points, and around
+minima until the neighbours of each minimum lie less than 1 % above it.
 
 Invariant:
-    - Values on a grid are evidence and no proof: features narrower than the grid's steps stay
-      hidden.
+    - Values on a grid are evidence but no proof: features that are narrower than the grid's
+      steps stay hidden.
 """
 
 from collections.abc import Callable
@@ -22,14 +22,16 @@ FrequencyCurve = Callable[[Array], Array]
 """Values, shape (F,), for frequencies of shape (F,), rad/s."""
 
 LOW_HZ = 1e-3
+"""Lower end of the default band."""
 HIGH_HZ = 100.0
-"""The default band."""
+"""Upper end of the default band."""
 
 _PER_DECADE = 40
 """Points per decade."""
 _PER_TURN = 16
 """Points per turn of the phase of a round trip."""
 _MAX_POINTS = 6000
+"""Largest number of points of a grid on a linear axis."""
 _CHANGE = 0.1
 """Largest relative change of the response between two points."""
 _CLOSEST = 1e-6
@@ -68,14 +70,16 @@ class Minima(NamedTuple):
     @property
     def least_hz(self) -> float:
         """The frequency of the least value, Hz."""
-        return float(self.w_rad_s[self.values.argmin()] / (2.0 * np.pi))
+        w_rad_s = self.w_rad_s[self.values.argmin()]
+        return float(w_rad_s / (2.0 * np.pi))
 
 
 def build_frequency_grid(low_hz: float, high_hz: float, delay_s: float) -> Array:
     """Returns frequencies that resolve the phase of a delay, rad/s, shape (F,).
 
-    They are even on a logarithmic axis, and above some frequency also on a linear axis: a round
-    trip over the longest delay T turns the phase once in pi / T rad/s.
+    The frequencies are evenly spaced on a logarithmic axis. Further frequencies are evenly
+    spaced on a linear axis, because a round trip over the longest delay T turns the phase once
+    in pi / T rad/s.
 
     Args:
         low_hz: lower end of the band, Hz.
@@ -84,23 +88,29 @@ def build_frequency_grid(low_hz: float, high_hz: float, delay_s: float) -> Array
     """
     low = 2.0 * np.pi * low_hz
     high = 2.0 * np.pi * high_hz
-    count = max(2, round(_PER_DECADE * np.log10(high / low)) + 1)
+    decades = np.log10(high / low)
+    count = max(2, round(_PER_DECADE * decades) + 1)
     points = np.geomspace(low, high, count)
     if delay_s > 0.0:
-        step = max(np.pi / (delay_s * _PER_TURN), (high - low) / _MAX_POINTS)
-        points = np.union1d(points, np.arange(low, high, step))
+        phase_step = np.pi / (delay_s * _PER_TURN)
+        least_step = (high - low) / _MAX_POINTS
+        step = max(phase_step, least_step)
+        linear_points = np.arange(low, high, step)
+        points = np.union1d(points, linear_points)
     return points
 
 
 def find_resolved_hz(low_hz: float, high_hz: float, delay_s: float) -> float:
     """Returns the frequency up to which the grid resolves the phase of a delay, Hz.
 
-    Up to there it has at least four points per turn of a round trip.
+    Up to this frequency the grid has at least four points per turn of a round trip.
     """
     step_hz = (high_hz - low_hz) / _MAX_POINTS
     if 8.0 * step_hz * delay_s <= 1.0:
         return high_hz
-    return 1.0 / (8.0 * delay_s * float(10.0 ** (1.0 / _PER_DECADE) - 1.0))
+    # relative step of the logarithmic axis
+    relative_step = float(10.0 ** (1.0 / _PER_DECADE) - 1.0)
+    return 1.0 / (8.0 * delay_s * relative_step)
 
 
 def refine_frequencies(response: PortResponse, w_rad_s: Array) -> Array:
@@ -116,12 +126,15 @@ def refine_frequencies(response: PortResponse, w_rad_s: Array) -> Array:
 
     def find_large_changes(Y: Complex) -> NDArray[np.bool_]:
         size = np.linalg.norm(Y, axis=(1, 2))
-        larger_size = np.maximum(np.maximum(size[1:], size[:-1]), 1e-300)
-        change = np.linalg.norm(np.diff(Y, axis=0), axis=(1, 2))
-        is_large: NDArray[np.bool_] = change > _CHANGE * larger_size
+        larger_size = np.maximum(size[1:], size[:-1])
+        reference = np.maximum(larger_size, 1e-300)
+        differences = np.diff(Y, axis=0)
+        change = np.linalg.norm(differences, axis=(1, 2))
+        is_large: NDArray[np.bool_] = change > _CHANGE * reference
         return is_large
 
-    return _refine(response, w_rad_s, find_large_changes)[0]
+    refined, _ = _refine(response, w_rad_s, find_large_changes)
+    return refined
 
 
 def _refine(
@@ -138,10 +151,13 @@ def _refine(
     """
     values = function(w_rad_s)
     for _ in range(_ROUNDS):
-        coarse = find_coarse(values) & (w_rad_s[1:] > w_rad_s[:-1] * (1.0 + _CLOSEST))
+        left = w_rad_s[:-1]
+        right = w_rad_s[1:]
+        is_divisible = right > left * (1.0 + _CLOSEST)
+        coarse = find_coarse(values) & is_divisible
         if not coarse.any() or len(w_rad_s) > 2 * _MAX_POINTS:
             break
-        middles = np.sqrt(w_rad_s[:-1] * w_rad_s[1:])[coarse]
+        middles = np.sqrt(left * right)[coarse]
         indices = np.flatnonzero(coarse) + 1
         w_rad_s = np.insert(w_rad_s, indices, middles)
         values = np.insert(values, indices, function(middles), axis=0)
@@ -149,9 +165,13 @@ def _refine(
 
 
 def cache_response(response: PortResponse, w_rad_s: Array) -> PortResponse:
-    """Returns the same response, which is computed only once for this array of frequencies."""
+    """Returns the same response, computed only once for this array of frequencies."""
     cached = response(w_rad_s)
-    return lambda w: cached if w is w_rad_s else response(w)
+
+    def evaluate(w: Array) -> Complex:
+        return cached if w is w_rad_s else response(w)
+
+    return evaluate
 
 
 def find_minima(
@@ -167,26 +187,30 @@ def find_minima(
         w_rad_s: first frequencies, rising, shape (F,), rad/s.
         level: the level.
         tolerance: rounding error of the curve. The curve must be below the level by more than
-            that, and a minimum below its neighbours. None: zero.
+            this error, and so must a minimum be below its neighbours. None: zero.
     """
-    rounding_error = tolerance or (lambda w: np.zeros(len(w)))
+
+    def find_rounding(w: Array) -> Array:
+        return tolerance(w) if tolerance is not None else np.zeros(len(w))
 
     def evaluate(w: Array) -> Array:
-        return np.stack([curve(w), rounding_error(w)], axis=1)
+        return np.stack([curve(w), find_rounding(w)], axis=1)
+
+    def evaluate_upper(w: Array) -> Array:
+        return curve(w) + find_rounding(w)
 
     w_rad_s, refined = _refine(evaluate, w_rad_s, _find_steps_at_minima)
     values, rounding = refined.T
-    below = _find_bands_below(
-        lambda w: curve(w) + rounding_error(w), w_rad_s, values + rounding, level
-    )
+    upper_values = values + rounding
+    below = _find_bands_below(evaluate_upper, w_rad_s, upper_values, level)
     return Minima(w_rad_s, values, below)
 
 
 def _find_steps_at_minima(curve_and_rounding: Array) -> NDArray[np.bool_]:
     """Returns the steps of a grid at minima that are not resolved yet, shape (F - 1,).
 
-    A minimum is not resolved if a neighbour lies above it by more than rounding, and by more
-    than 1 % of its own depth or of the deepest minimum's, whichever is larger.
+    A minimum is not resolved if a neighbour lies above it by more than the rounding error, by
+    more than 1 % of the minimum's depth, and by more than 1 % of the least value.
 
     Args:
         curve_and_rounding: values of the curve and their rounding errors, shape (F, 2).
@@ -195,11 +219,13 @@ def _find_steps_at_minima(curve_and_rounding: Array) -> NDArray[np.bool_]:
     middle = values[1:-1]
     left = values[:-2]
     right = values[2:]
-    rise = np.maximum(left, right) - middle
     is_minimum = (middle <= left) & (middle <= right)
-    limit = _SETTLED * np.maximum(np.abs(middle), abs(values.min()))
-    is_minimum &= rise > np.maximum(limit, rounding[1:-1])
-    at_points = np.r_[False, is_minimum, False]
+    rise = np.maximum(left, right) - middle
+    size = np.maximum(np.abs(middle), abs(values.min()))
+    limit = np.maximum(_SETTLED * size, rounding[1:-1])
+    is_coarse = is_minimum & (rise > limit)
+    # the steps on both sides of such a point; the ends of the grid are no minima
+    at_points = np.concatenate([[False], is_coarse, [False]])
     steps: NDArray[np.bool_] = at_points[1:] | at_points[:-1]
     return steps
 
@@ -220,17 +246,19 @@ def _find_bands_below(
     low = w_rad_s[edge_steps]
     high = w_rad_s[edge_steps + 1]
     is_low_below = is_below[edge_steps]
-    for _ in range(30 if len(edge_steps) else 0):
-        middle = np.sqrt(low * high)
-        is_like_low = (curve(middle) < level) == is_low_below
-        low = np.where(is_like_low, middle, low)
-        high = np.where(is_like_low, high, middle)
+    if len(edge_steps):
+        for _ in range(30):
+            middle = np.sqrt(low * high)
+            is_middle_below = curve(middle) < level
+            is_like_low = is_middle_below == is_low_below
+            low = np.where(is_like_low, middle, low)
+            high = np.where(is_like_low, high, middle)
     edges = np.sqrt(low * high).tolist()
+    # a band may extend beyond the grid
     if is_below[0]:
         edges.insert(0, float(w_rad_s[0]))
     if is_below[-1]:
         edges.append(float(w_rad_s[-1]))
     hz = [edge / (2.0 * np.pi) for edge in edges]
-    return tuple(
-        FrequencyBand(from_hz, to_hz) for from_hz, to_hz in zip(hz[::2], hz[1::2], strict=True)
-    )
+    pairs = zip(hz[::2], hz[1::2], strict=True)
+    return tuple(FrequencyBand(from_hz, to_hz) for from_hz, to_hz in pairs)

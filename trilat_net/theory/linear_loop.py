@@ -2,11 +2,10 @@
 
     x'(t) = A x(t) + sum_k A_k x(t - T_k) + B u(t) + sum_k B_k u(t - T_k),    y(t) = C x(t)
 
-A chain has ten estimates per link. A small motion changes, and the torque shows, at most one
-combination of them per joint: the learnt gravity torque. With the regressor Y_G at rest it is
-z = Y_G theta_hat in N m, with the rate z' = -Y_G Gamma Y' r. The loop of chains has z as states
-in place of the estimates. Every omitted combination is constant or has no effect, and adds one
-root at zero.
+A chain has ten estimates per link. Only one combination of them per joint takes part in small
+motions: the learnt gravity torque z = Y_G theta_hat in N m, with the regressor Y_G at rest and
+the rate z' = -Y_G Gamma Y' r. In the loop of chains, z replaces the estimates as state. Each
+omitted combination is constant or has no effect, and adds one root at zero.
 
 Invariant:
     - x holds deviations from the equilibrium, in the order of the scenario's sites.
@@ -107,18 +106,21 @@ class LinearLoop(NamedTuple):
     @property
     def static_matrix(self) -> Array:
         """A + sum_k A_k: the rates under a constant deviation."""
-        return sum((term.A for term in self.delayed), self.A)
+        delayed = [term.A for term in self.delayed]
+        return sum(delayed, self.A)
 
 
 def gather_site_arguments(conditions: OperatingConditions, rest: Equilibrium) -> list[Array]:
     """Returns the arguments of each site's rates at an equilibrium, shape (arguments,) each."""
-    layouts = list(map(site_dynamics.lay_out_arguments, conditions.sites))
+    layouts = [site_dynamics.lay_out_arguments(site) for site in conditions.sites]
     arguments = [np.zeros(layout.arguments) for layout in layouts]
     references = compute_references(conditions, rest)
     for i, (layout, x) in enumerate(zip(layouts, arguments, strict=True)):
         x[layout.q] = rest.q[i][: layout.joints]
         x[layout.estimate] = rest.theta_hat[i][: layout.parameters]
         x[layout.q_des] = references[i]
+
+    # the peers' torques follow from the arguments so far
     reflected = [rates.reflected for rates in conditions.evaluate_rates(arguments)]
     peer_torques = conditions.alpha @ reflected
     for i, (layout, x) in enumerate(zip(layouts, arguments, strict=True)):
@@ -128,16 +130,18 @@ def gather_site_arguments(conditions: OperatingConditions, rest: Equilibrium) ->
             j = peers[index]
             q = rest.q[j][: layout.coordinates]
             qd = np.zeros(layout.coordinates)
-            x[layout.peer_sample(index)] = np.r_[q, qd, -reflected[j]]
+            sample = layout.peer_sample(index)
+            x[sample] = np.concatenate([q, qd, -reflected[j]])
     return arguments
 
 
 def compute_shared_poses(conditions: OperatingConditions, rest: Equilibrium) -> list[Array]:
     """Returns the pose that each site shares at an equilibrium, shape (m,) each."""
-    return [
-        site_dynamics.compute_shared_pose(site, q[: site.layout.joints])
-        for site, q in zip(conditions.sites, rest.q, strict=True)
-    ]
+    poses = []
+    for site, q in zip(conditions.sites, rest.q, strict=True):
+        joint_positions = q[: site.layout.joints]
+        poses.append(site_dynamics.compute_shared_pose(site, joint_positions))
+    return poses
 
 
 def compute_references(conditions: OperatingConditions, rest: Equilibrium) -> list[Array]:
@@ -145,10 +149,8 @@ def compute_references(conditions: OperatingConditions, rest: Equilibrium) -> li
     poses = compute_shared_poses(conditions, rest)
     if not conditions.sites[0].layout.task:
         return list(conditions.alpha @ np.array(poses))
-    return [
-        evaluate_reference(shares, pose, poses)
-        for shares, pose in zip(conditions.alpha, poses, strict=True)
-    ]
+    pairs = zip(conditions.alpha, poses, strict=True)
+    return [evaluate_reference(shares, pose, poses) for shares, pose in pairs]
 
 
 def differentiate_references(
@@ -156,18 +158,19 @@ def differentiate_references(
 ) -> dict[tuple[int, int], Array]:
     """Returns the derivatives of site i's reference by site j's shared pose, by (i, j).
 
-    Each has shape (m, m). It is alpha_ij times the unit matrix, except where orientations
-    differ. Then the reference depends on the site's own pose too, as (i, i).
+    Each derivative has shape (m, m). For positions it is alpha_ij times the unit matrix. A
+    reference with an orientation depends on the site's own pose too, as (i, i).
     """
     derivatives = {}
     poses = compute_shared_poses(conditions, rest)
     for i, shares in enumerate(conditions.alpha):
-        for j in np.flatnonzero(shares).tolist():
+        followed = np.flatnonzero(shares).tolist()
+        for j in followed:
             derivatives[i, j] = shares[j] * np.eye(len(poses[i]))
         has_orientation = len(poses[i]) > POSITION and conditions.sites[i].layout.task
         if not has_orientation:
             continue
-        for j in {i, *np.flatnonzero(shares).tolist()}:
+        for j in {i, *followed}:
             columns = [pose[:, np.newaxis] + np.zeros(len(pose)) for pose in poses]
             step = 1j * site_dynamics.COMPLEX_STEP * np.eye(len(poses[j]))
             columns[j] = columns[j] + step
@@ -181,8 +184,8 @@ def compute_couplings(
 ) -> dict[tuple[int, int], Array]:
     """Returns the effect of site j's output on site i's inputs, by (i, j).
 
-    Each has shape (inputs, 3 m). An imported law receives each sample a second time: by itself,
-    beside the sums that are weighted with the dominance factors.
+    Each effect is a matrix of shape (inputs, 3 m). An imported law receives each sample twice:
+    within the sums that are weighted with the dominance factors, and by itself.
     """
     references = differentiate_references(conditions, rest)
     couplings = {}
@@ -195,8 +198,10 @@ def compute_couplings(
         if layout.peers:
             samples = np.zeros((layout.peers, len(coupling), len(coupling)))
             # tau_x in a sample is the torque of the arm, and not the torque ON the arm
-            peer_index = j - (j > i)
-            samples[peer_index] = np.diag(np.repeat([1.0, 1.0, -1.0], m))
+            signs = np.repeat([1.0, 1.0, -1.0], m)
+            # the site itself is not among its peers
+            peer_index = j - 1 if j > i else j
+            samples[peer_index] = np.diag(signs)
             coupling = np.vstack([coupling, *samples])
         couplings[i, j] = coupling
     return couplings
@@ -224,8 +229,8 @@ def differentiate_rates(
     Args:
         conditions: the numbers of the loop.
         rest: the equilibrium.
-        all_estimates: each estimate of a chain is a state, instead of only the combinations
-            that make the learnt gravity torque.
+        all_estimates: keep each estimate of a chain as a state, instead of only the learnt
+            gravity torques.
     """
     arguments = gather_site_arguments(conditions, rest)
     references = differentiate_references(conditions, rest)
@@ -243,10 +248,10 @@ def differentiate_rates(
             # chain rule: the reference depends on the site's own orientation
             reference_by_state = references[i, i] @ rates.x[:, : layout.states]
             for derivative in rates:
-                derivative[:, : layout.states] += (
-                    derivative[:, layout.q_des] @ reference_by_state
-                )
-        jacobians.append(_select_states(site, layout, rates, all_estimates=all_estimates))
+                by_reference = derivative[:, layout.q_des]
+                derivative[:, : layout.states] += by_reference @ reference_by_state
+        jacobian = _select_states(site, layout, rates, all_estimates=all_estimates)
+        jacobians.append(jacobian)
     return jacobians
 
 
@@ -262,7 +267,8 @@ def _select_states(
     if isinstance(site.law_factory, NumericLaw):
         return SiteJacobian(layout, rates, (*motion, *site.law_factory.names))
     if not site_dynamics.has_estimate(site):
-        return _replace_estimate(layout, rates, np.zeros((0, layout.parameters)), ())
+        no_combination = np.zeros((0, layout.parameters))
+        return _replace_estimate(layout, rates, no_combination, ())
     if site.chain is None or all_estimates:
         estimates = tuple(f"theta{p + 1}" for p in range(layout.parameters))
         return SiteJacobian(layout, rates, (*motion, *estimates))
@@ -270,7 +276,8 @@ def _select_states(
     # pivoted QR factorisation: the leading pivots are the independent rows of the effect
     _, R, pivots = qr(effect.T, mode="economic", pivoting=True)
     sizes = np.abs(np.diag(R))
-    rank = int(np.sum(sizes > _DEPENDENT * max(1.0, sizes[0])))
+    least_size = _DEPENDENT * max(1.0, sizes[0])
+    rank = int(np.sum(sizes > least_size))
     joints = sorted(pivots[:rank].tolist())
     names = tuple(f"gravity{joint + 1}" for joint in joints)
     jacobian = _replace_estimate(layout, rates, effect[joints], names)
@@ -279,7 +286,10 @@ def _select_states(
 
 def _name_motion(joints: int) -> tuple[str, ...]:
     """Returns the names of angles and velocities: "q1", "q2", ..., "qd1", "qd2", ..."""
-    return tuple(f"{kind}{joint + 1}" for kind in ("q", "qd") for joint in range(joints))
+    numbers = range(1, joints + 1)
+    angles = [f"q{number}" for number in numbers]
+    velocities = [f"qd{number}" for number in numbers]
+    return (*angles, *velocities)
 
 
 def _replace_estimate(
@@ -302,12 +312,16 @@ def _replace_estimate(
         return np.hstack([motion, by_z, inputs])
 
     converted = site_dynamics.SiteRates(*map(convert, rates))
+    z_rate = T @ converted.estimate
     new_layout = site_dynamics.ArgumentLayout(
-        layout.joints, len(T), layout.shared, layout.peers
+        joints=layout.joints,
+        parameters=len(T),
+        shared=layout.shared,
+        peers=layout.peers,
     )
     return SiteJacobian(
         layout=new_layout,
-        rates=converted._replace(estimate=T @ converted.estimate),
+        rates=converted._replace(estimate=z_rate),
         states=(*_name_motion(layout.joints), *names),
     )
 
@@ -336,25 +350,31 @@ def linearise_loop(
     A = np.zeros((state_count, state_count))
     B = np.zeros((state_count, port_count))
     C = np.zeros((port_count, state_count))
-    terms: dict[float, tuple[Array, Array]] = {}
     input_effects = []
     for i, site in enumerate(sites):
         layout = site.layout
-        position_rate = np.eye(layout.joints, layout.arguments, layout.qd.start)
+        joints = layout.joints
+        first_velocity = layout.qd.start
+        position_rate = np.eye(joints, layout.arguments, first_velocity)
         derivative = np.vstack([position_rate, site.rates.qdd, site.rates.estimate])
         A[states[i], states[i]] = derivative[:, : layout.states]
         B[states[i], ports[i]] = derivative[:, layout.external_torque]
-        C[ports[i], states[i]] = np.eye(layout.joints, layout.states, layout.qd.start)
+        C[ports[i], states[i]] = np.eye(joints, layout.states, first_velocity)
         input_effects.append(derivative[:, layout.inputs])
+
+    terms: dict[float, tuple[Array, Array]] = {}
     for (i, j), coupling in compute_couplings(conditions, rest, sites).items():
         delay_s = float(conditions.age_s[i, j])
-        effect = input_effects[i] @ coupling
-        late_A, late_B = terms.setdefault(delay_s, (np.zeros_like(A), np.zeros_like(B)))
+        if delay_s not in terms:
+            terms[delay_s] = (np.zeros_like(A), np.zeros_like(B))
+        late_A, late_B = terms[delay_s]
         peer = sites[j]
-        m = peer.layout.coordinates
+        effect = input_effects[i] @ coupling
         late_A[states[i], states[j]] += effect @ peer.output
+        # the torque on the peer's joints is reflected without a state in between
+        effect_of_torque = effect[:, 2 * peer.layout.coordinates :]
         reflected_by_port = peer.rates.reflected[:, peer.layout.external_torque]
-        late_B[states[i], ports[j]] += effect[:, 2 * m :] @ reflected_by_port
+        late_B[states[i], ports[j]] += effect_of_torque @ reflected_by_port
     loop = LinearLoop(
         names=_name_states(conditions, sites),
         inputs=_name_ports(conditions, sites, "tau"),
@@ -392,7 +412,11 @@ def _name_ports(
 
 def _sort_terms(terms: dict[float, tuple[Array, Array]]) -> tuple[DelayedTerm, ...]:
     """Returns the delayed terms by rising delay."""
-    return tuple(DelayedTerm(delay_s, *terms[delay_s]) for delay_s in sorted(terms))
+    delayed = []
+    for delay_s in sorted(terms):
+        A, B = terms[delay_s]
+        delayed.append(DelayedTerm(delay_s, A, B))
+    return tuple(delayed)
 
 
 def add_law_forms(
@@ -400,8 +424,8 @@ def add_law_forms(
 ) -> LinearLoop:
     """Returns a loop with the states and the sent signals that laws add (`LinearForm`).
 
-    A sent signal is an algebraic state: the law computes it without a rate, and the peer
-    receives it after the delay.
+    A sent signal is an algebraic state: it has no rate, and the peer receives it after the
+    delay.
     """
     inertias = []
     for site in sites:
@@ -413,29 +437,33 @@ def add_law_forms(
     port_count = len(loop.inputs)
 
     def make_zeros() -> tuple[Array, Array]:
-        return np.zeros((state_count, state_count)), np.zeros((state_count, port_count))
+        zero_A = np.zeros((state_count, state_count))
+        zero_B = np.zeros((state_count, port_count))
+        return zero_A, zero_B
 
     terms = {0.0: make_zeros()}
     for delay_s, A, B in (DelayedTerm(0.0, loop.A, loop.B), *loop.delayed):
         late_A, late_B = terms.setdefault(delay_s, make_zeros())
         late_A[: len(A), : len(A)] = A
         late_B[: len(B)] = B
-    E = np.ones(state_count)
     for i, form in enumerate(forms):
         if form is not None:
             _add_form(conditions, sites, blocks=blocks, i=i, form=form, terms=terms)
-    # only now are the accelerations complete that some laws send
+
+    # some laws send accelerations, which are complete only now
+    E = np.ones(state_count)
+    undelayed_A, _ = terms[0.0]
     for i, form in enumerate(forms):
         if form is None:
             continue
+        acceleration = blocks[i, "qd"]
         for j in form.list_receivers():
             signal = blocks[i, ("to", j)]
             E[signal] = 0.0
             if form.sends_acceleration:
                 for A, B in terms.values():
-                    A[signal] = A[blocks[i, "qd"]]
-                    B[signal] = B[blocks[i, "qd"]]
-            undelayed_A, _ = terms[0.0]
+                    A[signal] = A[acceleration]
+                    B[signal] = B[acceleration]
             undelayed_A[signal, signal] -= np.eye(len(sites[i].rates.qdd))
     A, B = terms.pop(0.0)
     new_columns = np.zeros((len(loop.C), state_count - loop.C.shape[1]))
@@ -470,7 +498,8 @@ def _index_form_states(
         for j in form.list_receivers():
             labels["to", j] = f"to_{conditions.names[j]}_"
         for signal, label in labels.items():
-            blocks[i, signal] = slice(len(names), len(names) + joints)
+            first = len(names)
+            blocks[i, signal] = slice(first, first + joints)
             names += [f"{site_name}.{label}{joint + 1}" for joint in range(joints)]
     return blocks, names
 
@@ -492,14 +521,18 @@ def _add_form(
 
     def find_delayed_matrix(j: int) -> Array:
         """Returns the state matrix at the age of site j's samples."""
-        zeros = np.zeros_like(A), np.zeros_like(B)
-        late_A, _ = terms.setdefault(float(conditions.age_s[i, j]), zeros)
+        delay_s = float(conditions.age_s[i, j])
+        if delay_s not in terms:
+            terms[delay_s] = (np.zeros_like(A), np.zeros_like(B))
+        late_A, _ = terms[delay_s]
         return late_A
 
+    external = layout.external_torque
     for (row, column), gain in form.blocks.items():
         if row == "tau":
             rows = blocks[i, "qd"]
-            block = site.rates.qdd[:, layout.external_torque] @ gain
+            inverse_inertia = site.rates.qdd[:, external]
+            block = inverse_inertia @ gain
         else:
             rows = blocks[i, row]
             block = gain
@@ -507,12 +540,13 @@ def _add_form(
             motion = slice(blocks[i, "q"].start, blocks[i, "qd"].stop)
             torque_on_arm = site.rates.external + site.rates.held
             A[rows, motion] += block @ torque_on_arm[:, : layout.qd.stop]
-            B[rows, ports[i]] += block @ torque_on_arm[:, layout.external_torque]
+            B[rows, ports[i]] += block @ torque_on_arm[:, external]
         elif column in ("q_des", "qd_des"):
             signal = str(column).removesuffix("_des")
-            for j in np.flatnonzero(conditions.alpha[i]):
-                late_A = find_delayed_matrix(int(j))
-                late_A[rows, blocks[int(j), signal]] += conditions.alpha[i, j] * block
+            for j in np.flatnonzero(conditions.alpha[i]).tolist():
+                late_A = find_delayed_matrix(j)
+                columns = blocks[j, signal]
+                late_A[rows, columns] += conditions.alpha[i, j] * block
         elif isinstance(column, tuple):
             sender = column[1]
             if (sender, ("to", i)) in blocks:

@@ -90,16 +90,17 @@ class NumericLaw:
         joints = self._layout.joints
         q0 = np.array(setup.q0)
         zeros = np.zeros(joints)
-        peers = [np.r_[link.q0, zeros, zeros] for link in setup.links]
+        peers = [np.concatenate([link.q0, zeros, zeros]) for link in setup.links]
         parts = [q0, zeros, self.memory, q0, zeros, zeros, *peers, zeros]
         arguments = np.concatenate(parts)
-        previous = np.r_[np.zeros(joints), setup.q0]
+        previous = np.concatenate([zeros, q0])
+        shifted = previous + 1e-3
         output = self._evaluate_tick(arguments, previous)
-        output_of_shifted = self._evaluate_tick(arguments, previous + 1e-3)
+        output_of_shifted = self._evaluate_tick(arguments, shifted)
         self._uses_previous_tick = not np.array_equal(output, output_of_shifted)
         if not self._uses_previous_tick:
             return
-        self.memory = np.r_[self.memory, previous]
+        self.memory = np.concatenate([self.memory, previous])
         for name in ("tau_before", "q_before"):
             self.names += tuple(f"{name}[{joint + 1}]" for joint in range(joints))
 
@@ -114,17 +115,19 @@ class NumericLaw:
         return self._law
 
     def complete_memory(self, memory: Array | None) -> Array:
-        """Returns a full memory: the initial one, overwritten by the known leading part.
+        """Returns a full memory: the initial memory, overwritten by the known leading part.
 
         Args:
-            memory: known numbers: all of the memory, or at least those that the law itself
-                remembers; longer arrays are cut. None: nothing is known.
+            memory: known numbers: all of the memory, or at least the numbers that the law
+                itself remembers; longer arrays are cut. None: nothing is known.
         """
         full_memory: Array = self.memory.copy()
-        if memory is not None:
-            is_full = len(memory) >= len(full_memory)
-            known = len(full_memory) if is_full else self._remembered_count
-            full_memory[:known] = memory[:known]
+        if memory is None:
+            return full_memory
+        known = self._remembered_count
+        if len(memory) >= len(full_memory):
+            known = len(full_memory)
+        full_memory[:known] = memory[:known]
         return full_memory
 
     def iterate_memory(self, x: Array, ticks: int) -> Array:
@@ -142,7 +145,8 @@ class NumericLaw:
             _, rate = self._evaluate_rates(x)
             step = rate / self._rate_hz
             x[memory] += step
-            if not np.abs(step).max(initial=0.0) > _STILL:
+            largest_step = np.abs(step).max(initial=0.0)
+            if not largest_step > _STILL:
                 break
         return x[memory]
 
@@ -171,11 +175,14 @@ class NumericLaw:
             lower[n] = value - half_step
             upper_rates = np.concatenate(self._evaluate_rates(upper))
             lower_rates = np.concatenate(self._evaluate_rates(lower))
-            # the divisor is the difference of the rounded arguments, not 2 half_step
-            columns.append((upper_rates - lower_rates) / (upper[n] - lower[n]))
-        values = np.concatenate([torque, rate])[:, np.newaxis]
+            # the difference of the rounded arguments, not 2 half_step
+            step = upper[n] - lower[n]
+            difference = upper_rates - lower_rates
+            columns.append(difference / step)
+        values = np.concatenate([torque, rate])
         derivatives = np.stack(columns, axis=1)
-        outputs = values + 1j * (derivatives @ x.imag)
+        imaginary_part = derivatives @ x.imag
+        outputs = values[:, np.newaxis] + 1j * imaginary_part
         return outputs[: len(torque)], outputs[len(torque) :]
 
     def _evaluate_rates(self, x: Array) -> tuple[Array, Array]:
@@ -186,16 +193,17 @@ class NumericLaw:
         if self._uses_previous_tick:
             previous = memory[self._remembered_count :]
         else:
-            previous = np.r_[np.zeros(joints), q]
+            previous = np.concatenate([np.zeros(joints), q])
         output = self._evaluate_tick(x, previous)
         torque = output[:joints]
         next_memory = output[joints:]
         if self._uses_previous_tick:
-            next_memory = np.r_[next_memory, torque, q]
-        return torque, (next_memory - memory) * self._rate_hz
+            next_memory = np.concatenate([next_memory, torque, q])
+        change = next_memory - memory
+        return torque, change * self._rate_hz
 
     def _evaluate_tick(self, x: Array, previous: Array) -> Array:
-        """Returns the torque and what the law itself remembers, after one tick.
+        """Returns the torque, and the numbers that the law itself remembers, after one tick.
 
         Args:
             x: arguments, shape (arguments,).
@@ -213,17 +221,21 @@ class NumericLaw:
         row.tau_before[:], row.q_before[:] = np.split(previous, 2)
         row.on_arm[:] = x[len(x) - n :]
         arrays.links["used"] = _TICK - 1
+        sample_length = 3 * n
         for j, link in enumerate(arrays.links):
-            first = peers_start + 3 * n * j
-            sample = x[first : first + 3 * n]
+            first = peers_start + sample_length * j
+            sample = x[first : first + sample_length]
             link["q"][:], link["qd"][:], link["tau_x"][:] = np.split(sample, 3)
         if arrays.chain is None:
-            two_link_stages.update_errors(row)  # also computes the regressor, for gravity
+            # also computes the regressor, for gravity
+            two_link_stages.update_errors(row)
         else:
             chain_stages.place_chain(row, arrays.chain)
-        remembered = x[2 * n : 2 * n + self._remembered_count]
+        memory_start = self._memory_slice.start
+        remembered = x[memory_start : memory_start + self._remembered_count]
         self._plugged_law.restore(remembered.tolist())
-        memory = self._plugged_law.compute(_TICK, tick_ns(_TICK, self._rate_hz))
+        time_ns = tick_ns(_TICK, self._rate_hz)
+        memory = self._plugged_law.compute(_TICK, time_ns)
         return np.concatenate([row.tau, memory])
 
 

@@ -1,10 +1,11 @@
 """Passivity and absolute stability at the haptic ports.
 
-Torques u at ports with the admittance Y put in the power 1/4 u^H (Y + Y^H) u. A stable loop is
-passive if Y + Y^H has no negative eigenvalue at any frequency; a passive loop is stable with
-every passive environment, and coupled operators count as one environment. With independent
-operators at the sites the condition is weaker. The loop is absolutely stable if every frequency
-has positive weights D per site with D Y + Y^H D >= 0.
+Torques u at ports with the admittance Y supply the mean power 1/4 u^H (Y + Y^H) u to the loop.
+A stable loop is passive if Y + Y^H has no negative eigenvalue at any frequency. A passive loop
+is stable with every passive environment, also with operators who are coupled to each other.
+
+For independent operators at the sites a weaker condition suffices: the loop is absolutely
+stable if at each frequency there are positive weights D, one per site, with D Y + Y^H D >= 0.
 
 Sources:
     - Passive environments: Colgate and Hogan, "Robust control of dynamically interacting
@@ -92,8 +93,23 @@ class HandMatrices(NamedTuple):
         The impedance is Z(j w) = j w M + B + K / (j w).
         """
         w = w_rad_s[:, np.newaxis, np.newaxis]
-        Z: Complex = 1j * w * self.M + self.B - 1j * self.K / w
-        return 0.5 * (Z + np.conj(np.swapaxes(Z, -1, -2)))
+        mass_term = 1j * w * self.M
+        stiffness_term = 1j * self.K / w
+        Z: Complex = mass_term + self.B - stiffness_term
+        return 0.5 * (Z + _conjugate_transpose(Z))
+
+
+def _conjugate_transpose(Y: Complex) -> Complex:
+    """Returns Y^H at each frequency, shape (F, p, p)."""
+    transposed = np.swapaxes(Y, -1, -2)
+    conjugate: Complex = np.conj(transposed)
+    return conjugate
+
+
+def _find_frobenius_norm(Y: Complex) -> Array:
+    """Returns the Frobenius norm of Y at each frequency, shape (F,)."""
+    norm: Array = np.linalg.norm(Y, axis=(1, 2))
+    return norm
 
 
 def check_against_hands(
@@ -123,19 +139,23 @@ def check_against_hands(
         return None
 
     def find_least(w: Array) -> Array:
-        Z = np.linalg.inv(response(w)).astype(np.complex128)
-        Z += np.conj(np.swapaxes(Z, -1, -2))
+        Y = response(w)
+        Z = np.linalg.inv(Y).astype(np.complex128)
+        Z += _conjugate_transpose(Z)
         resistances = []
         for hands, J in zip(held, places, strict=True):
-            resistances.append([2.0 * J.T @ hand.compute_resistance(w) @ J for hand in hands])
-        values = [np.linalg.eigvalsh(Z + sum(choice))[:, 0] for choice in product(*resistances)]
-        least: Array = np.min(values, axis=0)
+            at_ports = [2.0 * J.T @ hand.compute_resistance(w) @ J for hand in hands]
+            resistances.append(at_ports)
+        least_per_choice = []
+        for choice in product(*resistances):
+            eigenvalues = np.linalg.eigvalsh(Z + sum(choice))
+            least_per_choice.append(eigenvalues[:, 0])
+        least: Array = np.min(least_per_choice, axis=0)
         return least
 
     def find_tolerance(w: Array) -> Array:
-        norm = np.linalg.norm(np.linalg.inv(response(w)), axis=(1, 2))
-        tolerance: Array = EIGENVALUE_ROUNDING * norm
-        return tolerance
+        impedance = np.linalg.inv(response(w))
+        return EIGENVALUE_ROUNDING * _find_frobenius_norm(impedance)
 
     return find_minima(find_least, w_rad_s, tolerance=find_tolerance)
 
@@ -150,13 +170,17 @@ def weight_response(Y: Complex, weights: Array) -> Complex:
         weights: positive weights of the ports, shape (p,) or (F, p).
     """
     root = np.sqrt(weights)
-    return root[..., :, np.newaxis] * Y / root[..., np.newaxis, :]
+    rows = root[..., :, np.newaxis]
+    columns = root[..., np.newaxis, :]
+    return rows * Y / columns
 
 
 def find_least_eigenvalue(Y: Complex) -> Array:
     """Returns the least eigenvalue of Y + Y^H, shape (F,), for Y of shape (F, p, p)."""
-    values = np.linalg.eigvalsh(Y + np.conj(np.swapaxes(Y, -1, -2)))
-    return np.asarray(values[..., 0], dtype=np.float64)
+    eigenvalues = np.linalg.eigvalsh(Y + _conjugate_transpose(Y))
+    # eigvalsh sorts them in rising order
+    least = eigenvalues[..., 0]
+    return np.asarray(least, dtype=np.float64)
 
 
 def find_lacking_damping(Y: Complex, w_rad_s: Array) -> float:
@@ -170,11 +194,16 @@ def find_lacking_damping(Y: Complex, w_rad_s: Array) -> float:
         Y: admittance, shape (F, p, p), rad/s per N m.
         w_rad_s: frequencies, rising, shape (F,).
     """
-    lacking = -0.5 * find_least_eigenvalue(np.linalg.inv(Y).astype(np.complex128))
-    at_higher_frequency = float(np.interp(_LOW_BAND * w_rad_s[0], w_rad_s, lacking))
-    if lacking[0] > 0.0 and lacking[0] > 2.0 * at_higher_frequency:
+    Z = np.linalg.inv(Y).astype(np.complex128)
+    lacking = -0.5 * find_least_eigenvalue(Z)
+    lowest_w = w_rad_s[0]
+    at_lowest = lacking[0]
+    at_higher = float(np.interp(_LOW_BAND * lowest_w, w_rad_s, lacking))
+    grows_without_bound = at_lowest > 0.0 and at_lowest > 2.0 * at_higher
+    if grows_without_bound:
         return np.inf
-    return max(0.0, float(lacking.max()))
+    largest = float(lacking.max())
+    return max(0.0, largest)
 
 
 def check_passivity(
@@ -197,65 +226,80 @@ def check_passivity(
         return find_least_eigenvalue(evaluate_weighted(w))
 
     def find_tolerance(w: Array) -> Array:
-        tolerance: Array = EIGENVALUE_ROUNDING * np.linalg.norm(response(w), axis=(1, 2))
-        return tolerance
+        Y = response(w)
+        return EIGENVALUE_ROUNDING * _find_frobenius_norm(Y)
 
     minima = find_minima(find_least, w_rad_s, tolerance=find_tolerance)
     Y = evaluate_weighted(minima.w_rad_s)
-    size = np.asarray(np.linalg.norm(Y, 2, axis=(1, 2)), dtype=np.float64)
+    largest_singular_value = np.linalg.norm(Y, 2, axis=(1, 2))
+    size = np.asarray(largest_singular_value, dtype=np.float64)
     lacking = find_lacking_damping(Y, minima.w_rad_s) if minima.below else 0.0
     return Passivity(minima, size, lacking)
 
 
 def llewellyn_parameter(Y: Complex) -> Array:
-    """Returns Llewellyn's parameter of two scalar ports, shape (F,); the criterion wants >= 1.
+    """Returns Llewellyn's parameter of two scalar ports, shape (F,).
 
-    It is (2 Re y11 Re y22 - Re(y12 y21)) / abs(y12 y21). It is at most `MAX_LLEWELLYN`, which
-    stands for a two-port without transmission, and at most -1 where Re y11 or Re y22 is
-    negative.
+    The parameter is (2 Re y11 Re y22 - Re(y12 y21)) / abs(y12 y21); the criterion asks for at
+    least 1. The parameter is limited to `MAX_LLEWELLYN`, the value of two ports without
+    transmission, and to -1 where Re y11 or Re y22 is negative.
 
     Args:
         Y: admittance, shape (F, 2, 2).
     """
     y11 = Y[:, 0, 0].real
     y22 = Y[:, 1, 1].real
-    transmission = Y[:, 0, 1] * Y[:, 1, 0]
-    norm = np.linalg.norm(Y, axis=(1, 2))
-    size = np.maximum(np.abs(transmission), 1e-30 * norm**2)
-    parameter: Array = np.minimum((2.0 * y11 * y22 - transmission.real) / size, MAX_LLEWELLYN)
-    is_active = (y11 < -EIGENVALUE_ROUNDING * norm) | (y22 < -EIGENVALUE_ROUNDING * norm)
-    return np.where(is_active, np.minimum(parameter, -1.0), parameter)
+    y12 = Y[:, 0, 1]
+    y21 = Y[:, 1, 0]
+    transmission = y12 * y21
+    norm = _find_frobenius_norm(Y)
+    smallest = 1e-30 * norm**2
+    size = np.maximum(np.abs(transmission), smallest)
+    numerator = 2.0 * y11 * y22 - transmission.real
+    parameter: Array = np.minimum(numerator / size, MAX_LLEWELLYN)
+    limit = -EIGENVALUE_ROUNDING * norm
+    first_is_active = y11 < limit
+    second_is_active = y22 < limit
+    is_active = first_is_active | second_is_active
+    negative_parameter = np.minimum(parameter, -1.0)
+    return np.where(is_active, negative_parameter, parameter)
 
 
 def llewellyn_rounding(Y: Complex) -> Array:
     """Returns the rounding error of Llewellyn's parameter, shape (F,).
 
-    It is large if there is next to no transmission.
+    The error is large if almost nothing is transmitted from port to port.
     """
-    transmission = np.abs(Y[:, 0, 1] * Y[:, 1, 0])
-    norm = np.linalg.norm(Y, axis=(1, 2))
-    size = np.maximum(transmission, 1e-30 * norm**2)
-    rounding: Array = EIGENVALUE_ROUNDING + 1e-12 * norm**2 / size
-    return rounding
+    y12 = Y[:, 0, 1]
+    y21 = Y[:, 1, 0]
+    norm = _find_frobenius_norm(Y)
+    smallest = 1e-30 * norm**2
+    size = np.maximum(np.abs(y12 * y21), smallest)
+    relative_error = 1e-12 * norm**2 / size
+    return EIGENVALUE_ROUNDING + relative_error
 
 
 def clamp_ports(Y: Complex, keep: list[int], clamped: list[int]) -> Complex:
-    """Returns the admittance at some ports with other ports clamped (Schur complement).
+    """Returns the admittance at some ports while other ports are clamped.
 
-    No operator is at the remaining ports.
+    The result is a Schur complement. Ports in neither list are free: no operator is there.
 
     Args:
         Y: admittance, shape (F, p, p).
         keep: ports of the result.
         clamped: ports with velocity zero.
     """
-    Y_kk: Complex = Y[:, keep][:, :, keep]
+    kept_rows = Y[:, keep]
+    Y_kk: Complex = kept_rows[:, :, keep]
     if not clamped:
         return Y_kk
-    Y_cc = Y[:, clamped][:, :, clamped]
-    Y_ck = Y[:, clamped][:, :, keep]
-    Y_kc = Y[:, keep][:, :, clamped]
-    return Y_kk - Y_kc @ np.linalg.solve(Y_cc, Y_ck)
+    clamped_rows = Y[:, clamped]
+    Y_cc = clamped_rows[:, :, clamped]
+    Y_ck = clamped_rows[:, :, keep]
+    Y_kc = kept_rows[:, :, clamped]
+    # the torque that holds the clamped ports, per velocity of a kept port
+    holding = np.linalg.solve(Y_cc, Y_ck)
+    return Y_kk - Y_kc @ holding
 
 
 class BestWeights(NamedTuple):
@@ -287,35 +331,55 @@ def find_best_weights(Y: Complex, owner: NDArray[np.int64]) -> BestWeights:
     free = int(owner.max())
     centre = np.zeros((count, free))
     best = np.zeros((count, free))
-    shape = np.broadcast_to(_LOG_REACH**2 * free * np.eye(free), (count, free, free)).copy()
+    ball = _LOG_REACH**2 * free * np.eye(free)
+    ellipsoids = np.broadcast_to(ball, (count, free, free)).copy()
     margin = np.full(count, -np.inf)
-    active = np.arange(count)
     # the mean of the eigenvalues, which no weights change, bounds the least of them
-    bound = 2.0 * np.trace(scaled, axis1=1, axis2=2).real / scaled.shape[1]
+    trace = np.trace(scaled, axis1=1, axis2=2)
+    bound = 2.0 * trace.real / scaled.shape[1]
+    # the frequencies at which the search continues
+    active = np.arange(count)
+
     for _ in range(_MAX_ROUNDS):
         value, slope = _evaluate_margin(scaled[active], centre[active], owner)
         is_better = value > margin[active]
-        margin[active[is_better]] = value[is_better]
-        best[active[is_better]] = centre[active[is_better]]
-        direction = np.einsum("fij,fj->fi", shape[active], slope)
+        improved = active[is_better]
+        margin[improved] = value[is_better]
+        best[improved] = centre[improved]
+
+        direction = np.einsum("fij,fj->fi", ellipsoids[active], slope)
+        squared_gain = np.einsum("fi,fi->f", slope, direction)
         # largest possible gain within the ellipsoid
-        gain = np.sqrt(np.maximum(np.einsum("fi,fi->f", slope, direction), 0.0))
-        needed_gain = _WEIGHT_TOLERANCE * np.maximum(np.abs(margin[active]), 1e-6)
-        can_gain = gain > needed_gain
-        can_gain &= bound[active] - margin[active] > EIGENVALUE_ROUNDING
+        gain = np.sqrt(np.maximum(squared_gain, 0.0))
+        size = np.maximum(np.abs(margin[active]), 1e-6)
+        can_gain = gain > _WEIGHT_TOLERANCE * size
+        reserve = bound[active] - margin[active]
+        can_gain &= reserve > EIGENVALUE_ROUNDING
         active = active[can_gain]
-        direction = direction[can_gain] / gain[can_gain, np.newaxis]
         if not len(active) or free == 0:
             break
-        centre[active] += direction / (free + 1.0)
-        if free == 1:
-            shape[active] /= 4.0
-        else:
-            outer = direction[:, :, np.newaxis] * direction[:, np.newaxis, :]
-            reduced = shape[active] - 2.0 / (free + 1.0) * outer
-            shape[active] = free**2 / (free**2 - 1.0) * reduced
+
+        step = direction[can_gain] / gain[can_gain, np.newaxis]
+        centre[active] += step / (free + 1.0)
+        ellipsoids[active] = _shrink_ellipsoids(ellipsoids[active], step)
+    # the first site's weight is 1
     log_weights = np.concatenate([np.zeros((count, 1)), best], axis=1)
     return BestWeights(margin, np.exp(log_weights))
+
+
+def _shrink_ellipsoids(ellipsoids: Array, step: Array) -> Array:
+    """Returns the least ellipsoids around the half of each that can hold the maximum.
+
+    Args:
+        ellipsoids: matrices of the ellipsoids, shape (F, n, n).
+        step: from each centre to the border, along the ascent, shape (F, n).
+    """
+    n = step.shape[1]
+    if n == 1:
+        return ellipsoids / 4.0
+    outer = step[:, :, np.newaxis] * step[:, np.newaxis, :]
+    flattened = ellipsoids - 2.0 / (n + 1.0) * outer
+    return n**2 / (n**2 - 1.0) * flattened
 
 
 def _scale_sites(Y: Complex, owner: NDArray[np.int64]) -> Complex:
@@ -323,10 +387,14 @@ def _scale_sites(Y: Complex, owner: NDArray[np.int64]) -> Complex:
     size = np.ones(Y.shape[:2])
     for site in range(int(owner.max()) + 1):
         ports = np.flatnonzero(owner == site)
-        block = Y[:, ports][:, :, ports]
-        size[:, ports] = np.linalg.norm(block, axis=(1, 2))[:, np.newaxis]
+        rows = Y[:, ports]
+        block = rows[:, :, ports]
+        norm = _find_frobenius_norm(block)
+        size[:, ports] = norm[:, np.newaxis]
     root = np.sqrt(np.maximum(size, 1e-300))
-    scaled: Complex = Y / (root[:, :, np.newaxis] * root[:, np.newaxis, :])
+    row_roots = root[:, :, np.newaxis]
+    column_roots = root[:, np.newaxis, :]
+    scaled: Complex = Y / (row_roots * column_roots)
     return scaled
 
 
@@ -343,12 +411,21 @@ def _evaluate_margin(
         log_weights: logarithms of the weights of all sites but the first, shape (F, N - 1).
         owner: index of the site of each port, shape (p,).
     """
-    all_log_weights = np.concatenate([np.zeros((len(Y), 1)), log_weights], axis=1)
-    W = weight_response(Y, np.exp(all_log_weights[:, owner]))
-    values, vectors = np.linalg.eigh(W + np.conj(np.swapaxes(W, -1, -2)))
-    v = vectors[:, :, 0]
+    # the first site's weight is 1
+    first_site = np.zeros((len(Y), 1))
+    all_log_weights = np.concatenate([first_site, log_weights], axis=1)
+    port_weights = np.exp(all_log_weights[:, owner])
+    W = weight_response(Y, port_weights)
+    eigenvalues, eigenvectors = np.linalg.eigh(W + _conjugate_transpose(W))
+
+    v = eigenvectors[:, :, 0]
     v_conj = np.conj(v)
-    per_port = (v_conj * (W @ v[:, :, np.newaxis])[:, :, 0]).real
-    per_port -= ((v_conj[:, np.newaxis, :] @ W)[:, 0, :] * v).real
-    is_owner = owner[:, np.newaxis] == np.arange(1, all_log_weights.shape[1])
-    return values[:, 0], per_port @ is_owner.astype(np.float64)
+    W_v = (W @ v[:, :, np.newaxis])[:, :, 0]
+    v_conj_W = (v_conj[:, np.newaxis, :] @ W)[:, 0, :]
+    per_port = (v_conj * W_v).real
+    per_port -= (v_conj_W * v).real
+
+    sites = np.arange(1, all_log_weights.shape[1])
+    is_owner = owner[:, np.newaxis] == sites
+    gradient = per_port @ is_owner.astype(np.float64)
+    return eigenvalues[:, 0], gradient

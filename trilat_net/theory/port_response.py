@@ -39,6 +39,7 @@ ZERO_ROOT_RADIUS_PER_S = 1e-3
 _BATCH = 512
 """Frequencies that are solved together, which limits memory."""
 _CIRCLE_POINTS = 64
+"""Points of the circle around zero on which the response is evaluated."""
 _HIGHEST_POWER = 6
 """Highest order of a pole at zero that is searched."""
 _NEGLIGIBLE = 1e-3
@@ -58,12 +59,23 @@ class LoopOutput(NamedTuple):
 
     def evaluate(self, s: Complex) -> Complex:
         """Returns C + sum_k C_k e^{-s T_k}, shape (F, p, n)."""
-        total: Complex = np.broadcast_to(
-            self.C.astype(np.complex128), (len(s), *self.C.shape)
-        ).copy()
+        total = _repeat_matrix(self.C, len(s))
         for delay_s, C in self.delayed:
-            total += np.exp(-s * delay_s)[:, np.newaxis, np.newaxis] * C
+            total += _evaluate_shift(s, delay_s) * C
         return total
+
+
+def _repeat_matrix(matrix: Array, count: int) -> Complex:
+    """Returns complex copies of a matrix of shape (p, m), shape (count, p, m)."""
+    shape = (count, *matrix.shape)
+    copies: Complex = np.broadcast_to(matrix.astype(np.complex128), shape).copy()
+    return copies
+
+
+def _evaluate_shift(s: Complex, delay_s: float) -> Complex:
+    """Returns e^{-s T} of a delay T, shape (F, 1, 1)."""
+    shift: Complex = np.exp(-s * delay_s)
+    return shift[:, np.newaxis, np.newaxis]
 
 
 class PoleAtZero(NamedTuple):
@@ -85,11 +97,14 @@ class PoleAtZero(NamedTuple):
         A passive network has simple poles on the axis, with a residue that is symmetric and has
         no negative eigenvalue.
         """
-        asymmetry = np.abs(self.residue - self.residue.T).max(initial=0.0)
+        differences = np.abs(self.residue - self.residue.T)
+        asymmetry = differences.max(initial=0.0)
         size = np.abs(self.residue).max(initial=0.0)
         if self.order > 1 or asymmetry > _NEGLIGIBLE * size:
             return False
-        return bool(np.linalg.eigvalsh(self.residue).min(initial=0.0) >= -_NEGLIGIBLE * size)
+        eigenvalues = np.linalg.eigvalsh(self.residue)
+        least = eigenvalues.min(initial=0.0)
+        return bool(least >= -_NEGLIGIBLE * size)
 
 
 def evaluate_transfer(
@@ -97,7 +112,7 @@ def evaluate_transfer(
 ) -> Complex:
     """Returns the transfer function from torques to an output, shape (F, p, m).
 
-    It is C(s) (s E - A - sum_k A_k e^{-s T_k})^{-1} (B + sum_k B_k e^{-s T_k}).
+    The function is C(s) (s E - A - sum_k A_k e^{-s T_k})^{-1} (B + sum_k B_k e^{-s T_k}).
 
     Args:
         loop: the loop.
@@ -106,34 +121,40 @@ def evaluate_transfer(
             admittance Y(s), rad/s per N m.
     """
     output = LoopOutput(loop.C) if output is None else output
-    response = np.zeros((len(s), len(output.C), loop.B.shape[1]), np.complex128)
-    rate_matrix = np.eye(len(loop.A)) if loop.E is None else np.diag(loop.E)
+    shape = (len(s), len(output.C), loop.B.shape[1])
+    response = np.zeros(shape, np.complex128)
+    E = np.eye(len(loop.A)) if loop.E is None else np.diag(loop.E)
     for first in range(0, len(s), _BATCH):
-        batch = s[first : first + _BATCH]
-        left = batch[:, np.newaxis, np.newaxis] * rate_matrix - loop.A
-        B = loop.B.astype(np.complex128)
-        right = np.broadcast_to(B, (len(batch), *loop.B.shape)).copy()
+        end = first + _BATCH
+        batch = s[first:end]
+        left = batch[:, np.newaxis, np.newaxis] * E - loop.A
+        right = _repeat_matrix(loop.B, len(batch))
         for term in loop.delayed:
-            shift = np.exp(-batch * term.delay_s)[:, np.newaxis, np.newaxis]
+            shift = _evaluate_shift(batch, term.delay_s)
             left -= shift * term.A
             right += shift * term.B
         state = np.linalg.solve(left, right)
-        response[first : first + _BATCH] = output.evaluate(batch) @ state
+        response[first:end] = output.evaluate(batch) @ state
     return response
 
 
 def build_admittance(loop: LinearLoop) -> PortResponse:
     """Returns the admittance Y(j w) as a function of w.
 
-    It is the velocity of each joint per torque of an operator at each joint, rad/s per N m. The
-    loop's outputs must be the velocities of the joints of its inputs, in order.
+    The admittance is the velocity of each joint per torque of an operator at each joint, rad/s
+    per N m. The loop's outputs must be the velocities of the joints of its inputs, in order.
     """
-    if loop.C.shape[0] != loop.B.shape[1]:
+    velocities = loop.C.shape[0]
+    torques = loop.B.shape[1]
+    if velocities != torques:
         raise RuntimeFault(
-            "ports need as many velocities as torques, "
-            f"not {loop.C.shape[0]} of {loop.B.shape[1]}"
+            f"ports need as many velocities as torques, not {velocities} of {torques}"
         )
-    return lambda w_rad_s: evaluate_transfer(loop, to_imaginary_axis(w_rad_s))
+
+    def evaluate_admittance(w_rad_s: Array) -> Complex:
+        return evaluate_transfer(loop, to_imaginary_axis(w_rad_s))
+
+    return evaluate_admittance
 
 
 def to_imaginary_axis(w_rad_s: Array) -> Complex:
@@ -148,7 +169,9 @@ def parse_port_site(port: str) -> str:
 
 def list_port_sites(loop: LinearLoop) -> tuple[str, ...]:
     """Returns the sites of a loop, in the order of its inputs."""
-    return tuple(dict.fromkeys(parse_port_site(name) for name in loop.inputs))
+    sites = [parse_port_site(name) for name in loop.inputs]
+    # a dict keeps each site once, in order
+    return tuple(dict.fromkeys(sites))
 
 
 def find_site_ports(loop: LinearLoop, site: str) -> list[int]:
@@ -159,9 +182,8 @@ def find_site_ports(loop: LinearLoop, site: str) -> list[int]:
     """
     ports = [n for n, name in enumerate(loop.inputs) if parse_port_site(name) == site]
     if not ports:
-        raise UsageError(
-            f"no site {site!r} at the ports; there are {', '.join(list_port_sites(loop))}"
-        )
+        sites = ", ".join(list_port_sites(loop))
+        raise UsageError(f"no site {site!r} at the ports; there are {sites}")
     return ports
 
 
@@ -174,13 +196,19 @@ def group_ports_by_joint(loop: LinearLoop) -> dict[int, list[int]]:
     """Returns the ports of each joint, by its number, in the order of the sites."""
     ports: dict[int, list[int]] = {}
     for port, name in enumerate(loop.inputs):
-        ports.setdefault(parse_port_joint(name), []).append(port)
+        joint = parse_port_joint(name)
+        ports.setdefault(joint, []).append(port)
     return dict(sorted(ports.items()))
 
 
 def select_ports(response: PortResponse, ports: list[int]) -> PortResponse:
     """Returns the response at some ports, with no operator at the others."""
-    return lambda w_rad_s: response(w_rad_s)[:, ports][:, :, ports]
+
+    def evaluate_selected(w_rad_s: Array) -> Complex:
+        rows = response(w_rad_s)[:, ports]
+        return rows[:, :, ports]
+
+    return evaluate_selected
 
 
 def find_longest_delay_s(loop: LinearLoop) -> float:
@@ -197,29 +225,31 @@ def find_pole_at_zero(loop: LinearLoop) -> PoleAtZero:
     as zero.
     """
     angles = 2j * math.pi * np.arange(_CIRCLE_POINTS) / _CIRCLE_POINTS
-    circle = np.exp(angles)[:, np.newaxis, np.newaxis]
-    values = evaluate_transfer(loop, ZERO_ROOT_RADIUS_PER_S * circle[:, 0, 0])
+    unit_circle = np.exp(angles)
+    values = evaluate_transfer(loop, ZERO_ROOT_RADIUS_PER_S * unit_circle)
+    circle = unit_circle[:, np.newaxis, np.newaxis]
     # the coefficient of 1 / s^k is the mean of Y(s) s^k over the circle
-    coefficients = [
-        (values * circle**power).mean(axis=0).real for power in range(1, _HIGHEST_POWER + 1)
-    ]
-    size = _NEGLIGIBLE * np.abs(values).max(initial=0.0)
-    powers = [
-        power
-        for power, coefficient in enumerate(coefficients, 1)
-        if np.abs(coefficient).max(initial=0.0) > size
-    ]
-    residue = np.zeros_like(coefficients[0])
+    coefficients = {}
+    for power in range(1, _HIGHEST_POWER + 1):
+        mean = (values * circle**power).mean(axis=0)
+        coefficients[power] = mean.real
+    least = _NEGLIGIBLE * np.abs(values).max(initial=0.0)
+    powers = []
+    for power, coefficient in coefficients.items():
+        size = np.abs(coefficient).max(initial=0.0)
+        if size > least:
+            powers.append(power)
+    residue = np.zeros_like(coefficients[1])
     if 1 in powers:
-        residue = coefficients[0] * ZERO_ROOT_RADIUS_PER_S
+        residue = coefficients[1] * ZERO_ROOT_RADIUS_PER_S
     return PoleAtZero(max(powers, default=0), residue)
 
 
 def clamp_site(loop: LinearLoop, site: str) -> LinearLoop:
     """Returns the loop with a site clamped: without its ports, velocities and angles.
 
-    The clamp's torque is the one with which the site's accelerations are zero,
-    u_c = -B_cc^-1 (A_c x + B_c u + delayed terms); it enters wherever the law uses the site's
+    The torque of the clamp makes the site's accelerations zero,
+    u_c = -B_cc^-1 (A_c x + B_c u + delayed terms). It acts wherever the law uses the site's
     torque.
 
     Raises:
@@ -227,16 +257,21 @@ def clamp_site(loop: LinearLoop, site: str) -> LinearLoop:
     """
     ports = find_site_ports(loop, site)
     other_ports = [n for n in range(len(loop.inputs)) if n not in ports]
-    speeds = [loop.names.index(loop.outputs[port]) for port in ports]
-    angles = [loop.names.index(loop.inputs[port].replace(".tau", ".q")) for port in ports]
+    speeds = []
+    angles = []
+    for port in ports:
+        speeds.append(loop.names.index(loop.outputs[port]))
+        angle_name = loop.inputs[port].replace(".tau", ".q")
+        angles.append(loop.names.index(angle_name))
     removed = {*speeds, *angles}
     kept = [n for n in range(len(loop.names)) if n not in removed]
     terms = [DelayedTerm(0.0, loop.A, loop.B), *loop.delayed]
-    if any(term.B[np.ix_(speeds, ports)].any() for term in loop.delayed):
+    acceleration_block = np.ix_(speeds, ports)
+    if any(term.B[acceleration_block].any() for term in loop.delayed):
         raise UsageError(
             f"clamped sites that reflect force onto each other have no finite answer: {site}"
         )
-    inertia = np.linalg.inv(loop.B[np.ix_(speeds, ports)])
+    inertia = np.linalg.inv(loop.B[acceleration_block])
     sums: dict[float, DelayedTerm] = {}
 
     def add_term(delay_s: float, A: Array, B: Array) -> None:
@@ -247,25 +282,26 @@ def clamp_site(loop: LinearLoop, site: str) -> LinearLoop:
             B = sums[key].B + B
         sums[key] = DelayedTerm(key, A, B)
 
-    clamp_torque = [
-        DelayedTerm(
-            delay_s=term.delay_s,
-            A=-inertia @ term.A[speeds],
-            B=-inertia @ term.B[speeds][:, other_ports],
-        )
-        for term in terms
-    ]
+    clamp_torques = []
+    for term in terms:
+        by_state = term.A[speeds]
+        by_torque = term.B[speeds][:, other_ports]
+        clamp = DelayedTerm(term.delay_s, A=-inertia @ by_state, B=-inertia @ by_torque)
+        clamp_torques.append(clamp)
     for term in terms:
         add_term(term.delay_s, term.A, term.B[:, other_ports])
         effect = term.B[:, ports]
-        if effect.any():
-            for clamp in clamp_torque:
-                delay_s = term.delay_s + clamp.delay_s
-                add_term(delay_s, effect @ clamp.A, effect @ clamp.B)
-    undelayed, *delayed = [
-        DelayedTerm(term.delay_s, term.A[np.ix_(kept, kept)], term.B[kept])
-        for term in sorted(sums.values(), key=lambda term: term.delay_s)
-    ]
+        if not effect.any():
+            continue
+        for clamp in clamp_torques:
+            delay_s = term.delay_s + clamp.delay_s
+            add_term(delay_s, effect @ clamp.A, effect @ clamp.B)
+    kept_terms = []
+    for delay_s in sorted(sums):
+        total = sums[delay_s]
+        kept_A = total.A[np.ix_(kept, kept)]
+        kept_terms.append(DelayedTerm(delay_s, kept_A, total.B[kept]))
+    undelayed, *delayed = kept_terms
     return LinearLoop(
         names=tuple(loop.names[n] for n in kept),
         inputs=tuple(loop.inputs[n] for n in other_ports),
@@ -281,9 +317,11 @@ def clamp_site(loop: LinearLoop, site: str) -> LinearLoop:
 TRANSPARENCY_BAND_HZ = (0.1, 10.0)
 """Band of the means: operators drift below it, and do not move deliberately above it."""
 QUOTED_AT_HZ = 1.0
+"""Frequency at which impedances are quoted."""
 _SHOWN_HZ = (0.01, 100.0)
 """Band of the figures."""
 _PER_DECADE = 100
+"""Frequencies per decade of this band."""
 
 
 class Transparency(NamedTuple):
@@ -320,38 +358,47 @@ class Transparency(NamedTuple):
     @property
     def ratio_db(self) -> float:
         """Mean of 20 log10(abs(Z_clamped) / abs(Z_free)) over the band, dB."""
-        return 20.0 * float(np.log10(self.stiffest_nm_s_rad / self.softest_nm_s_rad))
+        ratio = self.stiffest_nm_s_rad / self.softest_nm_s_rad
+        return 20.0 * float(np.log10(ratio))
 
     @property
     def difference_nm_s_rad(self) -> float:
         """Mean magnitude of Z_clamped - Z_free over the band, on logarithmic axes.
 
-        It is zero if the two are equal at some frequency.
+        The mean is zero if the two impedances are equal at some frequency.
         """
         difference = self.clamped - self.free
-        return self._average_magnitude(difference) if difference.all() else 0.0
+        if not difference.all():
+            return 0.0
+        return self._average_magnitude(difference)
 
     def interpolate_magnitudes(self, frequency_hz: float) -> tuple[float, float]:
         """Returns the magnitudes of the free and the clamped impedance, N m s/rad.
 
-        They are interpolated on logarithmic axes.
+        The magnitudes are interpolated on logarithmic axes.
 
         Args:
             frequency_hz: the frequency, Hz.
         """
         log_w = np.log(self.w_rad_s)
         target = np.log(2.0 * np.pi * frequency_hz)
-        free = np.interp(target, log_w, np.log(np.abs(self.free)))
-        clamped = np.interp(target, log_w, np.log(np.abs(self.clamped)))
+        log_free = np.log(np.abs(self.free))
+        log_clamped = np.log(np.abs(self.clamped))
+        free = np.interp(target, log_w, log_free)
+        clamped = np.interp(target, log_w, log_clamped)
         return float(np.exp(free)), float(np.exp(clamped))
 
     def _average_magnitude(self, Z: Complex) -> float:
         """Returns the mean magnitude of an impedance over the band, on logarithmic axes."""
         low, high = (2.0 * np.pi * edge for edge in self.band_hz)
-        inside = (self.w_rad_s >= low * (1.0 - 1e-9)) & (self.w_rad_s <= high * (1.0 + 1e-9))
+        # the edges of the band belong to it, up to rounding
+        is_above = self.w_rad_s >= low * (1.0 - 1e-9)
+        is_below = self.w_rad_s <= high * (1.0 + 1e-9)
+        inside = is_above & is_below
         log_magnitudes = np.log(np.abs(Z[inside]))
         log_w = np.log(self.w_rad_s[inside])
-        mean = np.trapezoid(log_magnitudes, log_w) / (log_w[-1] - log_w[0])
+        width = log_w[-1] - log_w[0]
+        mean = np.trapezoid(log_magnitudes, log_w) / width
         return float(np.exp(mean))
 
 
@@ -369,17 +416,22 @@ def measure_transparency(loop: LinearLoop, at: str, of: str) -> tuple[Transparen
         UsageError: there is no such site, or both are the same.
     """
     low, high = _SHOWN_HZ
-    points = np.geomspace(low, high, 1 + round(_PER_DECADE * np.log10(high / low)))
-    w_rad_s = 2.0 * np.pi * np.union1d(points, TRANSPARENCY_BAND_HZ)
+    decades = np.log10(high / low)
+    points = np.geomspace(low, high, 1 + round(_PER_DECADE * decades))
+    frequencies_hz = np.union1d(points, TRANSPARENCY_BAND_HZ)
+    w_rad_s = 2.0 * np.pi * frequencies_hz
     ports = find_site_ports(loop, at)
     if at == of:
         raise UsageError(f"a load at {at} would be at the operator's own site")
     clamped_loop = clamp_site(loop, of)
-    free = select_ports(build_admittance(loop), ports)(w_rad_s)
     clamped_ports = find_site_ports(clamped_loop, at)
-    clamped = select_ports(build_admittance(clamped_loop), clamped_ports)(w_rad_s)
-    return tuple(
-        Transparency(
+    evaluate_free = select_ports(build_admittance(loop), ports)
+    evaluate_clamped = select_ports(build_admittance(clamped_loop), clamped_ports)
+    free = evaluate_free(w_rad_s)
+    clamped = evaluate_clamped(w_rad_s)
+    transparencies = []
+    for n, port in enumerate(ports):
+        transparency = Transparency(
             operator_site=at,
             other_site=of,
             joint=parse_port_joint(loop.inputs[port]),
@@ -387,5 +439,5 @@ def measure_transparency(loop: LinearLoop, at: str, of: str) -> tuple[Transparen
             free=1.0 / free[:, n, n],
             clamped=1.0 / clamped[:, n, n],
         )
-        for n, port in enumerate(ports)
-    )
+        transparencies.append(transparency)
+    return tuple(transparencies)

@@ -5,8 +5,8 @@ rounding because nothing is subtracted. Squire and Trapp, "Using complex variabl
 derivatives of real functions", SIAM Review 40 (1998).
 
 Invariant:
-    - Plain NumPy on `textbook_arm` and nothing of the compiled core, so that the two check each
-      other.
+    - All arithmetic is plain NumPy on `textbook_arm`, without the compiled core, so that this
+      module and the core check each other.
     - Where a law has branches (a wall, the bounds of an estimate), the real part decides, so
       that a complex step yields the Jacobian of the branch in force.
 """
@@ -16,15 +16,17 @@ from itertools import accumulate, pairwise
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..analysis.arm_rows import Numbers, PlacedArm, multiply_columns
-from ..core.exogenous import OWN_KINDS, SCRIPTED_KINDS, TorqueKind, TorqueSource
+from ..core.exogenous import SCRIPTED_KINDS, TorqueKind, TorqueSource
 from ..core.site_setup import Law, SiteSetup
 from ..core.vectors import Array
 from .numeric_law import NumericLaw
 from .textbook_arm import Following, PlacedChain, follow_in_task, follow_joints, share_pose
 
 COMPLEX_STEP = 1e-30
+"""Imaginary step h of the derivatives."""
 SWITCHING_TOLERANCE = 1e-9
 """Within this distance a wall, m, or an end of an estimate's box is at its switching point."""
 
@@ -59,7 +61,8 @@ class ArgumentLayout:
         self.peers = peers
         self.coordinates = m = shared or joints
         lengths = (joints, joints, parameters, m, m, m, 3 * m * peers, joints)
-        slices = [slice(*bounds) for bounds in pairwise(accumulate(lengths, initial=0))]
+        ends = accumulate(lengths, initial=0)
+        slices = [slice(start, stop) for start, stop in pairwise(ends)]
         self.q = slices[0]
         self.qd = slices[1]
         self.estimate = slices[2]
@@ -73,8 +76,9 @@ class ArgumentLayout:
 
     def peer_sample(self, index: int) -> slice:
         """Returns the slice of one peer's sample: its x, velocity, and exogenous torque."""
-        first = self.peer_torque.stop + 3 * self.coordinates * index
-        return slice(first, first + 3 * self.coordinates)
+        length = 3 * self.coordinates
+        first = self.peer_torque.stop + length * index
+        return slice(first, first + length)
 
 
 def lay_out_arguments(site: SiteSetup) -> ArgumentLayout:
@@ -82,11 +86,18 @@ def lay_out_arguments(site: SiteSetup) -> ArgumentLayout:
 
     The memory of an imported law takes the position of the estimate.
     """
+    layout = site.layout
     if isinstance(site.law_factory, NumericLaw):
         return ArgumentLayout(
-            site.layout.joints, len(site.law_factory.memory), 0, len(site.links)
+            joints=layout.joints,
+            parameters=len(site.law_factory.memory),
+            peers=len(site.links),
         )
-    return ArgumentLayout(site.layout.joints, site.layout.parameters, site.layout.shared)
+    return ArgumentLayout(
+        joints=layout.joints,
+        parameters=layout.parameters,
+        shared=layout.shared,
+    )
 
 
 def place_arm(site: SiteSetup, q: Numbers) -> PlacedArm | PlacedChain:
@@ -97,7 +108,7 @@ def place_arm(site: SiteSetup, q: Numbers) -> PlacedArm | PlacedChain:
 
 
 class SiteRates(NamedTuple):
-    """Rates and torques of a site; in a Jacobian, each has a column per argument.
+    """Rates and torques of a site; in a Jacobian, each of them has a column per argument.
 
     Attributes:
         qdd: joint accelerations, shape (n, ...), rad/s^2.
@@ -139,9 +150,21 @@ def compute_following(site: SiteSetup, arm: PlacedArm | PlacedChain, x: Numbers)
     reference_rate = x[layout.qd_des]
     if site.layout.task and isinstance(arm, PlacedChain):
         return follow_in_task(
-            site, arm, Lambda, q=q, qd=qd, x_des=reference, xd_des=reference_rate
+            site=site,
+            arm=arm,
+            Lambda=Lambda,
+            q=q,
+            qd=qd,
+            x_des=reference,
+            xd_des=reference_rate,
         )
-    return follow_joints(Lambda, q=q, qd=qd, q_des=reference, qd_des=reference_rate)
+    return follow_joints(
+        Lambda=Lambda,
+        q=q,
+        qd=qd,
+        q_des=reference,
+        qd_des=reference_rate,
+    )
 
 
 def compute_shared_pose(site: SiteSetup, q: Numbers) -> Numbers:
@@ -160,7 +183,7 @@ def compute_shared_pose(site: SiteSetup, q: Numbers) -> Numbers:
 def evaluate_site_rates(site: SiteSetup, x: Numbers) -> SiteRates:
     """Returns the rates of a site with the actors in force.
 
-    They are Eq. (8)-(13) and (15) of the paper, or those of a law with known gravity.
+    The rates are Eq. (8)-(13) and (15) of the paper, or those of a law with known gravity.
 
     Args:
         site: setup of the site.
@@ -170,10 +193,12 @@ def evaluate_site_rates(site: SiteSetup, x: Numbers) -> SiteRates:
     arm = place_arm(site, x[layout.q])
     qd = x[layout.qd]
     following = compute_following(site, arm, x)
-    external = x[layout.external_torque] + _sum_actors(site, arm, x, sampled=False)
+    continuous = _sum_actors(site, arm, x, sampled=False)
+    external = x[layout.external_torque] + continuous
     held = _sum_actors(site, arm, x, sampled=True)
     if isinstance(site.law_factory, NumericLaw):
-        law_arguments = np.concatenate([x[: layout.inputs.stop], external + held])
+        state_and_inputs = x[: layout.inputs.stop]
+        law_arguments = np.concatenate([state_and_inputs, external + held])
         tau, estimate_rate = site.law_factory.evaluate(law_arguments)
     elif has_estimate(site):
         tau, estimate_rate = _evaluate_adaptive_law(site, arm, following, x)
@@ -181,7 +206,8 @@ def evaluate_site_rates(site: SiteSetup, x: Numbers) -> SiteRates:
         tau = _evaluate_known_gravity_law(site, arm, following, x)
         estimate_rate = 0.0 * x[layout.estimate]
     torque = tau + external + held
-    qdd = arm.joint_acceleration(_as_columns(site.theta, qd), qd, torque)
+    theta = _as_columns(site.theta, qd)
+    qdd = arm.joint_acceleration(theta, qd, torque)
     return SiteRates(
         qdd=qdd,
         estimate=estimate_rate,
@@ -196,9 +222,11 @@ def evaluate_site_rates(site: SiteSetup, x: Numbers) -> SiteRates:
 
 def differentiate_site_rates(site: SiteSetup, x: Array) -> SiteRates:
     """Returns the derivatives of the rates at x by a complex step, a column per argument."""
-    stepped = x[:, np.newaxis] + 1j * COMPLEX_STEP * np.eye(len(x))
+    steps = 1j * COMPLEX_STEP * np.eye(len(x))
+    stepped = x[:, np.newaxis] + steps
     rates = evaluate_site_rates(site, stepped)
-    return SiteRates(*(rate.imag / COMPLEX_STEP for rate in rates))
+    derivatives = [rate.imag / COMPLEX_STEP for rate in rates]
+    return SiteRates(*derivatives)
 
 
 def has_estimate(site: SiteSetup) -> bool:
@@ -211,7 +239,10 @@ def has_estimate(site: SiteSetup) -> bool:
 def _as_columns(values: object, like: Numbers) -> Numbers:
     """Returns values with a copy for each column of another array, shape (..., columns)."""
     column = np.asarray(values, dtype=np.float64)
-    return column.reshape(column.shape + (1,) * (like.ndim - 1)) + np.zeros(like.shape[1:])
+    columns = like.shape[1:]
+    column_axes = (1,) * len(columns)
+    reshaped = column.reshape(column.shape + column_axes)
+    return reshaped + np.zeros(columns)
 
 
 def _evaluate_known_gravity_law(
@@ -219,18 +250,20 @@ def _evaluate_known_gravity_law(
 ) -> Numbers:
     """Returns the torque of a law with known gravity, shape (n, ...), N m.
 
-    tau = G(q) - d qd - J' (Kd ed + K e - k_f tau_peers), with J = 1 in joint space.
+    The law is tau = G(q) - d qd - J' (Kd ed + K e - k_f tau_peers), J = 1 in joint space.
     """
     layout = lay_out_arguments(site)
     gains = site.gains
     q = x[layout.q]
     qd = x[layout.qd]
     K = _as_columns(gains.K, q)
+    Kd = _as_columns(gains.Kd, q)
     d = _as_columns(gains.d, q)
     k_f = _as_columns(gains.k_f, q)
-    theta = _as_columns(np.broadcast_to(gains.known, site.theta.shape), q)
+    known_parameters = np.broadcast_to(gains.known, site.theta.shape)
+    theta = _as_columns(known_parameters, q)
     G = arm.gravity_torque(theta)
-    pull = _as_columns(gains.Kd, q) * following.ed
+    pull = Kd * following.ed
     pull = pull + K * following.e - k_f * x[layout.peer_torque]
     torque: Array = G - d * qd - following.to_joints(pull)
     return torque
@@ -254,7 +287,12 @@ def _evaluate_adaptive_law(
     qd = x[layout.qd]
     estimate = x[layout.estimate]
     Kp = _as_columns(gains.Kp, q)
-    pull = _as_columns(gains.Kd, q) * following.ed
+    Kd = _as_columns(gains.Kd, q)
+    Gamma = _as_columns(gains.Gamma, q)
+    rho = _as_columns(gains.rho, q)
+    width = _as_columns(gains.width, q)
+    known = _as_columns(gains.friction, q)
+    pull = Kd * following.ed
     v = following.v
     a = following.a
     r = qd - v
@@ -264,17 +302,20 @@ def _evaluate_adaptive_law(
         v = -Lambda * q
         a = -Lambda * qd
         r = qd + Lambda * q
-        pull = pull - Kp * (x[layout.qd_des] + Lambda * x[layout.q_des])
-    tau = arm.required_torque(estimate, qd, v, a) - Kp * r - following.to_joints(pull)
-    rho = _as_columns(gains.rho, q)
-    width = _as_columns(gains.width, q)
-    known = _as_columns(gains.friction, q)
+        reference_r = x[layout.qd_des] + Lambda * x[layout.q_des]
+        pull = pull - Kp * reference_r
+
+    model_torque = arm.required_torque(estimate, qd, v, a)
+    tau = model_torque - Kp * r - following.to_joints(pull)
     robust_torque = rho * r / np.sqrt(r * r + width * width)
     unknown_friction = (1.0 - known) * arm.friction_torque(v)
     tau = tau - robust_torque - unknown_friction
+
     Y = arm.regressor_matrix(qd, v, a)
-    rate = -_as_columns(gains.Gamma, q) * multiply_columns(np.swapaxes(Y, 0, 1), r)
-    return tau, np.where(_is_at_bound(site, estimate, rate), 0.0, rate)
+    gradient = multiply_columns(np.swapaxes(Y, 0, 1), r)
+    rate = -Gamma * gradient
+    is_blocked = _is_at_bound(site, estimate, rate)
+    return tau, np.where(is_blocked, 0.0, rate)
 
 
 def _is_at_bound(site: SiteSetup, estimate: Numbers, rate: Numbers) -> Numbers:
@@ -285,7 +326,9 @@ def _is_at_bound(site: SiteSetup, estimate: Numbers, rate: Numbers) -> Numbers:
     is_high = estimate.real >= high - SWITCHING_TOLERANCE
     falls = rate.real < -SWITCHING_TOLERANCE
     rises = rate.real > SWITCHING_TOLERANCE
-    return (is_low & falls) | (is_high & rises)
+    leaves_low = is_low & falls
+    leaves_high = is_high & rises
+    return leaves_low | leaves_high
 
 
 def _sum_actors(
@@ -318,7 +361,7 @@ def _evaluate_actor(
     """Returns the torque of one actor in force, shape (n, ...), N m.
 
     An operator's motion has ended, and a scripted torque has the constant value `a`. A
-    user-written model keeps the parameters that it has at `move_end_s`.
+    user-written model keeps its parameters of the time `move_end_s`.
     """
     if actor.kind in SCRIPTED_KINDS:
         return _as_columns(actor.a, q)
@@ -327,43 +370,52 @@ def _evaluate_actor(
     if actor.kind is TorqueKind.VISCOUS:
         return -damping * qd
     if actor.kind is TorqueKind.HAND:
-        torque: Numbers = stiffness * (_as_columns(actor.b, q) - q) - damping * qd
+        target = _as_columns(actor.b, q)
+        torque: Numbers = stiffness * (target - q) - damping * qd
         return torque
+    if actor.kind is TorqueKind.OWN_JOINTS:
+        return _evaluate_model(actor, q, qd)
+
+    # the other actors are at the end effector
     J = arm.position_jacobian()
-    J_transposed = np.swapaxes(J, 0, 1)
     position = arm.end_effector_position()
     velocity = multiply_columns(J, qd)
     if actor.kind is TorqueKind.OWN_TIP:
-        return multiply_columns(J_transposed, _evaluate_model(actor, position, velocity))
-    if actor.kind in OWN_KINDS:
-        return _evaluate_model(actor, q, qd)
-    if actor.kind is TorqueKind.TASK_HAND:
-        force = stiffness * (_as_columns(actor.b, q) - position) - damping * velocity
+        force = _evaluate_model(actor, position, velocity)
+    elif actor.kind is TorqueKind.TASK_HAND:
+        target = _as_columns(actor.b, q)
+        force = stiffness * (target - position) - damping * velocity
     else:
+        surface_point = _as_columns(actor.a, q)
         normal = _as_columns(actor.b, q)
-        depth = np.sum((_as_columns(actor.a, q) - position) * normal, axis=0)
-        push = stiffness[0] * depth - damping[0] * np.sum(velocity * normal, axis=0)
+        depth = np.sum((surface_point - position) * normal, axis=0)
+        outward_speed = np.sum(velocity * normal, axis=0)
+        push = stiffness[0] * depth - damping[0] * outward_speed
+        # a wall pushes and never pulls
         touches = (depth.real > 0.0) & (push.real > 0.0)
         force = np.where(touches, push, 0.0) * normal
-    return multiply_columns(J_transposed, force)
+    return multiply_columns(np.swapaxes(J, 0, 1), force)
 
 
 def _evaluate_model(actor: TorqueSource, position: Numbers, velocity: Numbers) -> Numbers:
     """Returns the effort of a user-written hand or environment, components first."""
     # models expect the components on the last axis
-    effort = actor.model.effort(
-        np.array(actor.move_end_s), np.moveaxis(position, 0, -1), np.moveaxis(velocity, 0, -1)
-    )
+    positions = np.moveaxis(position, 0, -1)
+    velocities = np.moveaxis(velocity, 0, -1)
+    time_s = np.array(actor.move_end_s)
+    effort = actor.model.effort(time_s, positions, velocities)
     return np.moveaxis(effort, -1, 0)
 
 
 def describe_switching_points(site: SiteSetup, x: Array) -> Iterator[str]:
     """Yields a sentence for each switching point at x, where the Jacobian is one-sided."""
     layout = lay_out_arguments(site)
-    position = place_arm(site, x[layout.q]).end_effector_position()
+    arm = place_arm(site, x[layout.q])
+    position = arm.end_effector_position()
     walls = [actor for actor in site.actors if actor.kind is TorqueKind.WALL]
     for n, wall in enumerate(walls):
-        depth_m = float((np.array(wall.a) - position) @ np.array(wall.b))
+        from_surface = np.array(wall.a) - position
+        depth_m = float(from_surface @ np.array(wall.b))
         if abs(depth_m) < SWITCHING_TOLERANCE:
             yield (
                 f"{site.name} rests exactly on the surface of its wall {n + 1}: "
@@ -371,17 +423,28 @@ def describe_switching_points(site: SiteSetup, x: Array) -> Iterator[str]:
             )
     if site.gains.law is not Law.ADAPTIVE:
         return
-    rate = evaluate_site_rates(site, x).estimate
-    unbounded = site.gains._replace(low=-np.inf, high=np.inf)
-    free_rate = evaluate_site_rates(site._replace(gains=unbounded), x).estimate
-    estimate = x[layout.estimate]
-    bounds = (site.gains.low, site.gains.high)
-    ends = np.stack([np.broadcast_to(end, estimate.shape) for end in bounds])
-    is_near = (np.abs(ends - estimate) < SWITCHING_TOLERANCE).any(axis=0)
-    is_near &= np.abs(rate) <= SWITCHING_TOLERANCE
-    is_near &= ~_is_at_bound(site, estimate, free_rate) & (np.asarray(site.gains.Gamma) > 0)
-    for p in np.flatnonzero(is_near):
+    for p in np.flatnonzero(_find_switching_estimates(site, x)):
         yield (
             f"theta{p + 1} of {site.name} rests exactly on the edge of its box: "
             "it counts as free"
         )
+
+
+def _find_switching_estimates(site: SiteSetup, x: Array) -> NDArray[np.bool_]:
+    """Returns True for each estimate that rests at an end of its box, shape (P,)."""
+    layout = lay_out_arguments(site)
+    gains = site.gains
+    estimate = x[layout.estimate]
+    low = np.broadcast_to(gains.low, estimate.shape)
+    high = np.broadcast_to(gains.high, estimate.shape)
+    is_near_low = np.abs(low - estimate) < SWITCHING_TOLERANCE
+    is_near_high = np.abs(high - estimate) < SWITCHING_TOLERANCE
+    rate = evaluate_site_rates(site, x).estimate
+    is_still = np.abs(rate) <= SWITCHING_TOLERANCE
+    # an estimate that would leave an open box is held by its bound
+    open_box = gains._replace(low=-np.inf, high=np.inf)
+    free_rate = evaluate_site_rates(site._replace(gains=open_box), x).estimate
+    is_held = _is_at_bound(site, estimate, free_rate)
+    adapts = np.asarray(gains.Gamma) > 0
+    switching: NDArray[np.bool_] = (is_near_low | is_near_high) & is_still & ~is_held & adapts
+    return switching

@@ -1,12 +1,13 @@
 """A chain of joints in plain NumPy, and how a site follows its peers.
 
-The planar arm is `analysis.arm_rows.PlacedArm`. Vectors have their components on the first axis
-and any number of columns behind it: shape (n,) or (n, B).
+The linear analysis differentiates these textbook equations; they share no code with the
+compiled core. The planar arm is `analysis.arm_rows.PlacedArm`. Vectors have their components on
+the first axis and any number of columns behind it: shape (n,) or (n, B).
 
 A spatial vector has its linear half first, at the origin of the link's own frame. Link i has
-the Jacobian J_i, the velocities V_i = J_i qd and W_i = J_i v, and the acceleration
-A_i = X A_p + S a + V_i x (S v), which includes gravity; A_p is that of the link before. Link i
-needs the force
+the Jacobian J_i and the velocities V_i = J_i qd and W_i = J_i v. Its acceleration, which
+includes gravity, is A_i = X A_p + S a + V_i x (S v), with A_p the acceleration of the link
+before. Link i needs the force
 
     f_i = I A_i + 1/2 (V_i x* I W_i + W_i x* I V_i - I (V_i x W_i))
 
@@ -41,7 +42,7 @@ _EPSILON = np.zeros((3, 3, 3))
 for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
     _EPSILON[_i, _j, _k] = 1.0
     _EPSILON[_i, _k, _j] = -1.0
-_INERTIA_PLACES = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2))
+_INERTIA_ENTRIES = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2))
 """Rows and columns of Ixx, Ixy, Iyy, Ixz, Iyz, Izz."""
 
 
@@ -62,9 +63,11 @@ def _build_inertia_units() -> Numbers:
         cross = build_cross_matrix(np.eye(3)[n])
         units[1 + n, :3, 3:] = -cross
         units[1 + n, 3:, :3] = cross
-    for n, (row, column) in enumerate(_INERTIA_PLACES):
-        units[4 + n, 3 + row, 3 + column] = 1.0
-        units[4 + n, 3 + column, 3 + row] = 1.0
+    for n, (row, column) in enumerate(_INERTIA_ENTRIES):
+        # the angular half of a spatial inertia begins at index 3
+        angular = units[4 + n, 3:, 3:]
+        angular[row, column] = 1.0
+        angular[column, row] = 1.0
     return units
 
 
@@ -88,6 +91,23 @@ def _multiply(a: Numbers, b: Numbers) -> Numbers:
     """Returns the product of matrices of shapes (a, b, ...) and (b, c, ...)."""
     product: Numbers = np.einsum("ab...,bc...->ac...", a, b)
     return product
+
+
+def _transpose(a: Numbers) -> Numbers:
+    """Returns the transposes of matrices of shape (a, b, ...)."""
+    return a.swapaxes(0, 1)
+
+
+def _repeat_columns(vector: Numbers, columns: tuple[int, ...]) -> Numbers:
+    """Returns an array of shape (*vector.shape, *columns) that repeats `vector`."""
+    repeated: Numbers = np.multiply.outer(vector, np.ones(columns))
+    return repeated
+
+
+def _add_axes(values: Numbers, shape: tuple[int, ...], count: int) -> Numbers:
+    """Returns values in a shape with `count` axes of length 1 behind it, to fit any columns."""
+    trailing = (1,) * count
+    return values.reshape(*shape, *trailing)
 
 
 class PlacedLink(NamedTuple):
@@ -115,31 +135,27 @@ class PlacedChain:
     def __init__(self, chain: ChainSetup, q: Numbers) -> None:
         self._chain = chain
         self._q = q
+        self._columns = q.shape[1:]
         self._links: list[PlacedLink] = []
-        columns = q.shape[1:]
-        J = np.zeros((6, len(q), *columns))
-        R_base = np.multiply.outer(np.eye(3), np.ones(columns))
-        place_m = np.zeros((3, *columns))
+        J = np.zeros((6, len(q), *self._columns))
+        R_base = _repeat_columns(np.eye(3), self._columns)
+        place_m = np.zeros((3, *self._columns))
         for i, joint in enumerate(chain.joints):
             R, p = _place_joint(joint, q[i])
-            R_transposed = R.swapaxes(0, 1)
-            X = np.zeros((6, 6, *columns), np.result_type(R, p))
-            X[:3, :3] = R_transposed
-            X[3:, 3:] = R_transposed
-            X[:3, 3:] = -_multiply(R_transposed, build_cross_matrix(p))
-            S = np.zeros(6)
-            half = slice(0, 3) if joint.prismatic else slice(3, 6)
-            S[half] = joint.axis
+            X = _transform_velocities(R, p)
+            S = _find_joint_axis(joint)
             J = _multiply(X, J)
-            J[:, i] += S.reshape(6, *(1,) * len(columns))
-            place_m = place_m + multiply_columns(R_base, p)
+            J[:, i] += _add_axes(S, (6,), len(self._columns))
+            offset_m = multiply_columns(R_base, p)
+            place_m = place_m + offset_m
             R_base = _multiply(R_base, R)
-            self._links.append(PlacedLink(X=X, S=S, J=J, R_base=R_base, place_m=place_m))
+            link = PlacedLink(X=X, S=S, J=J, R_base=R_base, place_m=place_m)
+            self._links.append(link)
 
     def _get_per_joint(self, name: str) -> Numbers:
         """Returns an attribute of every joint, shape (n, 1, ...)."""
         values = np.array([getattr(joint, name) for joint in self._chain.joints])
-        return values.reshape(-1, *(1,) * (self._q.ndim - 1))
+        return _add_axes(values, (-1,), len(self._columns))
 
     def regressor_matrix(self, qd: Numbers, v: Numbers, a: Numbers) -> Numbers:
         """Returns the regressor Y(q, qd, v, a) of the links without drives, Eq. (12).
@@ -149,23 +165,29 @@ class PlacedChain:
         blocks = []
         gravity = np.array([*self._chain.gravity_m_s2, 0.0, 0.0, 0.0])
         # an upward acceleration of the base stands for gravity
-        A = -np.multiply.outer(gravity, np.ones(self._q.shape[1:]))
+        A = -_repeat_columns(gravity, self._columns)
         for i, link in enumerate(self._links):
             V = multiply_columns(link.J, qd)
             W = multiply_columns(link.J, v)
             V_cross = _cross_motion(V)
             W_cross = _cross_motion(W)
-            A = multiply_columns(link.X, A) + np.multiply.outer(link.S, a[i])
-            A = A + multiply_columns(V_cross, np.multiply.outer(link.S, v[i]))
+            S_a = np.multiply.outer(link.S, a[i])
+            S_v = np.multiply.outer(link.S, v[i])
+            A = multiply_columns(link.X, A) + S_a
+            A = A + multiply_columns(V_cross, S_v)
+
             I_A = _multiply_inertia_units(A)
             I_V = _multiply_inertia_units(V)
             I_W = _multiply_inertia_units(W)
-            I_VW = _multiply_inertia_units(multiply_columns(V_cross, W))
+            V_cross_W = multiply_columns(V_cross, W)
+            I_VW = _multiply_inertia_units(V_cross_W)
             # V x* is minus the transpose of V x
-            cross_terms = _multiply(V_cross.swapaxes(0, 1), I_W)
-            cross_terms = cross_terms + _multiply(W_cross.swapaxes(0, 1), I_V) + I_VW
+            minus_V_force = _multiply(_transpose(V_cross), I_W)
+            minus_W_force = _multiply(_transpose(W_cross), I_V)
+            cross_terms = minus_V_force + minus_W_force + I_VW
             F = I_A - 0.5 * cross_terms
-            blocks.append(_multiply(link.J.swapaxes(0, 1), F))
+            block = _multiply(_transpose(link.J), F)
+            blocks.append(block)
         return np.concatenate(blocks, axis=1)
 
     def required_torque(self, theta: Numbers, qd: Numbers, v: Numbers, a: Numbers) -> Numbers:
@@ -173,16 +195,21 @@ class PlacedChain:
 
         M includes the inertia of the drives.
         """
+        Y = self.regressor_matrix(qd, v, a)
+        links = multiply_columns(Y, theta)
+        drives = self._get_per_joint("armature_kg_m2") * a
         friction = self.friction_torque(v)
-        links = multiply_columns(self.regressor_matrix(qd, v, a), theta)
-        torque: Numbers = links + self._get_per_joint("armature_kg_m2") * a + friction
+        torque: Numbers = links + drives + friction
         return torque
 
     def friction_torque(self, v: Numbers) -> Numbers:
         """Returns the torque of the joints' friction at speeds v, shape (n, ...), N m."""
-        x = v / COULOMB_SPEED
         viscous = self._get_per_joint("viscous") * v
-        return viscous + self._get_per_joint("coulomb") * x / np.sqrt(1.0 + x * x)
+        # a smooth sign of the speed
+        x = v / COULOMB_SPEED
+        root = np.sqrt(1.0 + x * x)
+        coulomb = self._get_per_joint("coulomb") * x / root
+        return viscous + coulomb
 
     def gravity_torque(self, theta: Numbers) -> Numbers:
         """Returns G(q), shape (n, ...), N m."""
@@ -191,12 +218,14 @@ class PlacedChain:
 
     def inertia_matrix(self, theta: Numbers) -> Numbers:
         """Returns M(q) with the drives' inertia, shape (n, n, ...)."""
-        armatures = np.diag([joint.armature_kg_m2 for joint in self._chain.joints])
-        M = np.multiply.outer(armatures, np.ones(self._q.shape[1:]))
+        armatures = [joint.armature_kg_m2 for joint in self._chain.joints]
+        M = _repeat_columns(np.diag(armatures), self._columns)
         for i, link in enumerate(self._links):
-            parameters = theta[LINK_PARAMETERS * i : LINK_PARAMETERS * (i + 1)]
+            first = LINK_PARAMETERS * i
+            parameters = theta[first : first + LINK_PARAMETERS]
             inertia = np.einsum("pab,p...->ab...", _INERTIA_UNITS, parameters)
-            M = M + _multiply(link.J.swapaxes(0, 1), _multiply(inertia, link.J))
+            momentum = _multiply(inertia, link.J)
+            M = M + _multiply(_transpose(link.J), momentum)
         return M
 
     def joint_acceleration(self, theta: Numbers, qd: Numbers, torque: Numbers) -> Numbers:
@@ -205,8 +234,9 @@ class PlacedChain:
         They solve M qdd + C qd + G + friction = torque + stops, Eq. (8).
         """
         bias = self.required_torque(theta, qd, qd, np.zeros_like(qd))
-        force = torque + self._compute_stop_torque(qd) - bias
-        return solve_columns(self.inertia_matrix(theta), force)
+        applied = torque + self._compute_stop_torque(qd)
+        M = self.inertia_matrix(theta)
+        return solve_columns(M, applied - bias)
 
     def _compute_stop_torque(self, qd: Numbers) -> Numbers:
         """Returns the torque of the joints' end stops, springs with dampers, shape (n, ...)."""
@@ -217,7 +247,10 @@ class PlacedChain:
         for name, sign in (("lower", 1.0), ("upper", -1.0)):
             limit = self._get_per_joint(name)
             is_beyond = sign * (limit - q.real) > 0.0
-            push = stiffness * (np.where(is_beyond, limit, 0.0) - q) - damping * qd
+            stop_position = np.where(is_beyond, limit, 0.0)
+            spring = stiffness * (stop_position - q)
+            push = spring - damping * qd
+            # a stop pushes and never pulls
             pushes_back = is_beyond & (sign * push.real > 0.0)
             total = total + np.where(pushes_back, push, 0.0)
         return total
@@ -225,20 +258,21 @@ class PlacedChain:
     def end_effector_position(self) -> Numbers:
         """Returns the position of the end effector in the base, shape (3, ...), m."""
         last = self._links[-1]
-        tip = np.multiply.outer(np.array(self._chain.tip_m), np.ones(self._q.shape[1:]))
+        tip_m = np.array(self._chain.tip_m)
+        tip = _repeat_columns(tip_m, self._columns)
         return last.place_m + multiply_columns(last.R_base, tip)
 
     def end_effector_orientation(self) -> Numbers:
         """Returns the orientation of the end effector in the base, shape (3, 3, ...)."""
-        turned: Numbers = np.einsum(
-            "ab...,bc->ac...", self._links[-1].R_base, self._chain.tip_rotation
-        )
-        return turned
+        R_last = self._links[-1].R_base
+        R_tip = self._chain.tip_rotation
+        orientation: Numbers = np.einsum("ab...,bc->ac...", R_last, R_tip)
+        return orientation
 
     def position_jacobian(self) -> Numbers:
         """Returns the Jacobian of the end effector's position, shape (3, n, ...).
 
-        Its unit is m/rad, or 1 for a prismatic joint.
+        The entries are in m/rad, or without unit for a prismatic joint.
         """
         return self.pose_jacobian()[:3]
 
@@ -260,28 +294,60 @@ class PlacedChain:
         rate = np.zeros(last.J.shape, np.result_type(last.J, qd))
         for k, link in enumerate(self._links):
             rate = _multiply(link.X, rate)
-            V_cross = _cross_motion(multiply_columns(link.J, qd))
-            axis = np.multiply.outer(link.S, np.ones(qd.shape[1:]))
-            rate[:, k] += multiply_columns(V_cross, axis)
-        rate = self._move_to_tip(rate - _multiply(_cross_motion(V_last), last.J))
+            V = multiply_columns(link.J, qd)
+            V_cross = _cross_motion(V)
+            S = _repeat_columns(link.S, qd.shape[1:])
+            rate[:, k] += multiply_columns(V_cross, S)
+        V_last_cross = _cross_motion(V_last)
+        rate = rate - _multiply(V_last_cross, last.J)
+        rate = self._move_to_tip(rate)
+
         angular_velocity = multiply_columns(last.R_base, V_last[3:])
         spin = build_cross_matrix(angular_velocity)
         J = self.pose_jacobian()
-        frame_rate: Numbers = np.concatenate([_multiply(spin, J[:3]), _multiply(spin, J[3:])])
+        linear = _multiply(spin, J[:3])
+        angular = _multiply(spin, J[3:])
+        frame_rate: Numbers = np.concatenate([linear, angular])
         return rate + frame_rate
 
     def _move_to_tip(self, columns: Numbers) -> Numbers:
         """Returns spatial velocities of the last link at the tip and along base axes."""
         R = self._links[-1].R_base
-        tip = build_cross_matrix(np.array(self._chain.tip_m))
-        linear = columns[:3] - np.einsum("ab,bn...->an...", tip, columns[3:])
-        return np.concatenate([_multiply(R, linear), _multiply(R, columns[3:])])
+        tip_cross = build_cross_matrix(np.array(self._chain.tip_m))
+        angular = columns[3:]
+        lever_term = np.einsum("ab,bn...->an...", tip_cross, angular)
+        linear = columns[:3] - lever_term
+        return np.concatenate([_multiply(R, linear), _multiply(R, angular)])
 
 
 def _multiply_inertia_units(motion: Numbers) -> Numbers:
     """Returns the momentum of each unit parameter for a spatial motion, shape (6, 10, ...)."""
     momentum: Numbers = np.einsum("pab,b...->ap...", _INERTIA_UNITS, motion)
     return momentum
+
+
+def _transform_velocities(R: Numbers, p: Numbers) -> Numbers:
+    """Returns the matrix X that takes spatial velocities into a link's frame.
+
+    Args:
+        R: orientation of the link in the frame of the link before, shape (3, 3, ...).
+        p: origin of the link in that frame, shape (3, ...), m.
+    """
+    R_transposed = _transpose(R)
+    lever = _multiply(R_transposed, build_cross_matrix(p))
+    X = np.zeros((6, 6, *p.shape[1:]), np.result_type(R, p))
+    X[:3, :3] = R_transposed
+    X[3:, 3:] = R_transposed
+    X[:3, 3:] = -lever
+    return X
+
+
+def _find_joint_axis(joint: ChainJoint) -> Array:
+    """Returns the spatial velocity of a joint that moves at speed 1, shape (6,)."""
+    S = np.zeros(6)
+    half = S[:3] if joint.prismatic else S[3:]
+    half[:] = joint.axis
+    return S
 
 
 def _place_joint(joint: ChainJoint, q: Numbers) -> tuple[Numbers, Numbers]:
@@ -299,11 +365,12 @@ def _place_joint(joint: ChainJoint, q: Numbers) -> tuple[Numbers, Numbers]:
     """
     R_0 = np.array(joint.rotation)
     axis = np.array(joint.axis)
-    ones = np.ones(np.shape(q))
-    R = np.multiply.outer(R_0, ones)
-    p = np.multiply.outer(np.array(joint.origin_m), ones)
+    columns = np.shape(q)
+    R = _repeat_columns(R_0, columns)
+    p = _repeat_columns(np.array(joint.origin_m), columns)
     if joint.prismatic:
-        return R, p + np.multiply.outer(R_0 @ axis, q)
+        shift = np.multiply.outer(R_0 @ axis, q)
+        return R, p + shift
     K = build_cross_matrix(axis)
     sine_term = np.multiply.outer(R_0 @ K, np.sin(q))
     cosine_term = np.multiply.outer(R_0 @ K @ K, 1.0 - np.cos(q))
@@ -311,10 +378,7 @@ def _place_joint(joint: ChainJoint, q: Numbers) -> tuple[Numbers, Numbers]:
 
 
 SINGULAR = 1e-9
-"""A pose is singular if the squared least singular value of its Jacobian is below this.
-
-A lower bound of that value is compared.
-"""
+"""A pose is singular if the squared least singular value of its Jacobian is below this."""
 _SMALL = 1e-4
 """Squares of angles below this are small: four terms of a series are exact."""
 
@@ -322,7 +386,7 @@ _SMALL = 1e-4
 def rotation_from_vector(vector: Numbers) -> Numbers:
     """Returns the rotation matrix of a rotation vector, shape (3, 3, ...).
 
-    Rodrigues' formula with series for small angles.
+    It is computed by Rodrigues' formula, with series for small angles.
 
     Args:
         vector: axis times angle, shape (3, ...), rad.
@@ -336,15 +400,16 @@ def rotation_from_vector(vector: Numbers) -> Numbers:
     sine_factor = np.where(is_small, sine_series, np.sin(angle) / angle)
     cosine_factor = np.where(is_small, cosine_series, (1.0 - np.cos(angle)) / angle**2)
     K = build_cross_matrix(vector)
-    identity = np.eye(3).reshape(3, 3, *(1,) * (vector.ndim - 1))
-    rotation: Numbers = identity + sine_factor * K + cosine_factor * _multiply(K, K)
+    K_squared = _multiply(K, K)
+    identity = _add_axes(np.eye(3), (3, 3), vector.ndim - 1)
+    rotation: Numbers = identity + sine_factor * K + cosine_factor * K_squared
     return rotation
 
 
 def vector_from_rotation(R: Numbers) -> Numbers:
     """Returns the rotation vector of a rotation matrix, shape (3, ...), at most pi long.
 
-    It is computed from the quaternion, and that from its largest part (Shepperd, 1978).
+    It is computed from the quaternion of the rotation.
 
     Args:
         R: rotation matrix, shape (3, 3, ...).
@@ -356,15 +421,20 @@ def vector_from_rotation(R: Numbers) -> Numbers:
     is_small = square.real < _SMALL
     sine = np.sqrt(np.where(is_small, 1.0, square))
     # series of 2 atan(t) / sine, with t = tan(angle / 2)
-    t_square = np.where(is_small, square, 0.0) / np.where(is_small, w, 1.0) ** 2
+    small_w = np.where(is_small, w, 1.0)
+    small_square = np.where(is_small, square, 0.0)
+    t_square = small_square / small_w**2
     series = 1.0 - t_square * (1.0 / 3.0 - t_square * (1.0 / 5.0 - t_square / 7.0))
-    small_factor = 2.0 / np.where(is_small, w, 1.0) * series
+    small_factor = 2.0 / small_w * series
     # the arctangent of a ratio of at most 1, so that no part of it divides by zero
     is_below = sine.real <= w.real
-    divisor = np.where(is_below, np.where(w == 0.0, 1.0, w), sine)
+    nonzero_w = np.where(w == 0.0, 1.0, w)
+    divisor = np.where(is_below, nonzero_w, sine)
     ratio = np.where(is_below, sine, w) / divisor
-    angle = 2.0 * np.where(is_below, np.arctan(ratio), 0.5 * np.pi - np.arctan(ratio))
-    vector: Numbers = np.where(is_small, small_factor, angle / sine) * v
+    arctangent = np.arctan(ratio)
+    half_angle = np.where(is_below, arctangent, 0.5 * np.pi - arctangent)
+    factor = 2.0 * half_angle / sine
+    vector: Numbers = np.where(is_small, small_factor, factor) * v
     return vector
 
 
@@ -392,16 +462,20 @@ def _find_quaternion(R: Numbers) -> Numbers:
         ]
     )
     sizes = np.array([products[n, n].real for n in range(4)])
-    largest = sizes.argmax(axis=0)[np.newaxis, np.newaxis]
-    quaternion = np.take_along_axis(products, largest, axis=0)[0]
-    quaternion = quaternion / np.sqrt(np.sum(quaternion * quaternion, axis=0))
-    with_positive_w: Numbers = np.where(quaternion[0].real < 0.0, -quaternion, quaternion)
+    largest = sizes.argmax(axis=0)
+    row = largest[np.newaxis, np.newaxis]
+    quaternion = np.take_along_axis(products, row, axis=0)[0]
+    square = np.sum(quaternion * quaternion, axis=0)
+    quaternion = quaternion / np.sqrt(square)
+    has_negative_w = quaternion[0].real < 0.0
+    with_positive_w: Numbers = np.where(has_negative_w, -quaternion, quaternion)
     return with_positive_w
 
 
 def relative_rotation_vector(other: Numbers, R: Numbers) -> Numbers:
     """Returns Log(R other'), the rotation from another orientation to R, in base axes."""
-    return vector_from_rotation(np.einsum("ab...,cb...->ac...", R, other))
+    rotation = np.einsum("ab...,cb...->ac...", R, other)
+    return vector_from_rotation(rotation)
 
 
 def evaluate_reference(shares: Array, site_pose: Numbers, shared: Sequence[Numbers]) -> Numbers:
@@ -415,18 +489,19 @@ def evaluate_reference(shares: Array, site_pose: Numbers, shared: Sequence[Numbe
         site_pose: the shared pose of the site itself, shape (m, ...).
         shared: the shared pose of each site, shape (m, ...).
     """
-    followed = [
-        (share, pose) for share, pose in zip(shares.tolist(), shared, strict=True) if share
-    ]
+    pairs = zip(shares.tolist(), shared, strict=True)
+    followed = [(share, pose) for share, pose in pairs if share]
     position = sum(share * pose[:POSITION] for share, pose in followed)
     if len(site_pose) == POSITION:
         return np.asarray(position)
+
     R = rotation_from_vector(site_pose[POSITION:])
-    difference = sum(
-        share * relative_rotation_vector(rotation_from_vector(pose[POSITION:]), R)
-        for share, pose in followed
-    )
-    reference = _multiply(rotation_from_vector(-np.asarray(difference)), R)
+    weighted = []
+    for share, pose in followed:
+        R_peer = rotation_from_vector(pose[POSITION:])
+        weighted.append(share * relative_rotation_vector(R_peer, R))
+    difference = np.asarray(sum(weighted))
+    reference = _multiply(rotation_from_vector(-difference), R)
     # zero times the site's pose gives the position the same number of columns
     columns = np.asarray(position) + 0.0 * site_pose[:POSITION]
     return np.concatenate([columns, vector_from_rotation(reference)])
@@ -461,13 +536,16 @@ class Following(NamedTuple):
 
     def to_joints(self, force: Numbers) -> Numbers:
         """Returns the joint torque J' F of a force F on the coordinates, shape (n, ...)."""
-        return force if self.J is None else multiply_columns(self.J.swapaxes(0, 1), force)
+        if self.J is None:
+            return force
+        return multiply_columns(_transpose(self.J), force)
 
     def from_joints(self, torque: Numbers) -> Numbers:
         """Returns the force A^-1 J tau on the coordinates of a joint torque, shape (m, ...)."""
         if self.J is None or self.A is None:
             return torque
-        return solve_columns(self.A, multiply_columns(self.J, torque))
+        along_axes = multiply_columns(self.J, torque)
+        return solve_columns(self.A, along_axes)
 
 
 def follow_joints(
@@ -476,7 +554,9 @@ def follow_joints(
     """Returns how a site follows joint by joint, Eq. (9), (10): v = -Lambda (q - q_des)."""
     e = q - q_des
     ed = qd - qd_des
-    return Following(x=q, xd=qd, e=e, ed=ed, v=-Lambda * e, a=-Lambda * ed)
+    v = -Lambda * e
+    a = -Lambda * ed
+    return Following(x=q, xd=qd, e=e, ed=ed, v=v, a=a)
 
 
 def share_pose(task: TaskSetup, arm: PlacedChain) -> Numbers:
@@ -484,7 +564,8 @@ def share_pose(task: TaskSetup, arm: PlacedChain) -> Numbers:
     position = task.scale * arm.end_effector_position()
     if len(task.axes) == POSITION:
         return position
-    return np.concatenate([position, vector_from_rotation(arm.end_effector_orientation())])
+    orientation = arm.end_effector_orientation()
+    return np.concatenate([position, vector_from_rotation(orientation)])
 
 
 def follow_in_task(
@@ -513,25 +594,24 @@ def follow_in_task(
     assert site.chain.task is not None
     task = site.chain.task
     m = site.layout.shared
+    column_axes = q.ndim - 1
     x = share_pose(task, arm)
-    trailing = (1,) * (q.ndim - 1)
-    axes = np.array(task.axes).reshape(m, *trailing)
-    scales = np.array([task.scale] * POSITION + [1.0] * POSITION)[:m].reshape(m, 1, *trailing)
-    full_J = scales * arm.pose_jacobian()[:m]
-    full_J_rate = scales * arm.pose_jacobian_rate(qd)[:m]
+
+    scales = np.array([task.scale] * POSITION + [1.0] * POSITION)
+    scale_rows = _add_axes(scales[:m], (m, 1), column_axes)
+    full_J = scale_rows * arm.pose_jacobian()[:m]
+    full_J_rate = scale_rows * arm.pose_jacobian_rate(qd)[:m]
     xd = multiply_columns(full_J, qd)
-    e = x - x_des
-    if m > POSITION:
-        R = rotation_from_vector(x[POSITION:])
-        columns_of_x_des = x_des + 0.0 * x
-        R_des = rotation_from_vector(columns_of_x_des[POSITION:])
-        e = np.concatenate([e[:POSITION], relative_rotation_vector(R_des, R)])
-    e = axes * e
+
+    axes = _add_axes(np.array(task.axes), (m,), column_axes)
+    e = axes * _subtract_poses(x, x_des)
     ed = axes * (xd - xd_des)
-    J = axes[:, np.newaxis] * full_J
-    J_rate = axes[:, np.newaxis] * full_J_rate
+    axis_rows = axes[:, np.newaxis]
+    J = axis_rows * full_J
+    J_rate = axis_rows * full_J_rate
     A, least = _damp(task, J)
-    posture = np.array(task.posture or site.q0).reshape(-1, *trailing)
+
+    posture = _add_axes(np.array(task.posture or site.q0), (-1,), column_axes)
     psi = -task.posture_rate * (q - posture)
     psi_d = -task.posture_rate * qd
     v, a = find_task_reference(
@@ -542,6 +622,19 @@ def follow_in_task(
         error=(Lambda * e, Lambda * ed),
     )
     return Following(x=x, xd=xd, e=e, ed=ed, v=v, a=a, J=J, A=A, least=least)
+
+
+def _subtract_poses(x: Numbers, x_des: Numbers) -> Numbers:
+    """Returns x - x_des, shape (m, ...); orientations differ by Log(R R_des')."""
+    e = x - x_des
+    if len(x) == POSITION:
+        return e
+    # zero times x gives x_des the same number of columns
+    columns_of_x_des = x_des + 0.0 * x
+    R = rotation_from_vector(x[POSITION:])
+    R_des = rotation_from_vector(columns_of_x_des[POSITION:])
+    turn = relative_rotation_vector(R_des, R)
+    return np.concatenate([e[:POSITION], turn])
 
 
 def _damp(task: TaskSetup, J: Numbers) -> tuple[Numbers, float]:
@@ -556,17 +649,23 @@ def _damp(task: TaskSetup, J: Numbers) -> tuple[Numbers, float]:
         J: Jacobian of the followed axes, shape (m, n, ...), with zero rows for the others.
     """
     m = len(task.axes)
-    trailing = (1,) * (J.ndim - 2)
+    column_axes = J.ndim - 2
     followed = [n for n, is_followed in enumerate(task.axes) if is_followed]
     # ones on the diagonal of the axes that are not followed keep the matrix regular
-    free_axes = np.diag(1.0 - np.array(task.axes)).reshape(m, m, *trailing)
+    is_free = 1.0 - np.array(task.axes)
+    free_axes = _add_axes(np.diag(is_free), (m, m), column_axes)
     A = np.einsum("an...,bn...->ab...", J, J) + free_axes
-    inner = np.moveaxis(A[followed][:, followed], (0, 1), (-2, -1))
-    singular_values = np.linalg.svd(inner.real, compute_uv=False)
-    if not singular_values[..., -1].min() > SINGULAR:
+    A_followed = A[followed][:, followed]
+    # NumPy expects matrices on the last two axes
+    matrices = np.moveaxis(A_followed, (0, 1), (-2, -1))
+    singular_values = np.linalg.svd(matrices.real, compute_uv=False)
+    least = singular_values[..., -1]
+    if not least.min() > SINGULAR:
         return A + np.nan, 0.0
-    bound = 1.0 / np.trace(np.linalg.inv(inner), axis1=-2, axis2=-1)
+
+    inverse_trace = np.trace(np.linalg.inv(matrices), axis1=-2, axis2=-1)
+    bound = 1.0 / inverse_trace
     limit = task.singular_value**2
     damping = np.where(bound.real < limit, limit - bound, 0.0)
-    identity = np.eye(m).reshape(m, m, *trailing)
+    identity = _add_axes(np.eye(m), (m, m), column_axes)
     return A + damping * identity, float(bound.real.min())

@@ -1,12 +1,14 @@
-"""Computes the energy balance of each site, and of all sites together under the weights beta.
+"""The energy balance of each site, and of all sites together under the weights beta.
 
-For every site, without any weights:
+For each site, without weights:
 
     V_i - V_i(0) + dissipation + transfer - work = 0
 
-For the weighted sum over all sites, whatever the operators do:
+For the weighted sum over all sites, where the transfers cancel:
 
     V - V(0) + dissipation - work = 0
+
+Both hold whatever the operators do.
 
 Invariant:
     - Records for which these sums do not vanish were not produced by the equations that the log
@@ -37,7 +39,7 @@ from . import energy_terms
 from .energy_terms import FunctionalParts, Increment, SiteMotion
 
 MIN_PERIODS = 10
-"""With fewer judged periods nothing is known of what happens within a period."""
+"""With fewer judged periods the error by motion within a period cannot be estimated."""
 ZERO_ENERGY_J = 1e-12
 """Rounding error of an energy that is zero, J."""
 EXTERNAL_SOURCES = ("hands", "walls", "stops")
@@ -68,73 +70,92 @@ class SiteEnergy:
     @cached_property
     def judged(self) -> Bools:
         """True if a period follows from records alone, shape (K - 1,)."""
-        known = [
-            self.motion.records.known_periods,
-            *(view.known for view in self.followed.values()),
-        ]
+        known_views = [view.known for view in self.followed.values()]
+        known = [self.motion.records.known_periods, *known_views]
         return np.asarray(np.logical_and.reduce(known))
 
     @cached_property
     def residual(self) -> Array:
         """V_i - V_i(0) + dissipation + transfer - work over judged periods, shape (K,), J."""
+        dissipated = [kind.total for kind in self.dissipation.values()]
+        worked = [source.total for source in self.work.values()]
         change = np.diff(self.parts.total) + self.transfer.total
-        change += np.sum([kind.total for kind in self.dissipation.values()], axis=0)
-        change -= np.sum([source.total for source in self.work.values()], axis=0)
+        change += np.sum(dissipated, axis=0)
+        change -= np.sum(worked, axis=0)
         return _accumulate(change, self.judged)
 
     @cached_property
     def unexplained(self) -> Array:
         """The residual without the work of the scheme, shape (K,), J."""
-        return self.residual - _accumulate(self.sampling.total, self.judged)
+        sampling = _accumulate(self.sampling.total, self.judged)
+        return self.residual - sampling
 
     @property
     def followed(self) -> dict[str, DelayedPeer]:
         """The peers that have a share at any time, as the site sees them."""
         alpha = self.motion.dominance.alpha
-        views = enumerate(self.motion.peers.items())
-        return {peer: view for j, (peer, view) in views if alpha[:, j].any()}
+        followed = {}
+        for j, (peer, view) in enumerate(self.motion.peers.items()):
+            if alpha[:, j].any():
+                followed[peer] = view
+        return followed
 
     @property
     def largest_age_s(self) -> float:
         """The largest age of a sample in use, in s; 0 if no sample came into use."""
         t_s = self.motion.records.t_s
-        ages_s = [t_s - view.stamp_s for view in self.followed.values()]
-        largest_s = [float(np.nanmax(age_s)) for age_s in ages_s if np.isfinite(age_s).any()]
+        largest_s = []
+        for view in self.followed.values():
+            age_s = t_s - view.stamp_s
+            if np.isfinite(age_s).any():
+                largest_s.append(float(np.nanmax(age_s)))
         return max(largest_s, default=0.0)
 
     @property
     def begin_s(self) -> float:
         """The first tick at which V_i follows from records, in s; infinite if there is none."""
         known = [view.delayed.known & view.now.known for view in self.followed.values()]
-        rows = np.flatnonzero(np.logical_and.reduce(known))
-        return float(self.motion.records.t_s[rows[0]]) if len(rows) else np.inf
+        known_rows = np.flatnonzero(np.logical_and.reduce(known))
+        if not len(known_rows):
+            return np.inf
+        return float(self.motion.records.t_s[known_rows[0]])
 
     @cached_property
     def uncertainty(self) -> float:
         """Bound of the energies' error by motion within the periods, in J.
 
-        The error of the trapezoid rule is estimated by the second differences of the total
-        power, summed; that of sampling and operators by the products of the changes of r and of
-        a torque. If these products add up, the period is long for these gains. With too few
-        periods for second differences, the whole energy is uncertain.
+        The error of the trapezoid rule is estimated by the sum of the second differences of the
+        total power. The error of sampling and operators is estimated by the products of the
+        changes of r and of a torque: if these products add up, the period is long for these
+        gains. With too few periods for second differences, the whole energy is uncertain.
         """
         dissipated = [self.transfer, *self.dissipation.values()]
-        signed = [(1.0, increment) for increment in dissipated]
-        signed += [(-1.0, increment) for increment in self.work.values()]
+        worked = list(self.work.values())
         if self.judged.sum() < MIN_PERIODS:
-            sizes = (
-                np.abs(increment.left).sum() + np.abs(increment.right).sum()
-                for _, increment in signed
-            )
+            sizes = []
+            for increment in [*dissipated, *worked]:
+                left_size = np.abs(increment.left).sum()
+                right_size = np.abs(increment.right).sum()
+                sizes.append(left_size + right_size)
             return float(sum(sizes))
-        power = np.sum([sign * increment.left for sign, increment in signed], axis=0)
+        powers = [increment.left for increment in dissipated]
+        powers += [-increment.left for increment in worked]
+        power = np.sum(powers, axis=0)
+        curvature = np.diff(power[self.judged], 2)
+        rule_error = float(np.abs(curvature).sum()) / 6.0
+        return rule_error + self._estimate_coupled_error()
+
+    def _estimate_coupled_error(self) -> float:
+        """Returns the energy of changes of r times changes of the torques, in J."""
         records = self.motion.records
         change_of_r = self.motion.ends.r_right - self.motion.ends.r_left
         coupled = 0.0
         for torque in (records.tau, records.tau_x):
-            product = records.h_s * (change_of_r * np.diff(torque, axis=0)).sum(axis=1)
-            coupled += 2.0 * float(np.abs(_accumulate(product, self.judged)).max())
-        return float(np.abs(np.diff(power[self.judged], 2)).sum()) / 6.0 + coupled
+            change_of_torque = np.diff(torque, axis=0)
+            product = (change_of_r * change_of_torque).sum(axis=1)
+            energy = _accumulate(records.h_s * product, self.judged)
+            coupled += 2.0 * float(np.abs(energy).max())
+        return coupled
 
 
 def _accumulate(amounts: Array, judged: Bools | None = None) -> Array:
@@ -154,8 +175,11 @@ def compute_site_energies(log: Log) -> dict[str, SiteEnergy]:
     """
     records = align_records(log, common=True)
     pasts = {site: PeerTrajectory(site_records) for site, site_records in records.items()}
-    energies = derive_site_energies(log.scenario, records, pasts, partial(trace_dominance, log))
-    return energies if energies and len(find_common_times(energies)) > 1 else {}
+    dominance = partial(trace_dominance, log)
+    energies = derive_site_energies(log.scenario, records, pasts, dominance)
+    if not energies or len(find_common_times(energies)) < 2:
+        return {}
+    return energies
 
 
 def derive_site_energies(
@@ -175,15 +199,19 @@ def derive_site_energies(
     energies = {}
     constants = {site: energy_terms.derive_site_constants(scenario, site) for site in records}
     axes = [c.axes for c in constants.values() if c.axes]
-    common_axes = tuple(np.prod(axes, axis=0).tolist()) if axes else ()
+    common_axes: tuple[float, ...] = ()
+    if axes:
+        # 1 along the axes that all sites follow
+        common_axes = tuple(np.prod(axes, axis=0).tolist())
     for site, site_records in records.items():
+        peers = {}
+        for peer in site_records.used:
+            peers[peer] = view_delayed_peer(site_records, pasts[peer])
         motion = SiteMotion(
             records=site_records,
             constants=constants[site],
             dominance=dominance(site, site_records.t_s),
-            peers={
-                peer: view_delayed_peer(site_records, pasts[peer]) for peer in site_records.used
-            },
+            peers=peers,
             torque=split_torque(site_records, scenario),
             scheme=Scheme[scenario.scheme.upper()],
             common=common_axes,
@@ -202,10 +230,13 @@ def derive_site_energies(
 def find_common_times(energies: Mapping[str, SiteEnergy]) -> Array:
     """Returns the ticks of the fastest site at which every V_i is known, shape (T,), s."""
     records = [energy.motion.records for energy in energies.values()]
-    times = max(records, key=lambda site_records: site_records.rate_hz).t_s
+    fastest = max(records, key=lambda site_records: site_records.rate_hz)
+    times = fastest.t_s
     begin_s = max(energy.begin_s for energy in energies.values())
     end_s = min(site_records.t_s[-1] for site_records in records)
-    common: Array = times[(times >= begin_s - 1e-9) & (times <= end_s + 1e-9)]
+    has_begun = times >= begin_s - 1e-9
+    has_not_ended = times <= end_s + 1e-9
+    common: Array = times[has_begun & has_not_ended]
     return common
 
 
@@ -247,12 +278,15 @@ class EnergyBalance:
     @cached_property
     def residual(self) -> Array:
         """V - V(0) + dissipation - work over the judged periods, shape (T,), J."""
-        return self._accumulate_judged(self.V + _sum(self.dissipation) - _sum(self.work))
+        dissipation = _sum(self.dissipation)
+        work = _sum(self.work)
+        return self._accumulate_judged(self.V + dissipation - work)
 
     @cached_property
     def unexplained(self) -> Array:
         """The residual less the work of sampling and the transfer, shape (T,), J."""
-        return self.residual - self._accumulate_judged(self.sampling - self.transfer)
+        explained = self._accumulate_judged(self.sampling - self.transfer)
+        return self.residual - explained
 
     @cached_property
     def unsupplied(self) -> Array:
@@ -260,26 +294,34 @@ class EnergyBalance:
 
         By the theorem this quantity does not rise.
         """
-        unsupplied: Array = self.V[0] + self._accumulate_judged(self.V - self.external_work)
+        rise = self._accumulate_judged(self.V - self.external_work)
+        unsupplied: Array = self.V[0] + rise
         return unsupplied
+
+    @property
+    def _work_from_outside(self) -> dict[str, Array]:
+        """External work by source (hands, walls, stops)."""
+        return {name: self.work[name] for name in EXTERNAL_SOURCES if name in self.work}
 
     @property
     def external_work(self) -> Array:
         """Work of operators, environments and stops since the first tick, shape (T,), J."""
-        return _sum({name: self.work[name] for name in EXTERNAL_SOURCES if name in self.work})
+        return _sum(self._work_from_outside)
 
     @property
     def external(self) -> dict[str, Array]:
         """External work by source (hands, walls, stops), of sources that did any work."""
-        names = [name for name in EXTERNAL_SOURCES if name in self.work]
-        return {name: self.work[name] for name in names if self.work[name].any()}
+        sources = self._work_from_outside
+        return {name: work for name, work in sources.items() if work.any()}
 
     @cached_property
     def scale(self) -> float:
         """Reference for residuals: the largest V, or the largest work if larger, in J."""
-        return max(float(np.abs(x).max()) for x in (self.V, *self.work.values()))
+        energies = [self.V, *self.work.values()]
+        return max(float(np.abs(energy).max()) for energy in energies)
 
     def _accumulate_judged(self, values: Array) -> Array:
+        """Returns the sum of a quantity's changes over the judged periods, shape (T,)."""
         return _accumulate(np.diff(values), self.judged)
 
 
@@ -302,28 +344,40 @@ def compute_energy_balance(
     sums: dict[tuple[str, str], Array] = {}
     for n, (site, energy) in enumerate(energies.items()):
         records = energy.motion.records
+        t_s = records.t_s
+        # sites with the same ticks share their weights
         grid = (records.first, len(records.known), records.rate_hz)
         if grid not in weights_by_grid:
             weights_by_grid[grid] = _trace_weights(
                 energies, records, paper_weights=paper_weights
             )
-        left, right = (beta[:, n] for beta in weights_by_grid[grid])
+        beta_left, beta_right = weights_by_grid[grid]
+        left = beta_left[:, n]
+        right = beta_right[:, n]
         for key, amounts in _weigh_site(energy, left, right).items():
-            resampled = _resample(times, records.t_s, amounts)
-            sums[key] = sums[key] + resampled if key in sums else resampled
-        beta_columns.append(_resample(times, records.t_s, left))
-        sites[site] = _resample(times, records.t_s, left * energy.parts.total)
-        unjudged_periods = _accumulate((~energy.judged).astype(np.float64))
-        unjudged += np.abs(_resample(times, records.t_s, unjudged_periods))
+            resampled = _resample(times, t_s, amounts)
+            if key in sums:
+                resampled = sums[key] + resampled
+            sums[key] = resampled
+        beta_columns.append(_resample(times, t_s, left))
+        sites[site] = _resample(times, t_s, left * energy.parts.total)
+        is_unjudged = (~energy.judged).astype(np.float64)
+        unjudged_periods = _accumulate(is_unjudged)
+        unjudged += np.abs(_resample(times, t_s, unjudged_periods))
     judged: Bools = np.diff(unjudged) == 0.0
+    all_judged = bool(judged.all())
 
     def select(kind: str) -> dict[str, Array]:
         """Returns the running sums of a kind by name, over the judged periods."""
-        return {
-            name: x - x[0] if judged.all() else _accumulate(np.diff(x), judged)
-            for (group, name), x in sums.items()
-            if group == kind
-        }
+        selected = {}
+        for (group, name), energy in sums.items():
+            if group != kind:
+                continue
+            if all_judged:
+                selected[name] = energy - energy[0]
+            else:
+                selected[name] = _accumulate(np.diff(energy), judged)
+        return selected
 
     return EnergyBalance(
         t_s=times,
@@ -352,21 +406,26 @@ def _weigh_site(energy: SiteEnergy, left: Array, right: Array) -> dict[tuple[str
     Returns:
         Contributions by (kind, name), shape (K,) each, in J.
     """
+    start = left[:-1]
+    after_step = left[1:]
 
     def weigh(increment: Increment) -> Array:
-        return _accumulate(
-            left[:-1] * increment.left + right * (increment.right + increment.jump)
-        )
+        at_start = start * increment.left
+        at_end = right * (increment.right + increment.jump)
+        return _accumulate(at_start + at_end)
 
-    V = energy.parts.total
-    ramp_work = (right - left[:-1]) * 0.5 * (V[:-1] + V[1:])
-    step_work = (left[1:] - right) * V[1:]
-    weighted = {("parts", name): left * part for name, part in energy.parts._asdict().items()}
+    weighted = {}
+    for name, part in energy.parts._asdict().items():
+        weighted["parts", name] = left * part
     for name, increment in energy.dissipation.items():
         weighted["dissipation", name] = weigh(increment)
     for name, increment in energy.work.items():
         weighted["work", name] = weigh(increment)
-    weighted["work", "shares"] = weighted["work", "shares"] + _accumulate(ramp_work + step_work)
+    V = energy.parts.total
+    ramp_work = (right - start) * 0.5 * (V[:-1] + V[1:])
+    step_work = (after_step - right) * V[1:]
+    weight_work = _accumulate(ramp_work + step_work)
+    weighted["work", "shares"] = weighted["work", "shares"] + weight_work
     weighted["sampling", ""] = weigh(energy.sampling)
     weighted["transfer", ""] = weigh(energy.transfer)
     return weighted
@@ -374,8 +433,10 @@ def _weigh_site(energy: SiteEnergy, left: Array, right: Array) -> dict[tuple[str
 
 def _resample(times: Array, t_s: Array, values: Array) -> Array:
     """Returns values at `t_s` interpolated at `times`; unchanged if the times are equal."""
-    is_same_grid = len(t_s) == len(times) and t_s[0] == times[0]
-    return values if is_same_grid else np.interp(times, t_s, values)
+    has_same_times = len(t_s) == len(times) and t_s[0] == times[0]
+    if has_same_times:
+        return values
+    return np.interp(times, t_s, values)
 
 
 def _trace_weights(
@@ -387,27 +448,33 @@ def _trace_weights(
         beta at the ticks, shape (K, N).
         beta at the end of every period, before a step there, shape (K - 1, N).
     """
-    Kd = np.array([energy.motion.constants.weighing_Kd for energy in energies.values()])
-    constant = all(energy.motion.dominance.constant for energy in energies.values())
+    motions = [energy.motion for energy in energies.values()]
+    Kd = np.array([motion.constants.weighing_Kd for motion in motions])
+    is_constant = all(motion.dominance.constant for motion in motions)
     beta_by_matrix: dict[bytes, Array] = {}
 
     def compute_beta(t_s: Array, ahead_s: float) -> Array:
         if paper_weights:
             return np.ones((len(t_s), len(Kd)))
-        alpha = _interpolate_dominance(energies, t_s[:1] if constant else t_s, ahead_s)
+        different_s = t_s[:1] if is_constant else t_s
+        alpha = _interpolate_dominance(energies, different_s, ahead_s)
         # equal matrices must be equal in their bytes, and adding 0.0 turns -0.0 into 0.0
-        rows = np.round(alpha, 12).reshape(len(alpha), -1) + 0.0
+        rounded = np.round(alpha, 12)
+        rows = rounded.reshape(len(alpha), -1) + 0.0
         matrices, matrix_index = np.unique(rows, axis=0, return_inverse=True)
+        betas = []
         for matrix in matrices:
             key = matrix.tobytes()
             if key not in beta_by_matrix:
-                weights = compute_lyapunov_weights(matrix.reshape(len(Kd), -1), Kd)
-                beta_by_matrix[key] = weights.beta
-        betas = np.array([beta_by_matrix[matrix.tobytes()] for matrix in matrices])
-        beta = betas[matrix_index.ravel()]
-        return np.tile(beta, (len(t_s), 1)) if constant else beta
+                square = matrix.reshape(len(Kd), -1)
+                beta_by_matrix[key] = compute_lyapunov_weights(square, Kd).beta
+            betas.append(beta_by_matrix[key])
+        beta = np.array(betas)[matrix_index.ravel()]
+        return np.tile(beta, (len(t_s), 1)) if is_constant else beta
 
-    return compute_beta(records.t_s, 0.0), compute_beta(records.t_s[:-1], records.h_s)
+    at_ticks = compute_beta(records.t_s, 0.0)
+    at_period_ends = compute_beta(records.t_s[:-1], records.h_s)
+    return at_ticks, at_period_ends
 
 
 def _interpolate_dominance(
@@ -426,35 +493,49 @@ def _interpolate_dominance(
         records = energy.motion.records
         dominance = energy.motion.dominance
         position = (t_s - records.t_s[0]) * records.rate_hz
+        tick_before = np.floor(position + 1e-5)
         last_row = len(records.known) - 1
-        row = np.clip(np.floor(position + 1e-5), 0, last_row).astype(np.int64)
-        later_s = np.maximum(position - row, 0.0) / records.rate_hz + ahead_s
+        row = np.clip(tick_before, 0, last_row).astype(np.int64)
+        since_tick = np.maximum(position - row, 0.0)
+        later_s = since_tick / records.rate_hz + ahead_s
         for j, peer in enumerate(energy.motion.peers):
-            if peer in energies:
-                factor = dominance.alpha[row, j] + later_s * dominance.rate[row, j]
-                alpha[:, i, names.index(peer)] = factor
+            if peer not in energies:
+                continue
+            at_tick = dominance.alpha[row, j]
+            rate = dominance.rate[row, j]
+            column = names.index(peer)
+            alpha[:, i, column] = at_tick + later_s * rate
     # a ramp that ends between two ticks is extrapolated beyond its end
     return np.clip(alpha, 0.0, 1.0)
 
 
 def find_dominance_matrices(energies: Mapping[str, SiteEnergy]) -> Array:
-    """Returns every dominance matrix that was in force, shape (M, N, N); of a ramp its ends."""
-    times = [next(iter(energies.values())).motion.records.t_s[:1]]
-    for energy in energies.values():
-        t_s = energy.motion.records.t_s
-        dominance = energy.motion.dominance
-        rate_changes = np.diff(dominance.rate, axis=0, prepend=0.0).any(axis=1)
-        is_step = (dominance.alpha[1:] != dominance.before).any(axis=1)
-        times.append(t_s[np.flatnonzero(rate_changes)])
-        times.append(t_s[np.flatnonzero(is_step) + 1])
+    """Returns all dominance matrices that were in force, shape (M, N, N).
+
+    Of a ramp the matrices at its ends are returned.
+    """
+    motions = [energy.motion for energy in energies.values()]
+    first_s = motions[0].records.t_s[:1]
+    times = [first_s]
+    for motion in motions:
+        t_s = motion.records.t_s
+        dominance = motion.dominance
+        change_of_rate = np.diff(dominance.rate, axis=0, prepend=0.0)
+        ramp_rows = np.flatnonzero(change_of_rate.any(axis=1))
+        is_step = dominance.alpha[1:] != dominance.before
+        step_rows = np.flatnonzero(is_step.any(axis=1)) + 1
+        times.append(t_s[ramp_rows])
+        times.append(t_s[step_rows])
     return _interpolate_dominance(energies, np.concatenate(times))
 
 
 def rise_above_minimum(values: Array) -> Array:
     """Returns how far a quantity is above its minimum up to each time, shape (T,)."""
-    return values - np.minimum.accumulate(values)
+    minimum_so_far = np.minimum.accumulate(values)
+    return values - minimum_so_far
 
 
 def _sum(columns: Mapping[str, Array]) -> Array:
+    """Returns the sum of columns at each time, shape (T,)."""
     total: Array = np.sum(list(columns.values()), axis=0)
     return total

@@ -1,4 +1,4 @@
-"""Computes the corrected functional V_i of a site, and every term that changes it, in J.
+"""The corrected functional V_i of a site, and all terms that change it, in J.
 
     V_i = 1/2 ( r'M r + (theta_hat - theta)' Gamma^-1 (theta_hat - theta) + e' Lambda Kd e
                 + sum_j alpha_ij int qd_j' Kd qd_j ds )
@@ -9,12 +9,12 @@ the integral that its Eq. (22) needs (docs/errata.md). With |x|^2 = x'Kd x, its 
     V_i' = -r'Kp r - 1/2 sum_j alpha_ij |qd_i - qd_j(t - T)|^2
            - 1/2 |qd_i|^2 + 1/2 sum_j alpha_ij |qd_j|^2
 
-The terms of the first line dissipate. Those of the second are transferred between sites, and
-cancel under the weights beta. In task space e and qd_j are those of end effectors, and r is
-that of the task (`following`); docs/certificate.md states what else changes.
+The terms of the first line dissipate energy. The terms of the second line transfer it between
+sites, and cancel under the weights beta. In task space e and qd_j are errors and velocities of
+end effectors, and r belongs to the task (`following`); docs/certificate.md has the rest.
 
 Within a sample period each term is integrated by the trapezoid rule, with an error of second
-order in the period, followed by an exact jump at the end of the period. A jump of e is divided
+order in the period. An exact jump at the end of the period follows. A jump of e is divided
 among the links, changes of dominance, and the rule for stale peers.
 
 Invariant:
@@ -58,8 +58,8 @@ class SiteConstants(NamedTuple):
         low: lower limits of the estimates.
         high: upper limits of the estimates.
         tau_limit: largest torque of a joint, N m, shape () or (n,).
-        axes: per coordinate of the task 1 if the site follows along it, else 0, and Lambda and
-            Kd are 0; () in joint space.
+        axes: for each coordinate of the task, 1 if the site follows along it; else 0, and then
+            Lambda and Kd are 0 too; () in joint space.
         rho: largest robust torque of each joint, N m.
         width: value of r at which the robust torque is 0.71 of the largest, rad/s.
         friction: share of the joints' friction that the law compensates.
@@ -94,12 +94,15 @@ class SiteConstants(NamedTuple):
 
     def robust_torque(self, r: Array) -> Array:
         """Returns the robust torque that opposes r in addition to Kp r, shape (K, n), N m."""
-        return self.rho * r / np.sqrt(r**2 + self.width**2)
+        root = np.sqrt(r**2 + self.width**2)
+        return self.rho * r / root
 
     @property
     def unknown_friction(self) -> Array:
         """Share of each joint's friction that the law does not compensate, shape (n,)."""
-        has_friction = self.arm.friction(np.ones((1, len(self.Kp))))[0] != 0.0
+        unit_speeds = np.ones((1, len(self.Kp)))
+        friction_torque = self.arm.friction(unit_speeds)[0]
+        has_friction = friction_torque != 0.0
         share: Array = (1.0 - self.friction) * has_friction
         return share
 
@@ -139,7 +142,8 @@ class PeriodEnds(NamedTuple):
 
     Attributes:
         following: True if the site followed its peers at both ends, shape (K - 1,).
-        link: per peer the jump of e by the age of its sample, shape (peers, K - 1, n), rad.
+        link: for each peer, the jump of e by the age of its sample, shape (peers, K - 1, n),
+            rad.
         dominance: jump of e by a step of dominance factors, rad.
         rule: jump of e by the rule for stale peers, rad.
         r_left: r = qd + Lambda e at the start, rad/s.
@@ -173,8 +177,8 @@ class SiteMotion:
         peers: the peers as the site sees them, in the order of the dominance factors.
         torque: torque ON the arm by source.
         scheme: whether the controller holds tau_k, or extrapolates the torque.
-        common: per coordinate 1 if all sites follow along it, else 0; () if all sites follow
-            along all coordinates.
+        common: for each coordinate, 1 if all sites follow along it, else 0; () if all sites
+            follow along all coordinates.
     """
 
     records: AlignedRecords
@@ -189,7 +193,8 @@ class SiteMotion:
     def following(self) -> Following:
         """The maps from an error of the reference to motion and torque of the joints."""
         records = self.records
-        return build_following(self.constants.arm, records.q, records.qd, self.constants.Lambda)
+        c = self.constants
+        return build_following(c.arm, records.q, records.qd, c.Lambda)
 
     @cached_property
     def r(self) -> Array:
@@ -206,7 +211,13 @@ class SiteMotion:
         """Y'r of Eq. (15), shape (K, P)."""
         records = self.records
         v, a = self.following.compute_reference(slice(None), records.e, records.ed)
-        return self.constants.arm.gradient(q=records.q, qd=records.qd, v=v, a=a, r=self.r)
+        return self.constants.arm.gradient(
+            q=records.q,
+            qd=records.qd,
+            v=v,
+            a=a,
+            r=self.r,
+        )
 
     @cached_property
     def mean_Yr(self) -> Array:  # noqa: N802 - the paper's symbol
@@ -233,11 +244,18 @@ class SiteMotion:
         c = self.constants
         v, a = self.following.compute_reference(rows, e, ed)
         model = c.arm.law_torque(
-            records.theta_hat[rows], records.q[rows], records.qd[rows], v, a
+            theta_hat=records.theta_hat[rows],
+            q=records.q[rows],
+            qd=records.qd[rows],
+            v=v,
+            a=a,
         )
         damping = self.following.compute_joint_torque(rows, c.Kd * ed)
-        tau: Array = model - c.Kp * r - damping - c.robust_torque(r)
-        return tau - (1.0 - c.friction) * c.arm.friction(v)
+        robust = c.robust_torque(r)
+        tau: Array = model - c.Kp * r - damping - robust
+        # `model` compensates all of the friction
+        uncompensated = (1.0 - c.friction) * c.arm.friction(v)
+        return tau - uncompensated
 
     @property
     def rests(self) -> Bools:
@@ -255,17 +273,21 @@ class SiteMotion:
         """
         records = self.records
         c = self.constants
-        low = np.broadcast_to(-c.tau_limit, records.tau.shape).copy()
+        shape = records.tau.shape
+        low = np.broadcast_to(-c.tau_limit, shape).copy()
         high = -low
-        if np.any(np.isfinite(c.tau_rate)):
-            # the torque before tick 0 is zero; before any other first tick it is unknown
-            before = np.vstack([np.zeros(records.tau.shape[1]), records.tau[:-1]])
-            largest_step = np.broadcast_to(records.h_s * c.tau_rate, records.tau.shape).copy()
-            if records.first != 0:
-                largest_step[0] = np.inf
-            low = np.maximum(low, before - largest_step)
-            high = np.minimum(high, before + largest_step)
-        return low, high
+        if not np.any(np.isfinite(c.tau_rate)):
+            return low, high
+        # the torque before tick 0 is zero; before any other first tick it is unknown
+        zero = np.zeros(shape[1])
+        before = np.vstack([zero, records.tau[:-1]])
+        step_limit = records.h_s * c.tau_rate
+        largest_step = np.broadcast_to(step_limit, shape).copy()
+        if records.first != 0:
+            largest_step[0] = np.inf
+        lowest = np.maximum(low, before - largest_step)
+        highest = np.minimum(high, before + largest_step)
+        return lowest, highest
 
     @cached_property
     def limited(self) -> Bools:
@@ -276,60 +298,70 @@ class SiteMotion:
         tolerance: Array | float = 0.0
         if np.any(np.isfinite(c.tau_rate)):
             tolerance = RATE_TOLERANCE * c.tau_limit
-        limited: Bools = (tau <= low + tolerance) | (tau >= high - tolerance)
+        is_low = tau <= low + tolerance
+        is_high = tau >= high - tolerance
+        limited: Bools = is_low | is_high
         return limited & ~self.rests[:, np.newaxis]
 
     @cached_property
     def ends(self) -> PeriodEnds:
         """The ends of all periods.
 
-        While the site follows its peers, the smooth course of its reference is Eq. (6) with
-        every stamp moving at rate one. Otherwise the rule for stale peers decides, and the
-        trapezoid rule is applied to the recorded derivative.
+        While the site follows its peers, its reference moves smoothly by Eq. (6) with all
+        stamps moving at rate one. Otherwise the rule for stale peers decides, and the trapezoid
+        rule is applied to the recorded derivative.
         """
         records = self.records
-        views = list(self.peers.values())
         dominance = self.dominance
         following = records.follows[:-1] & records.follows[1:]
         follows_at_both = following[:, np.newaxis]
         follows_at_left = records.follows[:-1, np.newaxis]
-        alpha_right = dominance.before[:, :, np.newaxis]
-        alpha_next = dominance.alpha[1:, :, np.newaxis]
-        alpha_rate = dominance.rate[:-1, :, np.newaxis]
 
         # the reference of Eq. (6) and its derivative at the end of the period, before any jump
         q_terms = []
         qd_terms = []
         link_jumps = []
         dominance_jumps = []
-        for j, view in enumerate(views):
+        for j, view in enumerate(self.peers.values()):
+            alpha_right = dominance.before[:, j, np.newaxis]
+            alpha_next = dominance.alpha[1:, j, np.newaxis]
+            alpha_rate = dominance.rate[:-1, j, np.newaxis]
             q_end = view.delayed_end.q
             qd_end = view.delayed_end.qd
             q_next = view.delayed.q[1:]
-            q_terms.append(alpha_right[:, j] * q_end)
-            qd_terms.append(alpha_right[:, j] * qd_end + alpha_rate[:, j] * q_end)
-            link_jumps.append(alpha_right[:, j] * (q_end - q_next))
-            dominance_jumps.append((alpha_right[:, j] - alpha_next[:, j]) * q_next)
+            q_terms.append(alpha_right * q_end)
+            qd_terms.append(alpha_right * qd_end + alpha_rate * q_end)
+            link_jumps.append(alpha_right * (q_end - q_next))
+            dominance_jumps.append((alpha_right - alpha_next) * q_next)
         q_des_followed = np.sum(q_terms, axis=0)
-        qd_des_left = records.qd_des[:-1]
-        qd_des_right = np.where(follows_at_left, np.sum(qd_terms, axis=0), records.qd_des[1:])
-        q_des_ruled = records.q_des[:-1] + 0.5 * records.h_s * (qd_des_left + qd_des_right)
+        qd_des_followed = np.sum(qd_terms, axis=0)
 
-        link = np.where(follows_at_both, link_jumps, 0.0)
-        dominance_jump = np.where(follows_at_both, np.sum(dominance_jumps, axis=0), 0.0)
+        qd_des_left = records.qd_des[:-1]
+        qd_des_right = np.where(follows_at_left, qd_des_followed, records.qd_des[1:])
+        rise_of_q_des = 0.5 * records.h_s * (qd_des_left + qd_des_right)
+        q_des_ruled = records.q_des[:-1] + rise_of_q_des
         q_des_right = np.where(follows_at_left, q_des_followed, q_des_ruled)
-        rule = np.where(follows_at_both, 0.0, q_des_right - records.q_des[1:])
+
+        # the jump of e by its causes
+        link = np.where(follows_at_both, link_jumps, 0.0)
+        all_dominance_jumps = np.sum(dominance_jumps, axis=0)
+        dominance_jump = np.where(follows_at_both, all_dominance_jumps, 0.0)
+        jump_of_q_des = q_des_right - records.q_des[1:]
+        rule = np.where(follows_at_both, 0.0, jump_of_q_des)
         jump_of_e = link.sum(axis=0) + dominance_jump + rule
+
         jump_of_r = self.following.compute_jump_of_r(slice(1, None), jump_of_e)
+        r_next = self.r[1:]
+        e_next = records.e[1:]
         return PeriodEnds(
             following=following,
             link=link,
             dominance=dominance_jump,
             rule=rule,
             r_left=self.r[:-1],
-            r_right=self.r[1:] - jump_of_r,
-            r_middle=self.r[1:] - 0.5 * jump_of_r,
-            e_middle=records.e[1:] - 0.5 * jump_of_e,
+            r_right=r_next - jump_of_r,
+            r_middle=r_next - 0.5 * jump_of_r,
+            e_middle=e_next - 0.5 * jump_of_e,
             qd_des_left=qd_des_left,
             qd_des_right=qd_des_right,
         )
@@ -354,22 +386,27 @@ def evaluate_functional(site: SiteMotion) -> FunctionalParts:
     records = site.records
     c = site.constants
     r = site.r
+    momentum = c.arm.multiply_inertia(records.q, r)
+    r_M_r = (r * momentum).sum(axis=1)
     parameter_error = (records.theta_hat - c.theta)[:, c.adapts]
-    delay_terms = [
-        alpha * _energy_in_transit(c, view)
-        for alpha, view in zip(site.dominance.alpha.T, site.peers.values(), strict=True)
-    ]
+    scaled_squares = parameter_error**2 / c.Gamma[c.adapts]
+    stiffness = c.Lambda * c.Kd
+    e_K_e = (stiffness * records.e**2).sum(axis=1)
+    delay_terms = []
+    for alpha, view in zip(site.dominance.alpha.T, site.peers.values(), strict=True):
+        delay_terms.append(alpha * _energy_in_transit(c, view))
     return FunctionalParts(
-        kinetic=0.5 * (r * c.arm.multiply_inertia(records.q, r)).sum(axis=1),
-        parameter=0.5 * (parameter_error**2 / c.Gamma[c.adapts]).sum(axis=1),
-        position=0.5 * (c.Lambda * c.Kd * records.e**2).sum(axis=1),
+        kinetic=0.5 * r_M_r,
+        parameter=0.5 * scaled_squares.sum(axis=1),
+        position=0.5 * e_K_e,
         delay=np.sum(delay_terms, axis=0),
     )
 
 
 def _energy_in_transit(c: SiteConstants, view: DelayedPeer) -> Array:
     """Returns 1/2 int qd_j' Kd qd_j ds from the stamp in use to now, shape (K,), J."""
-    return 0.5 * ((view.now.squares - view.delayed.squares) @ c.Kd)
+    integral_of_squares = view.now.squares - view.delayed.squares
+    return 0.5 * (integral_of_squares @ c.Kd)
 
 
 class Increment(NamedTuple):
@@ -402,11 +439,15 @@ def _trapezoid(
 
 
 def _jump_alone(amount: Array) -> Increment:
-    return Increment(np.zeros(len(amount)), np.zeros(len(amount)), amount)
+    """Returns amounts that all belong to the jumps at the ends of periods."""
+    zero = np.zeros(len(amount))
+    return Increment(zero, zero, amount)
 
 
 def _zero_increment(site: SiteMotion) -> Increment:
-    return _jump_alone(np.zeros(len(site.records.known) - 1))
+    """Returns an increment of no energy in every period."""
+    periods = len(site.records.known) - 1
+    return _jump_alone(np.zeros(periods))
 
 
 def compute_dissipation(site: SiteMotion) -> dict[str, Increment]:
@@ -426,25 +467,32 @@ def compute_dissipation(site: SiteMotion) -> dict[str, Increment]:
     left = np.zeros(len(records.known) - 1)
     right = left
     for j, view in enumerate(site.peers.values()):
-        squared_left = _weighted_square(c, rate[:-1] - view.delayed.qd[:-1])
-        squared_right = _weighted_square(c, rate[1:] - view.delayed_end.qd)
+        difference_left = rate[:-1] - view.delayed.qd[:-1]
+        difference_right = rate[1:] - view.delayed_end.qd
+        squared_left = _weighted_square(c, difference_left)
+        squared_right = _weighted_square(c, difference_right)
         left = left + 0.5 * dominance.alpha[:-1, j] * squared_left
         right = right + 0.5 * dominance.before[:, j] * squared_right
 
     def damping_power(r: Array) -> Array:
-        power: Array = (r * (c.Kp * r + c.robust_torque(r))).sum(axis=1)
+        torque = c.Kp * r + c.robust_torque(r)
+        power: Array = (r * torque).sum(axis=1)
         return power
 
     def friction_power(r: Array, qd: Array) -> Array:
-        power: Array = (r * (c.arm.friction(qd) - c.arm.friction(qd - r))).sum(axis=1)
+        torque = c.arm.friction(qd) - c.arm.friction(qd - r)
+        power: Array = (r * torque).sum(axis=1)
         return power
 
+    damping_left = damping_power(ends.r_left)
+    damping_right = damping_power(ends.r_right)
     dissipation = {
-        "damping": _trapezoid(site, damping_power(ends.r_left), damping_power(ends.r_right)),
+        "damping": _trapezoid(site, damping_left, damping_right),
         "disagreement": _trapezoid(site, left, right),
     }
     if not all(site.common):
-        dissipation["open axes"] = compute_transfer(site, 1.0 - np.array(site.common))
+        open_axes = 1.0 - np.array(site.common)
+        dissipation["open axes"] = compute_transfer(site, open_axes)
     friction_left = friction_power(ends.r_left, records.qd[:-1])
     friction_right = friction_power(ends.r_right, records.qd[1:])
     if friction_left.any() or friction_right.any():
@@ -461,25 +509,27 @@ def compute_transfer(site: SiteMotion, axes: Array) -> Increment:
         site: motion of the site.
         axes: weight of each axis, 1 or 0, shape (m,) or ().
     """
+    dominance = site.dominance
     c = site.constants._replace(Kd=axes * site.constants.Kd)
-    local = 0.5 * _weighted_square(c, site.records.shared_rate)
-    left = local[:-1]
-    right = local[1:]
+    site_power = 0.5 * _weighted_square(c, site.records.shared_rate)
+    left = site_power[:-1]
+    right = site_power[1:]
     for j, view in enumerate(site.peers.values()):
-        peer = 0.5 * _weighted_square(c, view.now.qd)
-        left = left - site.dominance.alpha[:-1, j] * peer[:-1]
-        right = right - site.dominance.before[:, j] * peer[1:]
+        peer_power = 0.5 * _weighted_square(c, view.now.qd)
+        left = left - dominance.alpha[:-1, j] * peer_power[:-1]
+        right = right - dominance.before[:, j] * peer_power[1:]
     return _trapezoid(site, left, right)
 
 
 def _weighted_square(c: SiteConstants, x: Array) -> Array:
     """Returns |x|^2 = x'Kd x of every row, shape (K,)."""
-    square: Array = (c.Kd * x**2).sum(axis=1)
+    weighted_squares = c.Kd * x**2
+    square: Array = weighted_squares.sum(axis=1)
     return square
 
 
 def compute_work(site: SiteMotion) -> dict[str, Increment]:
-    """Returns the work on a site by source: everything besides transfer that may raise V_i."""
+    """Returns the work on a site by source: all terms besides transfer that may raise V_i."""
     torque = site.torque
     records = site.records
     c = site.constants
@@ -511,13 +561,15 @@ def torque_work(site: SiteMotion, now: Array, held: Array) -> Increment:
         now: part of the torque that follows the state, shape (K, n), N m.
         held: part of the torque that is held over every period, shape (K, n), N m.
     """
-    left = (site.ends.r_left * (now[:-1] + held[:-1])).sum(axis=1)
-    right = (site.ends.r_right * (now[1:] + held[:-1])).sum(axis=1)
-    return _trapezoid(site, left, right)
+    torque_left = now[:-1] + held[:-1]
+    torque_right = now[1:] + held[:-1]
+    power_left = (site.ends.r_left * torque_left).sum(axis=1)
+    power_right = (site.ends.r_right * torque_right).sum(axis=1)
+    return _trapezoid(site, power_left, power_right)
 
 
 def link_work(site: SiteMotion, j: int) -> Increment:
-    """Returns the work of the link from peer j: the change of V_i as its sample's age jumps.
+    """Returns the work of the link from peer j: the change of V_i when a sample's age jumps.
 
     At the end of a period the stamp s + h is replaced by the stamp s' of the next sample in
     use. With r and e half-way through the jump, and de the jump of e by this link, the work is
@@ -529,9 +581,11 @@ def link_work(site: SiteMotion, j: int) -> Increment:
     dT/dt.
     """
     view = list(site.peers.values())[j]
-    stored = 0.5 * (view.delayed_end.squares - view.delayed.squares[1:]) @ site.constants.Kd
+    integral_of_squares = view.delayed_end.squares - view.delayed.squares[1:]
+    stored = 0.5 * integral_of_squares @ site.constants.Kd
     jump = _energy_of_jump(site, site.ends.link[j])
-    return _jump_alone(jump + site.dominance.before[:, j] * stored)
+    alpha = site.dominance.before[:, j]
+    return _jump_alone(jump + alpha * stored)
 
 
 def dominance_change_work(site: SiteMotion) -> Increment:
@@ -539,10 +593,10 @@ def dominance_change_work(site: SiteMotion) -> Increment:
 
     Along a ramp its power is
 
-        1/2 sum_j alpha_ij' int qd_j' Kd qd_j ds + qd_i' Kd sum_j alpha_ij' q_j(t - T_ij),
+        1/2 sum_j alpha_ij' int qd_j' Kd qd_j ds + qd_i' Kd sum_j alpha_ij' q_j(t - T_ij).
 
-    the second term because ed, and with it the damping, contains the ramp. The work of a change
-    of the weights beta is not included.
+    The second term arises because ed, and with it the damping, contains the ramp. The work of a
+    change of the weights beta is not included.
     """
     records = site.records
     c = site.constants
@@ -557,14 +611,18 @@ def dominance_change_work(site: SiteMotion) -> Increment:
     qd_right = records.shared_rate[1:]
     for j, view in enumerate(site.peers.values()):
         stored = _energy_in_transit(c, view)
-        stored_end = 0.5 * (view.now.squares[1:] - view.delayed_end.squares) @ c.Kd
+        integral_at_end = view.now.squares[1:] - view.delayed_end.squares
+        stored_at_end = 0.5 * integral_at_end @ c.Kd
         alpha_rate = dominance.rate[:-1, j]
         followed_rate = np.where(ends.following, alpha_rate, 0.0)
+        ramp_left = (qd_left * c.Kd * view.delayed.q[:-1]).sum(axis=1)
+        ramp_right = (qd_right * c.Kd * view.delayed_end.q).sum(axis=1)
         left = left + alpha_rate * stored[:-1]
-        left = left + followed_rate * (qd_left * c.Kd * view.delayed.q[:-1]).sum(axis=1)
-        right = right + alpha_rate * stored_end
-        right = right + followed_rate * (qd_right * c.Kd * view.delayed_end.q).sum(axis=1)
-        jump = jump + (dominance.alpha[1:, j] - dominance.before[:, j]) * stored[1:]
+        left = left + followed_rate * ramp_left
+        right = right + alpha_rate * stored_at_end
+        right = right + followed_rate * ramp_right
+        alpha_step = dominance.alpha[1:, j] - dominance.before[:, j]
+        jump = jump + alpha_step * stored[1:]
     return _trapezoid(site, left, right, jump)
 
 
@@ -578,20 +636,23 @@ def stale_rule_work(site: SiteMotion) -> Increment:
     left_terms = []
     right_terms = []
     for j, view in enumerate(site.peers.values()):
-        left_terms.append(dominance.alpha[:-1, j, None] * view.delayed.qd[:-1])
-        right_terms.append(dominance.before[:, j, None] * view.delayed_end.qd)
-    followed_left = np.sum(left_terms, axis=0)
-    followed_right = np.sum(right_terms, axis=0)
+        alpha_left = dominance.alpha[:-1, j, np.newaxis]
+        alpha_right = dominance.before[:, j, np.newaxis]
+        left_terms.append(alpha_left * view.delayed.qd[:-1])
+        right_terms.append(alpha_right * view.delayed_end.qd)
+    # the rule replaces the reference velocity that Eq. (6) would have
+    replaced_left = ends.qd_des_left - np.sum(left_terms, axis=0)
+    replaced_right = ends.qd_des_right - np.sum(right_terms, axis=0)
     rate = site.records.shared_rate
     Kd = site.constants.Kd
-    left = (rate[:-1] * Kd * (ends.qd_des_left - followed_left)).sum(axis=1)
-    right = (rate[1:] * Kd * (ends.qd_des_right - followed_right)).sum(axis=1)
+    left = (rate[:-1] * Kd * replaced_left).sum(axis=1)
+    right = (rate[1:] * Kd * replaced_right).sum(axis=1)
     jump = _energy_of_jump(site, ends.rule)
     return _trapezoid(
         site,
-        np.where(ruled, left, 0.0),
-        np.where(ruled, right, 0.0),
-        np.where(ruled, jump, 0.0),
+        left=np.where(ruled, left, 0.0),
+        right=np.where(ruled, right, 0.0),
+        jump=np.where(ruled, jump, 0.0),
     )
 
 
@@ -613,18 +674,20 @@ def unknown_friction_work(site: SiteMotion) -> Increment:
     ends = site.ends
 
     def power(r: Array, qd: Array) -> Array:
-        power: Array = -(r * (1.0 - c.friction) * c.arm.friction(qd - r)).sum(axis=1)
+        friction = c.arm.friction(qd - r)
+        products = r * (1.0 - c.friction) * friction
+        power: Array = -products.sum(axis=1)
         return power
 
-    return _trapezoid(
-        site, power(ends.r_left, records.qd[:-1]), power(ends.r_right, records.qd[1:])
-    )
+    left = power(ends.r_left, records.qd[:-1])
+    right = power(ends.r_right, records.qd[1:])
+    return _trapezoid(site, left, right)
 
 
 def singular_pose_work(site: SiteMotion) -> Increment:
     """Returns the work of the damping near singular poses.
 
-    It is int r'M(a - v') - (J r - x' - Lambda e)'Kd ed. Both terms are zero where J J+ = I.
+    The work is int r'M(a - v') - (J r - x' - Lambda e)'Kd ed. Both terms are zero if J J+ = I.
     """
     ends = site.ends
     e_right = 2.0 * ends.e_middle - site.records.e[1:]
@@ -653,7 +716,8 @@ def _singular_pose_power(
     c = site.constants
     velocity_error, acceleration_error = site.following.compute_damping_deviation(rows, e)
     ed = records.shared_rate[rows] - qd_des
-    power: Array = -(velocity_error * c.Kd * ed).sum(axis=1)
+    products = velocity_error * c.Kd * ed
+    power: Array = -products.sum(axis=1)
     if acceleration_error.any():
         momentum = c.arm.multiply_inertia(records.q[rows], r)
         power = power + (momentum * acceleration_error).sum(axis=1)
@@ -668,49 +732,58 @@ def measure_torque_error(site: SiteMotion) -> Array:
     """
     records = site.records
     low, high = site.nearest_torques
-    law_torque = site.law_torque(np.arange(len(records.known)))
-    error: Array = np.abs(records.tau - np.clip(law_torque, low, high)).max(axis=1)
-    return np.where(records.known & ~site.rests, error, 0.0)
+    all_rows = np.arange(len(records.known))
+    law_torque = site.law_torque(all_rows)
+    limited_torque = np.clip(law_torque, low, high)
+    errors = np.abs(records.tau - limited_torque)
+    largest: Array = errors.max(axis=1)
+    is_comparable = records.known & ~site.rests
+    return np.where(is_comparable, largest, 0.0)
 
 
 def estimate_work(site: SiteMotion) -> Increment:
     """Returns the work of estimates that do not follow Eq. (15): held in their box, or fixed.
 
     The box reduces 1/2 (theta_hat - theta)' Gamma^-1 (theta_hat - theta), since it contains
-    theta. A parameter that is not adapted, or not while the site rests, leaves r' Y (theta_hat
-    - theta) without its counterpart.
+    theta. For a parameter that is not adapted, or not while the site rests, no term cancels the
+    power r' Y (theta_hat - theta).
     """
     records = site.records
     c = site.constants
     theta_hat = records.theta_hat
     parameter_error = theta_hat - c.theta
-    is_unchanged = (np.diff(parameter_error, axis=0) == 0.0).all(axis=1)
+    change = np.diff(parameter_error, axis=0)
+    is_unchanged = (change == 0.0).all(axis=1)
     is_frozen = np.concatenate([[False], is_unchanged]) & site.rests
-    is_at_edge = ((theta_hat <= c.low) | (theta_hat >= c.high))[1:]
-    is_held = is_at_edge & c.adapts & ~is_frozen[1:, np.newaxis]
-    is_fixed = (parameter_error != 0.0) & (~c.adapts | is_frozen[:, np.newaxis])
+    is_frozen = is_frozen[:, np.newaxis]
+    is_at_edge = (theta_hat <= c.low) | (theta_hat >= c.high)
+    is_held = is_at_edge[1:] & c.adapts & ~is_frozen[1:]
+    is_fixed = (parameter_error != 0.0) & (~c.adapts | is_frozen)
     if not (is_held.any() or is_fixed.any()):
         return _zero_increment(site)
-    # change by which the box kept the estimate from the step of Eq. (15)
-    correction = np.diff(parameter_error, axis=0) + records.h_s * c.Gamma * site.mean_Yr
+    # the step of Eq. (15) would be -h Gamma Y'r; the box changed it by `correction`
+    correction = change + records.h_s * c.Gamma * site.mean_Yr
     mean_error = 0.5 * (parameter_error[:-1] + parameter_error[1:])
     with np.errstate(divide="ignore", invalid="ignore"):
-        jump = np.where(is_held, mean_error * correction / c.Gamma, 0.0).sum(axis=1)
-    power = np.where(is_fixed, site.Yr * parameter_error, 0.0).sum(axis=1)
+        box_work = mean_error * correction / c.Gamma
+    jump = np.where(is_held, box_work, 0.0).sum(axis=1)
+    fixed_power = site.Yr * parameter_error
+    power = np.where(is_fixed, fixed_power, 0.0).sum(axis=1)
     return _trapezoid(site, power[:-1], power[1:], jump)
 
 
 def compute_sampling_work(site: SiteMotion) -> Increment:
     """Returns the work of the scheme that samples the continuous law.
 
-    It has two parts:
+    The work has two parts:
 
     - int r' (u - tau), where u is the torque that is held: tau_k of `digital`, or the
-      extrapolated torque of `second_order`. tau is taken as straight up to its value before the
-      jump.
+      extrapolated torque of `second_order`. tau is taken as a straight line up to its value
+      before the jump.
     - the scheme's step of the estimate, in place of the trapezoid rule on Eq. (15).
 
-    This work is no part of the balance: the balance's residual without it is unexplained.
+    This work is not part of the balance. The residual of the balance less this work is the
+    unexplained energy.
     """
     records = site.records
     c = site.constants
@@ -718,13 +791,19 @@ def compute_sampling_work(site: SiteMotion) -> Increment:
     digital = site.scheme is Scheme.DIGITAL
     u = hold_torque(records.tau, c.tau_limit, digital=digital)[:-1]
     tau_right, Yr_right = _evaluate_before_jump(site)
-    torque_error = u - 0.5 * (records.tau[:-1] + tau_right)
+
+    mean_tau = 0.5 * (records.tau[:-1] + tau_right)
+    torque_error = u - mean_tau
     mean_r = 0.5 * (ends.r_left + ends.r_right)
-    torque_part = records.h_s * (mean_r * torque_error).sum(axis=1)
+    torque_power = (mean_r * torque_error).sum(axis=1)
+    torque_part = records.h_s * torque_power
+
     parameter_error = (records.theta_hat - c.theta) * c.adapts
-    Yr_error = 0.5 * (site.Yr[:-1] + Yr_right) - site.mean_Yr
     error_sum = parameter_error[1:] + parameter_error[:-1]
-    return _jump_alone(torque_part + 0.5 * records.h_s * (error_sum * Yr_error).sum(axis=1))
+    trapezoid_Yr = 0.5 * (site.Yr[:-1] + Yr_right)
+    Yr_error = trapezoid_Yr - site.mean_Yr
+    estimate_part = 0.5 * records.h_s * (error_sum * Yr_error).sum(axis=1)
+    return _jump_alone(torque_part + estimate_part)
 
 
 def _evaluate_before_jump(site: SiteMotion) -> tuple[Array, Array]:
@@ -739,20 +818,33 @@ def _evaluate_before_jump(site: SiteMotion) -> tuple[Array, Array]:
     ends = site.ends
     tau = records.tau[1:].copy()
     Yr = site.Yr[1:].copy()
-    e_right = 2.0 * ends.e_middle - records.e[1:]
-    jump_size = np.abs(e_right - records.e[1:]) + np.abs(ends.qd_des_right - records.qd_des[1:])
-    periods = np.flatnonzero((jump_size > JUMP_TOLERANCE).any(axis=1))
+    e_next = records.e[1:]
+    e_right = 2.0 * ends.e_middle - e_next
+    ed_right = records.shared_rate[1:] - ends.qd_des_right
+    jump_of_e = np.abs(e_right - e_next)
+    jump_of_rate = np.abs(ends.qd_des_right - records.qd_des[1:])
+    jumps = jump_of_e + jump_of_rate > JUMP_TOLERANCE
+    periods = np.flatnonzero(jumps.any(axis=1))
+
     e = e_right[periods]
-    ed = (records.shared_rate[1:] - ends.qd_des_right)[periods]
+    ed = ed_right[periods]
     r = ends.r_right[periods]
     rows = periods + 1
     v, a = site.following.compute_reference(rows, e, ed)
-    Yr[periods] = c.arm.gradient(q=records.q[rows], qd=records.qd[rows], v=v, a=a, r=r)
-    law_torque = np.clip(site.control_torque(rows, e, ed, r), -c.tau_limit, c.tau_limit)
+    Yr[periods] = c.arm.gradient(
+        q=records.q[rows],
+        qd=records.qd[rows],
+        v=v,
+        a=a,
+        r=r,
+    )
+    law_torque = site.control_torque(rows, e, ed, r)
+    limited_torque = np.clip(law_torque, -c.tau_limit, c.tau_limit)
     # a torque at its rate limit, or of a resting site, does not move with a jump of e
     has_rate_limit = np.any(np.isfinite(c.tau_rate))
-    is_bound = site.rests | (site.limited.any(axis=1) & has_rate_limit)
-    tau[periods] = np.where(is_bound[rows, np.newaxis], tau[periods], law_torque)
+    is_rate_limited = site.limited.any(axis=1) & has_rate_limit
+    is_bound = site.rests | is_rate_limited
+    tau[periods] = np.where(is_bound[rows, np.newaxis], tau[periods], limited_torque)
     return tau, Yr
 
 
@@ -775,6 +867,7 @@ def _energy_of_jump(site: SiteMotion, de: Array) -> Array:
         return np.zeros(len(de))
     momentum = c.arm.multiply_inertia(site.records.q[1:], ends.r_middle)
     dr = site.following.compute_jump_of_r(slice(1, None), de)
+    potential_change = c.Kd * ends.e_middle * c.Lambda * de
     change: Array = (momentum * dr).sum(axis=1)
-    change += (c.Kd * ends.e_middle * c.Lambda * de).sum(axis=1)
+    change += potential_change.sum(axis=1)
     return change

@@ -1,6 +1,6 @@
 """Metrics of energy: of a site's ports, of its arm, and of the delay of each link.
 
-The work of a torque is int tau' dq. For a torque that is held over a period it is exactly
+The work of a torque is int tau' dq. A torque that is held over a period does exactly the work
 tau_k' (q_{k+1} - q_k). For a torque that follows the state, the trapezoid rule over dq is used,
 which is exact for springs. The running energy of a port is that of a passivity observer
 (Hannaford and Ryu 2002).
@@ -45,7 +45,9 @@ def held_work(torque: Array, q: Array) -> Array:
     Returns:
         Work per period, shape (K - 1,), J.
     """
-    work: Array = np.einsum("kj,kj->k", torque[: len(q) - 1], np.diff(q, axis=0))
+    motion = np.diff(q, axis=0)
+    period_torque = torque[: len(motion)]
+    work: Array = np.einsum("kj,kj->k", period_torque, motion)
     return work
 
 
@@ -59,7 +61,8 @@ def trapezoid_work(torque: Array, q: Array) -> Array:
     Returns:
         Work per period, shape (K - 1,), J.
     """
-    return held_work(0.5 * (torque[:-1] + torque[1:]), q)
+    mean_torque = 0.5 * (torque[:-1] + torque[1:])
+    return held_work(mean_torque, q)
 
 
 def held_control_torque(records: AlignedRecords, scenario: Scenario) -> Array:
@@ -69,21 +72,26 @@ def held_control_torque(records: AlignedRecords, scenario: Scenario) -> Array:
     the mean of both ticks is used.
     """
     spec = scenario.sites[records.site]
+    tau = records.tau
     if spec.plant != "simulated":
-        return 0.5 * (records.tau[:-1] + records.tau[1:])
+        return 0.5 * (tau[:-1] + tau[1:])
+    tau_limit = np.asarray(spec.limits.tau_limit_nm)
     digital = Scheme[scenario.scheme.upper()] is Scheme.DIGITAL
-    return hold_torque(records.tau, np.asarray(spec.limits.tau_limit_nm), digital=digital)[:-1]
+    held = hold_torque(tau, tau_limit, digital=digital)
+    return held[:-1]
 
 
 def mechanical_energy(arm: ArmRows, records: AlignedRecords) -> Array:
     """Returns the arm's kinetic and potential energy, shape (K,), J.
 
-    For the planar arm it is 1/2 qd'M qd + g (theta_4 sin q_1 + theta_5 sin(q_1 + q_2)): the
-    height is zero when the arm is level.
+    For the planar arm the energy is 1/2 qd'M qd + g (theta_4 sin q_1 + theta_5 sin(q_1 + q_2)):
+    the potential energy is zero when the arm is level.
     """
     momentum = arm.multiply_inertia(records.q, records.qd)
-    kinetic = 0.5 * np.einsum("kj,kj->k", records.qd, momentum)
-    energy: Array = kinetic + arm.potential_energy(records.q)
+    qd_M_qd = np.einsum("kj,kj->k", records.qd, momentum)
+    kinetic = 0.5 * qd_M_qd
+    potential = arm.potential_energy(records.q)
+    energy: Array = kinetic + potential
     return energy
 
 
@@ -118,17 +126,18 @@ def measure_port_energy(view: RunView, site: str) -> MetricValues:
         return unavailable(ENERGY, "no two records in a row", of="site")
 
     def accumulate(work: Array) -> Array:
-        return np.cumsum(np.where(known, work, 0.0))
+        known_work = np.where(known, work, 0.0)
+        return np.cumsum(known_work)
 
-    controller = accumulate(held_work(held_control_torque(records, scenario), q))
-    operator = accumulate(
-        trapezoid_work(torque.operator_now, q) + held_work(torque.operator_held, q)
-    )
+    controller_torque = held_control_torque(records, scenario)
+    controller = accumulate(held_work(controller_torque, q))
+    operator_now_work = trapezoid_work(torque.operator_now, q)
+    operator_held_work = held_work(torque.operator_held, q)
+    operator = accumulate(operator_now_work + operator_held_work)
     stop_torque = arm.stop_torque(q, records.qd)
-    walls = accumulate(
-        trapezoid_work(torque.environment_now + stop_torque, q)
-        + held_work(torque.environment_held, q)
-    )
+    walls_now_work = trapezoid_work(torque.environment_now + stop_torque, q)
+    walls_held_work = held_work(torque.environment_held, q)
+    walls = accumulate(walls_now_work + walls_held_work)
     friction_torque = arm.friction(records.qd)
     friction = accumulate(trapezoid_work(friction_torque, q))
     metrics = {
@@ -136,24 +145,25 @@ def measure_port_energy(view: RunView, site: str) -> MetricValues:
         "hands_j": metric(operator[-1]),
         "hands_most_j": metric(max(0.0, float(operator.max()))),
     }
-    if bool(spec.environment) or stop_torque.any():
+    if spec.environment or stop_torque.any():
         metrics["walls_j"] = metric(walls[-1])
         metrics["walls_most_j"] = metric(max(0.0, float(walls.max())))
     else:
         no_walls = Metric(None, "the scenario has no environment here", applies=False)
         metrics["walls_j"] = no_walls
         metrics["walls_most_j"] = no_walls
-    metrics["friction_j"] = metric(friction[-1]) if friction_torque.any() else _NO_FRICTION
+    metrics["friction_j"] = _NO_FRICTION
+    if friction_torque.any():
+        metrics["friction_j"] = metric(friction[-1])
     if not spec.arm.known:
         unknown = Metric(None, "theta of the arm is not known")
         return {**metrics, "mechanical_j": unknown, "unaccounted_j": unknown}
-    gained = accumulate(np.diff(mechanical_energy(arm, records)))
+    energy = mechanical_energy(arm, records)
+    gained = accumulate(np.diff(energy))
     unaccounted = np.abs(gained - controller - operator - walls + friction)
-    return {
-        **metrics,
-        "mechanical_j": metric(gained[-1]),
-        "unaccounted_j": metric(float(unaccounted.max())),
-    }
+    metrics["mechanical_j"] = metric(gained[-1])
+    metrics["unaccounted_j"] = metric(float(unaccounted.max()))
+    return metrics
 
 
 @measures(
@@ -163,10 +173,10 @@ def measure_port_energy(view: RunView, site: str) -> MetricValues:
     Quantity("delay_most_j", "given by the delay at most", "J"),
 )
 def measure_delay_energy(view: RunView, link: str) -> MetricValues:
-    """Returns the energy that a link's delay injects: in all, and the most up to any time, J.
+    """Returns the energy that a link's delay injects: at the end, and its maximum, J.
 
     Only periods count that follow from records alone, and in which the site follows its peers.
-    The torque is that of the law before its limit.
+    The torque is the law's, before its limit.
     """
     runs = view.sites
     peer = view.links[link].peer
@@ -201,7 +211,9 @@ def measure_delay_energy(view: RunView, link: str) -> MetricValues:
         alpha=dominance.alpha[:, [j]],
         alpha_rate=dominance.rate[:, [j]],
     )
-    injected = np.cumsum(np.where(judged, trapezoid_work(torque, records.q), 0.0))
+    work = trapezoid_work(torque, records.q)
+    judged_work = np.where(judged, work, 0.0)
+    injected = np.cumsum(judged_work)
     return {
         "delay_j": metric(injected[-1]),
         "delay_most_j": metric(max(0.0, float(injected.max()))),
@@ -217,9 +229,9 @@ def _compute_delay_torque(
     alpha: Array,
     alpha_rate: Array,
 ) -> Array:
-    """Returns the torque that the delay of a link adds to that of the law, shape (K, n), N m.
+    """Returns the torque that the delay of a link adds to the law's torque, shape (K, n), N m.
 
-    Its effect on the Coulomb friction that a law compensates is left out.
+    The effect of the delay on the Coulomb friction that a law compensates is left out.
 
     Args:
         gains: gains of the law.
@@ -232,26 +244,52 @@ def _compute_delay_torque(
     """
     all_rows = slice(None)
     lag = view.delayed.q - view.now.q
+    rate_lag = view.delayed.qd - view.now.qd
     reference_change = alpha * lag
-    reference_rate_change = alpha * (view.delayed.qd - view.now.qd) + alpha_rate * lag
+    reference_rate_change = alpha * rate_lag + alpha_rate * lag
     axes = np.array(records.axes or 1.0)
     Lambda = axes * np.array(gains.Lambda)
     Kd = axes * np.array(gains.Kd)
     following = build_following(arm, records.q, records.qd, Lambda).without_posture()
     if gains.law is Law.ADAPTIVE:
         v, a = following.compute_reference(all_rows, -reference_change, -reference_rate_change)
-        torque = arm.weightless().law_torque(records.theta_hat, records.q, records.qd, v, a)
+        torque = arm.weightless().law_torque(
+            theta_hat=records.theta_hat,
+            q=records.q,
+            qd=records.qd,
+            v=v,
+            a=a,
+        )
         damping = following.compute_joint_torque(all_rows, Kd * reference_rate_change)
         return torque + np.array(gains.Kp) * v + damping
-    force = axes * np.array(gains.K) * reference_change + Kd * reference_rate_change
-    # a law that reflects force uses the peer's external torque as it arrived, instead of the
-    # peer's present one
+
+    K = axes * np.array(gains.K)
+    force = K * reference_change + Kd * reference_rate_change
     if np.any(gains.k_f):
-        used = records.used[peer_records.site]
-        row = np.clip(used - peer_records.first, 0, len(peer_records.known) - 1)
-        peer_torque = peer_records.wrench if peer_records.wrench.size else peer_records.tau_x
-        arrived = np.where((used >= 0)[:, None], -peer_torque[row], 0.0)
-        columns = [np.interp(records.t_s, peer_records.t_s, -x) for x in peer_torque.T]
-        present = np.stack(columns, axis=1)
-        force = force + axes * np.array(gains.k_f) * alpha * (arrived - present)
+        k_f = axes * np.array(gains.k_f)
+        torque_lag = _compute_reflected_lag(records, peer_records)
+        force = force + k_f * alpha * torque_lag
     return following.compute_joint_torque(all_rows, force)
+
+
+def _compute_reflected_lag(records: AlignedRecords, peer_records: AlignedRecords) -> Array:
+    """Returns the peer's external torque as it arrived, less its present value, shape (K, n).
+
+    Args:
+        records: records of a site whose law reflects force.
+        peer_records: the peer's records.
+    """
+    peer_torque = peer_records.tau_x
+    if peer_records.wrench.size:
+        peer_torque = peer_records.wrench
+    used = records.used[peer_records.site]
+    has_arrived = (used >= 0)[:, np.newaxis]
+    last_row = len(peer_records.known) - 1
+    row = np.clip(used - peer_records.first, 0, last_row)
+    arrived = np.where(has_arrived, -peer_torque[row], 0.0)
+    columns = [
+        np.interp(records.t_s, peer_records.t_s, -joint_torque)
+        for joint_torque in peer_torque.T
+    ]
+    present = np.stack(columns, axis=1)
+    return arrived - present
