@@ -1,13 +1,12 @@
-"""Aligns a site's records on its tick grid, and views its peers as the site sees them.
+"""Aligns a site's records on its tick grid, and shows its peers as the site sees them.
 
 Invariant:
     - A gap in the records is filled by interpolation, so that sums have all their terms and
       rows keep their times. Filled rows are not `known`, and no metric uses them.
-    - A peer's motion is a cubic through angles and velocities between its records, and rest
-      before its first record (L7).
+    - Between two records a peer moves along a cubic through angles and velocities. Before its
+      first record it rests (L7).
     - Between two ticks a stamp moves at rate one, as under the constant delay of the theorem.
-      The difference from the stamp of the sample in use at the next tick is a jump of that
-      link.
+      The difference from the stamp of the sample in use at the next tick is a jump of the link.
 """
 
 from collections.abc import Sequence
@@ -33,9 +32,7 @@ RECORD_COLUMNS = ("q", "qd", "q_des", "qd_des", "tau", "tau_x", "theta_hat")
 _NO_COLUMNS: Array = np.zeros((0, 0))
 _NO_ROWS: Bools = np.zeros(0, dtype=np.bool_)
 RESUMING_S = 2.0 * BLEND_S
-"""Time after one of the `RESTING_MODES` for which the torque may not be that of the law alone,
-s.
-"""
+"""Time after one of the `RESTING_MODES` in which the torque may not be the law's alone, s."""
 _TICK_TOLERANCE = 1e-5
 """Times that differ from a tick by less than this share of a period are at the tick."""
 
@@ -59,7 +56,8 @@ class AlignedRecords(NamedTuple):
         tau: control torque, shape (K, n), N m.
         tau_x: exogenous torque in the sign of Eq. (8), shape (K, n), N m.
         theta_hat: parameter estimates, shape (K, P).
-        used: per peer the tick of the sample in use, shape (K,); -1 before the first sample.
+        used: for each peer, the tick of the sample in use, shape (K,); -1 before the first
+            sample.
         x: position or pose of the end effector in task space, shape (K, m); else empty.
         xd: its derivative.
         wrench: the force at the end effector that tau_x amounts to, shape (K, m); else empty.
@@ -96,7 +94,7 @@ class AlignedRecords(NamedTuple):
 
     @property
     def shared_rate(self) -> Array:
-        """Their derivative: qd, or xd in task space, shape (K, m)."""
+        """The derivative of these coordinates: qd, or xd in task space, shape (K, m)."""
         return self.xd if self.x.size else self.qd
 
     @property
@@ -107,7 +105,13 @@ class AlignedRecords(NamedTuple):
     @property
     def t_s(self) -> Array:
         """Nominal time of every row, shape (K,), s."""
-        return np.arange(self.first, self.first + len(self.known)) / self.rate_hz
+        return self._ticks / self.rate_hz
+
+    @property
+    def _ticks(self) -> Ints:
+        """The tick of every row, shape (K,)."""
+        end = self.first + len(self.known)
+        return np.arange(self.first, end, dtype=np.int64)
 
     @property
     def nominal_s(self) -> Array:
@@ -115,8 +119,8 @@ class AlignedRecords(NamedTuple):
 
         The core compares these times with the start and end of an exogenous torque.
         """
-        tick = np.arange(self.first, self.first + len(self.known), dtype=np.int64)
-        return (tick * NS_PER_S // self.rate_hz).astype(np.float64) * 1e-9
+        time_ns = self._ticks * NS_PER_S // self.rate_hz
+        return time_ns.astype(np.float64) * 1e-9
 
     @property
     def e(self) -> Array:
@@ -137,7 +141,9 @@ class AlignedRecords(NamedTuple):
 
     def known_at_end(self, length_s: float) -> Bools:
         """Returns the recorded rows of the last `length_s` seconds, shape (K,)."""
-        rows: Bools = self.known & (self.t_s > self.t_s[-1] - length_s)
+        t_s = self.t_s
+        start_s = t_s[-1] - length_s
+        rows: Bools = self.known & (t_s > start_s)
         return rows
 
 
@@ -152,15 +158,16 @@ def hold_torque(tau: Array, limit_nm: Array | float, *, digital: bool) -> Array:
     """
     held = tau.copy()
     if not digital:
-        held[1:] = np.clip(1.5 * tau[1:] - 0.5 * tau[:-1], -limit_nm, limit_nm)
+        extrapolated = 1.5 * tau[1:] - 0.5 * tau[:-1]
+        held[1:] = np.clip(extrapolated, -limit_nm, limit_nm)
     return held
 
 
 def align_records(log: Log, *, common: bool = False) -> dict[str, AlignedRecords]:
     """Returns the aligned records of all sites that have records, in scenario order.
 
-    The record that says `diverged` is left out: it may hold zeros in place of numbers that are
-    not finite.
+    A record with the mode "diverged" is left out: it may hold zeros in place of numbers that
+    are not finite.
 
     Args:
         log: the log of a run.
@@ -171,15 +178,15 @@ def align_records(log: Log, *, common: bool = False) -> dict[str, AlignedRecords
     """
     rows_by_site: dict[str, Ints] = {}
     for site in log.sites:
-        first_of_tick = np.unique(log[site].tick, return_index=True)[1]
+        _, first_of_tick = np.unique(log[site].tick, return_index=True)
         modes = log[site].mode[first_of_tick]
         rows_by_site[site] = first_of_tick[modes != "diverged"]
+    aligned = {}
     if not common:
-        return {
-            site: _fill_tick_grid(log.scenario, log[site], rows)
-            for site, rows in rows_by_site.items()
-            if len(rows)
-        }
+        for site, rows in rows_by_site.items():
+            if len(rows):
+                aligned[site] = _fill_tick_grid(log.scenario, log[site], rows)
+        return aligned
     if min(map(len, rows_by_site.values())) < 2:
         return {}
     first_times_s = []
@@ -191,11 +198,13 @@ def align_records(log: Log, *, common: bool = False) -> dict[str, AlignedRecords
     end_s = min(last_times_s)
     if end_s <= max(first_times_s):
         return {}
-    aligned = {}
     for site, rows in rows_by_site.items():
         last_tick = int(np.floor(end_s * log[site].rate_hz + 1e-6))
-        aligned[site] = _fill_tick_grid(log.scenario, log[site], rows, last_tick)
-    return aligned if min(len(records.known) for records in aligned.values()) > 1 else {}
+        records = _fill_tick_grid(log.scenario, log[site], rows, last_tick)
+        if len(records.known) < 2:
+            return {}
+        aligned[site] = records
+    return aligned
 
 
 def find_unlimited_rows(limits: Limits, qd_des: Array) -> Bools:
@@ -208,7 +217,8 @@ def find_unlimited_rows(limits: Limits, qd_des: Array) -> Bools:
     Returns:
         True for such rows, shape (K,) or ().
     """
-    return np.asarray((np.abs(qd_des) < limits.motion.qd_des_limit).all(axis=-1))
+    is_slower = np.abs(qd_des) < limits.motion.qd_des_limit
+    return np.asarray(is_slower.all(axis=-1))
 
 
 def _find_resting_rows(modes: NDArray[Any], tick: Ints, rate_hz: int) -> Bools:
@@ -217,7 +227,8 @@ def _find_resting_rows(modes: NDArray[Any], tick: Ints, rate_hz: int) -> Bools:
     if not rests.any():
         return rests
     never = np.iinfo(np.int64).min // 2
-    last_resting_tick = np.maximum.accumulate(np.where(rests, tick, never))
+    resting_tick = np.where(rests, tick, never)
+    last_resting_tick = np.maximum.accumulate(resting_tick)
     return tick - last_resting_tick <= RESUMING_S * rate_hz
 
 
@@ -249,13 +260,15 @@ def _fill_tick_grid(
     known: Bools = tick[previous] == grid
     spec = scenario.sites[part.name]
     modes = part.mode[rows]
-    follows: Bools = (modes == "run")[previous]
-    follows &= find_unlimited_rows(spec.limits, part.qd_des[rows])[previous]
+    runs = modes == "run"
+    is_unlimited = find_unlimited_rows(spec.limits, part.qd_des[rows])
+    follows: Bools = (runs & is_unlimited)[previous]
     rests = _NO_ROWS
     if spec.on_stale.action == "glide":
-        resting = _find_resting_rows(modes, tick, part.rate_hz)[previous]
-        if resting.any():
-            rests = resting
+        resting = _find_resting_rows(modes, tick, part.rate_hz)
+        resting_in_grid = resting[previous]
+        if resting_in_grid.any():
+            rests = resting_in_grid
     columns = {}
     for name in names:
         values = getattr(part, name)[rows]
@@ -264,13 +277,17 @@ def _fill_tick_grid(
         else:
             interpolated = [np.interp(grid, tick, column) for column in values.T]
             columns[name] = np.stack(interpolated, axis=1)
+    used = {}
+    for peer in part.peers:
+        recorded = part.used[peer][rows]
+        used[peer] = recorded[previous]
     return AlignedRecords(
         site=part.name,
         rate_hz=part.rate_hz,
         first=first,
         known=known,
         follows=follows,
-        used={peer: part.used[peer][rows][previous] for peer in part.peers},
+        used=used,
         axes=part.axes,
         rests=rests,
         **columns,
@@ -305,7 +322,8 @@ class PeerTrajectory:
     def __init__(self, records: AlignedRecords) -> None:
         self.records = records
         squared_rate = records.shared_rate**2
-        steps = 0.5 * records.h_s * (squared_rate[1:] + squared_rate[:-1])
+        sums = squared_rate[1:] + squared_rate[:-1]
+        steps = 0.5 * records.h_s * sums
         start = np.zeros((1, squared_rate.shape[1]))
         self._squares: Array = np.vstack([start, np.cumsum(steps, axis=0)])
 
@@ -374,8 +392,9 @@ class DelayedPeer(NamedTuple):
         """True if the whole period follows from records, shape (K - 1,)."""
         now = self.now.known
         delayed = self.delayed.known
-        conditions = [now[:-1], now[1:], delayed[:-1], delayed[1:], self.delayed_end.known]
-        known: Bools = np.logical_and.reduce(conditions)
+        now_known = now[:-1] & now[1:]
+        delayed_known = delayed[:-1] & delayed[1:]
+        known: Bools = now_known & delayed_known & self.delayed_end.known
         return known
 
 
@@ -392,28 +411,32 @@ def view_delayed_peer(records: AlignedRecords, past: PeerTrajectory) -> DelayedP
     """
     used = records.used[past.records.site]
     has_sample = used >= 0
-    stamp_s = np.where(has_sample, used / past.records.rate_hz, _BEFORE_EPOCH_S)
-    end_stamp_s = np.where(has_sample, stamp_s + records.h_s, _BEFORE_EPOCH_S)[:-1]
+    sample_s = used / past.records.rate_hz
+    stamp_s = np.where(has_sample, sample_s, _BEFORE_EPOCH_S)
+    # the stamp moves at rate one over the period after a tick
+    next_stamp_s = np.where(has_sample, stamp_s + records.h_s, _BEFORE_EPOCH_S)
     return DelayedPeer(
         now=past.evaluate(records.t_s),
         delayed=past.evaluate(stamp_s),
-        delayed_end=past.evaluate(end_stamp_s),
+        delayed_end=past.evaluate(next_stamp_s[:-1]),
         stamp_s=np.where(has_sample, stamp_s, np.nan),
     )
 
 
 def find_latest_rows(records: AlignedRecords, t_s: Array) -> tuple[Ints, Bools]:
-    """Returns the rows of a site's latest ticks at given times, shape (K,).
+    """Returns the rows of a site's latest ticks at some times, shape (K,) each.
 
     Returns:
         The rows.
-        True where the tick is recorded.
+        True for each tick that is recorded.
     """
-    row = np.floor(t_s * records.rate_hz + 1e-6).astype(np.int64) - records.first
-    inside = (row >= 0) & (row < len(records.known))
-    row = np.clip(row, 0, len(records.known) - 1)
-    recorded: Bools = inside & records.known[row]
-    return row, recorded
+    tick = np.floor(t_s * records.rate_hz + 1e-6).astype(np.int64)
+    row = tick - records.first
+    row_count = len(records.known)
+    is_inside = (row >= 0) & (row < row_count)
+    nearest_row = np.clip(row, 0, row_count - 1)
+    recorded: Bools = is_inside & records.known[nearest_row]
+    return nearest_row, recorded
 
 
 def find_common_rows(sites: Sequence[AlignedRecords]) -> tuple[list[Ints], Bools]:
@@ -421,7 +444,7 @@ def find_common_rows(sites: Sequence[AlignedRecords]) -> tuple[list[Ints], Bools
 
     Returns:
         The rows by site, shape (K,) each.
-        True where the ticks of all sites are recorded, shape (K,).
+        True if the ticks of all sites are recorded, shape (K,).
     """
     rows = []
     recorded_by_site = []

@@ -3,10 +3,10 @@
 All functions work over all rows of a log at once. Torques act ON the arm.
 
 Invariant:
-    - Everything is written from the definitions of the scenario, independently of the core; the
-      tests compare the two.
-    - A torque that the scenario does not explain is the operator's: the recorded torque less
-      the environment's.
+    - All torques are computed from the definitions of the scenario, independently of the core;
+      the tests compare the two.
+    - The recorded torque less the environment's torque is the operator's, even if the scenario
+      does not explain it.
     - An operator has a script only if its torque matches the scenario.
 """
 
@@ -35,7 +35,9 @@ def list_walls(spec: SiteSpec) -> list[TorqueSource]:
 
 def wall_depth(wall: TorqueSource, end_effector: EndEffectorRows) -> Array:
     """Returns the depth of an end effector in a wall, shape (K,), m; negative outside."""
-    depth: Array = (np.array(wall.a) - end_effector.position) @ np.array(wall.b)
+    surface_point = np.array(wall.a)
+    normal = np.array(wall.b)
+    depth: Array = (surface_point - end_effector.position) @ normal
     return depth
 
 
@@ -52,14 +54,18 @@ def wall_force(wall: TorqueSource, t_s: Array, end_effector: EndEffectorRows) ->
     """
     depth = wall_depth(wall, end_effector)
     outward_speed = end_effector.speed @ np.array(wall.b)
-    push = np.maximum(wall.K[0] * depth - wall.B[0] * outward_speed, 0.0)
+    spring = wall.K[0] * depth
+    damper = wall.B[0] * outward_speed
+    push = np.maximum(spring - damper, 0.0)
     is_inside = _is_active(wall, t_s) & (depth > 0.0)
     return np.where(is_inside, push, 0.0)
 
 
 def _is_active(source: TorqueSource, t_s: Array) -> Bools:
     """Returns the times between start and end of a source, shape (K,)."""
-    active: Bools = (t_s >= source.start_s) & (t_s < source.end_s)
+    has_started = t_s >= source.start_s
+    has_not_ended = t_s < source.end_s
+    active: Bools = has_started & has_not_ended
     return active
 
 
@@ -76,14 +82,17 @@ def compute_target_motion(source: TorqueSource, t_s: Array) -> tuple[Array, Arra
     progress = (t_s > source.move_start_s).astype(np.float64)
     progress_rate = 0.0
     if span_s > 0.0:
-        progress = np.clip((t_s - source.move_start_s) / span_s, 0.0, 1.0)
+        since_start_s = t_s - source.move_start_s
+        progress = np.clip(since_start_s / span_s, 0.0, 1.0)
         progress_rate = 1.0 / span_s
     start = np.array(source.a)
     distance = np.array(source.b) - start
-    x = progress[:, None]
+    x = progress[:, np.newaxis]
     # minimum jerk: 10 x^3 - 15 x^4 + 6 x^5, and its derivative 30 x^2 (1 - x)^2
-    position = start + x**3 * (10.0 + x * (6.0 * x - 15.0)) * distance
-    velocity = 30.0 * x**2 * (1.0 - x) ** 2 * progress_rate * distance
+    share = x**3 * (10.0 + x * (6.0 * x - 15.0))
+    share_by_x = 30.0 * x**2 * (1.0 - x) ** 2
+    position = start + share * distance
+    velocity = share_by_x * progress_rate * distance
     return position, velocity
 
 
@@ -98,10 +107,10 @@ def compute_spring_effort(
         position: joint angles, or position of the end effector, shape (K, n).
         speed: their velocities, shape (K, n).
     """
-    target, velocity = compute_target_motion(source, t_s)
-    stiffness = np.array(source.K)
-    damping = np.array(source.B)
-    effort: Array = stiffness * (target - position) + damping * (velocity - speed)
+    target, target_velocity = compute_target_motion(source, t_s)
+    spring = np.array(source.K) * (target - position)
+    damper = np.array(source.B) * (target_velocity - speed)
+    effort: Array = spring + damper
     return effort
 
 
@@ -114,7 +123,9 @@ def _map_to_joints(J: Array, force: Array) -> Array:
 def compute_source_torque(
     source: TorqueSource, t_s: Array, q: Array, qd: Array, end_effector: EndEffectorRows
 ) -> Array:
-    """Returns the torque of a spring, damper, wall or own kind ON the arm, shape (K, n), N m.
+    """Returns the torque of a source that depends on the state, ON the arm, (K, n), N m.
+
+    Such a source is a spring, a damper, a wall, or a user-written model.
 
     Args:
         source: the source.
@@ -131,21 +142,25 @@ def compute_source_torque(
     speed = end_effector.speed
     J = end_effector.J
     if kind is TorqueKind.WALL:
-        force = wall_force(source, t_s, end_effector)[:, None] * np.array(source.b)
+        normal_force = wall_force(source, t_s, end_effector)
+        force = normal_force[:, np.newaxis] * np.array(source.b)
         torque = _map_to_joints(J, force)
     elif kind is TorqueKind.VISCOUS:
         torque = -np.array(source.B) * qd
     elif kind is TorqueKind.HAND:
         torque = compute_spring_effort(source, t_s, q, qd)
     elif kind is TorqueKind.TASK_HAND:
-        torque = _map_to_joints(J, compute_spring_effort(source, t_s, position, speed))
+        force = compute_spring_effort(source, t_s, position, speed)
+        torque = _map_to_joints(J, force)
     elif kind is TorqueKind.OWN_JOINTS:
         torque = source.model.effort(t_s, q, qd)
     elif kind is TorqueKind.OWN_TIP:
-        torque = _map_to_joints(J, source.model.effort(t_s, position, speed))
+        force = source.model.effort(t_s, position, speed)
+        torque = _map_to_joints(J, force)
     else:
         raise ValueError(f"{kind.name} is no function of the state")
-    return np.where(_is_active(source, t_s)[:, None], torque, 0.0)
+    is_active = _is_active(source, t_s)
+    return np.where(is_active[:, np.newaxis], torque, 0.0)
 
 
 def compute_live_torque(
@@ -155,8 +170,8 @@ def compute_live_torque(
 
     Args:
         source: the live hand.
-        hand: its recorded action, see `HandInForce`, shape (K, h): its share, two further
-            values, its target and the target's velocity.
+        hand: recorded action of the hand, see `HandInForce`, shape (K, h): the hand's share,
+            two further values, the hand's target and the target's velocity.
         q: joint angles, shape (K, n), rad.
         qd: joint velocities, shape (K, n), rad/s.
         end_effector: motion of the end effector.
@@ -171,14 +186,19 @@ def compute_live_torque(
     if source.kind is TorqueKind.LIVE_FORCE:
         pull = target
     else:
-        stiffness = np.array(source.K)
-        damping = np.array(source.B)
-        pull = stiffness * (target - position) + damping * (target_rate - speed)
+        spring = np.array(source.K) * (target - position)
+        damper = np.array(source.B) * (target_rate - speed)
+        pull = spring + damper
+
+    # a larger pull is scaled down to the hand's limit
     norm = np.linalg.norm(pull, axis=1)
     limited_share = source.limit / np.maximum(norm, source.limit)
-    scale = share * np.where(norm > source.limit, limited_share, 1.0)
-    effort: Array = scale[:, None] * pull
-    return effort if acts_on_joints else _map_to_joints(end_effector.J, effort)
+    is_limited = norm > source.limit
+    scale = share * np.where(is_limited, limited_share, 1.0)
+    effort: Array = scale[:, np.newaxis] * pull
+    if acts_on_joints:
+        return effort
+    return _map_to_joints(end_effector.J, effort)
 
 
 class TorqueSplit(NamedTuple):
@@ -189,7 +209,7 @@ class TorqueSplit(NamedTuple):
         operator_now: the operator's torque that follows the state.
         operator_held: the operator's torque that is computed once a tick and held.
         environment_now: the environment's torque that follows the state.
-        environment_held: the environment's torque that is held.
+        environment_held: the environment's torque that is computed once a tick and held.
         script: the operator's intention, see `compute_operator_script`; None if not requested,
             or if the operator's torque does not match the scenario.
     """
@@ -248,9 +268,10 @@ def split_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit:
     environment_now = add_torques(spec.environment, sampled=False)
     environment_held = add_torques(spec.environment, sampled=True)
     operator_held = add_torques(spec.hands, sampled=True)
+    operator_now = -records.tau_x - environment_now - environment_held - operator_held
     return TorqueSplit(
         end_effector=end_effector,
-        operator_now=-records.tau_x - environment_now - environment_held - operator_held,
+        operator_now=operator_now,
         operator_held=operator_held,
         environment_now=environment_now,
         environment_held=environment_held,
@@ -261,49 +282,66 @@ def compute_operator_script(source: TorqueSource, t_s: Array, J: Array) -> Array
     """Returns the intention of an operator, shape (K, n), N m.
 
     The intention does not depend on the arm's motion, and changes if and only if the operator
-    moves. It is
+    moves. Its definition depends on the kind of the operator:
 
-    - of a scripted torque (pulse, recorded, chirp, multisine) the torque itself;
-    - of a spring, K times the displacement of its target plus B times the target's speed; if it
-      acts at the end effector, mapped to joints by the Jacobian J of one pose;
-    - of an own kind, its effort on an arm at zero, at rest.
+    - Scripted torque (pulse, recorded, chirp, multisine): the torque itself.
+    - Spring: K times the displacement of its target plus B times the target's speed. If the
+      spring acts at the end effector, the Jacobian J of one pose maps this force to the joints.
+    - User-written model: its effort on an arm that rests at zero.
 
     Args:
         source: the operator.
         t_s: times, shape (K,), s.
         J: Jacobian of one pose, shape (2, 2) or (3, n).
     """
-    kind = source.kind
-    since_start_s = t_s - source.start_s
-    if kind is TorqueKind.PULSE:
-        x = np.clip(since_start_s / (source.end_s - source.start_s), 0.0, 1.0)
-        intent = np.sin(np.pi * x)[:, None] ** 2 * np.array(source.a)
-    elif kind is TorqueKind.RECORDED and source.table is not None:
-        table_s = source.table[:, 0]
-        torques = source.table[:, 1:].T
-        columns = [np.interp(t_s, table_s, torque, left=0.0, right=0.0) for torque in torques]
-        intent = np.stack(columns, axis=1)
-    elif kind is TorqueKind.CHIRP:
-        span_s = source.move_end_s - source.move_start_s
-        first_hz, last_hz = source.b
-        x = np.mod(since_start_s, span_s)
-        turns = first_hz * x + (last_hz - first_hz) * x**2 / (2.0 * span_s)
-        intent = np.sin(2.0 * np.pi * turns)[:, None] * np.array(source.a)
-    elif kind is TorqueKind.MULTISINE and source.table is not None:
-        frequencies_hz = source.table[:, 0]
-        phases = source.table[:, 1]
-        turns = np.outer(since_start_s, frequencies_hz) + phases
-        intent = np.sin(2.0 * np.pi * turns).sum(axis=1)[:, None] * np.array(source.a)
-    elif kind in OWN_KINDS:
-        acts_at_tip = kind is TorqueKind.OWN_TIP
-        origin = np.zeros((len(t_s), J.shape[0 if acts_at_tip else 1]))
+    if source.kind in SCRIPTED_KINDS:
+        intent = _evaluate_scripted_torque(source, t_s)
+    elif source.kind in OWN_KINDS:
+        acts_at_tip = source.kind is TorqueKind.OWN_TIP
+        coordinates, joints = J.shape
+        origin = np.zeros((len(t_s), coordinates if acts_at_tip else joints))
         effort = source.model.effort(t_s, origin, origin)
         intent = effort @ J if acts_at_tip else effort
     else:
         origin = np.zeros((len(t_s), len(source.a)))
         effort = compute_spring_effort(source, t_s, origin, origin)
-        intent = effort @ J if kind is TorqueKind.TASK_HAND else effort
-    return np.where(_is_active(source, t_s)[:, None], intent, 0.0)
+        intent = effort @ J if source.kind is TorqueKind.TASK_HAND else effort
+    is_active = _is_active(source, t_s)
+    return np.where(is_active[:, np.newaxis], intent, 0.0)
+
+
+def _evaluate_scripted_torque(source: TorqueSource, t_s: Array) -> Array:
+    """Returns a scripted torque over time, shape (K, n), N m, as if it never started or ended.
+
+    Args:
+        source: a pulse, a recorded torque, a chirp or a multisine.
+        t_s: times, shape (K,), s.
+    """
+    since_start_s = t_s - source.start_s
+    if source.kind is TorqueKind.RECORDED:
+        assert source.table is not None
+        table_s = source.table[:, 0]
+        torques = source.table[:, 1:].T
+        columns = [np.interp(t_s, table_s, torque, left=0.0, right=0.0) for torque in torques]
+        return np.stack(columns, axis=1)
+    if source.kind is TorqueKind.PULSE:
+        span_s = source.end_s - source.start_s
+        x = np.clip(since_start_s / span_s, 0.0, 1.0)
+        wave = np.sin(np.pi * x) ** 2
+    elif source.kind is TorqueKind.CHIRP:
+        span_s = source.move_end_s - source.move_start_s
+        first_hz, last_hz = source.b
+        x = np.mod(since_start_s, span_s)
+        turns = first_hz * x + (last_hz - first_hz) * x**2 / (2.0 * span_s)
+        wave = np.sin(2.0 * np.pi * turns)
+    else:
+        assert source.table is not None
+        frequencies_hz = source.table[:, 0]
+        phases = source.table[:, 1]
+        turns = np.outer(since_start_s, frequencies_hz) + phases
+        wave = np.sin(2.0 * np.pi * turns).sum(axis=1)
+    torque: Array = wave[:, np.newaxis] * np.array(source.a)
+    return torque
 
 
 def attribute_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit:
@@ -322,15 +360,16 @@ def attribute_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit
         if source.kind in LIVE_KINDS:
             # the intention of a live hand is its torque on an arm that rests in the first pose
             first_q = np.broadcast_to(records.q[0], records.q.shape)
-            rest = 0.0 * first_q
+            at_rest = 0.0 * first_q
             arm = build_arm_rows(scenario, records.site)
-            script = script + compute_live_torque(
+            live_torque = compute_live_torque(
                 source=source,
                 hand=records.hand,
                 q=first_q,
-                qd=rest,
-                end_effector=arm.place_end_effector(first_q, rest),
+                qd=at_rest,
+                end_effector=arm.place_end_effector(first_q, at_rest),
             )
+            script = script + live_torque
             continue
         source_script = compute_operator_script(source, t_s, split.end_effector.J[0])
         script = script + source_script
@@ -345,12 +384,14 @@ def attribute_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit
                 end_effector=split.end_effector,
             )
             expected = expected + torque
-    tolerance = SCRIPT_TORQUE_TOLERANCE * (1.0 + np.abs(records.tau_x))
-    matches = np.abs(split.operator_now - expected) <= tolerance
+    size = 1.0 + np.abs(records.tau_x)
+    difference = np.abs(split.operator_now - expected)
+    matches = difference <= SCRIPT_TORQUE_TOLERANCE * size
     if matches[records.known].all():
         split = split._replace(script=script)
     if not spec.hands:
-        split = split._replace(operator_now=np.where(matches, 0.0, split.operator_now))
+        without_rounding = np.where(matches, 0.0, split.operator_now)
+        split = split._replace(operator_now=without_rounding)
     return split
 
 
@@ -383,7 +424,8 @@ class WallEnergy(NamedTuple):
 
 def list_sampled_walls(spec: SiteSpec) -> list[TorqueSource]:
     """Returns the walls of a site whose force is held over a tick and depends on the depth."""
-    return [wall for wall in list_walls(spec) if wall.sampled and any(wall.K)]
+    walls = list_walls(spec)
+    return [wall for wall in walls if wall.sampled and any(wall.K)]
 
 
 def find_wall_energies(log: Log) -> list[WallEnergy]:
@@ -398,17 +440,17 @@ def find_wall_energies(log: Log) -> list[WallEnergy]:
             touched = force > 0.0
             if not touched.any():
                 continue
-            arm_damping = _find_arm_damping(
-                spec, wall, end_effector.J[touched], records.nominal_s[touched]
+            generated_j = _find_generated_energy(wall, records, end_effector, force)
+            spring_share = 0.5 * wall.K[0] * records.h_s
+            contact_J = end_effector.J[touched]
+            contact_s = records.nominal_s[touched]
+            energy = WallEnergy(
+                site=site,
+                generated_j=generated_j,
+                required_damping_n_s_m=spring_share + wall.B[0],
+                arm_damping_n_s_m=_find_arm_damping(spec, wall, contact_J, contact_s),
             )
-            energies.append(
-                WallEnergy(
-                    site=site,
-                    generated_j=_find_generated_energy(wall, records, end_effector, force),
-                    required_damping_n_s_m=0.5 * wall.K[0] * records.h_s + wall.B[0],
-                    arm_damping_n_s_m=arm_damping,
-                )
-            )
+            energies.append(energy)
     return energies
 
 
@@ -423,19 +465,23 @@ def _find_generated_energy(
         end_effector: motion of the end effector.
         force: force of the wall along its normal, shape (K,), N.
     """
-    torque = _map_to_joints(end_effector.J, force[:, None] * np.array(wall.b))
-    work = (torque[:-1] * np.diff(records.q, axis=0)).sum(axis=1)
+    force_vector = force[:, np.newaxis] * np.array(wall.b)
+    torque = _map_to_joints(end_effector.J, force_vector)
+    motion = np.diff(records.q, axis=0)
+    work = (torque[:-1] * motion).sum(axis=1)
     depth = np.where(force > 0.0, wall_depth(wall, end_effector), 0.0)
     stored = 0.5 * wall.K[0] * depth**2
-    change = np.where(records.known_periods, work + np.diff(stored), 0.0)
-    supplied = np.concatenate([[0.0], np.cumsum(change)])
-    return float((supplied - np.minimum.accumulate(supplied)).max())
+    generated = work + np.diff(stored)
+    known_part = np.where(records.known_periods, generated, 0.0)
+    supplied = np.concatenate([[0.0], np.cumsum(known_part)])
+    least_so_far = np.minimum.accumulate(supplied)
+    return float((supplied - least_so_far).max())
 
 
 def _find_arm_damping(spec: SiteSpec, wall: TorqueSource, J: Array, t_s: Array) -> float:
     """Returns the arm's own least damping along a wall's normal n in contact, in N s/m.
 
-    It is 1 / (n'J D^-1 J'n), with D the damping of joints that acts continuously.
+    The damping is 1 / (n'J D^-1 J'n), with D the damping of joints that acts continuously.
 
     Args:
         spec: site of the wall.
@@ -443,14 +489,18 @@ def _find_arm_damping(spec: SiteSpec, wall: TorqueSource, J: Array, t_s: Array) 
         J: Jacobian of the rows in contact, shape (K, m, n).
         t_s: times of the rows in contact, shape (K,), s.
     """
-    actors = [source.actor for source in spec.environment]
-    # a damper that does not act in all of these rows does not count
-    lasting = [actor for actor in actors if actor.start_s <= t_s[0] and actor.end_s > t_s[-1]]
-    viscous = [
-        actor.B for actor in lasting if actor.kind is TorqueKind.VISCOUS and not actor.sampled
-    ]
+    viscous = []
+    for source in spec.environment:
+        actor = source.actor
+        is_damper = actor.kind is TorqueKind.VISCOUS and not actor.sampled
+        acts_in_all_rows = actor.start_s <= t_s[0] and actor.end_s > t_s[-1]
+        if is_damper and acts_in_all_rows:
+            viscous.append(actor.B)
     D = np.sum(viscous, axis=0) if viscous else np.zeros(J.shape[2])
-    squared_arms = np.einsum("kij,i->kj", J, np.array(wall.b)) ** 2
+    lever_arms = np.einsum("kij,i->kj", J, np.array(wall.b))
+    squared_arms = lever_arms**2
     with np.errstate(divide="ignore", invalid="ignore"):
-        compliance = np.where(squared_arms > 0.0, squared_arms / D, 0.0).sum(axis=1)
-        return float((1.0 / compliance).min())
+        # mobility n'J D^-1 J'n, in which joints that do not move along the normal do not count
+        terms = np.where(squared_arms > 0.0, squared_arms / D, 0.0)
+        damping = 1.0 / terms.sum(axis=1)
+        return float(damping.min())

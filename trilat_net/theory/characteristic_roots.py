@@ -2,9 +2,9 @@
 
 Roots are refined by Newton's method in the form of successive linear problems: solve
 Delta(s) v = mu Delta'(s) v and subtract the smallest mu from s. The method converges
-quadratically for simple roots, and also for multiple roots with as many vectors, which loops of
-identical sites have. Ruhe, "Algorithms for the nonlinear eigenvalue problem", SIAM J. Numerical
-Analysis 10 (1973).
+quadratically for simple roots. It does so for multiple roots too if they have as many vectors,
+as in loops of identical sites. Ruhe, "Algorithms for the nonlinear eigenvalue problem", SIAM J.
+Numerical Analysis 10 (1973).
 
 First guesses for the continuous loop are the eigenvalues of the Chebyshev pseudospectral
 discretisation of the infinitesimal generator. Its order doubles until the wanted roots agree.
@@ -17,7 +17,7 @@ divides products of a hundred rows among all cores and busy-waits for them, whic
 hundred times as long if another process occupies a core.
 
 Invariant:
-    - A root solves the equation to rounding, whatever discretisation its guess came from.
+    - A root solves the equation to rounding, for every discretisation that supplies its guess.
     - Roots that are zero for every delay (shared poses, estimates without excitation) are
       counted, and never called the rightmost.
 """
@@ -47,6 +47,7 @@ STABILITY_EDGE_PER_S = 1e-6
 ROOT_RESIDUAL_TOLERANCE = 1e-12
 """Largest residual of a root, relative to the size of Delta's terms."""
 _MAX_NEWTON_STEPS = 30
+"""Largest number of Newton steps from one guess."""
 _STEP_TOLERANCE = 1e-9
 """Newton's method stops after a step this small, relative to 1 + abs(s).
 
@@ -73,6 +74,7 @@ _BLAS_SYMBOLS = (
     "openblas_{}_num_threads64_",
     "openblas_{}_num_threads",
 )
+"""Names of OpenBLAS's functions in the builds of NumPy; "{}" stands for "get" or "set"."""
 
 
 @contextmanager
@@ -101,9 +103,11 @@ def _find_blas_functions() -> tuple[Callable[[], int], Callable[[int], None]] | 
         return None
     for name in _BLAS_SYMBOLS:
         try:
-            return getattr(library, name.format("get")), getattr(library, name.format("set"))
+            get_threads = getattr(library, name.format("get"))
+            set_threads = getattr(library, name.format("set"))
         except AttributeError:
             continue
+        return get_threads, set_threads
     return None
 
 
@@ -130,30 +134,40 @@ class Pencil(NamedTuple):
 
     def evaluate(self, s: complex) -> tuple[Complex, Complex]:
         """Returns Delta(s) and its derivative by s, shape (n, n) each."""
-        exponentials = np.exp(-s * self.delays)[:, np.newaxis, np.newaxis]
-        delayed = exponentials * self.Ad
-        delta = s * self.rate_matrix - self.A - delayed.sum(axis=0)
-        weighted = self.delays[:, np.newaxis, np.newaxis] * delayed
-        derivative = self.rate_matrix + weighted.sum(axis=0)
+        E = self.rate_matrix
+        exponentials = np.exp(-s * self.delays)
+        delayed = exponentials[:, np.newaxis, np.newaxis] * self.Ad
+        delta = s * E - self.A - delayed.sum(axis=0)
+        delays = self.delays[:, np.newaxis, np.newaxis]
+        weighted = delays * delayed
+        derivative = E + weighted.sum(axis=0)
         return delta.astype(np.complex128), derivative.astype(np.complex128)
 
     def sum_term_norms(self, s: complex) -> float:
         """Returns the sum of the norms of the terms of Delta(s), which scales residuals."""
-        delayed = np.exp(-s.real * self.delays) @ np.linalg.norm(self.Ad, axis=(1, 2))
-        return float(abs(s) + np.linalg.norm(self.A) + delayed)
+        growth = np.exp(-s.real * self.delays)
+        delayed = growth @ np.linalg.norm(self.Ad, axis=(1, 2))
+        undelayed = np.linalg.norm(self.A)
+        return float(abs(s) + undelayed + delayed)
 
     def compute_taylor_coefficient(self, power: int) -> Array:
         """Returns the coefficient of s^power in Delta's Taylor series at 0, shape (n, n)."""
-        undelayed = {0: -self.A, 1: self.rate_matrix}.get(power, 0.0)
+        undelayed: Array | float = 0.0
+        if power == 0:
+            undelayed = -self.A
+        elif power == 1:
+            undelayed = self.rate_matrix
         moments = (-self.delays) ** power
-        delayed = np.einsum("k,kab->ab", moments, self.Ad) / math.factorial(power)
+        derivative = np.einsum("k,kab->ab", moments, self.Ad)
+        delayed = derivative / math.factorial(power)
         coefficient: Array = undelayed - delayed
         return coefficient
 
     @property
     def delayed_states(self) -> NDArray[np.intp]:
         """Indices of the states that act after a delay."""
-        return np.flatnonzero(np.abs(self.Ad).sum(axis=(0, 1)))
+        effects = np.abs(self.Ad).sum(axis=(0, 1))
+        return np.flatnonzero(effects)
 
 
 MovingPart = tuple[Pencil, tuple[str, ...], int]
@@ -187,7 +201,9 @@ def extract_moving_part(pencil: Pencil, names: Sequence[str]) -> MovingPart:
         Ad=Ad[is_used],
         E=None if pencil.E is None else pencil.E[kept],
     )
-    return moving, tuple(names[n] for n in kept), len(names) - len(kept)
+    kept_names = tuple(names[n] for n in kept)
+    omitted = len(names) - len(kept)
+    return moving, kept_names, omitted
 
 
 class CharacteristicRoot(NamedTuple):
@@ -215,9 +231,10 @@ class CharacteristicRoot(NamedTuple):
         for state in self.states:
             site, _, name = state.partition(".")
             sites.setdefault(name, []).append(site)
-        return "; ".join(
-            f"{name} of {', '.join(sorted(names))}" for name, names in sites.items()
-        )
+        phrases = []
+        for name, owners in sites.items():
+            phrases.append(f"{name} of {', '.join(sorted(owners))}")
+        return "; ".join(phrases)
 
 
 class Spectrum(NamedTuple):
@@ -227,7 +244,7 @@ class Spectrum(NamedTuple):
         roots: the rightmost roots that are not zero by structure, by falling real part.
         zeros: number of roots that are zero by structure.
         drifting: number of those zeros without a vector of their own; their modes grow with t.
-        dropped: number of guesses from which no root was found.
+        dropped: number of guesses from which Newton's method reached no root.
         order: order of the discretisation that gave the guesses; 0 if none was needed.
         span_s: the period of delays and tick rates over which the roots are computed, or the
             analysed span of delays that do not repeat, s; None if all ticks are alike.
@@ -261,7 +278,9 @@ class Spectrum(NamedTuple):
     @property
     def verdict(self) -> str:
         """The stability verdict: "stable", "unstable" or "at the edge"."""
-        rightmost_per_s = self.roots[0].s.real if self.roots else -math.inf
+        rightmost_per_s = -math.inf
+        if self.roots:
+            rightmost_per_s = self.roots[0].s.real
         edge_per_s = max(STABILITY_EDGE_PER_S, self.deviation_per_s or 0.0)
         if rightmost_per_s > edge_per_s:
             return "unstable"
@@ -273,7 +292,7 @@ class Spectrum(NamedTuple):
 def _solve_for_root(
     pencil: Pencil, guess: complex, names: Sequence[str]
 ) -> CharacteristicRoot | None:
-    """Returns the root to which Newton's method converges from a guess; None: it diverges.
+    """Returns the root to which Newton's method converges from a guess; None without one.
 
     Args:
         pencil: the characteristic matrix.
@@ -287,7 +306,8 @@ def _solve_for_root(
             if step is None:
                 return None
             s -= step
-            if not np.isfinite(s) or abs(s - guess) > _MAX_DISTANCE_PER_S:
+            distance = abs(s - guess)
+            if not np.isfinite(s) or distance > _MAX_DISTANCE_PER_S:
                 return None
             if abs(step) <= _STEP_TOLERANCE * (1.0 + abs(s)):
                 break
@@ -295,12 +315,16 @@ def _solve_for_root(
     if measured is None:
         return None
     multiplicity, participation = measured
+    relative = participation / participation.max()
     # rounded, so that equal shares stay in their order
-    shares = np.round(participation / participation.max(), 6)
+    shares = np.round(relative, 6)
     falling = np.argsort(-shares, kind="stable")
-    states = [names[n] for n in falling if shares[n] >= NAMED_SHARE]
-    imag = abs(s.imag) if abs(s.imag) > SAME_ROOT_TOLERANCE else 0.0
-    return CharacteristicRoot(complex(s.real, imag), multiplicity, tuple(states))
+    states = tuple(names[n] for n in falling if shares[n] >= NAMED_SHARE)
+    imaginary_part = abs(s.imag)
+    if imaginary_part <= SAME_ROOT_TOLERANCE:
+        imaginary_part = 0.0
+    root = complex(s.real, imaginary_part)
+    return CharacteristicRoot(root, multiplicity, states)
 
 
 def _compute_newton_step(pencil: Pencil, s: complex) -> complex | None:
@@ -311,7 +335,8 @@ def _compute_newton_step(pencil: Pencil, s: complex) -> complex | None:
         return None
     try:
         if pencil.E is None:
-            mu = np.linalg.eigvals(np.linalg.solve(derivative, delta))
+            matrix = np.linalg.solve(derivative, delta)
+            mu = np.linalg.eigvals(matrix)
         else:
             # algebraic states make the derivative singular, with infinite eigenvalues
             mu = eigvals(delta, derivative)
@@ -320,7 +345,8 @@ def _compute_newton_step(pencil: Pencil, s: complex) -> complex | None:
         return None
     if not len(mu):
         return None
-    return complex(mu[np.argmin(np.abs(mu))])
+    smallest = np.argmin(np.abs(mu))
+    return complex(mu[smallest])
 
 
 def _measure_participation(pencil: Pencil, s: complex) -> tuple[int, Array] | None:
@@ -335,13 +361,17 @@ def _measure_participation(pencil: Pencil, s: complex) -> tuple[int, Array] | No
         return None
     left, values, right = np.linalg.svd(delta)
     scale = pencil.sum_term_norms(s)
-    if not float(values[-1]) / scale <= ROOT_RESIDUAL_TOLERANCE:
+    residual = float(values[-1]) / scale
+    if not residual <= ROOT_RESIDUAL_TOLERANCE:
         return None
-    count = int(np.sum(values <= _SAME_VALUE * scale))
+    is_null = values <= _SAME_VALUE * scale
+    count = int(np.sum(is_null))
     W = left[:, -count:]
+    W_transposed = W.conj().T
     V = right[-count:].conj().T
+    inner = W_transposed @ derivative @ V
     try:
-        residue = V @ np.linalg.solve(W.conj().T @ derivative @ V, W.conj().T)
+        residue = V @ np.linalg.solve(inner, W_transposed)
     except np.linalg.LinAlgError:
         return None
     return count, np.abs(np.diag(residue))
@@ -352,21 +382,28 @@ def count_zero_roots(pencil: Pencil) -> tuple[int, int]:
 
     With Delta(s) = D_0 + s D_1 + s^2 D_2 + ..., the block Toeplitz matrix of D_0 ... D_(m-1)
     has as many null vectors as there are roots at zero, with each Jordan chain counted up to
-    length m. Once that number no longer rises with m, all are counted. Roots in chains longer
-    than 1 drift: their modes grow with t.
+    length m. When the number no longer rises with m, all roots are counted. Roots in chains
+    longer than 1 drift: their modes grow with t.
     """
     counts = [0]
     for length in range(1, _LONGEST_CHAIN + 1):
-        coefficients = [pencil.compute_taylor_coefficient(power) for power in range(length)]
-        if not len(coefficients[0]):
-            return 0, 0
-        blocks = [np.kron(np.eye(length, k=-power), D) for power, D in enumerate(coefficients)]
+        blocks = []
+        for power in range(length):
+            D = pencil.compute_taylor_coefficient(power)
+            if not len(D):
+                return 0, 0
+            # D_k stands on the k-th diagonal below the main diagonal
+            diagonal = np.eye(length, k=-power)
+            blocks.append(np.kron(diagonal, D))
         toeplitz = np.sum(blocks, axis=0)
         values = np.linalg.svd(toeplitz, compute_uv=False)
-        counts.append(int(np.sum(values <= ZERO_SHARE * values[0])))
+        is_zero = values <= ZERO_SHARE * values[0]
+        counts.append(int(np.sum(is_zero)))
         if counts[-1] == counts[-2]:
             break
-    return counts[-1], counts[-1] - counts[1]
+    zeros = counts[-1]
+    vectors = counts[1]
+    return zeros, zeros - vectors
 
 
 def refine_roots(
@@ -395,15 +432,22 @@ def refine_roots(
             dropped += 1
             continue
         tolerance = SAME_ROOT_TOLERANCE * (1.0 + abs(root.s))
-        if all(abs(root.s - known.s) >= tolerance for known in roots):
+        distances = [abs(root.s - known.s) for known in roots]
+        if min(distances, default=math.inf) >= tolerance:
             roots.append(root)
-    roots.sort(key=lambda root: (-round(root.s.real, 9), root.s.imag))
+
+    def rank(root: CharacteristicRoot) -> tuple[float, float]:
+        return -round(root.s.real, 9), root.s.imag
+
+    roots.sort(key=rank)
     return roots[:wanted], dropped
 
 
 def find_moving_part(loop: LinearLoop) -> MovingPart:
     """Returns the part of a loop without constant states and without states of no effect."""
-    Ad = np.array([term.A for term in loop.delayed]).reshape(-1, *loop.A.shape)
+    delayed_matrices = np.array([term.A for term in loop.delayed])
+    # without delays, an empty array of the right shape
+    Ad = delayed_matrices.reshape(-1, *loop.A.shape)
     delays_s = np.array([term.delay_s for term in loop.delayed])
     pencil = Pencil(loop.A, delays_s, Ad, E=loop.E)
     moving, names, idle_count = extract_moving_part(pencil, loop.names)
@@ -422,20 +466,18 @@ def compute_delay_spectrum(loop: LinearLoop, wanted: int = 6) -> Spectrum:
         zeros, drifting = count_zero_roots(pencil)
         if not len(names):
             return Spectrum(
-                roots=(), zeros=idle_count + zeros, drifting=drifting, dropped=0, order=0
+                roots=(),
+                zeros=idle_count + zeros,
+                drifting=drifting,
+                dropped=0,
+                order=0,
             )
         has_delays = len(pencil.delays) > 0
         order = _INITIAL_ORDER if has_delays else 0
         previous_roots = None
         while True:
-            matrix = discretise_generator(pencil, order) if has_delays else pencil.A
-            if pencil.E is not None:
-                matrix = _eliminate_states(matrix, pencil.E)
-            values = np.linalg.eigvals(matrix).astype(np.complex128)
-            # the eigenvalues of smallest modulus approximate the roots at zero
-            values = values[np.argsort(np.abs(values), kind="stable")][zeros:]
-            falling = np.lexsort((np.abs(values.imag), -np.round(values.real, 9)))
-            roots, dropped = refine_roots(pencil, values[falling], names, wanted)
+            guesses = _guess_roots(pencil, order, zeros)
+            roots, dropped = refine_roots(pencil, guesses, names, wanted)
             next_size = len(names) + 2 * order * len(pencil.delayed_states)
             is_converged = previous_roots is not None and _agree(previous_roots, roots)
             if not has_delays or next_size > MAX_GENERATOR_SIZE or is_converged:
@@ -448,6 +490,26 @@ def compute_delay_spectrum(loop: LinearLoop, wanted: int = 6) -> Spectrum:
                 )
             previous_roots = roots
             order = 2 * order
+
+
+def _guess_roots(pencil: Pencil, order: int, zeros: int) -> Complex:
+    """Returns guesses of the nonzero roots, by falling real part.
+
+    Args:
+        pencil: the characteristic matrix.
+        order: order of the discretisation; 0 for a loop without delays.
+        zeros: number of roots at zero.
+    """
+    matrix = discretise_generator(pencil, order) if order else pencil.A
+    if pencil.E is not None:
+        matrix = _eliminate_states(matrix, pencil.E)
+    values = np.linalg.eigvals(matrix).astype(np.complex128)
+    # the eigenvalues of smallest modulus approximate the roots at zero
+    by_modulus = np.argsort(np.abs(values), kind="stable")
+    nonzero = values[by_modulus][zeros:]
+    rounded_real_part = np.round(nonzero.real, 9)
+    falling = np.lexsort((np.abs(nonzero.imag), -rounded_real_part))
+    return nonzero[falling]
 
 
 def _eliminate_states(matrix: Array, E: Array) -> Array:
@@ -464,7 +526,9 @@ def _eliminate_states(matrix: Array, E: Array) -> Array:
     M_aa = matrix[np.ix_(algebraic, algebraic)]
     M_ar = matrix[np.ix_(algebraic, kept)]
     M_ra = matrix[np.ix_(kept, algebraic)]
-    return matrix[np.ix_(kept, kept)] - M_ra @ np.linalg.solve(M_aa, M_ar)
+    M_rr = matrix[np.ix_(kept, kept)]
+    algebraic_by_kept = np.linalg.solve(M_aa, M_ar)
+    return M_rr - M_ra @ algebraic_by_kept
 
 
 def _agree(previous: list[CharacteristicRoot], roots: list[CharacteristicRoot]) -> bool:
@@ -473,7 +537,8 @@ def _agree(previous: list[CharacteristicRoot], roots: list[CharacteristicRoot]) 
         return False
     for root in roots:
         tolerance = _ROOT_AGREEMENT * (1.0 + abs(root.s))
-        if not any(abs(root.s - known.s) <= tolerance for known in previous):
+        distances = [abs(root.s - known.s) for known in previous]
+        if not min(distances, default=math.inf) <= tolerance:
             return False
     return True
 
@@ -492,14 +557,19 @@ def discretise_generator(pencil: Pencil, order: int) -> Array:
     longest_s = float(pencil.delays.max())
     n = len(pencil.A)
     c = len(delayed)
-    generator = np.zeros((n + order * c, n + order * c))
+    size = n + order * c
+    generator = np.zeros((size, size))
     generator[:n, :n] = pencil.A
     # x in [-1, 1] stands for the time from -T_max to 0
     x = 1.0 - 2.0 * pencil.delays / longest_s
-    for weights, Ad in zip(chebyshev_interpolation(order, x), pencil.Ad, strict=True):
-        generator[:n, delayed] += weights[0] * Ad[:, delayed]
-        generator[:n, n:] += np.kron(weights[1:], Ad[:, delayed])
-    transport = chebyshev_differentiation(order)[1:] * (2.0 / longest_s)
+    interpolation = chebyshev_interpolation(order, x)
+    for weights, Ad in zip(interpolation, pencil.Ad, strict=True):
+        delayed_columns = Ad[:, delayed]
+        generator[:n, delayed] += weights[0] * delayed_columns
+        generator[:n, n:] += np.kron(weights[1:], delayed_columns)
+    # the history moves along the nodes: its rate is its derivative by time
+    differentiation = chebyshev_differentiation(order)
+    transport = differentiation[1:] * (2.0 / longest_s)
     generator[n:, n:] = np.kron(transport[:, 1:], np.eye(c))
     for column, state in enumerate(delayed):
         generator[n + column :: c, state] = transport[:, 0]
@@ -508,11 +578,12 @@ def discretise_generator(pencil: Pencil, order: int) -> Array:
 
 def chebyshev_nodes(order: int) -> Array:
     """Returns the extremal nodes cos(pi k / order) from 1 to -1, shape (order + 1,)."""
-    return np.cos(np.pi * np.arange(order + 1) / order)
+    angles = np.pi * np.arange(order + 1) / order
+    return np.cos(angles)
 
 
 def chebyshev_interpolation(order: int, x: Array) -> Array:
-    """Returns the matrix from values at the nodes to the interpolating polynomial at x.
+    """Returns the matrix that takes values at the nodes to their interpolation at x.
 
     Args:
         order: degree of the polynomial.
@@ -521,12 +592,18 @@ def chebyshev_interpolation(order: int, x: Array) -> Array:
     Returns:
         Matrix of shape (K, order + 1).
     """
-    basis_at_nodes = chebvander(chebyshev_nodes(order), order)
-    return np.linalg.solve(basis_at_nodes.T, chebvander(x, order).T).T.astype(np.float64)
+    nodes = chebyshev_nodes(order)
+    basis_at_nodes = chebvander(nodes, order)
+    basis_at_x = chebvander(x, order)
+    transposed = np.linalg.solve(basis_at_nodes.T, basis_at_x.T)
+    return transposed.T.astype(np.float64)
 
 
 def chebyshev_differentiation(order: int) -> Array:
-    """Returns the matrix from values at the nodes to the polynomial's derivatives there."""
+    """Returns the matrix that takes values at the nodes to their polynomial's derivatives."""
     nodes = chebyshev_nodes(order)
-    slopes = chebvander(nodes, order - 1) @ chebder(np.eye(order + 1))
-    return np.linalg.solve(chebvander(nodes, order).T, slopes.T).T.astype(np.float64)
+    basis_at_nodes = chebvander(nodes, order)
+    derivatives = chebder(np.eye(order + 1))
+    slopes = chebvander(nodes, order - 1) @ derivatives
+    transposed = np.linalg.solve(basis_at_nodes.T, slopes.T)
+    return transposed.T.astype(np.float64)

@@ -1,12 +1,16 @@
 """The delay margin: common delays of all links for which the continuous loop is stable.
 
-With one delay T on all links the loop has a root at j w where det(I - exp(-j w T) G(j w)) = 0.
-Here G(j w) consists of the delayed rows of (j w I - A)^-1 A_d. So G has an eigenvalue of
-modulus 1 there, with the phase w T modulo 2 pi. With rising T, a pair of roots moves to the
-right if that modulus falls with w, and to the left if it rises. Chen, Gu and Nett, "A new
-method for computing delay margins for stability of linear delay systems", Systems & Control
-Letters 26 (1995); Cooke and van den Driessche, "On zeroes of some transcendental equations",
-Funkcialaj Ekvacioj 29 (1986).
+With the delay T on all links, j w is a root of the loop if det(I - exp(-j w T) G(j w)) = 0.
+G(j w) consists of the delayed rows of (j w I - A)^-1 A_d. Such a root exists if and only if
+G(j w) has an eigenvalue of modulus 1 with the phase w T modulo 2 pi. With rising T, a pair of
+roots moves to the right if the modulus of this eigenvalue falls with w, and to the left if it
+rises.
+
+Sources:
+    - Chen, Gu and Nett, "A new method for computing delay margins for stability of linear delay
+      systems", Systems & Control Letters 26 (1995).
+    - Cooke and van den Driessche, "On zeroes of some transcendental equations", Funkcialaj
+      Ekvacioj 29 (1986).
 
 Invariant:
     - Crossings of the imaginary axis are searched over frequency and not over delay, so that no
@@ -30,14 +34,16 @@ MAX_COMMON_DELAY_S = 10.0
 _LISTED_INTERVALS = 3
 """Largest number of intervals that the description lists one by one."""
 _POINTS = 600
-"""Frequencies of the grid, beside those about the loop's modes."""
+"""Frequencies of the grid, in addition to the frequencies near the loop's modes."""
 _LOWEST = 1e-4
-"""The lowest frequency, relative to the highest at which a crossing is possible."""
+"""The lowest frequency, relative to the highest frequency at which a crossing is possible."""
 _BISECTIONS = 60
+"""Largest number of bisections that locate a crossing."""
 _OUTSIDE = 1.0 + 1e-9
 """Moduli above this lie outside the unit circle.
 
-The difference to 1 is for rounding: the modulus of a lossless line is 1 at every frequency.
+The difference from 1 allows for rounding: the modulus of a lossless line is 1 at every
+frequency.
 """
 
 
@@ -75,11 +81,13 @@ class DelayInterval(NamedTuple):
         """The ends and the frequency at the upper end; "" if the interval has no ends."""
         if self.low is None and self.high is None:
             return ""
-        start = "" if self.low is None else f"from {1e3 * self.low_s:.4g} ms "
+        low_ms = 1e3 * self.low_s
+        high_ms = 1e3 * self.high_s
+        start = "" if self.low is None else f"from {low_ms:.4g} ms "
         if self.high is None:
             return f"{start}on"
         frequency = f"(crosses at {self.high.omega_rad_s:.4g} rad/s)"
-        return f"{start}up to {1e3 * self.high_s:.4g} ms {frequency}"
+        return f"{start}up to {high_ms:.4g} ms {frequency}"
 
 
 class DelayMargin(NamedTuple):
@@ -120,11 +128,14 @@ def set_common_delay(loop: LinearLoop, delay_s: float) -> LinearLoop:
     """Returns a loop with the same delay, s, on all of its links."""
     if not loop.delayed:
         return loop
-    A = np.sum([term.A for term in loop.delayed], axis=0)
-    B = np.sum([term.B for term in loop.delayed], axis=0)
+    delayed_A = np.sum([term.A for term in loop.delayed], axis=0)
+    delayed_B = np.sum([term.B for term in loop.delayed], axis=0)
     if delay_s == 0.0:
-        return loop._replace(A=loop.A + A, B=loop.B + B, delayed=())
-    return loop._replace(delayed=(DelayedTerm(delay_s, A, B),))
+        A = loop.A + delayed_A
+        B = loop.B + delayed_B
+        return loop._replace(A=A, B=B, delayed=())
+    term = DelayedTerm(delay_s, delayed_A, delayed_B)
+    return loop._replace(delayed=(term,))
 
 
 def find_delay_margin(loop: LinearLoop) -> DelayMargin:
@@ -136,7 +147,8 @@ def find_delay_margin(loop: LinearLoop) -> DelayMargin:
     crossings, lossless = find_axis_crossings(loop)
     if lossless:
         return DelayMargin((), (), lossless)
-    first_s = min((crossing.delay_s for crossing in crossings), default=0.2)
+    delays_s = [crossing.delay_s for crossing in crossings]
+    first_s = min(delays_s, default=0.2)
     start_s = 0.5 * min(first_s, 0.2)
     unstable_roots = _count_unstable_roots(set_common_delay(loop, start_s))
     intervals: list[DelayInterval] = []
@@ -144,16 +156,19 @@ def find_delay_margin(loop: LinearLoop) -> DelayMargin:
     low_s = 0.0
     stable = unstable_roots == 0
     for crossing in crossings:
-        unstable_roots += 2 * crossing.pairs if crossing.omega_rad_s else crossing.pairs
+        roots_per_pair = 2 if crossing.omega_rad_s else 1
+        unstable_roots += roots_per_pair * crossing.pairs
         if stable and unstable_roots > 0:
-            intervals.append(DelayInterval(low_s, crossing.delay_s, low, crossing))
+            interval = DelayInterval(low_s, crossing.delay_s, low, crossing)
+            intervals.append(interval)
             stable = False
         elif not stable and unstable_roots == 0:
             low = crossing
             low_s = crossing.delay_s
             stable = True
     if stable:
-        intervals.append(DelayInterval(low_s, MAX_COMMON_DELAY_S, low, None))
+        last_interval = DelayInterval(low_s, MAX_COMMON_DELAY_S, low, None)
+        intervals.append(last_interval)
     return DelayMargin(tuple(intervals), tuple(crossings))
 
 
@@ -163,9 +178,16 @@ def _count_unstable_roots(loop: LinearLoop) -> int:
     while True:
         roots = characteristic_roots.compute_delay_spectrum(loop, wanted).roots
         unstable = [root for root in roots if root.s.real > 0.0]
-        if len(unstable) < len(roots) or len(roots) < wanted:
-            return sum(root.multiplicity * (2 if root.s.imag else 1) for root in unstable)
+        has_stable_root = len(unstable) < len(roots)
+        if has_stable_root or len(roots) < wanted:
+            break
         wanted *= 2
+    count = 0
+    for root in unstable:
+        # a root with an imaginary part stands for a conjugate pair
+        roots_per_entry = 2 if root.s.imag else 1
+        count += root.multiplicity * roots_per_entry
+    return count
 
 
 def find_axis_crossings(loop: LinearLoop) -> tuple[list[AxisCrossing], bool]:
@@ -182,13 +204,18 @@ def find_axis_crossings(loop: LinearLoop) -> tuple[list[AxisCrossing], bool]:
         sweep = _FrequencySweep(pencil)
         grid = sweep.build_grid()
         moduli = np.abs(sweep.compute_eigenvalues(grid))
-        is_on_circle = (moduli <= _OUTSIDE) & (moduli >= 2.0 - _OUTSIDE)
+        is_not_outside = moduli <= _OUTSIDE
+        is_not_inside = moduli >= 2.0 - _OUTSIDE
+        is_on_circle = is_not_outside & is_not_inside
         if is_on_circle.any(axis=1).all():
             return [], True
-        counts = (moduli > _OUTSIDE).sum(axis=1)
+        is_outside = moduli > _OUTSIDE
+        counts = is_outside.sum(axis=1)
         crossings = []
         for n in np.flatnonzero(np.diff(counts)):
-            crossings += sweep.find_crossings(float(grid[n]), float(grid[n + 1]))
+            low = float(grid[n])
+            high = float(grid[n + 1])
+            crossings += sweep.find_crossings(low, high)
     return _merge_crossings(crossings), False
 
 
@@ -197,7 +224,8 @@ def _merge_crossings(crossings: Sequence[AxisCrossing]) -> list[AxisCrossing]:
     merged: list[AxisCrossing] = []
     for crossing in sorted(crossings):
         if merged and _is_same_crossing(merged[-1], crossing):
-            merged[-1] = merged[-1]._replace(pairs=merged[-1].pairs + crossing.pairs)
+            pairs = merged[-1].pairs + crossing.pairs
+            merged[-1] = merged[-1]._replace(pairs=pairs)
         else:
             merged.append(crossing)
     return sorted(merged)
@@ -205,43 +233,53 @@ def _merge_crossings(crossings: Sequence[AxisCrossing]) -> list[AxisCrossing]:
 
 def _is_same_crossing(last: AxisCrossing, crossing: AxisCrossing) -> bool:
     """True if two crossings differ in delay and frequency by rounding only."""
+    delay_difference_s = abs(crossing.delay_s - last.delay_s)
     delay_tolerance_s = 1e-7 * (1e-3 + crossing.delay_s)
-    if abs(crossing.delay_s - last.delay_s) > delay_tolerance_s:
+    if delay_difference_s > delay_tolerance_s:
         return False
-    return abs(crossing.omega_rad_s - last.omega_rad_s) <= 1e-7 * crossing.omega_rad_s
+    difference_rad_s = abs(crossing.omega_rad_s - last.omega_rad_s)
+    return difference_rad_s <= 1e-7 * crossing.omega_rad_s
 
 
 class _FrequencySweep:
     """The eigenvalues of G(j w) over the frequency w."""
 
     def __init__(self, pencil: characteristic_roots.Pencil) -> None:
-        self._A = pencil.A
+        A = pencil.A
+        Ad = pencil.Ad[0]
+        self._A = A
         self._delayed = pencil.delayed_states
         self._rate_matrix = pencil.rate_matrix
-        self._Ad = pencil.Ad[0][:, self._delayed]
-        self._highest = float(np.linalg.norm(pencil.A, 2) + np.linalg.norm(pencil.Ad[0], 2))
-        modes_without_links = np.linalg.eigvals(pencil.A)
-        modes_without_delay = np.linalg.eigvals(pencil.A + pencil.Ad[0])
-        self._modes: characteristic_roots.Complex = np.concatenate(
-            [modes_without_links, modes_without_delay]
-        ).astype(np.complex128)
+        self._Ad = Ad[:, self._delayed]
+        norm_bound = np.linalg.norm(A, 2) + np.linalg.norm(Ad, 2)
+        self._highest = float(norm_bound)
+        modes_without_links = np.linalg.eigvals(A)
+        modes_without_delay = np.linalg.eigvals(A + Ad)
+        modes = np.concatenate([modes_without_links, modes_without_delay])
+        self._modes: characteristic_roots.Complex = modes.astype(np.complex128)
 
     def build_grid(self) -> Array:
         """Returns frequencies to evaluate, rad/s, denser about the loop's own modes."""
-        even = np.geomspace(_LOWEST * self._highest, self._highest, _POINTS)
-        modes = self._modes[np.abs(self._modes.imag) > 0.0]
+        lowest = _LOWEST * self._highest
+        even = np.geomspace(lowest, self._highest, _POINTS)
+        oscillates = np.abs(self._modes.imag) > 0.0
+        modes = self._modes[oscillates]
         centres = np.abs(modes.imag)[:, np.newaxis]
         widths = np.abs(modes.real)[:, np.newaxis]
         near_modes = centres + widths * np.linspace(-3, 3, 13)
         points = np.unique(np.concatenate([even, near_modes.ravel()]))
-        grid: Array = points[(points >= even[0]) & (points <= even[-1])]
+        is_within = (points >= even[0]) & (points <= even[-1])
+        grid: Array = points[is_within]
         return grid
 
     def compute_eigenvalues(self, omega: Array) -> characteristic_roots.Complex:
         """Returns the eigenvalues of G(j w) for frequencies of shape (K,), shape (K, c)."""
-        delta = 1j * omega[:, np.newaxis, np.newaxis] * self._rate_matrix - self._A
-        G = np.linalg.solve(delta, np.broadcast_to(self._Ad, (len(omega), *self._Ad.shape)))
-        return np.linalg.eigvals(G[:, self._delayed, :]).astype(np.complex128)
+        s = 1j * omega[:, np.newaxis, np.newaxis]
+        delta = s * self._rate_matrix - self._A
+        Ad = np.broadcast_to(self._Ad, (len(omega), *self._Ad.shape))
+        G = np.linalg.solve(delta, Ad)
+        delayed_rows = G[:, self._delayed, :]
+        return np.linalg.eigvals(delayed_rows).astype(np.complex128)
 
     def count_outside(self, omega: Array) -> NDArray[np.int64]:
         """Returns the number of eigenvalues with a modulus above 1, shape (K,)."""
@@ -259,33 +297,36 @@ class _FrequencySweep:
             count = self.count_outside(np.array([middle]))[0]
             if count not in ends:
                 # several eigenvalues cross here: search both halves
-                return self.find_crossings(low, middle) + self.find_crossings(middle, high)
+                lower_half = self.find_crossings(low, middle)
+                upper_half = self.find_crossings(middle, high)
+                return lower_half + upper_half
             if count == ends[0]:
                 low = middle
             else:
                 high = middle
             if high - low <= 1e-13 * high:
                 break
-        return self._list_delays(0.5 * (low + high), int(ends[0] - ends[1]))
+        omega = 0.5 * (low + high)
+        return self._list_delays(omega, int(ends[0] - ends[1]))
 
     def _list_delays(self, omega: float, pairs: int) -> list[AxisCrossing]:
-        """Returns a crossing per delay T with w T = phase + 2 pi k, for each eigenvalue.
+        """Returns a crossing for each delay T with w T = phase + 2 pi k, for each eigenvalue.
 
         Args:
             omega: frequency at which eigenvalues have modulus 1, rad/s.
             pairs: number of such eigenvalues; positive if roots move to the right.
         """
-        values = self.compute_eigenvalues(np.array([omega]))[0]
-        nearest = np.argsort(np.abs(np.abs(values) - 1.0), kind="stable")[: abs(pairs)]
+        (values,) = self.compute_eigenvalues(np.array([omega]))
+        distances = np.abs(np.abs(values) - 1.0)
+        by_distance = np.argsort(distances, kind="stable")
+        nearest = values[by_distance[: abs(pairs)]]
         sign = 1 if pairs > 0 else -1
-        turns = range(int(MAX_COMMON_DELAY_S * omega / (2.0 * math.pi)) + 2)
+        most_turns = int(MAX_COMMON_DELAY_S * omega / (2.0 * math.pi))
         crossings = []
-        for value in values[nearest]:
+        for value in nearest:
             phase = math.atan2(value.imag, value.real) % (2.0 * math.pi)
-            delays_s = [(phase + 2.0 * math.pi * turn) / omega for turn in turns]
-            crossings += [
-                AxisCrossing(delay_s, omega, sign)
-                for delay_s in delays_s
-                if 0.0 < delay_s <= MAX_COMMON_DELAY_S
-            ]
+            for turn in range(most_turns + 2):
+                delay_s = (phase + 2.0 * math.pi * turn) / omega
+                if 0.0 < delay_s <= MAX_COMMON_DELAY_S:
+                    crossings.append(AxisCrossing(delay_s, omega, sign))
         return crossings

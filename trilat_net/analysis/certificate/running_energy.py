@@ -4,17 +4,16 @@ The newest records of every site are kept in a window. V is computed by the func
 `certify`, over the records of these windows.
 
 Invariant:
-    - V equals that of `certify` at the same instants, up to rounding: the windows reach back to
-      the oldest sample in use.
+    - V equals the V of `certify` at the same instants, up to rounding: the windows reach back
+      to the oldest sample in use.
     - Nothing is extrapolated: an instant waits until its records are complete, and is skipped
-      if they cannot be had.
+      if records are lost.
     - The size of a window is bounded.
     - A record may arrive late, out of order or twice. Ticks without a record are marked
       unknown, as in `AlignedRecords`.
 """
 
 from collections.abc import Iterable, Mapping
-from itertools import accumulate, pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -49,16 +48,19 @@ from .premises import describe_closed_groups, explain_no_functional
 STEP_S = 0.25
 """Shortest span over which V is computed in one call, s."""
 LONGEST_STEP_S = 2.0
-"""Longest span over which V is computed in one call, s; a longer backlog takes several
-calls.
+"""Longest span over which V is computed in one call, s.
+
+A longer backlog takes several calls.
 """
 KEPT_S = 12.0
-"""Least time that a window reaches back, s: it covers the largest age of a sample, and the time
-within which a gap is filled.
+"""Least time that a window reaches back, s.
+
+It covers the largest age of a sample, and the time within which a gap is filled.
 """
 _NEVER_TICK = -(2**40)
+"""The last resting tick of a site that has never rested."""
 _RAMP_MARGIN_S = 1.0
-"""Ramps are kept until this long after they were superseded, s."""
+"""Time for which a ramp is kept after a later ramp has replaced it, s."""
 
 
 class RecordWindow:
@@ -84,6 +86,7 @@ class RecordWindow:
         self._axes = scenario.arms[site].axes
         self._limits = spec.limits
         self._kept = max(8, round(kept_s * self.rate_hz))
+        # records move to the front only once as many again have arrived
         capacity = 2 * self._kept
         layout = scenario.layout(site)
         names = [*RECORD_COLUMNS]
@@ -92,10 +95,13 @@ class RecordWindow:
         if layout.hand:
             names.append("hand")
         lengths = layout.lengths()
-        ends = list(accumulate(lengths[name] for name in names))
-        spans = pairwise([0, *ends])
-        self._columns = {name: slice(*span) for name, span in zip(names, spans, strict=True)}
-        self._floats = np.zeros((capacity, ends[-1]))
+        self._columns: dict[str, slice] = {}
+        width = 0
+        for name in names:
+            end = width + lengths[name]
+            self._columns[name] = slice(width, end)
+            width = end
+        self._floats = np.zeros((capacity, width))
         self._used = np.full((capacity, len(self.peers)), -1, dtype=np.int64)
         self._known = np.zeros(capacity, dtype=np.bool_)
         self._follows = np.zeros(capacity, dtype=np.bool_)
@@ -107,44 +113,50 @@ class RecordWindow:
         """Stores a record.
 
         Returns:
-            False if the record is older than the window, or says that the site diverged.
+            False if the record is older than the window, or if its mode is "diverged".
         """
-        if record.tick < self.first or record.mode == "diverged":
+        tick = record.tick
+        if tick < self.first or record.mode == "diverged":
             return False
         if self.newest < 0:
-            self.first = max(0, record.tick - self._kept)
-        if record.tick - self.first >= len(self._floats):
-            self._shift_to(record.tick - self._kept + 1)
-        row = record.tick - self.first
+            self.first = max(0, tick - self._kept)
+        if tick - self.first >= len(self._floats):
+            self._shift_to(tick - self._kept + 1)
+        row = tick - self.first
         for name, columns in self._columns.items():
             self._floats[row, columns] = getattr(record, name)
         self._used[row] = [record.used.get(peer, -1) for peer in self.peers]
         if self._glides and record.mode in RESTING_MODES:
-            self._last_resting_tick = max(self._last_resting_tick, record.tick)
-        ticks_since_rest = record.tick - self._last_resting_tick
+            self._last_resting_tick = max(self._last_resting_tick, tick)
+        ticks_since_rest = tick - self._last_resting_tick
         self._known[row] = True
         self._rests[row] = 0 <= ticks_since_rest <= RESUMING_S * self.rate_hz
         self._follows[row] = record.mode == "run" and self._is_unlimited(record)
-        self.newest = max(self.newest, record.tick)
+        self.newest = max(self.newest, tick)
         return True
 
     def _is_unlimited(self, record: State) -> bool:
-        """True if the reference of a record moves slower than it may."""
+        """True if the reference of a record moves slower than its limit."""
         if self._limits.qd_des_limit_rad_s is None:
             return True
-        return bool(find_unlimited_rows(self._limits, np.array(record.qd_des)))
+        qd_des = np.array(record.qd_des)
+        return bool(find_unlimited_rows(self._limits, qd_des))
 
     def _shift_to(self, first: int) -> None:
         """Drops the records before tick `first`, and moves the others to the front."""
         remaining = max(0, self.newest + 1 - first)
+        dropped = first - self.first
         for rows in (self._floats, self._used, self._known, self._follows, self._rests):
-            rows[:remaining] = rows[first - self.first :][:remaining].copy()
+            kept_rows = rows[dropped:]
+            rows[:remaining] = kept_rows[:remaining].copy()
         self._known[remaining:] = False
         self.first = first
 
     def has_record(self, tick: int) -> bool:
         """True if the window has a record of tick `tick`."""
-        return self.first <= tick <= self.newest and bool(self._known[tick - self.first])
+        if not self.first <= tick <= self.newest:
+            return False
+        return bool(self._known[tick - self.first])
 
     def rows(self, first: int, last: int) -> AlignedRecords:
         """Returns the records of ticks `first` to `last`; missing records are interpolated."""
@@ -159,16 +171,17 @@ class RecordWindow:
             ticks = np.arange(len(known))
             known_rows = np.flatnonzero(known)
             for column in floats.T:
-                column[:] = np.interp(ticks, known_rows, column[known_rows])
-            # what is no number is that of the last record before the gap
+                known_values = column[known_rows]
+                column[:] = np.interp(ticks, known_rows, known_values)
+            # other values than numbers are those of the last record before the gap
             preceding = np.searchsorted(known_rows, ticks, side="right") - 1
             last_known = known_rows[np.maximum(preceding, 0)]
             used = used[last_known]
             follows = follows[last_known]
             rests = rests[last_known]
-        columns: dict[str, Any] = {
-            name: floats[:, span] for name, span in self._columns.items()
-        }
+        columns: dict[str, Any] = {}
+        for name, span in self._columns.items():
+            columns[name] = floats[:, span]
         return AlignedRecords(
             site=self.site,
             rate_hz=self.rate_hz,
@@ -220,22 +233,28 @@ class RunningEnergy:
         self._supplied = 0.0
 
     def add_changes(self, site: str, changes: Iterable[CoreChange]) -> None:
-        """Adds changes that a site applied; only those of its dominance factors matter."""
+        """Adds the changes of a site's dominance factors; other changes have no effect on V."""
         _, ramps = self._dominance[site]
-        ramps.extend(change.ramp for change in changes if change.ramp is not None)
+        for change in changes:
+            if change.ramp is not None:
+                ramps.append(change.ramp)
 
     def compute_next(self, complete: Mapping[str, int]) -> EnergyCourse | None:
         """Returns V since the last call; None if no further span is complete yet.
 
         Args:
-            complete: for every site, the last tick up to which each record has arrived or
-                cannot be had.
+            complete: for every site, the last tick up to which each record has arrived or is
+                lost.
         """
         if self.reason or min(complete.values()) < 1:
             return None
-        windows = self._windows
-        complete_s = min(complete[site] / window.rate_hz for site, window in windows.items())
-        oldest_s = max(window.first / window.rate_hz for window in windows.values())
+        complete_times_s = []
+        oldest_times_s = []
+        for site, window in self._windows.items():
+            complete_times_s.append(complete[site] / window.rate_hz)
+            oldest_times_s.append(window.first / window.rate_hz)
+        complete_s = min(complete_times_s)
+        oldest_s = max(oldest_times_s)
         if self._computed_until_s is None:
             self._computed_until_s = oldest_s
         if complete_s - self._computed_until_s < STEP_S:
@@ -246,16 +265,14 @@ class RunningEnergy:
         return self._compute_span(begin_s, end_s)
 
     def _compute_span(self, begin_s: float, end_s: float) -> EnergyCourse | None:
-        """Returns V between two times; the first one ended the span before."""
-        tick_spans = {
-            site: (
-                int(np.ceil(begin_s * window.rate_hz - 1e-6)),
-                int(np.floor(end_s * window.rate_hz + 1e-6)),
-            )
-            for site, window in self._windows.items()
-        }
-        if any(last - first < 1 for first, last in tick_spans.values()):
-            return None
+        """Returns V from the end of the span before until `end_s`; None if V is not known."""
+        tick_spans = {}
+        for site, window in self._windows.items():
+            first = int(np.ceil(begin_s * window.rate_hz - 1e-6))
+            last = int(np.floor(end_s * window.rate_hz + 1e-6))
+            if last - first < 1:
+                return None
+            tick_spans[site] = (first, last)
         energies = self._derive_energies(tick_spans)
         for alpha in find_dominance_matrices(energies):
             groups = find_closed_groups(alpha)
@@ -266,9 +283,10 @@ class RunningEnergy:
                 return None
         is_known = len(find_common_times(energies)) > 1
         balance = compute_energy_balance(energies) if is_known else None
+        ramps_from_s = begin_s - _RAMP_MARGIN_S
         for site, (start, ramps) in self._dominance.items():
-            self._dominance[site] = drop_finished_ramps(start, ramps, begin_s - _RAMP_MARGIN_S)
-        # no balance yet: the session was joined late, and what was under way then is unknown
+            self._dominance[site] = drop_finished_ramps(start, ramps, ramps_from_s)
+        # in a session that was joined late, the oldest samples in use are unknown at first
         if balance is None:
             return None
         supplied = self._supplied + balance.external_work
@@ -279,22 +297,26 @@ class RunningEnergy:
         self, tick_spans: Mapping[str, tuple[int, int]]
     ) -> dict[str, SiteEnergy]:
         """Returns the energies of all sites over their spans of ticks, (first, last) each."""
-        windows = self._windows
-        records = {
-            site: windows[site].rows(first, last) for site, (first, last) in tick_spans.items()
-        }
-        # the first tick of each site of which a peer may still use the sample
-        oldest_used = {site: first for site, (first, _) in tick_spans.items()}
+        records = {}
+        # for each site, the first tick whose sample a peer may still use
+        oldest_used = {}
+        for site, (first, last) in tick_spans.items():
+            records[site] = self._windows[site].rows(first, last)
+            oldest_used[site] = first
         for site_records in records.values():
             for peer, used in site_records.used.items():
-                oldest_used[peer] = min(oldest_used[peer], max(int(used.min()) - 2, 0))
+                oldest = max(int(used.min()) - 2, 0)
+                oldest_used[peer] = min(oldest_used[peer], oldest)
         pasts = {}
-        for site, window in windows.items():
+        for site, window in self._windows.items():
             first = max(oldest_used[site], window.first)
             _, last = tick_spans[site]
-            pasts[site] = PeerTrajectory(window.rows(first, last))
+            past_records = window.rows(first, last)
+            pasts[site] = PeerTrajectory(past_records)
         return derive_site_energies(self._scenario, records, pasts, self._trace_dominance)
 
     def _trace_dominance(self, site: str, t_s: Array) -> DominanceHistory:
+        """Returns the dominance factors of a site at times in s."""
         start, ramps = self._dominance[site]
-        return evaluate_ramps(start, ramps, t_s, 1.0 / self._windows[site].rate_hz)
+        h_s = 1.0 / self._windows[site].rate_hz
+        return evaluate_ramps(start, ramps, t_s, h_s)
