@@ -1,14 +1,20 @@
-"""A whole session on one machine: starts all sites and the recorder, watches and ends them.
+"""Run a whole session on one machine, with a process per site and a recorder.
 
-The processes are copies of one process, the starter, which has loaded everything: a copy starts
-in a tenth of the time that an interpreter takes. The copied process has no connection, no
-threads of its own and no user's code.
+A site is a process that runs one arm and its control loop. The recorder is a process that
+writes the log of the session. `run_demo` runs such a session for the command `trilat demo`, and
+`run` does so for Python programs.
+
+All processes are copies (forks) of one process, the starter, which has imported all modules and
+compiled the control code. A copy starts in a tenth of the time that a Python interpreter takes.
+The starter has no network connection, no threads of its own, and none of the user's code,
+because these cannot be copied safely.
 
 Invariant:
-    - The recorder always ends last, and no child process is left on return, even if this
-      process is killed. If the starter is killed, all processes are asked to end.
-    - The children have process sessions of their own, so that Ctrl-C reaches them through this
-      process, in that order.
+    - The recorder always ends last, so that it receives the last messages of the sites.
+    - No child process is left when a function returns, even if this process is killed. If the
+      starter is killed, all processes receive a signal to end.
+    - Each child has a process session of its own. Ctrl-C in the terminal therefore reaches only
+      this process, which then ends the children in the right order.
 """
 
 import os
@@ -53,31 +59,34 @@ from .monitor import SessionDisplay, SessionMonitor
 from .site_parts import warm_up
 
 POLL_NS = 100_000_000
+"""Time between two updates of the display, in ns."""
 START_S = 10
-"""Time for a site to start, s, if many of them share a few processors."""
+"""Time that a site may need to start if many sites share a few processors, in s."""
 JOIN_S = 60
-"""Longest wait of the sites for each other and for the recorder, s."""
+"""Longest wait of the sites for each other and for the recorder, in s."""
 WAIT_S = 600
-"""The same wait if people begin the session, s."""
+"""Longest wait of the sites if people decide when the session begins, in s."""
 END_TIMEOUT_NS = 45 * NS_PER_S
-"""Time for a child to end after its signal; then it is killed.
+"""Time after which a child is killed that has not ended after its signal, in ns.
 
 A site waits 10 s for the recorder, and as long again after each query of a recorder that lacks
 messages.
 """
 RECORDER_NS = 2 * NS_PER_S
-"""Time for the recorder to write the last messages after all sites have ended."""
+"""Time that the recorder may need to write the last messages after all sites have ended, in ns.
+"""
 
 
 @dataclass(slots=True)
 class SessionResult:
-    """How a session ended.
+    """Outcome of a session that `run_demo` has run.
 
     Attributes:
-        log: the path of the log.
-        problems: what failed, in order.
-        interrupted: the number of the signal that ended the session, or 0.
-        exit_code: the code of a failed run, or of a disk that refused the log.
+        log: Path of the log. The file exists only if the session has begun.
+        problems: Sentences that say what failed, in the order of the failures.
+        interrupted: Number of the signal that ended the session. 0 if no signal did.
+        exit_code: Exit code for the command: that of a failed run, or of a disk that refused
+            the log.
     """
 
     log: Path
@@ -87,13 +96,16 @@ class SessionResult:
 
 
 class SessionProcess:
-    """A process of a session.
+    """A child process of a session, as this process sees it.
+
+    `ProcessStarter` creates this object, and updates it with the reports of the starter
+    process.
 
     Attributes:
-        name: the name of the process, such as that of its site.
-        output: the file with everything that the process prints.
-        pid: its process number; None before it has started.
-        code: its exit code; None before it has ended.
+        name: Name of the process, which is that of its site or "recorder".
+        output: File with everything that the process prints.
+        pid: Process number. None before the process has started.
+        code: Exit code. None before the process has ended.
     """
 
     def __init__(self, starter: "ProcessStarter", name: str, output: Path) -> None:
@@ -105,21 +117,33 @@ class SessionProcess:
         self._signalled = False
 
     def end(self, number: int) -> None:
-        """Sends the process a signal, unless it has ended."""
+        """Sends the process a signal, unless it has ended.
+
+        Args:
+            number: Number of the signal.
+        """
         if self.code is None:
             self._signalled = True
             self._starter.signal(self, number)
 
     def problem(self) -> str | None:
-        """Describes how the process failed; returns None if it did not fail."""
+        """Describes how the process failed.
+
+        Returns:
+            A sentence with the exit code or signal, and the last line that the process printed.
+            None if the process has not failed: it is running, it ended with code 0, or it was
+            ended by a signal of this process.
+        """
         code = self.code
         if self._signalled and self.pid is None:
-            # The signal met an interpreter that was still starting; it may end with any code.
+            # The signal met an interpreter that was still starting, which may end with any
+            # code.
             return None
         if code in (0, None):
             return None
         if self._signalled and code in (128 + signal.SIGINT, -signal.SIGINT):
-            return None  # a process that is ending anyway has no signal handler any more
+            # The process was already ending, and had removed its signal handler.
+            return None
         if code is not None and code < 0:
             return f"{self.name} was killed by {signal.Signals(-code).name}"
         lines = self.output.read_text(encoding="utf-8", errors="replace").strip().splitlines()
@@ -128,11 +152,15 @@ class SessionProcess:
 
 
 class ProcessStarter:
-    """Starts the processes of a session on this machine, and keeps their output in a folder.
+    """Starts the child processes of a session, and collects their output in a folder.
+
+    This object runs the starter as a child process (`run_starter`), and sends it requests
+    through a pipe. The starter reports through the same pipe when a process has started or
+    ended.
 
     Args:
-        scenario_file: the scenario of the session.
-        folder: the folder for the outputs.
+        scenario_file: Scenario of the session.
+        folder: Folder for the output of each process.
     """
 
     def __init__(self, scenario_file: Path, folder: Path) -> None:
@@ -141,12 +169,8 @@ class ProcessStarter:
         self._processes: dict[str, SessionProcess] = {}
         self._pipe, child_end = Pipe()
         with child_end, create_file(self._output) as sink:
-            # see `run_starter`
-            arguments = [
-                "start-processes",
-                str(child_end.fileno()),
-                str(scenario_file),
-            ]
+            # The arguments of `run_starter`.
+            arguments = ["start-processes", str(child_end.fileno()), str(scenario_file)]
             self._starter = subprocess.Popen(
                 [sys.executable, "-m", "trilat_net", *arguments],
                 stdin=subprocess.DEVNULL,
@@ -157,32 +181,46 @@ class ProcessStarter:
             )
 
     def start(self, name: str, arguments: Sequence[str]) -> SessionProcess:
-        """Starts a command as a process.
+        """Requests the start of a command as a child process.
 
         Args:
-            name: a name that no other process has.
-            arguments: the command and its arguments, without `trilat`.
+            name: Name of the process, which no other process of the session has.
+            arguments: The command and its arguments, without `trilat`.
+
+        Returns:
+            The process, which may not have started yet.
         """
         process = SessionProcess(self, name, self._folder / f"{name}.txt")
-        create_file(process.output).close()  # here, where a full disk is reported to the user
+        # Created in this process, so that a full disk is reported to the user.
+        create_file(process.output).close()
         self._processes[name] = process
         self._send_order(name, [*arguments], 0, process.output)
         return process
 
     def signal(self, process: SessionProcess, number: int) -> None:
-        """Sends a process a signal; a process that has not started yet will not start."""
+        """Sends a process a signal. A process that has not started yet then does not start."""
         self._send_order(process.name, [], number, process.output)
-        # Interrupts a starter that still imports; it blocks the signal before its first order.
+        # This signal interrupts a starter that is still importing modules. A starter that is
+        # ready has blocked it.
         self._starter.send_signal(signal.SIGINT)
 
     def _send_order(self, name: str, arguments: list[str], number: int, output: Path) -> None:
+        """Sends a request to the starter: a start if `number` is 0, otherwise a signal.
+
+        Args:
+            name: Name of the process.
+            arguments: The command and its arguments. Empty for a signal.
+            number: Number of the signal. 0 requests a start.
+            output: File for the output of the process.
+        """
         with suppress(OSError):  # the starter has failed, which `poll` reports
             self._pipe.send((name, arguments, number, output))
 
     def poll(self) -> None:
-        """Updates the processes by the starter's reports of starts and ends.
+        """Receives the starter's reports, and updates the processes.
 
-        If the starter has failed, all of its processes are asked to end.
+        If the starter itself has failed, its processes are sent a signal to end, and count as
+        ended with the exit code of the starter.
         """
         try:
             while self._pipe.poll():
@@ -201,7 +239,7 @@ class ProcessStarter:
                         os.kill(process.pid, signal.SIGINT)
 
     def close(self) -> None:
-        """Ends the starter; all processes that it has started have ended by then."""
+        """Ends the starter. All other processes must have ended."""
         self._pipe.close()
         self._starter.send_signal(signal.SIGINT)
         self._starter.wait()
@@ -210,10 +248,11 @@ class ProcessStarter:
 SessionAttendant = Callable[
     [str, Sequence[str], Callable[[str], None]], AbstractContextManager[Callable[[], bool]]
 ]
-"""A function of a session's name, its endpoints, and a function that prints a line.
+"""Function that watches a session, for example to serve a web page, and may end the session.
 
-It returns a context that lasts as long as the session. The context yields a function that
-returns True once the session is to end.
+It receives the name of the session, its endpoints, and a function that prints a line for the
+user. It returns a context manager that lasts as long as the session. The value of the `with`
+statement is a function that returns True once the session should end.
 """
 
 
@@ -224,21 +263,25 @@ def run_demo(
     attend: SessionAttendant | None = None,
     begins: Callable[[], bool] | None = None,
 ) -> SessionResult:
-    """Runs a session of all sites and a recorder, under the scenario's name.
+    """Runs a session of all sites and a recorder on this machine.
+
+    The session has the name of the scenario.
 
     Args:
-        scenario: the scenario.
-        folder: the folder of the log and of the processes' outputs.
-        console: the terminal for the user.
-        attend: observes the session and may end it.
-        begins: returns True once the session may begin; the sites wait for the recorder until
-            then, at most `WAIT_S`. The session begins a second or two later.
+        scenario: The scenario.
+        folder: Folder for the log and for the output of the processes.
+        console: Terminal of the user.
+        attend: Function that watches the session and may end it. None if there is no such
+            function.
+        begins: Function that returns True once the session may begin. Until then, for at most
+            `WAIT_S`, the sites wait for the recorder. The session begins a second or two later.
+            None lets it begin at once.
 
     Returns:
-        How the session ended. The log is valid whenever the session has begun.
+        The outcome of the session. If the session has begun, the log is valid.
 
     Raises:
-        ScenarioError: an external arm lacks limits.
+        ScenarioError: The scenario lacks the limits of an external arm.
     """
     check_outside_arms(scenario)
     result = SessionResult(folder / "run.mcap")
@@ -250,8 +293,9 @@ def run_demo(
         ExitStack() as reserved,
     ):
         compile_core(scenario, display.say, interrupt)
-        if warning := describe_load(measure_busy_share(clock)):
-            display.say(f"warning: {warning}")
+        load_warning = describe_load(measure_busy_share(clock))
+        if load_warning:
+            display.say(f"warning: {load_warning}")
         endpoints = reserved.enter_context(reserve_session_endpoints(session, scenario.names))
         patience_s = JOIN_S if begins is None else WAIT_S
         starter, sites, start_recorder = _start(
@@ -261,26 +305,23 @@ def run_demo(
             endpoints=endpoints,
             wait_s=patience_s,
         )
-        recorder: list[SessionProcess] = []
+        recorder: list[SessionProcess] = []  # empty until the session may begin
         display.say(f"others connect to {', '.join(endpoints)}")
         for name in scenario.outside:
             key = topics.key(session, name, topics.MEASURED)
             endpoint = endpoints[scenario.names.index(name)]
             page = find_page("external-arm.md")
             display.say(f"{name} waits for its arm on {key} at {endpoint}; see {page}")
-        attending = (
-            nullcontext(lambda: False)
-            if attend is None
-            else attend(session, endpoints, display.say)
-        )
+
+        attending: AbstractContextManager[Callable[[], bool]] = nullcontext(lambda: False)
+        if attend is not None:
+            attending = attend(session, endpoints, display.say)
         try:
-            with closing(ZenohBus([], endpoints)) as bus, attending as is_enough:
+            with closing(ZenohBus([], endpoints)) as bus, attending as should_end:
                 monitor = SessionMonitor(bus, session, scenario, display)
-                while not (
-                    interrupt.is_requested()
-                    or is_enough()
-                    or _is_over([*sites, *recorder], result)
-                ):
+                while not interrupt.is_requested() and not should_end():
+                    if _is_over([*sites, *recorder], result):
+                        break
                     if not recorder and (begins is None or begins()):
                         recorder.append(start_recorder())
                     monitor.poll()
@@ -296,6 +337,7 @@ def run_demo(
                 say=display.say,
             )
         result.interrupted = interrupt.number
+
     for child in [*sites, *recorder]:
         problem = child.problem()
         if child.code == LogRefused.exit_code:
@@ -306,56 +348,75 @@ def run_demo(
 
 
 def compile_core(scenario: Scenario, say: Callable[[str], None], interrupt: Interrupt) -> None:
-    """Compiles the code that a scenario's arms need, unless it is cached.
+    """Compiles the control code for the arms of a scenario, unless it is cached on disk.
 
-    A signal interrupts the compilation.
+    The compilation may take minutes. A signal interrupts it.
+
+    Args:
+        scenario: The scenario.
+        say: Function that tells the user that the code is being compiled.
+        interrupt: Handler of the signals.
     """
-    layouts = {arm.counts: name for name, arm in scenario.arms.items()}
-    chains = any(arm.chain is not None for arm in scenario.arms.values())
+    # One site of each kind of arm suffices.
+    sites_by_counts = {arm.counts: name for name, arm in scenario.arms.items()}
+    has_chains = any(arm.chain is not None for arm in scenario.arms.values())
     # The cached code may be for chains with another number of joints.
-    if chains or not is_core_cached():
+    if has_chains or not is_core_cached():
         compiling_notice.report = say
         with interrupt.raising():
-            for name in layouts.values():
+            for name in sites_by_counts.values():
                 warm_up(scenario, name)
 
 
 def _start(
     scenario: Scenario, folder: Path, reserved: ExitStack, endpoints: list[str], wait_s: int
 ) -> tuple[ProcessStarter, list[SessionProcess], Callable[[], SessionProcess]]:
-    """Starts all sites and hands.
+    """Starts all sites, and the user's operator programs that run in processes of their own.
+
+    Args:
+        scenario: The scenario.
+        folder: Folder for the scenario, the log and the output of the processes.
+        reserved: Closes the starter at the end of the session.
+        endpoints: Endpoint at which each site listens, in the order of the scenario.
+        wait_s: Longest wait of a process for the others, in s.
 
     Returns:
         The starter, the processes, and a function that starts the recorder.
     """
-    file = folder / "scenario.toml"
+    scenario_file = folder / "scenario.toml"
     log = folder / "run.mcap"
     output = folder / "processes"
-    write_whole(file, scenario.text)
+    write_whole(scenario_file, scenario.text)
     make_subfolder(output)
     log.unlink(missing_ok=True)  # of an earlier run, in a folder that may be replaced
-    starter = reserved.enter_context(closing(ProcessStarter(file, output)))
+    starter = reserved.enter_context(closing(ProcessStarter(scenario_file, output)))
+
     session = scenario.name
-    common = ["--scenario", str(file), "--session", session]
+    common = ["--scenario", str(scenario_file), "--session", session]
     connect = [["--connect", endpoint] for endpoint in endpoints]
     patience = ["--join-timeout", str(max(wait_s, START_S * len(endpoints)))]
     processes = []
-    for n, name in enumerate(scenario.names):
-        arguments = ["site", name, *common, "--listen", endpoints[n]]
-        arguments += [*chain(*connect[:n]), "--needs-recorder", *patience]
+    # Each site connects to the sites before it, so that every two sites are connected once.
+    for index, name in enumerate(scenario.names):
+        arguments = ["site", name, *common, "--listen", endpoints[index]]
+        arguments += [*chain(*connect[:index]), "--needs-recorder", *patience]
         processes.append(starter.start(name, arguments))
-    for n, name in enumerate(scenario.names):
+    for index, name in enumerate(scenario.names):
         own_hand = find_own_hand(scenario, name)
         if own_hand is not None and own_hand.has_separate_process:
-            arguments = ["hand", name, *common, *connect[n], *patience]
+            arguments = ["hand", name, *common, *connect[index], *patience]
             processes.append(starter.start(f"hand-{name}", arguments))
+
     record = ["record", "--session", session, *chain(*connect), "-o", str(log)]
     record += [*patience, "--force"]
     return starter, processes, lambda: starter.start(topics.RECORDER, record)
 
 
 def _is_over(children: list[SessionProcess], result: SessionResult) -> bool:
-    """Adds the problems of ended processes to the result; True if the session is over."""
+    """Returns True if a process has failed, or if all processes have ended.
+
+    The problems of failed processes are added to the result.
+    """
     problems = [child.problem() for child in children]
     result.problems += [problem for problem in problems if problem]
     return bool(result.problems) or all(child.code == 0 for child in children)
@@ -369,9 +430,10 @@ def _end_all(
     interrupt: Interrupt,
     say: Callable[[str], None],
 ) -> None:
-    """Ends the sites, then the recorder, which has all their messages by then.
+    """Ends first the sites, and then the recorder, which has received their last messages.
 
-    A second signal of the user reaches all of them, and ends them at once.
+    If the user presses Ctrl-C a second time, all processes receive another signal, which ends
+    them at once.
     """
     announce = partial(
         say,
@@ -388,9 +450,9 @@ def _end_all(
     sites_ended_ns = clock.monotonic_ns()
 
     def must_end_now() -> bool:
-        """True if the user insists, or the recorder's time is over.
+        """Returns True if the user insists, or if the recorder has had enough time.
 
-        After the end of the sites there are no more messages for the recorder to request.
+        After the end of the sites, the recorder has no more messages to wait for.
         """
         return interrupt.is_repeated() or clock.monotonic_ns() - sites_ended_ns > RECORDER_NS
 
@@ -410,14 +472,17 @@ def _end_group(
     ends_now: Callable[[], bool],
     announce: Callable[[], None],
 ) -> None:
-    """Ends processes in order, and waits for them.
+    """Sends processes a signal to end, and waits until all have ended.
+
+    A process that does not end within `END_TIMEOUT_NS` is killed.
 
     Args:
-        starter: the starter of the processes.
-        group: the processes.
-        clock: the clock of this process.
-        ends_now: returns True to end the processes at once, by a second signal.
-        announce: tells the user why the wait takes long.
+        starter: Starter of the processes.
+        group: The processes.
+        clock: Clock of this process.
+        ends_now: Function that returns True to end the processes at once, by a second signal.
+        announce: Function that tells the user why the wait takes long. It is called once, after
+            a second.
     """
     for process in group:
         process.end(signal.SIGINT)
@@ -441,36 +506,51 @@ def _end_group(
 
 
 def run_starter(number: int, scenario_file: str) -> list[str] | None:
-    """Starts and signals processes on request, until the requesting process is gone.
+    """Runs the starter, which copies itself on request until the requesting process is gone.
 
-    It returns in each started process, with the command and arguments of that process, and in
-    the starter itself with None.
+    The function returns twice, as `os.fork` does: once in each copy, and finally in the
+    starter.
 
     Args:
-        number: the file descriptor of the pipe to the requesting process.
-        scenario_file: the scenario of the session.
+        number: File descriptor of the pipe to the requesting process.
+        scenario_file: Scenario of the session.
+
+    Returns:
+        In a copy, the command and arguments that the copy has to run. In the starter, None.
     """
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     scenario = load_scenario(scenario_file)
     # A user's own code is imported only in the process that runs it.
     if not list_imported_code([scenario]):
-        for name in {arm.counts: name for name, arm in scenario.arms.items()}.values():
+        # One site of each kind of arm suffices.
+        sites_by_counts = {arm.counts: name for name, arm in scenario.arms.items()}
+        for name in sites_by_counts.values():
             warm_up(scenario, name)
     freeze_gc()
-    # Blocked, not ignored: a copy would lose a signal that arrives before it has a handler.
+    # The signal is blocked and not ignored. If it arrives while a copy has no handler yet, it
+    # is delivered as soon as the copy has one.
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     return _StarterProcess(Connection(number)).serve()
 
 
 class _StarterProcess:
-    """The starter's loop, and the processes that it has started."""
+    """The loop of the starter process, and the processes that it has created.
+
+    Args:
+        pipe: Connection to the requesting process.
+    """
 
     def __init__(self, pipe: Connection) -> None:
         self._pipe = pipe
         self._running: dict[str, int] = {}
 
     def serve(self) -> list[str] | None:
-        """Executes orders; returns the arguments in a started process, None in the starter."""
+        """Executes the requests to start or signal processes, and reports their ends.
+
+        Returns:
+            In a copy, the arguments of the copy. In the starter, None, once the requesting
+            process is gone and all copies have ended.
+        """
         arguments: list[str]
         while True:
             self._report_ends()
@@ -488,8 +568,16 @@ class _StarterProcess:
                 os.kill(self._running[name], number)
 
     def _fork(self, name: str) -> bool:
-        """Copies this process; returns True in the copy."""
-        if pid := os.fork():
+        """Copies this process.
+
+        Args:
+            name: Name of the copy.
+
+        Returns:
+            True in the copy, False in the starter.
+        """
+        pid = os.fork()
+        if pid:
             self._running[name] = pid
             self._report(name, pid, None)
             return False
@@ -497,6 +585,7 @@ class _StarterProcess:
         return True
 
     def _report_ends(self) -> None:
+        """Reports the exit codes of the processes that have ended."""
         for name, pid in list(self._running.items()):
             ended, status = os.waitpid(pid, os.WNOHANG)
             if ended:
@@ -504,14 +593,17 @@ class _StarterProcess:
                 self._report(name, pid, os.waitstatus_to_exitcode(status))
 
     def _report(self, name: str, pid: int, code: int | None) -> None:
+        """Reports that a process has started, or has ended with an exit code."""
         with suppress(OSError):  # the requesting process is gone, which `serve` notices next
             self._pipe.send((name, pid, code))
 
     def _end_all(self) -> None:
-        recorder = (
-            [self._running.pop(topics.RECORDER)] if topics.RECORDER in self._running else []
-        )
-        for pids in (list(self._running.values()), recorder):
+        """Ends all processes and waits for them, the recorder last."""
+        recorder = []
+        if topics.RECORDER in self._running:
+            recorder.append(self._running.pop(topics.RECORDER))
+        others = list(self._running.values())
+        for pids in (others, recorder):
             for pid in pids:
                 os.kill(pid, signal.SIGINT)
             for pid in pids:
@@ -519,7 +611,14 @@ class _StarterProcess:
 
 
 def _become_process(arguments: list[str], output: Path) -> None:
-    """Gives a copy the name, process session, output and signals of a process of a shell."""
+    """Turns a copy of the starter into a process like one that a shell has started.
+
+    The copy receives its own process session, output file, signal handling and process title.
+
+    Args:
+        arguments: The command and its arguments.
+        output: File for everything that the process prints.
+    """
     os.setsid()
     sink = os.open(output, os.O_WRONLY | os.O_NOFOLLOW)
     for stream in (sys.stdout, sys.stderr):
@@ -540,32 +639,33 @@ def run(
     force: bool = False,
     quiet: bool = True,
 ) -> Log:
-    """Runs a scenario live, with a process per site and a recorder, and returns its log.
+    """Runs a scenario live, with one process per site and a recorder, and returns the log.
 
-    The command is `trilat demo`, which also reports on the log: `tn.report(log)`.
+    The command `trilat demo` does the same, and also reports on the log, as `tn.report(log)`
+    does.
 
     >>> log = tn.run("two_sites", duration_s=2)
     >>> tn.verify(log).passed
     True
 
     Args:
-        scenario: the name of a shipped scenario, a path, a TOML text, its tables, or a
-            scenario.
-        set: overrides, as in `{"control.Kd": 5}`.
-        duration_s: the duration of the run, s; by default the scenario's.
-        seed: the seed; by default the scenario's.
-        out: folder of the log; by default the next free runs/NAME-N.
-        force: whether the folder may contain files already.
-        quiet: whether nothing is printed during the run.
+        scenario: The name of a shipped scenario, a path, a TOML text, the tables of a scenario,
+            or a scenario.
+        set: Settings that replace those of the scenario, as in `{"control.Kd": 5}`.
+        duration_s: Duration of the run in s. None keeps that of the scenario.
+        seed: Seed of the random numbers. None keeps that of the scenario.
+        out: Folder of the log. None uses the next free folder runs/NAME-N.
+        force: True if the folder may contain files already.
+        quiet: True if nothing is printed during the run.
 
     Raises:
-        ScenarioError: the scenario or an override is not valid.
-        RunFailed: a process failed, or the run was interrupted; the message says whether there
+        ScenarioError: The scenario or a replaced setting is not valid.
+        RunFailed: A process failed, or the run was interrupted. The message says whether there
             is a log.
     """
-    chosen = load_scenario(scenario, set, duration_s=duration_s, seed=seed)
-    folder = make_results_folder(None if out is None else Path(out), chosen.name, force=force)
-    result = run_demo(chosen, folder, Console(quiet=quiet))
+    loaded = load_scenario(scenario, set, duration_s=duration_s, seed=seed)
+    folder = make_results_folder(None if out is None else Path(out), loaded.name, force=force)
+    result = run_demo(loaded, folder, Console(quiet=quiet))
     problems = ["interrupted"] if result.interrupted else result.problems
     if problems:
         kept = f"; {result.log} holds what there was" if result.log.exists() else ""

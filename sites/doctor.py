@@ -1,11 +1,16 @@
-"""Checks what stands in the way of a session on this machine.
+"""Check whether this machine is ready for a session, and say what to do about each problem.
 
-The checks are of keys, links, clocks, rights, tick rate, disk and processors.
+A session consists of processes ("sites") that run arms at 1000 ticks per second and exchange
+their states over the network. The checks concern the keys, the network endpoints, the clocks,
+the operating system's real-time rights, the tick rate that this machine achieves, the disk and
+the processors. The command is `trilat doctor`.
 
 Invariant:
-    - Nothing is changed, and nothing is sent except the messages of a member that connects.
-    - A finding says what was found and, if there is a problem, what to do.
-    - Rights and rates are measured in a process of their own.
+    - The checks change nothing. They send nothing except the messages of a member that
+      connects.
+    - Each finding states the result of a check and, if there is a problem, a remedy.
+    - Rights and rates are measured in a process of their own, so that this process keeps its
+      settings.
 """
 
 import json
@@ -59,31 +64,36 @@ from .site_parts import warm_up
 
 FindingState = Literal["ok", "warn", "fail"]
 CONNECT_S = 2.0
+"""Longest wait for a connection or for replies to pings, in s."""
 MIN_FREE_BYTES = 100 << 20
 """Free space below which a recording is likely to end early."""
 LOW_FREE_BYTES = 2 << 30
-"""Free space below which there is a warning: 90 minutes of three sites."""
+"""Free space below which there is a warning. It is enough for 90 minutes of three sites."""
 CLOCK_TEST_NS = 100_000_000
-"""Duration of the comparison of the clocks."""
+"""Time for which the monotonic clock and the time of day are compared, in ns."""
 MAX_CLOCK_STEP_NS = 1_000_000
-"""Largest change of the difference of the clocks in that time."""
+"""Largest change of the difference between the clocks in that time, in ns."""
 MAX_BOUND_US = 1_000
-"""Largest error bound of a clock offset without a warning."""
+"""Largest error bound of a clock offset without a warning, in us."""
 PINGS = 20
+"""Number of pings to each member of a session."""
 RATES_HZ = (1000, 500, 200, 100)
+"""Tick rates that are tried, in Hz, until one of them is achieved."""
 REHEARSAL_S = 1.0
+"""Duration of the trial of each rate, in s."""
 MAX_LATE_PERIODS = 0.5
+"""Largest lateness of a punctual tick, in periods of the tick rate."""
 MIN_PUNCTUAL_SHARE = 0.99
-"""A rate is held if this share of ticks begins at most `MAX_LATE_PERIODS` after it is due."""
+"""A rate counts as achieved if at least this share of its ticks is punctual."""
 
 
 class DoctorFinding(NamedTuple):
-    """The result of one check.
+    """Result of one check.
 
     Attributes:
-        check: the subject of the check.
-        state: "ok", "warn" or "fail".
-        text: a sentence about the result.
+        check: Subject of the check, such as "keys" or "disk".
+        state: "ok", "warn" for a possible problem, or "fail" for a certain one.
+        text: Sentence about the result and, if there is a problem, its remedy.
     """
 
     check: str
@@ -100,7 +110,17 @@ def examine_machine(
     *,
     insecure: bool,
 ) -> Iterator[DoctorFinding]:
-    """Yields all findings, one after the other; `doctor` explains the arguments."""
+    """Performs all checks, and yields each finding as soon as it is known.
+
+    Args:
+        connection: Endpoints at which this machine would listen, or to which it would connect.
+        keys: Folder of a member's keys. None if there is none.
+        folder: Folder where results would be stored.
+        session: Name of a running session with whose members the clocks are compared. None
+            skips that comparison.
+        clock: Clock of this process.
+        insecure: True if everybody on the network is trusted.
+    """
     member_keys = yield from examine_keys(keys)
     yield from examine_links(connection, keys, member_keys, insecure=insecure)
     yield from examine_clock(clock)
@@ -114,10 +134,13 @@ def examine_machine(
 
 
 def examine_keys(folder: Path | None) -> Generator[DoctorFinding, None, MemberKeys | None]:
-    """Yields whether the keys are valid, until when, and whether others can read them.
+    """Checks if the keys are valid, until when they are, and if others can read them.
+
+    Args:
+        folder: Folder of a member's keys. None if there is none.
 
     Returns:
-        The keys; None if there are none, or if they cannot be used.
+        The keys. None if there are no keys, or if they cannot be used.
     """
     if folder is None:
         yield DoctorFinding(
@@ -153,21 +176,30 @@ def examine_links(
     *,
     insecure: bool,
 ) -> Iterator[DoctorFinding]:
-    """Yields whether each endpoint can be listened at or reached, and is encrypted."""
+    """Checks if each endpoint can be listened at or reached, and if it is encrypted.
+
+    Args:
+        connection: Endpoints to listen at and to connect to.
+        folder: Folder of a member's keys. None if there is none.
+        member_keys: The keys. None if there are no keys, or if they cannot be used.
+        insecure: True if everybody on the network is trusted.
+    """
     try:
         safe = secure_connection(connection, member_keys, insecure=insecure)
     except UsageError as error:
         yield DoctorFinding("links", "fail", str(error))
         return
     for endpoint in find_endpoint_addresses(safe.reach(safe.listen)):
-        if (address := _split_address(endpoint)) is None:
+        address = _split_address(endpoint)
+        if address is None:
             yield _describe_untried(endpoint)
         else:
             yield _examine_listening(endpoint, address)
     for endpoint in find_endpoint_addresses(safe.reach(safe.connect or ())):
+        address = _split_address(endpoint)
         if endpoint.startswith("quic/"):
             yield _examine_quic(endpoint, member_keys)
-        elif (address := _split_address(endpoint)) is None:
+        elif address is None:
             yield _describe_untried(endpoint)
         else:
             yield _examine_reaching(endpoint, address, folder if member_keys else None)
@@ -178,18 +210,24 @@ def examine_links(
 
 
 def _describe_untried(endpoint: str) -> DoctorFinding:
+    """Returns the finding about an endpoint that this module cannot try."""
     text = f"{endpoint} was not tried: not an address of TCP or QUIC"
     return DoctorFinding("links", "warn", text)
 
 
 def _examine_listening(endpoint: str, address: tuple[str, int]) -> DoctorFinding:
-    """Returns whether this machine can listen at an endpoint."""
+    """Checks if this machine can listen at an endpoint, by listening there for a moment.
+
+    Args:
+        endpoint: The endpoint, such as "tls/0.0.0.0:7447".
+        address: Its host and port.
+    """
     is_quic = endpoint.startswith("quic/")
     family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
     kind = socket.SOCK_DGRAM if is_quic else socket.SOCK_STREAM
     try:
         with socket.socket(family, kind) as probe:
-            if not is_quic:  # with this option, two sockets of UDP could share the port
+            if not is_quic:  # with this option, two UDP sockets could share the port
                 probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind(address)
             if not is_quic:
@@ -206,7 +244,14 @@ def _examine_listening(endpoint: str, address: tuple[str, int]) -> DoctorFinding
 def _examine_reaching(
     endpoint: str, address: tuple[str, int], folder: Path | None
 ) -> DoctorFinding:
-    """Returns whether a member answers at an endpoint of TCP or TLS."""
+    """Checks if another member answers at an endpoint of TCP or TLS.
+
+    Args:
+        endpoint: The endpoint.
+        address: Its host and port.
+        folder: Folder of this member's keys. None if they cannot be used: then only the
+            connection is tried, and not the certificate.
+    """
     try:
         with socket.create_connection(address, CONNECT_S) as link:
             if not endpoint.startswith("tls/"):
@@ -229,9 +274,13 @@ def _examine_reaching(
 
 
 def _examine_quic(endpoint: str, member_keys: MemberKeys | None) -> DoctorFinding:
-    """Returns whether a member answers over QUIC.
+    """Checks if another member answers over QUIC, by connecting as a member.
 
-    The only way to find out is to connect as a member.
+    Python has no QUIC client in its standard library, so that the connection uses Zenoh.
+
+    Args:
+        endpoint: The endpoint.
+        member_keys: Keys of this member. None if there are no keys, or if they cannot be used.
     """
     if member_keys is None:
         return DoctorFinding(
@@ -248,6 +297,11 @@ def _examine_quic(endpoint: str, member_keys: MemberKeys | None) -> DoctorFindin
 
 
 def _tls_context(folder: Path | None) -> ssl.SSLContext:
+    """Returns the TLS settings with which a member connects.
+
+    Args:
+        folder: Folder of this member's keys. None accepts any certificate.
+    """
     if folder is None:
         context = ssl.create_default_context()
         context.check_hostname = False
@@ -259,7 +313,8 @@ def _tls_context(folder: Path | None) -> ssl.SSLContext:
 
 
 def _split_address(endpoint: str) -> tuple[str, int] | None:
-    """Returns host and port of an endpoint; None if it has no such address."""
+    """Returns the host and the port of an endpoint, or None if it has no such address."""
+    # protocol / host or [IPv6 address] : port, with optional Zenoh settings after ? or #
     pattern = r"(?:tcp|tls|quic)/(\[[^\]]+\]|[^:/]+):(\d{1,5})(?:[?#].*)?"
     match = re.fullmatch(pattern, endpoint)
     if match is None or int(match[2]) >= 1 << 16:
@@ -268,7 +323,10 @@ def _split_address(endpoint: str) -> tuple[str, int] | None:
 
 
 def examine_clock(clock: Clock) -> Iterator[DoctorFinding]:
-    """Yields whether the clocks of this machine are steady."""
+    """Checks if the clocks of this machine run steadily, for `CLOCK_TEST_NS`.
+
+    The monotonic clock must not go back. The time of day must not step relative to it.
+    """
     begun_ns = clock.monotonic_ns()
     wall_ns = clock.unix_ns()
     previous_ns = begun_ns
@@ -296,7 +354,11 @@ def examine_clock(clock: Clock) -> Iterator[DoctorFinding]:
 def examine_offsets(
     connection: Connection, clock: Clock, session: str
 ) -> Iterator[DoctorFinding]:
-    """Yields the clock offset of each member of a session, and its error bound."""
+    """Compares the clock of this machine with those of a session's members.
+
+    Yields:
+        For each member, the offset of its clock and the error bound of the offset.
+    """
     try:
         ping = ping_session(
             connection=connection,
@@ -326,7 +388,7 @@ def _run_in_process(code: str) -> Any:
     """Runs Python code in a new process.
 
     Returns:
-        The JSON value of the last printed line; None if the process fails.
+        The JSON value in the last line that the process prints. None if the process fails.
     """
     completed = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, encoding="utf-8", check=False
@@ -339,10 +401,11 @@ def _run_in_process(code: str) -> Any:
 _RIGHTS_CODE = (
     "import json; from sites.realtime import prepare; print(json.dumps(prepare(None)))"
 )
+"""Program that requests the real-time settings of a site, and prints the obtained ones."""
 
 
 def examine_rights() -> Iterator[DoctorFinding]:
-    """Yields which real-time settings a site obtains."""
+    """Checks which real-time settings the operating system grants to a site."""
     obtained: dict[str, str] | None = _run_in_process(_RIGHTS_CODE)
     if obtained is None:
         yield DoctorFinding("rights", "warn", "could not be tried")
@@ -358,7 +421,7 @@ def examine_rights() -> Iterator[DoctorFinding]:
 
 
 def examine_system() -> DoctorFinding:
-    """Returns which parts of the program are supported on this operating system."""
+    """Reports which parts of the program are supported on this operating system."""
     name = {"Darwin": "macOS"}.get(platform.system(), platform.system())
     if name == "Linux":
         return DoctorFinding(
@@ -371,11 +434,14 @@ def examine_system() -> DoctorFinding:
 
 
 class Rehearsal(LoopStats):
-    """The live loop of a single site, with everything that a tick does except the network.
+    """The control loop of a single site, with everything that a tick does except the network.
+
+    The object replaces the statistics and the `RunningSite` of the loop. It keeps the lateness
+    of each tick.
 
     Args:
-        scenario: the scenario.
-        name: the name of the site.
+        scenario: The scenario.
+        name: Name of the site.
     """
 
     def __init__(self, scenario: Scenario, name: str) -> None:
@@ -385,7 +451,11 @@ class Rehearsal(LoopStats):
         self._late_us: list[int] = []
 
     def run(self, clock: Clock) -> list[int]:
-        """Runs all ticks in real time; returns the lateness of each, us."""
+        """Executes all ticks of the scenario in real time.
+
+        Returns:
+            The lateness of each tick, in us.
+        """
         inbox = PeerInbox(links=(), rings=(), boots=(), monitors=(), dropped=self.dropped)
         epoch_ns = clock.monotonic_ns() + NS_PER_S // 10
         timing = SiteTiming(epoch_ns, self._site.rate_hz, (), "")
@@ -404,18 +474,19 @@ class Rehearsal(LoopStats):
         return self._late_us
 
     def count_tick(self, late_us: int, busy_us: int, skipped: int = 0) -> None:
-        """Counts a tick, and keeps its lateness."""
+        """Updates the statistics with a tick, and stores its lateness, see `LoopStats`."""
         super().count_tick(late_us, busy_us, skipped)
         self._late_us.append(late_us)
 
     def step(self, k: int, arrivals: Sequence[Arrival]) -> TickRecord:
-        """Steps the site."""
+        """Computes a tick without any samples of peers."""
         return self._site.step(TickInput(k, arrivals))
 
     def run_housekeeping(self, *_: object) -> bool:
-        """Does nothing; False means that the run goes on."""
+        """Does nothing, and returns False, which lets the loop continue."""
         return False
 
+    # The other methods of `RunningSite` that the loop calls.
     publish_sample = run_housekeeping
     publish_link = run_housekeeping
     report_tick = run_housekeeping
@@ -424,16 +495,18 @@ class Rehearsal(LoopStats):
 
 
 def rehearse_rates(clock: Clock) -> list[tuple[int, int, int]]:
-    """Runs a site at decreasing rates until a rate is held.
+    """Runs a site at decreasing tick rates until a rate is achieved.
 
     Returns:
-        For each rate: the rate, Hz; the lateness that `MIN_PUNCTUAL_SHARE` of its ticks did
-        not exceed, us; and the largest lateness, us.
+        For each rate that was tried: the rate in Hz, the lateness in us that
+        `MIN_PUNCTUAL_SHARE` of its ticks did not exceed, and the largest lateness in us.
     """
     results: list[tuple[int, int, int]] = []
     for rate_hz in RATES_HZ:
-        if results and is_held(results[-1][0], results[-1][1]):
-            break
+        if results:
+            last_rate_hz, last_quantile_us, _ = results[-1]
+            if is_held(last_rate_hz, last_quantile_us):
+                break
         scenario = load_scenario("free", {"rate_hz": rate_hz, "duration_s": REHEARSAL_S})
         warm_up(scenario, "s", clock)
         late_us = sorted(Rehearsal(scenario, "s").run(clock))
@@ -443,7 +516,12 @@ def rehearse_rates(clock: Clock) -> list[tuple[int, int, int]]:
 
 
 def is_held(rate_hz: int, late_us: int) -> bool:
-    """True if a lateness is at most `MAX_LATE_PERIODS` of the period of a rate."""
+    """Returns True if a lateness is punctual at a tick rate, see `MAX_LATE_PERIODS`.
+
+    Args:
+        rate_hz: The tick rate.
+        late_us: The lateness, in us.
+    """
     return late_us <= MAX_LATE_PERIODS * 1e6 / rate_hz
 
 
@@ -451,10 +529,15 @@ _RATES_CODE = (
     "import json; from sites import doctor, realtime; realtime.prepare(None); "
     "print(json.dumps(doctor.rehearse_rates(doctor.SystemClock())))"
 )
+"""Program that requests the real-time settings of a site, and prints the result of the trials.
+"""
 
 
 def examine_rate() -> DoctorFinding:
-    """Returns the highest tick rate that a single site holds now, measured for 1 s each."""
+    """Finds the highest tick rate that a single site achieves on this machine at present.
+
+    Each rate of `RATES_HZ` is tried for `REHEARSAL_S`, until one is achieved.
+    """
     if not is_core_cached():
         return DoctorFinding(
             "rate", "warn", "not measured: the core is not yet compiled, see below"
@@ -479,7 +562,11 @@ def examine_rate() -> DoctorFinding:
 
 
 def examine_room(folder: Path) -> Iterator[DoctorFinding]:
-    """Yields the free disk space, the load, and whether the kernel is compiled."""
+    """Checks the free disk space, the load of the processors, and if the code is compiled.
+
+    Args:
+        folder: Folder where results would be stored. It need not exist.
+    """
     candidates = (folder.absolute(), *folder.absolute().parents)
     existing = next(path for path in candidates if path.is_dir())
     free = shutil.disk_usage(existing).free
@@ -508,12 +595,16 @@ def examine_room(folder: Path) -> Iterator[DoctorFinding]:
 
 @dataclass(frozen=True, repr=False)
 class DoctorReport(Result):
-    """All findings about this machine."""
+    """All findings about this machine, in the order of the checks.
+
+    Attributes:
+        findings: The findings.
+    """
 
     findings: list[DoctorFinding]
 
     def headline(self) -> str:
-        """Returns the numbers of findings that fail, warn and are ok."""
+        """Returns how many findings are failures, warnings and successes."""
         states = [finding.state for finding in self.findings]
         return (
             f"{states.count('fail')} fail, {states.count('warn')} warn, {states.count('ok')} ok"
@@ -524,7 +615,7 @@ class DoctorReport(Result):
         return {"findings": self.to_rows()}
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a row per finding."""
+        """Returns one row per finding, with the fields of `DoctorFinding`."""
         return [finding._asdict() for finding in self.findings]
 
 
@@ -538,22 +629,25 @@ def doctor(
     folder: str | Path = "runs",
     insecure: bool = False,
 ) -> DoctorReport:
-    """Examines keys, links, clocks, rights, disk and processors; as `trilat doctor`.
+    """Checks whether this machine is ready for a session, as `trilat doctor` does.
 
     >>> "clock" in {finding.check for finding in tn.doctor().findings}
     True
 
     Args:
-        listen: endpoints to listen at.
-        connect: endpoints to connect to.
-        router: endpoints of routers.
-        keys: the folder of a member's keys.
-        session: a session whose members' clocks are compared.
-        folder: where results would be stored.
-        insecure: whether everybody on the network is trusted.
+        listen: Endpoints at which this machine would listen.
+        connect: Endpoints to which this machine would connect.
+        router: Endpoints of routers that this machine would connect to.
+        keys: Folder of a member's keys. None if there is none.
+        session: Name of a running session with whose members the clocks are compared.
+        folder: Folder where results would be stored.
+        insecure: True if everybody on the network is trusted.
+
+    Returns:
+        The findings.
 
     Raises:
-        UsageError: an endpoint or the keys cannot be used.
+        UsageError: An endpoint or the keys cannot be used.
     """
     findings = examine_machine(
         connection=resolve_member_connection(listen, connect, router),

@@ -1,12 +1,16 @@
-"""The benchmark of a network: round trips by size, rate and transport.
+"""Measure a network before a session: round trips by message size, message rate and transport.
 
-The results are judged against the delay and the loss that a scenario tolerates.
+The near end sends messages to the far end (`trilat ping --answer`), which sends each of them
+back at once. The near end measures the round trip times and the lost messages. The results are
+judged against the delay and the loss that a scenario tolerates. The command is `trilat ping
+--benchmark`.
 
 Invariant:
-    - The benchmark is part of no session. Its payloads travel like samples, with the same
-      roles, priority and settings, in a session of its own name.
-    - The far end sends each payload back at once.
-    - The benchmark takes as long as requested.
+    - The benchmark measures what a session would experience. Its messages have the size, rate,
+      priority and network settings of samples, the states that sites send to each other in
+      every tick.
+    - The benchmark is not part of any session. It uses a session name of its own.
+    - The benchmark takes as long as the user requests, plus the time to connect.
 """
 
 import math
@@ -46,44 +50,65 @@ from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.delay_models.kernel_delays import ConstantDelay
 
 SESSION = "benchmark"
+"""Name of the session under whose keys the messages of the benchmark travel."""
 NEAR = "near"
 FAR = "far"
-"""Names of the near and far ends without keys."""
+"""Names of the near end and the far end if they have no keys with a member's name."""
 PROTOCOLS = ("tcp", "tls", "quic")
+"""Transports that are measured if the far end runs on this machine."""
 SIZE_FACTORS = (1, 4, 16)
-"""Sizes of the payloads, in samples of the scenario."""
+"""Sizes of the messages, as multiples of the size of a sample of the scenario."""
 RATE_SHARES = (0.1, 1.0)
-"""Rates of the payloads, as shares of the scenario's rate."""
+"""Rates of the messages, as fractions of the tick rate of the scenario."""
 DEFAULT_S = 24.0
-"""Duration of all cases together, s: with three transports 18 cases of 1.33 s each."""
+"""Duration of all cases together, in s. With three transports, 18 cases take 1.33 s each."""
 CONNECT_NS = 20_000_000_000
-"""Longest wait for the far end."""
+"""Longest wait for the far end, in ns."""
 MAX_LOST = 1e-3
-"""Largest tolerable share of lost samples."""
+"""Largest tolerable fraction of lost samples."""
 _RETRY_NS = 50_000_000
+"""Time between two attempts to reach the far end, in ns."""
 _LAST_REPLY_NS = 500_000_000
+"""Longest wait for replies after the last message, in ns."""
 _HEADER = struct.Struct("<QQqB")
-"""Identity of the measuring end, number of the sample, its time of sending in ns; 1 in a reply.
+"""Start of each message: identity of the near end, number of the message, time of sending in
+ns, and a byte that is 1 in a reply.
 """
 
 
 def _parse_header(payload: bytes) -> tuple[int, ...] | None:
+    """Returns the fields of a message's header, or None if the message is too short."""
     return _HEADER.unpack_from(payload) if len(payload) >= _HEADER.size else None
 
 
 def answer_benchmarks(bus: Bus, member: str) -> None:
-    """Sends back the payloads of benchmarks until the bus is closed."""
+    """Sends back the messages of benchmarks until the connection is closed.
+
+    Args:
+        bus: Network connection of the far end.
+        member: Name of the far end.
+    """
     put = bus.publisher(topics.key(SESSION, member, topics.SAMPLE))
 
     def answer(_: str, payload: bytes) -> None:
-        if (header := _parse_header(payload)) is not None and not header[-1]:
-            put(_HEADER.pack(*header[:-1], 1) + payload[_HEADER.size :])
+        header = _parse_header(payload)
+        if header is None:
+            return
+        *fields, is_reply = header
+        if not is_reply:
+            put(_HEADER.pack(*fields, 1) + payload[_HEADER.size :])
 
     bus.tap(topics.key(SESSION, "*", topics.SAMPLE), answer)
 
 
 class NearEnd:
-    """The end that measures round trips."""
+    """The end that sends messages and measures when they come back.
+
+    Args:
+        bus: Network connection of the near end.
+        clock: Clock of this process.
+        member: Name of the near end.
+    """
 
     def __init__(self, bus: Bus, clock: Clock, member: str) -> None:
         self._clock = clock
@@ -96,12 +121,16 @@ class NearEnd:
         )
 
     def _send(self, size_bytes: int) -> None:
+        """Sends the next message, filled up with zeros to its size."""
         sample = _HEADER.pack(self._owner, self._number, self._clock.monotonic_ns(), 0)
         self._number += 1
         self._put(sample.ljust(size_bytes, b"\0"))
 
     def _read_replies(self) -> Iterator[tuple[int, int]]:
-        """Yields the number and the round-trip time, ns, of each reply that has arrived."""
+        """Yields the number and the round trip time in ns of each reply that has arrived.
+
+        Replies to other near ends are ignored.
+        """
         while (entry := self._inbox.poll()) is not None:
             header, arrived_ns = entry
             if header is not None:
@@ -110,7 +139,11 @@ class NearEnd:
                     yield number, arrived_ns - sent_ns
 
     def wait_for_far_end(self) -> bool:
-        """Returns True once the far end replies; False if it does not reply in time."""
+        """Sends messages until the far end replies.
+
+        Returns:
+            True once the far end has replied. False if it does not reply within `CONNECT_NS`.
+        """
         clock = self._clock
         until_ns = clock.monotonic_ns() + CONNECT_NS
         while clock.monotonic_ns() < until_ns:
@@ -121,12 +154,15 @@ class NearEnd:
         return False
 
     def measure(self, size_bytes: int, rate_hz: float, duration_s: float) -> Array:
-        """Returns the round-trip times of samples, s; NaN for samples without a reply.
+        """Sends messages at a constant rate, and measures their round trips.
 
         Args:
-            size_bytes: the size of a sample.
-            rate_hz: the rate at which samples are sent, 1/s.
-            duration_s: how long samples are sent, s; at least 10 samples are sent.
+            size_bytes: Size of a message, in bytes.
+            rate_hz: Rate of the messages, in 1/s.
+            duration_s: Time for which messages are sent, in s. At least 10 messages are sent.
+
+        Returns:
+            Round trip time of each message in s. NaN for messages without a reply.
         """
         count = max(10, round(rate_hz * duration_s))
         clock = self._clock
@@ -144,7 +180,7 @@ class NearEnd:
             clock.sleep_until(begun_ns + round(n * 1e9 / rate_hz))
             self._send(size_bytes)
             if n % 1000 == 0:
-                count_missing()
+                count_missing()  # empties the inbox, which would overflow otherwise
         until_ns = clock.monotonic_ns() + _LAST_REPLY_NS
         while count_missing() and clock.monotonic_ns() < until_ns:
             clock.sleep_until(clock.monotonic_ns() + 5_000_000)
@@ -154,7 +190,21 @@ class NearEnd:
 def _open(
     endpoint: str, keys: MemberKeys | None, *, listens: bool, insecure: bool
 ) -> tuple[ZenohBus, str]:
-    """Returns a bus at an endpoint, and the name of the member that it belongs to."""
+    """Opens the network connection of a near or far end.
+
+    Args:
+        endpoint: Endpoint to listen at or to connect to.
+        keys: Keys of a site. They are used only if the endpoint is encrypted.
+        listens: True for the far end.
+        insecure: True if everybody on the network is trusted.
+
+    Returns:
+        The connection, and the name of the end: that of its keys, otherwise "near" or "far".
+
+    Raises:
+        UsageError: The endpoint is encrypted, and there are no keys or they are not those of a
+            site.
+    """
     is_encrypted = endpoint.startswith(ENCRYPTED)
     if is_encrypted and keys is None:
         raise UsageError(
@@ -184,18 +234,18 @@ def run_far_end(
     insecure: bool = False,
     say: Callable[[str], None] = lambda _: None,
 ) -> None:
-    """Replies to benchmarks at some endpoints.
+    """Runs the far end: replies to benchmarks at some endpoints.
 
     Args:
-        endpoints: the endpoints to listen at.
-        keys: the folder of a site's keys, for encrypted endpoints.
-        stopped: returns True to end the call.
-        duration_s: the longest duration, s.
-        insecure: whether everybody on the network is trusted.
-        say: prints a line for the user.
+        endpoints: Endpoints to listen at.
+        keys: Folder with the keys of a site, for encrypted endpoints.
+        stopped: Function that returns True to end the call.
+        duration_s: Longest duration, in s.
+        insecure: True if everybody on the network is trusted.
+        say: Function that prints a line for the user.
 
     Raises:
-        UsageError: an endpoint or the keys cannot be used.
+        UsageError: An endpoint or the keys cannot be used.
     """
     known = None if keys is None else read_member_keys(keys)
     clock = SystemClock()
@@ -211,9 +261,13 @@ def run_far_end(
 
 @contextmanager
 def _run_local_far_end(duration_s: float) -> Iterator[tuple[list[str], Path]]:
-    """Runs a far end of all transports on this machine.
+    """Runs a far end for all transports in a process on this machine, as a context manager.
 
-    It yields the endpoints, and the folder of the near end's keys.
+    Args:
+        duration_s: Duration of the benchmark, in s. The process ends some time later by itself.
+
+    Yields:
+        The endpoints of the far end, and the folder with the keys of the near end.
     """
     with tempfile.TemporaryDirectory() as folder:
         near_keys, far_keys = create_keys(Path(folder) / "keys", [NEAR, FAR], days=1)
@@ -239,19 +293,21 @@ def _run_local_far_end(duration_s: float) -> Iterator[tuple[list[str], Path]]:
 
 
 class ScenarioNeeds(NamedTuple):
-    """The requirements of a scenario on its network.
+    """Requirements of a scenario on the network.
 
     Attributes:
-        sample_bytes: the size of a sample of the largest arm.
-        rate_hz: the largest rate of a site, 1/s.
-        playout_ms: the smallest play-out delay of its links.
-        held_ms: the shortest time for which any link holds its samples, by play-out or a
-            constant delay.
-        in_use_ms: the age of samples in use that the scenario's links cause; None if theory
-            cannot tell.
-        stable_ms: the intervals of the common delay for which the loop is stable; None if
-            theory cannot tell.
-        words: a sentence about these intervals, or the reason why theory cannot tell.
+        sample_bytes: Size of a sample of the largest arm, in bytes.
+        rate_hz: Largest tick rate of a site, in 1/s.
+        playout_ms: Smallest play-out delay of the links. A play-out delay holds each sample
+            until it has a fixed age, and so replaces varying network delays by a constant one.
+        held_ms: Shortest time for which a link holds its samples, by a play-out delay or by the
+            constant delay that the scenario prescribes.
+        in_use_ms: Age of the samples that the sites use, as far as the scenario's links cause
+            it. None if the linear theory does not cover the scenario.
+        stable_ms: Intervals of the delay of all links for which the control loop is stable.
+            None if the linear theory does not cover the scenario.
+        words: Sentence about these intervals, or the reason why the theory does not cover the
+            scenario.
     """
 
     sample_bytes: int
@@ -264,14 +320,19 @@ class ScenarioNeeds(NamedTuple):
 
 
 def find_needs(scenario: Scenario) -> ScenarioNeeds:
-    """Returns the requirements of a scenario; takes as long as `trilat linear`."""
+    """Computes the requirements of a scenario on the network.
+
+    The stable delays come from the linear analysis of the control loop, which takes as long as
+    the command `trilat linear`.
+    """
     links = list(scenario.links.values())
-    held_ms = [
-        max(link.playout_ms, link.delay_ms if isinstance(link, ConstantDelay) else 0.0)
-        for link in links
-    ]
+    held_ms = []
+    for link in links:
+        constant_ms = link.delay_ms if isinstance(link, ConstantDelay) else 0.0
+        held_ms.append(max(link.playout_ms, constant_ms))
     rates_hz = [site.rate_hz for site in scenario.sites.values()]
-    # The links of a measured network are replaced by one of 1 ms: their delay is the result.
+    # Links whose delay the benchmark measures are analysed with a delay of 1 ms: their actual
+    # delay is the result of the benchmark.
     overrides = ["link.model=constant", "link.delay_ms=1"] if scenario.measured else []
     in_use_ms: float | None = None
     stable_ms: list[list[float]] | None = None
@@ -302,7 +363,10 @@ def find_needs(scenario: Scenario) -> ScenarioNeeds:
 
 
 def _measure_sample(scenario: Scenario) -> int:
-    """Returns the size of a sample of the scenario's largest arm, in bytes."""
+    """Returns the size in bytes of an encoded sample of the scenario's largest arm.
+
+    The values are typical ones of a long session: numbers take more bytes the larger they are.
+    """
     shared = max(arm.counts.shared for arm in scenario.arms.values())
     vectors = {name: [0.5] * shared for name in ("q", "qd", "tau_x")}
     sample = PeerSample(
@@ -318,15 +382,20 @@ def _measure_sample(scenario: Scenario) -> int:
 
 
 def judge_network(needs: ScenarioNeeds, row: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns whether a network is good enough for a scenario.
+    """Judges whether a network is good enough for a scenario.
 
-    A sample is in use from the receiver's first tick after the sample has arrived and is due
-    (L2). The network therefore counts with its p99 delay; a play-out delay and the scenario's
-    own delay hide shorter ones.
+    A site uses a sample from its first tick after the sample has arrived (rule L2). Samples
+    therefore have an age of whole ticks. The p99 delay of the network counts. It has no effect
+    if it is shorter than the time for which the scenario itself holds samples. The network is
+    good if the loop is stable at that age, and if at most `MAX_LOST` of the samples are lost.
 
     Args:
-        needs: the requirements of the scenario.
-        row: the measurement at the scenario's own size and rate.
+        needs: Requirements of the scenario.
+        row: Measurement at the scenario's own message size and rate.
+
+    Returns:
+        The fields of a verdict, as `trilat ping --benchmark --json` prints them. Times are None
+        if no message came back.
     """
     fields = {
         "transport": row["transport"],
@@ -337,11 +406,14 @@ def judge_network(needs: ScenarioNeeds, row: Mapping[str, Any]) -> dict[str, Any
     if times is None:
         unknown = dict.fromkeys(("p99_ms", "age_ms", "spare_ms", "playout_ms"))
         return {**fields, "hidden": False, **unknown}
+
     period_ms = 1e3 / needs.rate_hz
     p99_ms = times["p99"] / 1e3
+    # 1e-9 absorbs the rounding error of a delay of exactly a whole number of ticks.
     ticks = max(1, math.ceil(max(p99_ms, needs.held_ms) / period_ms - 1e-9))
     age_ms = max(period_ms * ticks, needs.in_use_ms or 0.0)
     is_hidden = p99_ms <= needs.held_ms
+    # Upper end of the stable interval that contains the age, if there is one.
     limits_ms = [high for low, high in needs.stable_ms or [] if low <= age_ms <= high]
     is_tolerated = is_hidden if needs.stable_ms is None else bool(limits_ms)
     return {
@@ -357,14 +429,14 @@ def judge_network(needs: ScenarioNeeds, row: Mapping[str, Any]) -> dict[str, Any
 
 @dataclass(frozen=True, repr=False)
 class NetworkBenchmark(Result):
-    """A measured network, and whether each transport is good enough for a scenario.
+    """Result of a benchmark, with a verdict for each transport.
 
     Attributes:
-        scenario: the name of the scenario.
-        duration_s: the duration of all cases together, s.
-        needs: the requirements of the scenario.
-        rows: a row per size, rate and transport.
-        judged: a verdict per transport.
+        scenario: Name of the scenario.
+        duration_s: Duration of all cases together, in s.
+        needs: Requirements of the scenario.
+        rows: Measurements, one row per message size, message rate and transport.
+        judged: Verdicts, one per transport, see `judge_network`.
     """
 
     scenario: str
@@ -375,7 +447,7 @@ class NetworkBenchmark(Result):
 
     @property
     def good(self) -> bool:
-        """True if every transport is good enough."""
+        """True if every transport is good enough for the scenario."""
         return all(verdict["good"] for verdict in self.judged)
 
     def to_dict(self) -> dict[str, Any]:
@@ -390,7 +462,7 @@ class NetworkBenchmark(Result):
         }
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a row per size, rate and transport; times in us."""
+        """Returns one flat row per message size, rate and transport, with times in us."""
         flat_rows = []
         for row in self.rows:
             times = row["one_way_us"] or dict.fromkeys(("p50", "p99", "max"))
@@ -408,28 +480,31 @@ def ping_benchmark(
     connect: Sequence[str] | None = None,
     keys: str | Path | None = None,
 ) -> NetworkBenchmark:
-    """Measures a network against a scenario's requirements; as `trilat ping --benchmark`.
+    """Measures a network and judges it for a scenario, as `trilat ping --benchmark` does.
 
     >>> found = tn.ping_benchmark("p_d_margin", duration_s=2)
     >>> [row["transport"] for row in found.to_dict()["transports"]]
     ['tcp', 'tls', 'quic']
 
     Args:
-        scenario: the name of a shipped scenario, a path, a TOML text, its tables, or a
-            scenario.
-        set: overrides, as in `{"link.model": "measured"}`.
-        duration_s: the duration of all cases together, s.
-        connect: endpoints at which `trilat ping --answer` runs; by default a far end on this
-            machine, over TCP, TLS and QUIC.
-        keys: the folder of a site's keys, for encrypted endpoints.
+        scenario: The name of a shipped scenario, a path, a TOML text, the tables of a scenario,
+            or a scenario.
+        set: Settings that replace those of the scenario, as in `{"link.model": "measured"}`.
+        duration_s: Duration of all cases together, in s.
+        connect: Endpoints at which `trilat ping --answer` runs. None starts a far end on this
+            machine, for TCP, TLS and QUIC.
+        keys: Folder with the keys of a site, for encrypted endpoints.
+
+    Returns:
+        The measurements and the verdicts.
 
     Raises:
-        ScenarioError: the scenario is not valid.
-        UsageError: an endpoint or the keys cannot be used.
-        RunFailed: nobody replies at an endpoint.
+        ScenarioError: The scenario is not valid.
+        UsageError: An endpoint or the keys cannot be used.
+        RunFailed: No far end replies at an endpoint.
     """
-    chosen = load_scenario(scenario, set)
-    needs = find_needs(chosen)
+    loaded = load_scenario(scenario, set)
+    needs = find_needs(loaded)
     with ExitStack() as stack:
         if not connect:
             connect, keys = stack.enter_context(_run_local_far_end(duration_s))
@@ -438,19 +513,34 @@ def ping_benchmark(
         rows: list[dict[str, Any]] = []
         for endpoint in connect:
             rows += _measure_endpoint(endpoint, member_keys, needs, case_s)
+
+    # Only the case with the scenario's own message size and rate is judged.
     scenario_case = (needs.sample_bytes, needs.rate_hz)
     verdicts = [
         judge_network(needs, row)
         for row in rows
         if (row["bytes"], row["rate_hz"]) == scenario_case
     ]
-    return NetworkBenchmark(chosen.name, duration_s, needs, rows, verdicts)
+    return NetworkBenchmark(loaded.name, duration_s, needs, rows, verdicts)
 
 
 def _measure_endpoint(
     endpoint: str, keys: MemberKeys | None, needs: ScenarioNeeds, case_s: float
 ) -> Iterator[dict[str, Any]]:
-    """Yields a row per size and rate, each measured for `case_s`."""
+    """Measures the transport of one endpoint, with all message sizes and rates.
+
+    Args:
+        endpoint: Endpoint of the far end.
+        keys: Keys of this end. None if the endpoint is not encrypted.
+        needs: Requirements of the scenario, which determine the sizes and rates.
+        case_s: Duration of each measurement, in s.
+
+    Yields:
+        One row per size and rate.
+
+    Raises:
+        RunFailed: No far end replies.
+    """
     protocol = endpoint.partition("/")[0]
     bus, member = _open(endpoint, keys, listens=False, insecure=False)
     with closing(bus):
@@ -477,7 +567,16 @@ def _measure_endpoint(
 
 
 def _summarise_trips(trips_s: Array) -> dict[str, float] | None:
-    """Returns quantiles of the one-way times, us, half a round trip each; None without any."""
+    """Returns the median, the 99 % quantile and the maximum of the one-way times, in us.
+
+    A one-way time is half of a round trip.
+
+    Args:
+        trips_s: Round trip times in s, NaN for lost messages.
+
+    Returns:
+        The three values. None if all messages were lost.
+    """
     one_way_us = trips_s[np.isfinite(trips_s)] / 2 * 1e6
     if not len(one_way_us):
         return None

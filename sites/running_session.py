@@ -1,7 +1,16 @@
-"""A running session from Python: orders, changes, pings and hands, and processes of a session.
+"""Control a running session from Python: stop arms, change links, move an arm, read records.
+
+A session is a set of processes ("sites") that each run one arm, and that exchange the states of
+their arms over the network. `session` returns a `RunningSession`, whose methods send requests
+to the sites and return their replies. `hand` lets a program act as the operator of an arm.
+`start` starts a process of a session, as a terminal would.
+
+The commands `trilat stop`, `enable`, `reset`, `set`, `ping` and `hand` use the same functions.
 
 Invariant:
-    - Each call connects to the session, as its command does, and keeps no connection open.
+    - Each call opens a connection to the session, and closes it at its end, as the command of
+      the same name does. A `RunningSession` therefore remains usable if sites come and go
+      between calls.
 """
 
 import subprocess
@@ -38,19 +47,33 @@ from .devices import Device
 from .session_ping import PingReport, ping_session
 
 GATHERING_NS = 500_000_000
-"""Time for further sites to reply, after the first one of a session that sites may leave."""
+"""Time that further sites have to reply after the first one, in ns.
+
+It applies to sessions that sites may leave, in which some sites may never reply.
+"""
 STATES_KEPT = 4096
-"""Number of a peer's latest records among which its sample in use is looked up."""
+"""Number of records of each site that `RunningSession.states` keeps.
+
+A peer's sample that is in use is found among them by its tick.
+"""
 AHEAD_S = 0.5
-"""Time from the newest known tick to a requested end; sites report their tick every 100 ms."""
+"""Time from the newest known tick of any site to the tick at which a session is ended, in s.
+
+Sites report their tick every 100 ms, so that the known ticks are slightly out of date.
+"""
 
 
 SOURCE = "the operator"
-"""Who gives the orders of this interface and of its commands, as events of sites name it."""
+"""Name that the sites' events give to the person behind the requests of this module."""
 
 
 class ShareHistory:
-    """The shares of a site in its peers, by the changes that are known so far."""
+    """Dominance factors of one site over time, with all changes that are known so far.
+
+    A dominance factor is the weight with which a site follows one of its peers. The scenario
+    states the factors at the start, and scripted changes. Users request further changes during
+    the session. Each change is a linear ramp from the present factors to other ones.
+    """
 
     def __init__(self, scenario: Scenario, site: str) -> None:
         self._scenario = scenario
@@ -60,42 +83,54 @@ class ShareHistory:
         self._shares_before = self._ramp.alpha
 
     def add_change(self, change: str) -> None:
-        """Adds a change, as an event of the site holds it; other changes are ignored."""
-        with suppress(ScenarioError):  # a change that cannot be parsed comes from a stranger
+        """Adds a change that an event of the site reports.
+
+        Changes of other settings are ignored, and so are texts that are no change.
+
+        Args:
+            change: Text of the change, as the field `command` of the event contains it.
+        """
+        with suppress(ScenarioError):  # raised if the text is not a change
             ramp = parse_core_change(self._scenario, self._site, change).ramp
-            # An older ramp is one that has been added before.
+            # A ramp that starts before the present one was added earlier, from another event.
             if ramp is not None and ramp.start_ns >= self._ramp.start_ns:
                 self._later_ramps.append(ramp)
 
     def advance_to(self, t_ns: int) -> tuple[float, ...]:
-        """Returns the shares at `t_ns`, ns since the epoch; the time must not decrease."""
-        for ramp in sorted(ramp for ramp in self._later_ramps if ramp.start_ns <= t_ns):
+        """Returns the dominance factors at a time, in the order of the site's peers.
+
+        Args:
+            t_ns: The time, in ns since the epoch (the start of the session). It must not be
+                earlier than in the previous call.
+        """
+        started = sorted(ramp for ramp in self._later_ramps if ramp.start_ns <= t_ns)
+        for ramp in started:
             self._shares_before = self._interpolate(ramp.start_ns)
             self._ramp = ramp
         self._later_ramps = [ramp for ramp in self._later_ramps if ramp.start_ns > t_ns]
         return self._interpolate(t_ns)
 
     def _interpolate(self, t_ns: int) -> tuple[float, ...]:
-        """Returns the shares at a time after the start of the present ramp."""
+        """Returns the dominance factors at a time during or after the present ramp."""
         ramp = self._ramp
-        _, end_ns, shares_after = ramp
-        if t_ns >= end_ns:
-            return shares_after
-        part = (t_ns - ramp.start_ns) / (end_ns - ramp.start_ns)
-        pairs = zip(self._shares_before, shares_after, strict=True)
+        if t_ns >= ramp.end_ns:
+            return ramp.alpha
+        part = (t_ns - ramp.start_ns) / (ramp.end_ns - ramp.start_ns)
+        pairs = zip(self._shares_before, ramp.alpha, strict=True)
         return tuple(before + part * (after - before) for before, after in pairs)
 
 
 class RunningSession:
-    """A running session, as `session` returns it.
+    """A session that is running, to be controlled and observed from Python.
 
-    Most methods return the replies of the sites, a sentence each.
+    `session` creates this object. Most methods send a request to some sites, and return the
+    replies, one sentence for each site.
 
     Args:
-        name: the session's name.
-        connection: the endpoints and keys.
-        bus: a bus that reaches the session; without it, each call opens a connection.
-        clock: the clock of this process.
+        name: Name of the session.
+        connection: Endpoints of the session and keys of the member whose name is used.
+        bus: An open network connection to the session. None opens a connection in each call.
+        clock: Clock of this process. None creates one.
     """
 
     def __init__(
@@ -114,14 +149,18 @@ class RunningSession:
     def reach(
         self, member: str = OPERATOR, timeout_s: float = REPLY_TIMEOUT_S
     ) -> Iterator[Bus]:
-        """Yields a connection to the session.
+        """Opens a connection to the session, as a context manager.
 
         Args:
-            member: the member whose keys are used; "" stands for any member's.
-            timeout_s: longest wait for a reply, s.
+            member: Name of the member whose keys must be available. Empty if the keys of any
+                member suffice.
+            timeout_s: Longest wait for a reply, in s.
+
+        Yields:
+            The connection.
 
         Raises:
-            SessionError: no site replies.
+            SessionError: No site replies.
         """
         if self._bus is not None:
             yield self._bus
@@ -141,18 +180,22 @@ class RunningSession:
 
     @contextmanager
     def reach_site(self, site: str, timeout_s: float) -> Iterator[tuple[Bus, Scenario]]:
-        """Waits until a site runs; yields a connection to the session, and its scenario.
+        """Waits until a site runs, and opens a connection to its session, as a context manager.
 
         Args:
-            site: the name of the site.
-            timeout_s: longest wait, s.
+            site: Name of the site.
+            timeout_s: Longest wait, in s.
+
+        Yields:
+            The connection, and the scenario of the session.
 
         Raises:
-            SessionError: the session has no such site, or the site does not run in time.
+            SessionError: The session has no such site, or the site does not run in time.
         """
         with self.reach(timeout_s=timeout_s) as bus:
             give_up_ns = self._clock.monotonic_ns() + int(timeout_s * 1e9)
             while True:
+                # Errors are ignored until the last attempt, which raises its error.
                 is_last_try = self._clock.monotonic_ns() >= give_up_ns
                 with nullcontext() if is_last_try else suppress(SessionError):
                     info = self._find_running(bus, site)
@@ -169,19 +212,21 @@ class RunningSession:
         say: Callable[[str], None] = print,
         timeout_s: float = REPLY_TIMEOUT_S,
     ) -> None:
-        """Leads an arm by a device until the session ends; as `trilat hand --device`.
+        """Moves an arm with an input device until the session ends.
+
+        The command `trilat hand --device` does the same.
 
         Args:
-            site: the site of the arm. The live hand of its scenario has the settings of the
-                device.
-            device: the device.
-            stopped: returns True to end the call earlier.
-            say: prints a line for the user.
-            timeout_s: longest wait until the session runs, s.
+            site: Site of the arm. The live operator of its scenario contains the settings of
+                the device.
+            device: The input device.
+            stopped: Function that returns True to end the call earlier.
+            say: Function that prints a line for the user.
+            timeout_s: Longest wait until the session runs, in s.
 
         Raises:
-            SessionError: there is no such session, or it does not begin.
-            UsageError: no device can lead that arm.
+            SessionError: There is no such session, or it does not begin.
+            UsageError: No input device can move that arm.
         """
         with (
             self.reach_site(site, timeout_s) as (bus, scenario),
@@ -211,26 +256,51 @@ class RunningSession:
             say(f"{site}: {device_hand.describe()}")
 
     def stop(self, *sites: str) -> list[str]:
-        """Stops some arms, or all, at once while the session goes on; as `trilat stop`."""
+        """Stops some arms at once while the session continues, as `trilat stop` does.
+
+        Args:
+            *sites: Names of the sites. All sites if no name is given.
+
+        Returns:
+            The reply of each site.
+        """
         return _read_replies(self.send_order(sites, "stop"))
 
     def enable(self, *sites: str) -> list[str]:
-        """Lets stopped arms follow again; as `trilat enable`."""
+        """Lets stopped arms follow their peers again, as `trilat enable` does.
+
+        Args:
+            *sites: Names of the sites. All sites if no name is given.
+
+        Returns:
+            The reply of each site.
+        """
         return _read_replies(self.send_order(sites, "enable"))
 
     def reset(self, *sites: str) -> list[str]:
-        """Ends the fault of sites, unless its reason persists; as `trilat reset`."""
+        """Clears the fault of arms, unless its reason persists, as `trilat reset` does.
+
+        Args:
+            *sites: Names of the sites. All sites if no name is given.
+
+        Returns:
+            The reply of each site.
+        """
         return _read_replies(self.send_order(sites, "reset"))
 
     def send_order(self, sites: Sequence[str], order: OrderName) -> list[ChangeReply]:
-        """Sends an order to some sites, and returns their replies.
+        """Sends an order such as "stop" to some sites.
 
         Args:
-            sites: the sites. () stands for all sites, under `glide` for those that are present.
-            order: the order.
+            sites: Names of the sites. Empty addresses all sites, or all that are present if the
+                scenario allows sites to leave.
+            order: The order.
+
+        Returns:
+            The reply of each site, accepted or refused.
 
         Raises:
-            SessionError: the session has not begun or has no such site, or a site does not
+            SessionError: The session has not begun or has no such site, or a site does not
                 reply.
         """
         with self.reach("" if order == "stop" else OPERATOR) as bus:
@@ -248,24 +318,32 @@ class RunningSession:
             return [self._send_change(bus, name, request) for name in addressed]
 
     def _send_change(self, bus: Bus, site: str, request: ChangeRequest) -> ChangeReply:
+        """Sends a request to one site, and waits for its reply."""
         return send_change(
             bus=bus, clock=self._clock, session=self.name, site=site, request=request
         )
 
     def end(self) -> list[str]:
-        """Ends the session in order, all sites at the same time; as `trilat stop --end`.
+        """Ends the session regularly, as `trilat stop --end` does.
+
+        All sites end at the same time of the session, about half a second from now.
+
+        Returns:
+            The reply of each site.
 
         Raises:
-            SessionError: the session has not begun, or a site does not reply.
+            SessionError: The session has not begun, or a site does not reply.
         """
         with self.reach() as bus:
             scenario, infos = self._find_sites(bus)
             present = _list_present(scenario, infos)
-            if missing := [name for name in present if name not in infos]:
+            missing = [name for name in present if name not in infos]
+            if missing:
                 raise SessionError(
                     f"session {self.name!r}: {', '.join(missing)} of its sites did not answer"
                 )
-            if waiting := [name for name in present if not infos[name].running]:
+            waiting = [name for name in present if not infos[name].running]
+            if waiting:
                 names = ", ".join(waiting)
                 raise SessionError(
                     f"session {self.name!r} has not begun: {names} waits for the others"
@@ -275,12 +353,16 @@ class RunningSession:
             return [self._send_change(bus, name, request).text for name in present]
 
     def _find_sites(self, bus: Bus) -> tuple[Scenario, dict[str, Info]]:
-        """Returns the scenario of the session, and the replies of its sites by name.
+        """Collects the replies of the sites of the session.
 
-        Sites of a session that they may leave have `GATHERING_NS` to reply after the first one.
+        The search ends when all sites of the scenario have replied. If the scenario allows
+        sites to leave, it also ends `GATHERING_NS` after the first reply.
+
+        Returns:
+            The scenario of the session, and the replies by the name of the site.
 
         Raises:
-            SessionError: no site replies.
+            SessionError: No site replies.
         """
         clock = self._clock
         infos: dict[str, Info] = {}
@@ -304,15 +386,16 @@ class RunningSession:
         return scenario, infos
 
     def _find_members(self, bus: Bus) -> Iterator[Info]:
+        """Yields the replies of the session's members until a time limit."""
         return find_members(
             bus, self._clock, self.name, stopped=lambda: False, timeout_s=REPLY_TIMEOUT_S
         )
 
     def _find_running(self, bus: Bus, site: str) -> Info:
-        """Returns the reply of a running site.
+        """Waits for the reply of one site, and checks that the site runs.
 
         Raises:
-            SessionError: the session has no such site or has not begun, or the site does not
+            SessionError: The session has no such site or has not begun, or the site does not
                 reply in time.
         """
         read_names = embedded_names_reader(self.name)
@@ -333,30 +416,59 @@ class RunningSession:
         )
 
     def set_link(self, link: str, **to: Any) -> str:
-        """Changes settings of a link such as "m1->s", as in `delay_ms=350`.
+        """Changes settings of a link while the session runs, as `trilat set link` does.
 
-        It does the same as `trilat set link`.
+        Args:
+            link: The link, as in "m1->s" for the direction from site m1 to site s.
+            **to: The new settings, as in `delay_ms=350`.
+
+        Returns:
+            The reply of the receiving site.
+
+        Raises:
+            RunFailed: The site has refused the change.
         """
         return self._change(link.partition("->")[2], link=link, to=to)
 
     def set_dominance(self, site: str, shares: Mapping[str, float], ramp_s: float = 1.0) -> str:
-        """Changes a site's shares in its peers, as in `{"m1": 0.9, "m2": 0.1}`.
+        """Changes the weights with which a site follows its peers, as `trilat set dominance`.
 
-        It does the same as `trilat set dominance`.
+        Args:
+            site: Name of the site.
+            shares: New weight of each peer, as in `{"m1": 0.9, "m2": 0.1}`.
+            ramp_s: Duration of the change, in s.
+
+        Returns:
+            The reply of the site.
+
+        Raises:
+            RunFailed: The site has refused the change.
         """
         return self._change(site, dominance=site, to=dict(shares), ramp_s=ramp_s)
 
     def _change(self, site: str, **change: Any) -> str:
+        """Requests a change from a site, and returns its reply.
+
+        Raises:
+            RunFailed: The site has refused the change.
+        """
         reply = self.change(site, ChangeRequest(**change))
         if not reply.accepted:
             raise RunFailed(f"refused: {reply.text}")
         return reply.text
 
     def change(self, site: str, request: ChangeRequest) -> ChangeReply:
-        """Requests a change from the site that carries it out, and returns its reply.
+        """Requests a change from the site that carries it out.
+
+        Args:
+            site: Name of the site.
+            request: The change.
+
+        Returns:
+            The reply of the site, accepted or refused.
 
         Raises:
-            SessionError: the session has no such site or has not begun, or the site does not
+            SessionError: The session has no such site or has not begun, or the site does not
                 reply.
         """
         with self.reach() as bus:
@@ -365,12 +477,18 @@ class RunningSession:
 
     @contextmanager
     def records(self, *sites: str) -> Iterator[Callable[[], list[State]]]:
-        """Subscribes to the records of some sites, by default of all.
+        """Subscribes to the records of some sites, as a context manager.
 
-        It yields a function that returns the records that have arrived since its last call.
+        A record is the stored result of one tick of a site's control loop.
 
         >>> with tn.session("paper").records("s") as receive:  # doctest: +SKIP
         ...     [record.q_des for record in receive()]
+
+        Args:
+            *sites: Names of the sites. All sites if no name is given.
+
+        Yields:
+            A function that returns the records that have arrived since its last call.
         """
         with self.reach("") as bus:
             inboxes = [
@@ -385,16 +503,22 @@ class RunningSession:
 
     @contextmanager
     def states(self, as_site: str = "") -> Iterator[Callable[[], dict[str, State]]]:
-        """Subscribes to all sites; yields a function that returns a record of each, by name.
+        """Subscribes to the newest record of each site, as a context manager.
 
-        Without `as_site` these are the newest records. With `as_site` they are the records that
-        the user of that site is shown: the site's own newest record, and of each peer the
-        record whose sample is in use, delayed by the link or by the picture
-        (`[sites.NAME.view]`). A peer is missing if that record was made before the
-        subscription, or more than `STATES_KEPT` ticks ago.
+        With `as_site`, the records are those that the user of that site sees. These are the
+        newest record of the site itself, and of each peer the record of the sample that the
+        site uses at present. That sample is older than the newest one, because the link delays
+        it, or because the scenario delays the picture (`[sites.NAME.view]`). A peer is missing
+        if that record was made before the subscription, or more than `STATES_KEPT` ticks ago.
 
         >>> with tn.session("paper").states(as_site="m1") as find:  # doctest: +SKIP
         ...     find()["s"].q
+
+        Args:
+            as_site: Name of the site whose view is returned. Empty returns the newest records.
+
+        Yields:
+            A function that returns one record of each site, by the name of the site.
         """
         with self.reach("") as bus:
             inbox = bus.inbox(topics.key(self.name, "*", topics.STATE), STATES_KEPT)
@@ -426,7 +550,13 @@ class RunningSession:
             yield find
 
     def mark(self, text: str) -> str:
-        """Marks this moment in the log by a text, which is an event of a site."""
+        """Marks the present moment in the log with a text.
+
+        The mark becomes an event of the first site that replies.
+
+        Returns:
+            The reply of the site.
+        """
         with self.reach() as bus:
             scenario, infos = self._find_sites(bus)
             first = next(name for name in scenario.names if name in infos)
@@ -434,12 +564,18 @@ class RunningSession:
 
     @contextmanager
     def episode(self, name: str) -> Iterator[Callable[[bool], None]]:
-        """Marks the beginning and the end of an episode.
-
-        It yields a function that records whether the episode has succeeded.
+        """Marks the beginning and the end of an episode in the log, as a context manager.
 
         >>> with tn.session("paper").episode("reach 3") as judge:  # doctest: +SKIP
         ...     judge(True)
+
+        Args:
+            name: Name of the episode.
+
+        Yields:
+            A function that states whether the episode has succeeded. If it is called several
+            times, the last call counts. If it is never called, the log only says that the
+            episode ended.
         """
         judgements: list[bool] = []
         self.mark(f"episode {name} begins")
@@ -452,7 +588,16 @@ class RunningSession:
 
     @contextmanager
     def shares(self, site: str) -> Iterator[Callable[[], dict[str, float]]]:
-        """Subscribes to a site; yields a function that returns its present shares, by peer."""
+        """Subscribes to the present dominance factors of a site, as a context manager.
+
+        The dominance factor of a peer is the weight with which the site follows it.
+
+        Args:
+            site: Name of the site.
+
+        Yields:
+            A function that returns the present factors, by the name of the peer.
+        """
         with self.reach("") as bus:
             info = self._find_running(bus, site)
             records = bus.inbox(topics.key(self.name, site, topics.STATE), 256)
@@ -474,7 +619,15 @@ class RunningSession:
             yield find
 
     def ping(self, count: int = 50, timeout_s: float = 3.0) -> PingReport:
-        """Measures round trips, clock offsets and links of the session; as `trilat ping`."""
+        """Measures the network of the session, as `trilat ping` does.
+
+        Args:
+            count: Number of pings to each member.
+            timeout_s: Longest wait for replies, in s.
+
+        Returns:
+            Round trip times, clock offsets, and the state of the links.
+        """
         report = ping_session(
             connection=self._connection,
             clock=self._clock,
@@ -494,7 +647,7 @@ def session(
     router: Sequence[str] | None = None,
     keys: str | Path | None = None,
 ) -> RunningSession:
-    """Returns a running session, to stop, change and measure it.
+    """Returns an object that controls and observes a running session.
 
     Its methods do the same as `trilat stop`, `set` and `ping`.
 
@@ -503,33 +656,37 @@ def session(
     >>> paper.stop("s"), paper.enable("s"), paper.ping()  # doctest: +SKIP
 
     Args:
-        name: the session's name.
-        connect: endpoints, as for --connect; by default the session's own on this machine.
-        router: endpoints of routers to go through instead, as for --router.
-        keys: the folder of the operator's keys, as for --keys. To stop arms and to ping, the
+        name: Name of the session.
+        connect: Endpoints of the session, as for --connect. None uses the session's own
+            endpoint on this machine.
+        router: Endpoints of routers to connect through instead, as for --router.
+        keys: Folder with the keys of the operator, as for --keys. To stop arms and to ping, the
             keys of any member suffice.
 
     Raises:
-        UsageError: an endpoint or the keys cannot be used.
+        UsageError: An endpoint or the keys cannot be used.
     """
     connection = resolve_member_connection(None, connect, router)
     return RunningSession(name, secure_connection(connection, keys, insecure=False))
 
 
-def start(*words: str | Path) -> "subprocess.Popen[bytes]":
-    """Starts a process of a session, as in a terminal.
+def start(*arguments: str | Path) -> "subprocess.Popen[bytes]":
+    """Starts a process of a session, as a terminal would.
 
-    It runs until its end, or until it is terminated. The commands are `trilat site`, `hand`,
-    `record`, `router`, `replay`, `watch`, `live` and `ros2`.
+    The process runs until its end, or until it is terminated. The commands are `trilat site`,
+    `hand`, `record`, `router`, `replay`, `watch`, `live` and `ros2`.
 
     >>> recorder = tn.start("record", "--session", "paper", "-o", "run.mcap")  # doctest: +SKIP
     >>> player = tn.start("replay", "run.mcap", "--rate", "2")  # doctest: +SKIP
     >>> player.wait()  # doctest: +SKIP
 
     Args:
-        words: the command and its arguments, without `trilat`.
+        *arguments: The command and its arguments, without `trilat`.
+
+    Returns:
+        The process.
     """
-    return subprocess.Popen([sys.executable, "-m", "trilat_net", *map(str, words)])
+    return subprocess.Popen([sys.executable, "-m", "trilat_net", *map(str, arguments)])
 
 
 @contextmanager
@@ -543,24 +700,31 @@ def hand(
     source: str = "",
     timeout_s: float = 5.0,
 ) -> Iterator[Hand]:
-    """Joins a live session as a hand at one arm; a context manager that releases the arm.
+    """Lets a program move an arm of a live session, as its operator, as a context manager.
+
+    The arm is released at the end of the `with` block.
 
     >>> with tn.hand("play", "m1") as hand:  # doctest: +SKIP
     ...     hand.move(1.2, 0.4)
     ...     hand.force, hand.pose
 
     Args:
-        session: the session's name, by default the scenario's.
-        site: the site of the arm; its scenario must have an operator of kind "live".
-        connect: endpoints, as for --connect; by default the session's own on this machine.
-        router: endpoints of routers to go through instead, as for --router.
-        keys: the folder of the operator's keys, as for --keys.
-        source: a name of the holder, for events.
-        timeout_s: longest wait until the session runs, s.
+        session: Name of the session, by default that of the scenario.
+        site: Site of the arm. Its scenario must have an operator of kind "live".
+        connect: Endpoints of the session, as for --connect. None uses the session's own
+            endpoint on this machine.
+        router: Endpoints of routers to connect through instead, as for --router.
+        keys: Folder with the keys of the operator, as for --keys.
+        source: Name of the program or person, which events of the session mention.
+        timeout_s: Longest wait until the session runs, in s.
+
+    Yields:
+        The connection to the arm.
 
     Raises:
-        SessionError: there is no such session, or it does not begin.
-        UsageError: nobody can hold that arm, or an endpoint cannot be used.
+        SessionError: There is no such session, or it does not begin.
+        UsageError: The scenario permits no live operator at that arm, or an endpoint cannot be
+            used.
     """
     connection = secure_connection(
         resolve_member_connection(None, connect, router), keys, insecure=False
@@ -589,19 +753,20 @@ def open_hand(
     *,
     repeats: bool = True,
 ) -> Hand:
-    """Returns a hand at a site of a scenario.
+    """Opens the connection through which a program moves an arm.
 
     Args:
-        bus: a bus that reaches the site.
-        clock: the clock of this process.
-        session: the session's name.
-        site: the site of the arm.
-        scenario: the scenario of the session.
-        source: a name of the holder, for events.
-        repeats: whether a thread repeats the hand's last message, see `Hand`.
+        bus: Network connection that reaches the site.
+        clock: Clock of this process.
+        session: Name of the session.
+        site: Site of the arm.
+        scenario: Scenario of the session.
+        source: Name of the program or person, which events of the session mention.
+        repeats: True if a thread repeats the last message regularly, so that the site knows
+            that the program is still there, see `Hand`.
 
     Raises:
-        UsageError: nobody can hold that arm.
+        UsageError: The scenario permits no live operator at that arm.
     """
     find_site(scenario, site)
     live = scenario.sites[site].find_live_hand(is_open=True)
@@ -626,10 +791,10 @@ def open_hand(
 
 
 def _read_replies(replies: Sequence[ChangeReply]) -> list[str]:
-    """Returns the texts of replies that all accept.
+    """Returns the texts of the replies if all sites have accepted.
 
     Raises:
-        RunFailed: a site has refused; the message begins with the refusals.
+        RunFailed: A site has refused. The message lists the refusals first.
     """
     accepted = [reply.text for reply in replies if reply.accepted]
     refused = [reply.text for reply in replies if not reply.accepted]
@@ -639,10 +804,12 @@ def _read_replies(replies: Sequence[ChangeReply]) -> list[str]:
 
 
 def _list_present(scenario: Scenario, infos: dict[str, Info]) -> list[str]:
-    """Returns the sites that an order to all sites is for.
+    """Lists the sites that a request to all sites addresses.
 
-    These are all sites of the scenario. If sites may leave the session, they are only the
-    running ones, unless no site runs.
+    These are all sites of the scenario. If the scenario allows sites to leave, they are only
+    the running sites, as long as at least one site runs.
     """
     running = [name for name in scenario.names if name in infos and infos[name].running]
-    return running if running and scenario.sites_may_return else list(scenario.names)
+    if running and scenario.sites_may_return:
+        return running
+    return list(scenario.names)
