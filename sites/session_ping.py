@@ -1,8 +1,13 @@
-"""Measures the round trips to all members of a session, its links, and delays of ROS 2 topics.
+"""Measure the network of a running session, and the delays of ROS 2 topics.
+
+`ping_session` sends pings to all members of a session, and reports round trip times and the
+offsets of their clocks. It also reports the delays of the links between the sites, which the
+receiving sites measure themselves. `ping_topic` measures the delays of the messages on a ROS 2
+topic.
 
 Invariant:
-    - The client only reads. It announces no token, so the session neither waits for it nor
-      sees it.
+    - The measurement does not disturb the session. This process announces no token, so that the
+      session neither waits for it nor knows about it.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,20 +33,23 @@ from trilat_net.results import Result
 from trilat_net.scenario import parse_embedded
 
 POLL_NS = 1_000_000
+"""Longest pause between two polls, in ns."""
 GATHERING_NS = 600_000_000
-"""Time for further members to reply after the first one."""
+"""Time that further members have to reply after the first one, in ns."""
 PATIENCE_NS = 3_000_000_000
-"""Additional time for the last replies after they are due."""
+"""Time after which missing replies to pings are given up, counted from when they are due, in
+ns.
+"""
 
 
 @dataclass(frozen=True, repr=False)
 class PingReport(Result):
-    """Round trips and clock offsets to the members of a session, and its links.
+    """Result of a measurement of a session's network.
 
     Attributes:
-        session: the session's name.
-        members: a row per member, with the round trips and the offset of its clock.
-        links: a row per link, as the receiving site measures it.
+        session: Name of the session.
+        members: One row per member, with the round trip times and the offset of its clock.
+        links: One row per link between two sites, as the receiving site measures it.
     """
 
     session: str
@@ -49,18 +57,23 @@ class PingReport(Result):
     links: list[dict[str, Any]]
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a row per member."""
+        """Returns the rows of the members."""
         return self.members
 
 
 class SessionPing:
-    """One measurement of a session; call `poll` until `is_over`.
+    """One measurement of a session's network. The caller calls `poll` until `is_over` is True.
 
     Args:
-        bus: a bus that reaches the session.
-        clock: the clock of this process.
-        session: the session's name.
-        count: the number of round trips to each member.
+        bus: Network connection that reaches the session.
+        clock: Clock of this process.
+        session: Name of the session.
+        count: Number of round trips to each member.
+
+    Attributes:
+        infos: Identity of each member that has replied, by name.
+        links: Newest statistics of each site, by name.
+        pinger: Sends the pings, and estimates the offsets of the clocks.
     """
 
     def __init__(self, bus: Bus, clock: Clock, session: str, count: int) -> None:
@@ -75,7 +88,7 @@ class SessionPing:
         self._first_ns: int | None = None
 
     def poll(self) -> None:
-        """Receives the replies that have arrived, and sends the next queries."""
+        """Receives what has arrived, and sends the pings and queries that are due."""
         for info in self._members.poll():
             self.infos[info.member] = info
             self._first_ns = self._first_ns or self._clock.monotonic_ns()
@@ -85,14 +98,16 @@ class SessionPing:
 
     @property
     def _boots(self) -> set[int]:
+        """Boots of the members that have replied. Pings are addressed to them."""
         return {info.boot for info in self.infos.values()}
 
     def is_over(self, timeout_ns: int, begun_ns: int) -> bool:
-        """Returns True once every member has replied, or has had the time to.
+        """Returns True once the pings of every member are complete, or once they are given up.
 
         Args:
-            timeout_ns: the longest wait for the first reply.
-            begun_ns: the start of the measurement on this process's clock.
+            timeout_ns: Longest wait for the first reply, in ns.
+            begun_ns: Time at which the measurement was started, on the clock of this process,
+                in ns.
         """
         now_ns = self._clock.monotonic_ns()
         if self._first_ns is None:
@@ -104,24 +119,29 @@ class SessionPing:
 
     def report(self) -> PingReport:
         """Returns the results of the measurement."""
-        members = [self._describe(info) for _, info in sorted(self.infos.items())]
-        links = [
-            {
-                "from": peer,
-                "to": site,
-                "delay_us": stats.delay_us[peer],
-                "delay_max_us": stats.delay_max_us.get(peer, -1),
-                "rtt_us": stats.rtt_us.get(peer, -1),
-                "offset_us": stats.offset_us.get(peer, 0),
-                "bound_us": stats.bound_us.get(peer, 0),
-            }
-            for site, stats in sorted(self.links.items())
-            for peer in stats.delay_us
-        ]
+        members = [self._describe_member(info) for _, info in sorted(self.infos.items())]
+        links = []
+        for site, stats in sorted(self.links.items()):
+            for peer in stats.delay_us:
+                link = {
+                    "from": peer,
+                    "to": site,
+                    "delay_us": stats.delay_us[peer],
+                    "delay_max_us": stats.delay_max_us.get(peer, -1),
+                    "rtt_us": stats.rtt_us.get(peer, -1),
+                    "offset_us": stats.offset_us.get(peer, 0),
+                    "bound_us": stats.bound_us.get(peer, 0),
+                }
+                links.append(link)
         return PingReport(self._session, members, links)
 
-    def _describe(self, info: Info) -> dict[str, Any]:
-        """Returns the row of a member."""
+    def _describe_member(self, info: Info) -> dict[str, Any]:
+        """Returns the row of a member.
+
+        The row contains the round trip times if the member has replied to pings, and their mean
+        change from one to the next (jitter). It contains the offset of the clock if it is
+        known.
+        """
         trips = self.pinger.trips.get(info.boot)
         has_same_clock = info.clock == self._clock.identity()
         rtts_ns = tuple(trips.rtts_ns) if trips else ()
@@ -134,7 +154,6 @@ class SessionPing:
             "same_clock": has_same_clock,
         }
         if rtts_ns:
-            steps_ns = [abs(following - rtt) for rtt, following in pairwise(rtts_ns)]
             ordered_ns = sorted(rtts_ns)
             count = len(ordered_ns)
             fields["rtt_us"] = {
@@ -142,15 +161,16 @@ class SessionPing:
                 "p50": ordered_ns[count // 2] / 1000,
                 "p99": ordered_ns[min(count - 1, count * 99 // 100)] / 1000,
             }
-            fields["jitter_us"] = sum(steps_ns) / max(1, len(steps_ns)) / 1000
+            changes_ns = [abs(following - rtt) for rtt, following in pairwise(rtts_ns)]
+            fields["jitter_us"] = sum(changes_ns) / max(1, len(changes_ns)) / 1000
+
         estimate = trips.latest if trips else None
         if has_same_clock:
             estimate = exact_offset(0)
         if estimate is not None:
+            bound_ns = estimate.error_bound_ns(estimate.local_ns, estimate.offset_ns)
             fields["offset_ns"] = estimate.offset_ns
-            fields["bound_us"] = (
-                estimate.error_bound_ns(estimate.local_ns, estimate.offset_ns) / 1000
-            )
+            fields["bound_us"] = bound_ns / 1000
         return fields
 
 
@@ -162,28 +182,29 @@ def ping_session(
     timeout_s: float,
     stopped: Callable[[], bool],
 ) -> PingReport | None:
-    """Measures a session once.
+    """Measures the network of a running session once.
 
     Args:
-        connection: the endpoints and keys.
-        clock: the clock of this process.
-        session: the session's name.
-        count: the number of round trips to each member.
-        timeout_s: longest wait for the first reply, s.
-        stopped: returns True to end the measurement.
+        connection: Endpoints of the session, and keys.
+        clock: Clock of this process.
+        session: Name of the session.
+        count: Number of round trips to each member.
+        timeout_s: Longest wait for the first reply, in s.
+        stopped: Function that returns True to end the measurement.
 
     Returns:
-        The results; None if `stopped` has returned True.
+        The results. None if `stopped` returned True.
 
     Raises:
-        RunFailed: no member replied.
+        RunFailed: No member replied.
     """
 
     def read_site_names(text: str) -> tuple[str, ...]:
         try:
             return parse_embedded(text, session).names
         except ScenarioError:
-            # A scenario of another version: only the first site's endpoint is known.
+            # The scenario belongs to another version of this program. Without the names of the
+            # sites, only the default endpoint of the first site is known.
             return ()
 
     try:
@@ -213,15 +234,15 @@ def ping_session(
 
 @dataclass(frozen=True, repr=False)
 class TopicDelays(Result):
-    """The delays of the messages of a ROS 2 topic, for each of its publishers.
+    """Delays of the messages on a ROS 2 topic, for each program that publishes them.
 
-    A delay is the time from the sending time stamp of a message to its arrival here. It
-    contains the offset between the clocks of the two machines.
+    A delay is the time from the time stamp with which a message was sent to its arrival at this
+    process. Between two machines it contains the offset of their clocks.
 
     Attributes:
-        topic: the name of the topic.
-        lasted_s: the duration of the measurement, s.
-        publishers: a row per publisher.
+        topic: Name of the topic.
+        lasted_s: Duration of the measurement, in s.
+        publishers: One row per publisher.
     """
 
     topic: str
@@ -229,17 +250,24 @@ class TopicDelays(Result):
     publishers: list[dict[str, Any]]
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a row per publisher."""
+        """Returns the rows of the publishers."""
         return self.publishers
 
 
 def ping_topic(
     graph: Ros2Graph, clock: Clock, topic: str, lasts_s: float, stopped: Callable[[], bool]
 ) -> TopicDelays:
-    """Measures the delays of a ROS 2 topic for `lasts_s`, or until `stopped` returns True.
+    """Measures the delays of the messages on a ROS 2 topic.
+
+    Args:
+        graph: Connection to the ROS 2 programs.
+        clock: Clock of this process.
+        topic: Name of the topic.
+        lasts_s: Duration of the measurement, in s.
+        stopped: Function that returns True to end the measurement earlier.
 
     Raises:
-        RunFailed: nobody has published on the topic.
+        RunFailed: Nobody has published on the topic.
     """
     samples: dict[bytes, list[tuple[int, int]]] = {}
     types: dict[bytes, str] = {}
@@ -261,7 +289,7 @@ def ping_topic(
         )
     publishers = []
     for gid, publisher_samples in list(samples.items()):
-        # From the name of the type in DDS, as in "std_msgs::msg::dds_::Bool_".
+        # DDS calls a type "std_msgs::msg::dds_::Bool_" that ROS calls "std_msgs/msg/Bool".
         kind = types[gid].replace("::dds_::", "/").replace("::", "/").removesuffix("_")
         delays = _describe_delays(list(publisher_samples), lasted_s)
         publishers.append({"gid": gid.hex(), "type": kind} | delays)
@@ -269,12 +297,12 @@ def ping_topic(
 
 
 def _describe_delays(samples: Sequence[tuple[int, int]], lasted_s: float) -> dict[str, Any]:
-    """Returns the row of a publisher.
+    """Returns the row of a publisher, with a histogram of its delays.
 
     Args:
-        samples: the number and the delay, ns, of each received message. A number that is
-            missing between others was lost.
-        lasted_s: the duration of the measurement, s.
+        samples: Number and delay in ns of each message that arrived. The publisher numbers its
+            messages consecutively, so that a gap in the numbers shows lost messages.
+        lasted_s: Duration of the measurement, in s.
     """
     numbers = {number for number, _ in samples}
     delays_us = np.array([delay_ns for _, delay_ns in samples]) / 1e3

@@ -1,9 +1,8 @@
-"""Clients of a site: the programs of an external arm, of its dead-man switch, and of a hand.
+"""Connect a program to a site: the driver of a real arm, its dead-man switch, or an operator.
 
-An external arm (`plant = "external"`) measures its joints and applies the torque that its site
-computes. `ArmClient` connects the arm's program to that site, `SwitchClient` connects its
-dead-man switch, and `Hand` connects a person or a program that holds an arm. The program of an
-arm looks like this:
+A site is a process that computes the torque of one arm. If the arm is external (`plant =
+"external"` in the scenario), its driver sends the measured joint positions to the site, and
+applies the torque that the site publishes:
 
     with ArmClient.connected("two_sites", "s", ["tcp/127.0.0.1:10241"]) as client:
         while not client.over:
@@ -12,17 +11,22 @@ arm looks like this:
             robot.brake() if tau is None else robot.apply(tau)
             robot.wait()
 
+`SwitchClient` reports whether somebody holds the dead-man switch of such an arm. `Hand` lets a
+person or a program move an arm as its operator.
+
 Invariant:
-    - The arm may send measurements at any rate. The torque that it applies is read from the
-      record which the site publishes at every tick, so it equals the torque in the log.
-    - `ArmClient.torque` returns None if there is no valid torque; the arm must then brake.
-    - The client follows the boot of the site that it saw first: records of other boots are
-      ignored, and so are records that are older than the newest one or more than `AHEAD_NS`
-      too far ahead.
-    - Messages that cannot be decoded come from a stranger and are ignored.
-    - A thread repeats a resting hand's last message, so the site keeps receiving messages while
-      the program lives. If the program dies or hangs, the site releases the arm.
-    - The force on the arm, and the force that a hand feels, follow from the site's records.
+    - The driver may send measurements at any rate. The torque that it applies is part of the
+      record that the site publishes in every tick. The log therefore contains the applied
+      torque.
+    - `ArmClient.torque` returns None if there is no valid torque. The arm must then brake.
+    - A client follows the start of the site (boot) that it saw first. It ignores records of
+      other boots, records that are older than the newest one, and records that are more than
+      `AHEAD_NS` too far in the future.
+    - Messages that cannot be decoded come from other programs and are ignored.
+    - A thread repeats the last message of an operator who does not move. The site can thus
+      detect that the operator's program has died, and then releases the arm.
+    - The force on the arm, and the force that an operator feels, are computed from the site's
+      records. They are the forces in the log.
 """
 
 import math
@@ -47,18 +51,24 @@ from .wire import decode, encode, split_states
 from .zenoh_config import OPERATOR
 
 FRESH_NS = 100_000_000
-"""Largest age of a usable record; the site of an older record is late or gone."""
+"""Largest age of a usable record, in ns. If it is older, the site is late or gone."""
 AHEAD_NS = 1_000_000_000
-"""Largest excess of the time between two records over the time between their arrivals."""
+"""Largest time by which a record may be ahead of its expected time, in ns.
+
+The expected time of a record is the time of the previous one plus the time between their
+arrivals.
+"""
 BRAKE_NS = 100_000_000
-"""Time after a fault, or after the release of a dead-man switch, until the brakes must hold."""
+"""Time from a fault, or from the release of the dead-man switch, until the brakes hold, in ns.
+"""
 HEARTBEAT_S = SILENCE_NS / 4e9
-"""Period at which the last message of a resting hand is repeated."""
+"""Period with which the last message of an operator who does not move is repeated, in s."""
 _ACTIONS = {
     TorqueKind.LIVE_TIP: "move",
     TorqueKind.LIVE_JOINT: "turn",
     TorqueKind.LIVE_FORCE: "push",
 }
+"""Name of the method with which an operator of each kind moves an arm."""
 _DERIVATIVE_STEP_S = 1e-6
 """Step of the numerical derivative of the arm's pose, in s."""
 
@@ -69,9 +79,17 @@ R = TypeVar("R", bound=Request)
 class SiteSender:
     """Sends numbered messages to one channel of a site.
 
+    Args:
+        bus: Network connection.
+        clock: Clock of this process.
+        session: Name of the session.
+        site: Name of the site.
+        channel: Channel of the messages, the last part of their key.
+        boot: Random number that identifies this start of the sending program.
+
     Attributes:
-        boot: the number that identifies this start of the sending program.
-        number: the number of the newest message; -1 before the first.
+        boot: Random number that identifies this start of the sending program.
+        number: Number of the newest message. It is -1 before the first message.
     """
 
     def __init__(
@@ -84,12 +102,12 @@ class SiteSender:
         self._publish = bus.publisher(topics.key(session, site, channel))
 
     def send(self, kind: type[R], **fields: object) -> R:
-        """Sends the next message and returns it.
+        """Sends the next message, and returns it.
 
         Args:
-            kind: the class of the message.
-            fields: its fields other than the site, the boot and the number; they may replace
-                the time stamp `sent_ns`.
+            kind: Class of the message.
+            **fields: Fields of the message other than the site, the boot and the number. They
+                may replace the time stamp `sent_ns`.
         """
         header = {"site": self._site, "boot": self.boot, "n": self.number + 1}
         stamp = {"sent_ns": self._clock.monotonic_ns()}
@@ -99,12 +117,21 @@ class SiteSender:
         return message
 
     def repeat(self, message: R) -> None:
-        """Sends a message again, with its number unchanged."""
+        """Sends a message again with the same number. Nothing has changed since."""
         self._publish(encode(message))
 
 
 class SiteClient:
-    """The connection of a program to one site; a context manager that closes the connection."""
+    """Connection of a program to one site, from which it receives the records and events.
+
+    The object is a context manager that closes the network connection.
+
+    Args:
+        bus: Network connection.
+        clock: Clock of this process.
+        session: Name of the session.
+        site: Name of the site.
+    """
 
     def __init__(self, bus: Bus, clock: Clock, session: str, site: str) -> None:
         self._bus = bus
@@ -128,13 +155,13 @@ class SiteClient:
 
     @property
     def record(self) -> State | None:
-        """The newest record of the site; None before the first record."""
+        """Newest record of the site, the result of one tick. None before the first record."""
         self._read_messages()
         return self._record
 
     @property
     def fresh(self) -> bool:
-        """True if the newest record is at most `FRESH_NS` old and the run goes on.
+        """True if the newest record is at most `FRESH_NS` old and the run continues.
 
         It is False before the first tick, after the run, and once the run has diverged.
         """
@@ -145,11 +172,21 @@ class SiteClient:
 
     @property
     def over(self) -> bool:
-        """True once the site's run has ended, or the site is gone."""
+        """True once the run of the site has ended, or the site is gone."""
         self._read_messages()
         return self._is_over
 
     def _is_next_record(self, record: State, received_ns: int) -> bool:
+        """Returns True if a record may follow the newest known one.
+
+        It must come from the same boot of the site, be newer, and not be further in the future
+        than the time that has passed since the last arrival explains. A forged record with a
+        wrong time would otherwise make the client ignore all correct ones.
+
+        Args:
+            record: The record.
+            received_ns: Time of its arrival on the local clock, in ns.
+        """
         last = self._record
         if last is None:
             return True
@@ -160,33 +197,41 @@ class SiteClient:
         return is_newer and record.t_ns - last.t_ns <= elapsed_ns + AHEAD_NS
 
     def _read_messages(self) -> None:
+        """Receives records and events, and notes if the run has ended or the site is gone."""
         while (message := self._records.poll()) is not None:
             block, received_ns = message
             try:
-                # A block holds the records of several ticks; only the last one matters here.
+                # A block holds the records of several ticks. Only the last one matters here.
                 (payload,) = deque(split_states(block), maxlen=1)
                 record = decode(payload, State)
             except WireError:
-                continue  # sent by a stranger
+                continue  # sent by another program
             if self._is_next_record(record, received_ns):
                 self._record = record
                 self._received_ns = received_ns
+
         for event in read_messages(self._events, Event):
-            if (
-                event.kind == "end"
-                and self._record is not None
-                and event.boot == self._record.boot
-            ):
+            known = self._record
+            if event.kind == "end" and known is not None and event.boot == known.boot:
                 self._is_over = True
-        for _, alive in topics.read_presence(self._presence):
-            self._was_present = self._was_present or alive
-            self._is_over = self._is_over or (self._was_present and not alive)
+
+        for _, is_alive in topics.read_presence(self._presence):
+            self._was_present = self._was_present or is_alive
+            is_gone = self._was_present and not is_alive
+            self._is_over = self._is_over or is_gone
 
 
 class OutsideClient(SiteClient):
-    """The connection of a program that sends messages to one channel of a site.
+    """Connection of a program that also sends messages to one channel of a site.
 
-    It is a context manager that closes the connection.
+    `ArmClient` and `SwitchClient` define the channel. The object is a context manager that
+    closes the network connection.
+
+    Args:
+        bus: Network connection.
+        clock: Clock of this process.
+        session: Name of the session.
+        site: Name of the site.
     """
 
     channel = ""
@@ -209,17 +254,20 @@ class OutsideClient(SiteClient):
     def connected(
         cls, session: str, site: str, connect: Sequence[str], keys: str | Path | None = None
     ) -> Self:
-        """Returns a client that is connected to a site over Zenoh.
+        """Connects to a site over the network.
 
         Args:
-            session: the session's name, by default the scenario's.
-            site: the site of the arm.
-            connect: the site's endpoints, as the site prints them when it waits for its arm.
-            keys: the folder of keys, as for --keys. An arm uses the keys of its site, a switch
-                uses those of the operator.
+            session: Name of the session, by default that of the scenario.
+            site: Site of the arm.
+            connect: Endpoints of the site, which the site prints while it waits for its arm.
+            keys: Folder with keys, as for --keys. An arm uses the keys of its site, and a
+                switch those of the operator.
+
+        Returns:
+            The client.
 
         Raises:
-            UsageError: an endpoint cannot be used.
+            UsageError: An endpoint cannot be used.
         """
         connection = secure_connection(Connection((), list(connect)), keys, insecure=False)
         bus = connection.require(cls.member or site).open()
@@ -227,7 +275,10 @@ class OutsideClient(SiteClient):
 
 
 class SwitchClient(OutsideClient):
-    """The dead-man switch of an arm; its program reports whether somebody holds the switch.
+    """Connection of the program of a dead-man switch to the site of the arm.
+
+    The program reports regularly whether somebody holds the switch. The arm stops if the switch
+    is released, or if no message has arrived for 100 ms.
 
     >>> place = ["tcp/127.0.0.1:10241"]
     >>> with tn.SwitchClient.connected("two_sites", "s", place) as switch:  # doctest: +SKIP
@@ -238,16 +289,19 @@ class SwitchClient(OutsideClient):
 
     channel = topics.ENABLE
     member = OPERATOR
+    """Member whose keys the program uses. Empty stands for the site."""
 
     def send(self, *, held: bool) -> None:
-        """Sends whether somebody holds the switch."""
+        """Reports whether somebody holds the switch."""
         self._sender.send(ArmEnable, held=held)
 
 
 class ArmClient(OutsideClient):
-    """The connection of an arm to its site; a context manager that closes the connection.
+    """Connection of the driver of an external arm to the site of the arm.
 
-    `record` is the newest record of the site.
+    The driver sends measurements with `send`, and reads the torque to apply with `torque`. The
+    attribute `record` is the newest record of the site. The object is a context manager that
+    closes the network connection.
 
     >>> place = ["tcp/127.0.0.1:10241"]
     >>> with tn.ArmClient.connected("two_sites", "s", place) as client:  # doctest: +SKIP
@@ -256,6 +310,7 @@ class ArmClient(OutsideClient):
     """
 
     channel = topics.MEASURED
+    """Channel of the messages, the last part of their key."""
 
     def send(
         self,
@@ -264,15 +319,16 @@ class ArmClient(OutsideClient):
         tau_x: Sequence[float] = (),
         stamp_ns: int | None = None,
     ) -> None:
-        """Sends a measurement of the arm.
+        """Sends a measurement of the arm to its site.
 
         Args:
-            q: joint angles, rad.
-            qd: joint velocities, rad/s.
-            tau_x: torque of operator and environment, N m per joint, if the arm measures it. In
-                the paper's sign: the torque ON the arm is the negative of `tau_x`.
-            stamp_ns: time of the measurement, ns on any monotonic clock of the arm; by default
-                the present time of this program's monotonic clock.
+            q: Joint angles in rad.
+            qd: Joint velocities in rad/s.
+            tau_x: Torque of the operator and the environment in N m per joint, if the arm
+                measures it. The sign is that of the paper: the torque that acts ON the arm is
+                the negative of `tau_x`.
+            stamp_ns: Time of the measurement in ns, on any monotonic clock of the arm. None
+                uses the present time of this program's monotonic clock.
 
         Raises:
             ValueError: `tau_x` is not as long as `q`, or a number is not finite.
@@ -283,18 +339,22 @@ class ArmClient(OutsideClient):
         self._sender.send(ArmMeasurement, **numbers, **stamp)
 
     def torque(self) -> tuple[float, ...] | None:
-        """Returns the torque to apply now, N m per joint; None if the arm must brake.
+        """Returns the torque to apply now in N m per joint, or None if the arm must brake.
 
-        The arm must brake:
-            - before the first tick and after the run,
-            - if the newest record is older than `FRESH_NS`,
-            - `BRAKE_NS` after a fault, or after the release of the dead-man switch. Until then
-              the torque brings the arm to rest.
+        The arm must brake
+
+        - before the first tick and after the run,
+        - if the newest record is older than `FRESH_NS`,
+        - `BRAKE_NS` after a fault or after the release of the dead-man switch. Until then the
+          torque brings the arm to rest.
         """
         record = self.record
         if record is None or not self.fresh:
             return None
-        # `mem` begins with the held pose and the time at which a fault or a stop began.
+
+        # `mem` begins with the position that the arm holds. The next number is the time at
+        # which the fault or stop began. The reason of a stop follows after as many numbers
+        # again.
         shared = len(record.q_des)
         begun_ns = record.mem[shared : shared + 1]
         reason = record.mem[2 * shared + 1 : 2 * shared + 2]
@@ -307,10 +367,10 @@ class ArmClient(OutsideClient):
 
 
 def make_hand_sender(bus: Bus, clock: Clock, session: str, site: str) -> SiteSender:
-    """Returns a sender of a hand's messages to a site.
+    """Returns a sender of an operator's messages to a site.
 
-    Its boot lies in 1 ... 2^32 - 1: records store it as a float, and 0 means that nobody holds
-    the arm.
+    Its boot is a random number in 1 ... 2^32 - 1. Records store it as a float, which represents
+    these numbers exactly. The number 0 means that nobody holds the arm.
     """
     return SiteSender(
         bus=bus,
@@ -323,14 +383,24 @@ def make_hand_sender(bus: Bus, clock: Clock, session: str, site: str) -> SiteSen
 
 
 class Hand(SiteClient):
-    """The hand of a person or a program at one arm; a context manager that releases the arm.
+    """Connection of a person or a program that moves an arm as its operator.
+
+    `tn.hand` and the commands of the live page create it. The methods `move`, `turn` and `push`
+    take hold of the arm, and `release` lets it go. The object is a context manager that
+    releases the arm.
 
     Args:
-        operator: the live hand of the scenario, as the kernel has it.
-        compute_pose: returns the arm's pose for given joint angles, in the coordinates of the
-            hand's target: of the end effector in m, or the joints in rad.
-        source: a name of the holder, for events.
-        repeats: whether a thread repeats the last message. Without the thread, the site
+        bus: Network connection.
+        clock: Clock of this process.
+        session: Name of the session.
+        site: Site of the arm.
+        operator: Settings of the live operator in the scenario, as the simulation kernel stores
+            them.
+        compute_pose: Function that returns the arm's pose for given joint angles, in the
+            coordinates of the operator's target: the position of the end effector in m, or the
+            joint angles in rad.
+        source: Name of the person or program, which events of the session mention.
+        repeats: True if a thread repeats the last message. Without the thread, the site
             releases the arm if the program hangs.
     """
 
@@ -358,7 +428,7 @@ class Hand(SiteClient):
             threading.Thread(target=self._repeat_messages, daemon=True).start()
 
     def __exit__(self, *_: object) -> None:
-        """Releases the arm and waits until the site confirms it; leaves the bus open."""
+        """Releases the arm and waits until the site has confirmed it. The bus stays open."""
         try:
             self.release()
             deadline_ns = self._clock.monotonic_ns() + 2 * GRIP_NS
@@ -368,30 +438,33 @@ class Hand(SiteClient):
             self._ended.set()
 
     def move(self, *place_m: float) -> int:
-        """Moves the target of the end effector to x, y (in space also z), m.
+        """Moves the target of the end effector to x, y (in space also z), in m.
 
         The first call takes hold of the arm.
 
+        Args:
+            *place_m: Coordinates of the target, in m.
+
         Returns:
-            The number of the message. The `hand` of each record names the number of the message
-            that the record follows.
+            The number of the message. Each record states in `hand` which message the site
+            follows.
 
         Raises:
-            UsageError: the hand of this site is not moved in this way, or a number is not
+            UsageError: The scenario's operator is not moved in this way, or a number is not
                 finite.
         """
         return self._send("move", place_m)
 
     def turn(self, *angles_rad: float) -> int:
-        """Moves the target angles of the joints, rad; otherwise like `move`."""
+        """Moves the target angles of the joints, in rad. Otherwise it is like `move`."""
         return self._send("turn", angles_rad)
 
     def push(self, *force_n: float) -> int:
-        """Sets the force ON the end effector, N; otherwise like `move`."""
+        """Sets the force that acts ON the end effector, in N. Otherwise it is like `move`."""
         return self._send("push", force_n)
 
     def release(self) -> None:
-        """Releases the arm; the grip fades within 100 ms."""
+        """Releases the arm. The force fades within 100 ms."""
         with self._lock:
             is_gripping = self._message is not None
             self._message = None
@@ -400,15 +473,16 @@ class Hand(SiteClient):
 
     @property
     def holds(self) -> bool:
-        """True if this hand holds the arm, by the newest record."""
+        """True if this operator holds the arm according to the newest record."""
         hand = self.in_force
         return hand is not None and hand.source == self._sender.boot
 
     @property
     def number(self) -> int:
-        """The number of this hand's newest message that the newest record follows.
+        """Number of this operator's message that the site follows according to the newest
+        record.
 
-        It is -1 if this hand does not hold the arm.
+        It is -1 if this operator does not hold the arm.
         """
         hand = self.in_force
         if hand is None or hand.source != self._sender.boot:
@@ -417,7 +491,9 @@ class Hand(SiteClient):
 
     @property
     def in_force(self) -> HandInForce | None:
-        """The state of the holder's hand in the newest record; None before the first record."""
+        """State of the operator who holds the arm, in the newest record. None before the first
+        record.
+        """
         record = self.record
         if record is None or not record.hand:
             return None
@@ -425,40 +501,45 @@ class Hand(SiteClient):
 
     @property
     def pose(self) -> tuple[float, ...]:
-        """The pose of the arm in the newest record.
+        """Pose of the arm in the newest record.
 
-        It is the position of the end effector in m; for `turn` the joint angles in rad.
+        It is the position of the end effector in m, or for `turn` the joint angles in rad.
         """
         record = self._wait_for_record()
         return tuple(map(float, self._compute_pose(record.q)))
 
     @property
     def force(self) -> tuple[float, ...]:
-        """The force of the holder ON the arm in the newest record, N; for `turn` torques, N m.
+        """Force of the operator ON the arm in the newest record, in N, or for `turn` torques in
+        N m.
 
-        A hand with a target pulls with F = K (target - pose) + B (target rate - pose rate),
-        limited in size and scaled by the grip. The operator feels the negative of this force.
+        An operator with a target pulls the arm like a spring and a damper,
+
+            F = K (target - pose) + B (target rate - pose rate).
+
+        The force is limited in size, and scaled by the grip between 0 and 1. The operator feels
+        the negative of this force.
         """
         record = self._wait_for_record()
         operator = self._operator
         hand = HandInForce.read(record.hand)
-        pull = list(hand.target)
+        pull = list(hand.target)  # for an operator who pushes, the target is the force
         if operator.kind is not TorqueKind.LIVE_FORCE:
             pose = self._compute_pose(record.q)
             pose_rate = self._compute_pose_rate(record)
-            terms = zip(
+            coordinates = zip(
                 operator.K, operator.B, hand.target, hand.rate, pose, pose_rate, strict=True
             )
             pull = [
                 K * (target - position) + B * (target_rate - rate)
-                for K, B, target, target_rate, position, rate in terms
+                for K, B, target, target_rate, position, rate in coordinates
             ]
         size = math.hypot(*pull)
-        share = hand.grip * (operator.limit / size if size > operator.limit else 1.0)
-        return tuple(share * component for component in pull)
+        scale = hand.grip * (operator.limit / size if size > operator.limit else 1.0)
+        return tuple(scale * component for component in pull)
 
     def _compute_pose_rate(self, record: State) -> list[float]:
-        """Returns the rate of the pose by a central difference along the joint velocities."""
+        """Returns the rate of the pose, by a central difference along the joint velocities."""
         step_s = _DERIVATIVE_STEP_S
         joints = list(zip(record.q, record.qd, strict=True))
         pose_after = self._compute_pose([q + step_s * qd for q, qd in joints])
@@ -467,6 +548,11 @@ class Hand(SiteClient):
         return [(after - before) / (2.0 * step_s) for after, before in pairs]
 
     def _wait_for_record(self) -> State:
+        """Returns the newest record, and waits for the first one if there is none yet.
+
+        Raises:
+            UsageError: The run has ended before the first record.
+        """
         while (record := self.record) is None:
             if self.over:
                 raise UsageError(f"the run of {self._site} has ended: there is no record")
@@ -474,6 +560,15 @@ class Hand(SiteClient):
         return record
 
     def _send(self, action: str, numbers: Sequence[float]) -> int:
+        """Sends a goal of the operator, and returns the number of the message.
+
+        Args:
+            action: Name of the method that the program called: "move", "turn" or "push".
+            numbers: Coordinates of the goal.
+
+        Raises:
+            UsageError: The scenario's operator has another kind, or a number is not finite.
+        """
         allowed = _ACTIONS[self._operator.kind]
         if action != allowed:
             raise UsageError(
@@ -489,6 +584,9 @@ class Hand(SiteClient):
             return self._sender.number
 
     def _repeat_messages(self) -> None:
+        """Repeats the last message regularly until the arm is released and the object is
+        closed.
+        """
         while not self._ended.wait(HEARTBEAT_S):
             with self._lock:
                 if self._message is not None:

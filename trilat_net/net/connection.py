@@ -1,13 +1,23 @@
-"""A member's connection to the network, and the router process.
+"""Decide how a process connects to the network of a session, and run the router process.
 
-A connection has endpoints and a mode; opening it returns the bus.
+A `Connection` consists of the endpoints at which a process listens and to which it connects,
+its mode, and optionally the keys that prove its identity. Opening it returns the bus through
+which messages are sent. `resolve_member_connection` derives the connection from the command
+line and a user's Zenoh file.
+
+Each site of a session has a default endpoint on this machine: a port that follows from the name
+of the session and the index of the site. Processes that are started in separate terminals
+therefore find each other without any option.
 
 Invariant:
-    - Default endpoints are explicit loopback addresses. They are a function of session and
-      site, so that separate terminals find each other and two sessions on one host do not.
-    - A named endpoint replaces the defaults. Values on the command line and in a file are
-      united or refused; the program never chooses between them.
-    - A router forwards Zenoh traffic, and prints which members join and leave.
+    - Default endpoints are addresses of this machine only (127.0.0.1). Nobody else can connect
+      unless the user names an endpoint.
+    - Two sessions with different names get different default ports in most cases, because the
+      port is selected by a checksum of the name.
+    - An endpoint that the user names replaces the default. If the command line and the file
+      name different ones, they are united or refused, but the program never silently prefers
+      one of them.
+    - A router forwards the messages of all sessions. It prints which members join and leave.
 """
 
 import ipaddress
@@ -34,13 +44,20 @@ if TYPE_CHECKING:
     from .member_keys import MemberKeys
 
 _FIRST_PORT = 10_240
+"""Lowest default port. The default ports are divided into blocks, one block per session."""
 _BLOCKS = 340
+"""Number of blocks. The CRC-32 of the session's name selects one."""
 _BLOCK = 64
-"""Number of ports in a block; a session has the block that the CRC-32 of its name selects."""
+"""Number of ports in a block."""
 
 
 def default_endpoint(session: str, index: int) -> str:
-    """Returns the default endpoint of a site by its index in the scenario."""
+    """Returns the endpoint at which a site listens by default.
+
+    Args:
+        session: Name of the session.
+        index: Index of the site in the scenario.
+    """
     port = _FIRST_PORT + zlib.crc32(session.encode()) % _BLOCKS * _BLOCK + index % _BLOCK
     return f"tcp/127.0.0.1:{port}"
 
@@ -48,7 +65,13 @@ def default_endpoint(session: str, index: int) -> str:
 def default_endpoints(
     session: str, sites: Sequence[str], *, encrypted: bool = False
 ) -> dict[str, str]:
-    """Returns the default endpoint of every site of a session."""
+    """Returns the default endpoint of each site of a session, by the name of the site.
+
+    Args:
+        session: Name of the session.
+        sites: Names of the sites, in the order of the scenario.
+        encrypted: True for endpoints of TLS instead of TCP.
+    """
     endpoints = {}
     for index, site in enumerate(sites):
         endpoint = default_endpoint(session, index)
@@ -58,37 +81,49 @@ def default_endpoints(
 
 @contextmanager
 def reserve_session_endpoints(session: str, sites: Sequence[str]) -> Iterator[list[str]]:
-    """Yields endpoints for the sites of a session: the defaults, or else free ones.
+    """Reserves an endpoint for each site of a session, as a context manager.
 
-    Inside the block, other callers of this function get other endpoints.
+    The default endpoints are used if they are free, and otherwise any free ports. Inside the
+    `with` block, other callers of this function get other endpoints, so that two sessions of
+    the same name can run at the same time.
+
+    Yields:
+        The endpoints, in the order of the sites.
     """
     default = list(default_endpoints(session, sites).values())
     ports = [int(endpoint.rpartition(":")[2]) for endpoint in default]
+    # The last port of the block shows that the block is reserved. The ports themselves cannot
+    # show it, because they are shared with the sites that will listen at them.
+    first_port_of_block = ports[0] - ports[0] % _BLOCK
+    last_port_of_block = first_port_of_block + _BLOCK - 1
     with ExitStack() as stack:
         try:
-            _bind_ports(stack, [ports[0] - ports[0] % _BLOCK + _BLOCK - 1], shared=False)
-            chosen = _bind_ports(stack, ports, shared=True)
+            _bind_ports(stack, [last_port_of_block], shared=False)
+            endpoints = _bind_ports(stack, ports, shared=True)
         except OSError:
-            chosen = _bind_ports(stack, [0] * len(sites), shared=True)
-        yield chosen
+            endpoints = _bind_ports(stack, [0] * len(sites), shared=True)
+        yield endpoints
 
 
 def find_free_endpoints(count: int) -> list[str]:
-    """Returns loopback endpoints whose ports are free at present."""
+    """Returns endpoints on this machine whose ports are free at present."""
     with ExitStack() as stack:
         return _bind_ports(stack, [0] * count, shared=False)
 
 
 def _bind_ports(stack: ExitStack, ports: Sequence[int], *, shared: bool) -> list[str]:
-    """Binds loopback ports until the stack is closed, and returns their endpoints.
+    """Binds ports of this machine until the stack is closed.
 
     Args:
-        stack: closes the sockets.
-        ports: the ports; 0 stands for any free port.
+        stack: Closes the sockets.
+        ports: The ports. 0 stands for any free port.
         shared: True if another program may listen at the ports meanwhile.
 
+    Returns:
+        The endpoints of the ports.
+
     Raises:
-        OSError: a port is in use.
+        OSError: A port is in use.
     """
     sockets = [stack.enter_context(socket.socket()) for _ in ports]
     for probe, port in zip(sockets, ports, strict=True):
@@ -98,25 +133,27 @@ def _bind_ports(stack: ExitStack, ports: Sequence[int], *, shared: bool) -> list
 
 
 ENDS_SOON = timedelta(days=7)
-"""Time before the end of keys from which on the user is warned."""
+"""Time before the end of the keys' validity from which on the user is warned."""
 DATE = "%Y-%m-%d %H:%M:%S UTC"
+"""Format of the end of validity in messages to the user."""
 RETRY_NS = 200_000_000
 """Time between two attempts to reach a router, in ns."""
 
 
 @dataclass(frozen=True, slots=True)
 class Connection:
-    """Endpoints and mode of a member.
+    """How a process connects to the network: endpoints, mode and keys.
 
     Attributes:
-        listen: endpoints at which the member listens.
-        connect: endpoints to which the member connects; a client uses the first one that
-            answers. None if the endpoints are still to be found.
-        mode: "peer" of the other members, "client" of a router, or "router".
-        settings: Zenoh settings of a user's file, or of a member's keys.
-        keys_of: the member whose keys the connection uses; "" without keys. With keys, links
-            are encrypted, and both ends prove their identities by certificates.
-        keys_end: end of the validity of these keys, in UTC; None without keys.
+        listen: Endpoints at which the process listens.
+        connect: Endpoints to which the process connects. A client uses the first one that
+            answers. None if the endpoints are not known yet and have to be found.
+        mode: "peer" connects directly to the other members, "client" connects to a router, and
+            "router" is a router itself.
+        settings: Zenoh settings from a user's file or from keys.
+        keys_of: Name of the member whose keys are used. Empty if there are no keys. With keys,
+            all messages are encrypted, and both ends prove their identities by certificates.
+        keys_end: End of the validity of the keys, in UTC. None if there are no keys.
     """
 
     listen: Sequence[Endpoint] = ()
@@ -127,7 +164,7 @@ class Connection:
     keys_end: datetime | None = None
 
     def reach(self, endpoints: Sequence[Endpoint]) -> list[Endpoint]:
-        """Returns endpoints as this member opens them: with keys, TLS replaces TCP."""
+        """Returns endpoints as this process opens them: if it has keys, TLS replaces TCP."""
         if not self.keys_of:
             return list(endpoints)
         return [
@@ -136,10 +173,13 @@ class Connection:
         ]
 
     def open(self) -> ZenohBus:
-        """Opens the connection; see `ZenohBus`.
+        """Opens the connection, and returns the bus.
 
         Raises:
-            UnknownHost: a host name does not resolve. Zenoh would try to resolve it for ever.
+            UnknownHost: A host name cannot be resolved. This is checked first, because Zenoh
+                would try to resolve the name for ever.
+            RouterSilent: This process is a client, and no router answers.
+            UsageError: An endpoint cannot be used.
         """
         listen = self.reach(self.listen)
         connect = self.reach(self.connect or ())
@@ -147,16 +187,16 @@ class Connection:
         return ZenohBus(listen, connect, self.mode, self.settings)
 
     def require_keys_until(self, left_s: float) -> None:
-        """Refuses keys that end before a session does.
+        """Refuses keys whose validity ends before a session does.
 
-        An open link outlives the end of its certificate, but no link can be opened after that:
-        a cable that is pulled for six seconds would then end the session.
+        A connection that is open outlives the end of its certificate, but no connection can be
+        opened after that. If a cable were unplugged for six seconds, the session would end.
 
         Args:
-            left_s: remaining duration of the session, in s.
+            left_s: Remaining duration of the session, in s.
 
         Raises:
-            UsageError: the keys end before the session.
+            UsageError: The keys end before the session.
         """
         if self.keys_end is None:
             return
@@ -169,17 +209,17 @@ class Connection:
             )
 
     def describe_end(self) -> str:
-        """Returns a sentence if the keys end soon, else ""."""
+        """Returns a warning if the validity of the keys ends soon. Empty if it does not."""
         if self.keys_end is None or self.keys_end - datetime.now(UTC) > ENDS_SOON:
             return ""
         remedy = "renew them with trilat keys renew (docs/network.md)"
         return f"the keys of {self.keys_of} end on {self.keys_end:{DATE}}: {remedy}"
 
     def require(self, member: str) -> "Connection":
-        """Returns this connection if it may be used by a member.
+        """Checks that the connection may be used in the name of a member, and returns itself.
 
         Raises:
-            UsageError: the connection uses the keys of another member.
+            UsageError: The connection uses the keys of another member.
         """
         if self.keys_of not in ("", member):
             raise UsageError(
@@ -191,16 +231,20 @@ class Connection:
 def secure_connection(
     connection: Connection, keys: "MemberKeys | str | Path | None", *, insecure: bool
 ) -> Connection:
-    """Returns a connection with a member's keys, or checks that it is safe without keys.
+    """Adds a member's keys to a connection, or checks that it is safe without keys.
 
     Args:
-        connection: the connection.
-        keys: a member's keys, or the folder of these; None for no keys.
-        insecure: True to accept endpoints that other machines reach without keys.
+        connection: The connection.
+        keys: Keys of a member, or the folder that contains them. None if there are no keys.
+        insecure: True to permit endpoints that other machines can reach without keys.
+
+    Returns:
+        The connection, with the keys.
 
     Raises:
-        UsageError: an endpoint is not encrypted, or other machines reach it without keys; or
-            the user's settings contradict the keys; or the keys cannot be used.
+        UsageError: With keys, an endpoint is not encrypted, or the user's settings contradict
+            the keys. Without keys, other machines can reach an endpoint. Or the keys cannot be
+            used.
     """
     if isinstance(keys, str | Path):
         from .member_keys import read_member_keys  # loads the cryptography package
@@ -228,7 +272,14 @@ def secure_connection(
 
 
 def _check_encrypted_endpoint(address: str) -> None:
-    """Refuses an endpoint that is not encrypted, or states how it is encrypted."""
+    """Refuses an endpoint that is not encrypted, or that states its own encryption settings.
+
+    The settings of the encryption come from the keys. Settings of the network interface
+    (`iface`, `bind`, `dscp`, `so_...`) are permitted.
+
+    Raises:
+        UsageError: The endpoint is refused.
+    """
     if not address.startswith(ENCRYPTED):
         raise UsageError(
             f"{address}: with --keys an endpoint is encrypted: tls/HOST:PORT or quic/HOST:PORT"
@@ -240,7 +291,11 @@ def _check_encrypted_endpoint(address: str) -> None:
 
 
 def _check_settings_without_keys(settings: Mapping[str, Any]) -> None:
-    """Refuses user settings that the keys set as well."""
+    """Refuses Zenoh settings of a user that the keys determine as well.
+
+    Raises:
+        UsageError: A setting is refused.
+    """
     for name in sorted(set(settings) & {"access_control", "low_pass_filter", "adminspace"}):
         raise UsageError(f"--zenoh-config: {name}: comes from --keys; give it in one place")
     link_settings = settings.get("transport", {}).get("link", {})
@@ -251,12 +306,23 @@ def _check_settings_without_keys(settings: Mapping[str, Any]) -> None:
 
 
 def _check_open_endpoints(connection: Connection, *, insecure: bool) -> None:
-    """Refuses endpoints without keys that other machines reach, unless `insecure`."""
+    """Refuses to listen without keys at an endpoint that other machines can reach.
+
+    It is permitted if the user's own Zenoh settings require certificates of both ends.
+
+    Args:
+        connection: The connection.
+        insecure: True to permit such endpoints.
+
+    Raises:
+        UsageError: An endpoint is refused.
+    """
     link_settings = connection.settings.get("transport", {}).get("link", {})
     has_mutual_tls = link_settings.get("tls", {}).get("enable_mtls") is True
     for address in find_endpoint_addresses(connection.listen):
         is_certified = has_mutual_tls and address.startswith(ENCRYPTED)
-        if not (insecure or is_loopback(address) or is_certified):
+        is_safe = insecure or is_loopback(address) or is_certified
+        if not is_safe:
             raise UsageError(
                 f"--listen {address}: anybody on that network could take part: give "
                 "--keys DIR (make them with trilat keys new), or --insecure where you trust "
@@ -265,10 +331,14 @@ def _check_open_endpoints(connection: Connection, *, insecure: bool) -> None:
 
 
 ENCRYPTED = ("tls/", "quic/")
+"""Beginnings of the endpoints whose transport is encrypted."""
 
 
 def find_endpoint_addresses(endpoints: Sequence[Endpoint]) -> list[str]:
-    """Returns the addresses of endpoints, including those in Zenoh's groups of locators."""
+    """Returns the addresses of endpoints as text, including those of grouped endpoints.
+
+    A Zenoh file may group several addresses into one endpoint, a table with the key "locators".
+    """
     addresses: list[str] = []
     for endpoint in endpoints:
         locators = endpoint.get("locators", ()) if isinstance(endpoint, Mapping) else [endpoint]
@@ -280,9 +350,10 @@ def find_endpoint_addresses(endpoints: Sequence[Endpoint]) -> list[str]:
 
 
 def is_loopback(address: str) -> bool:
-    """True if other machines cannot reach an address."""
+    """Returns True if an address can be reached from this machine only."""
     protocol, _, rest = address.partition("/")
-    host = re.split(r"[?#]", rest)[0].rpartition(":")[0].strip("[]")
+    host_and_port = re.split(r"[?#]", rest)[0]  # without Zenoh's settings
+    host = host_and_port.rpartition(":")[0].strip("[]")
     if protocol.startswith("unix") or host == "localhost":
         return True
     try:
@@ -301,22 +372,25 @@ def resolve_member_connection(
     *,
     routes: bool = False,
 ) -> Connection:
-    """Returns the connection of a member or a tool by the command line and a user's file.
+    """Derives the connection of a process from the command line and a user's Zenoh file.
 
-    With a router, named by `--router` or by a file of mode "client", a member listens nowhere
-    and connects only to the router.
+    If there is a router (named by `--router`, or if the file has the mode "client"), the
+    process connects only to the router, and listens nowhere.
 
     Args:
-        listen: endpoints of --listen; None without the option.
-        connect: endpoints of --connect; None without the option.
-        routers: endpoints of --router; None without the option.
-        file: the user's Zenoh configuration.
-        listen_else: endpoints at which to listen if neither an option nor the file names any.
-        connect_else: endpoints to which to connect if neither an option nor the file names any.
-        routes: True for the connection of a router.
+        listen: Endpoints of the option --listen. None if the option is absent.
+        connect: Endpoints of the option --connect. None if the option is absent.
+        routers: Endpoints of the option --router. None if the option is absent.
+        file: The user's Zenoh file. None if there is none.
+        listen_else: Endpoints at which to listen if neither an option nor the file names any.
+        connect_else: Endpoints to which to connect if neither an option nor the file names any.
+        routes: True if the process is a router itself.
+
+    Returns:
+        The connection.
 
     Raises:
-        UsageError: options and file contradict each other.
+        UsageError: The options and the file contradict each other.
     """
     file = file or ZenohFile("")
     if routes:
@@ -378,7 +452,7 @@ def _join_options(
     listen_else: Sequence[str],
     connect_else: Sequence[str] | None,
 ) -> Connection:
-    """Returns the connection of a peer or a router; see `resolve_member_connection`."""
+    """Derives the connection of a peer or a router, see `resolve_member_connection`."""
     file_listen = file.endpoints("listen", mode)
     if listen is not None and file_listen is not None:
         raise UsageError(
@@ -397,13 +471,20 @@ def _merge_endpoints(
     mode: ZenohMode,
     otherwise: Sequence[str] | None,
 ) -> Sequence[Endpoint] | None:
-    """Returns the endpoints of options and file to which to connect, each once."""
+    """Returns the endpoints to which to connect: those of the option, then those of the file.
+
+    Args:
+        named: Endpoints of the option. None if the option is absent.
+        file: The user's Zenoh file.
+        mode: Mode of the process.
+        otherwise: Endpoints to use if neither the option nor the file names any.
+    """
     file_endpoints = file.endpoints("connect", mode)
     if named is None and file_endpoints is None:
         return otherwise
     endpoints: list[Endpoint] = list(named or ())
-    more = [endpoint for endpoint in file_endpoints or () if endpoint not in endpoints]
-    return endpoints + more
+    further = [endpoint for endpoint in file_endpoints or () if endpoint not in endpoints]
+    return endpoints + further
 
 
 def open_bus(
@@ -413,23 +494,23 @@ def open_bus(
     timeout_s: float | None,
     say: Callable[[str], None],
 ) -> ZenohBus | None:
-    """Opens a connection whose `connect` is known, and waits for a router.
+    """Opens a connection, and waits until a router answers if there is one.
 
     Args:
-        connection: the connection.
-        clock: clock of the caller.
-        stopped: returns True to give up.
-        timeout_s: time to wait for a router, in s; None for no limit.
-        say: receives messages for the user.
+        connection: The connection. Its endpoints must be known.
+        clock: Clock of the caller.
+        stopped: Function that returns True to give up.
+        timeout_s: Longest wait for a router, in s. None waits without a limit.
+        say: Function that prints a line for the user.
 
     Returns:
-        The bus; None if `stopped` before a router answers.
+        The bus. None if `stopped` returned True before a router answered.
 
     Raises:
-        UsageError: an endpoint cannot be used.
-        UnknownHost: a host name does not resolve at the first attempt. Later attempts may fail
-            while the name service is away.
-        SessionError: no router answered in time.
+        UsageError: An endpoint cannot be used.
+        UnknownHost: A host name cannot be resolved at the first attempt. In later attempts this
+            is ignored, because the name service may be away for some time.
+        SessionError: No router answered in time.
     """
     begun_ns = clock.monotonic_ns()
     has_reported = False
@@ -450,6 +531,7 @@ def open_bus(
 
 
 ROUTER_POLL_NS = 50_000_000
+"""Time between two checks of the members by a router, in ns."""
 
 
 def run_router(
@@ -459,7 +541,16 @@ def run_router(
     say: Callable[[str], None],
     until_idle_s: float | None = None,
 ) -> None:
-    """Runs a router until `stopped`, or until `until_idle_s` after the last member has left."""
+    """Runs a router, and prints which members join and leave.
+
+    Args:
+        bus: Network connection of the router, which forwards the messages by itself.
+        clock: Clock of this process.
+        stopped: Function that returns True to end the router.
+        say: Function that prints a line for the user.
+        until_idle_s: Time after which the router ends once the last member has left, in s. None
+            means never.
+    """
     presence = bus.presence(topics.presence_key("*", "*"))
     present: set[topics.KeyParts] = set()
     idle_ns = math.inf if until_idle_s is None else until_idle_s * 1e9
