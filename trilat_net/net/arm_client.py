@@ -479,8 +479,7 @@ class Hand(SiteClient):
 
     @property
     def number(self) -> int:
-        """Number of this operator's message that the site follows according to the newest
-        record.
+        """Number of this operator's message that the site followed in the newest record.
 
         It is -1 if this operator does not hold the arm.
         """
@@ -491,8 +490,9 @@ class Hand(SiteClient):
 
     @property
     def in_force(self) -> HandInForce | None:
-        """State of the operator who holds the arm, in the newest record. None before the first
-        record.
+        """State of the operator who holds the arm, in the newest record.
+
+        None before the first record.
         """
         record = self.record
         if record is None or not record.hand:
@@ -510,9 +510,9 @@ class Hand(SiteClient):
 
     @property
     def force(self) -> tuple[float, ...]:
-        """Force of the operator ON the arm in the newest record, in N, or for `turn` torques in
-        N m.
+        """Force of the operator ON the arm in the newest record, in N.
 
+        For `turn`, these are the torques on the joints in N m.
         An operator with a target pulls the arm like a spring and a damper,
 
             F = K (target - pose) + B (target rate - pose rate).
@@ -584,9 +584,7 @@ class Hand(SiteClient):
             return self._sender.number
 
     def _repeat_messages(self) -> None:
-        """Repeats the last message regularly until the arm is released and the object is
-        closed.
-        """
+        """Repeats the last message regularly until the object is closed."""
         while not self._ended.wait(HEARTBEAT_S):
             with self._lock:
                 if self._message is not None:

@@ -1,11 +1,18 @@
-"""The messages that the members of a session publish, and that a log stores.
+"""Define the messages that the members of a session publish, and that a log stores.
 
-The types define the schema. A log stores their JSON Schema, which includes their docstrings.
+A member is a process that takes part in a session: a site, which runs one arm, or a recorder. A
+site publishes a `PeerSample` for the other sites and a `State` for the recorder in every tick
+of its control loop, `LinkStats` ten times a second, and an `Event` when something happens. A
+recorder publishes `RecorderStats` and events. Every member replies to queries with an `Info`.
+
+The classes are the schema of the messages. A log contains their JSON Schema, which includes
+their docstrings.
 
 Invariant:
-    - One definition validates a message, yields the JSON Schema, and documents the format.
-    - The unit of a number is in its field name or in the schema (`x-unit`). All units are SI
-      units and radians.
+    - One definition serves three purposes: it validates a message, it yields the JSON Schema,
+      and it documents the format.
+    - The unit of each number is part of the field's name or of the schema (`x-unit`). All units
+      are SI units and radians.
 """
 
 import ast
@@ -22,35 +29,40 @@ from ..core.ticks import Mode
 from ..core.user_law import MAX_LAW_MEMORY
 
 VERSION = 4
-"""Version of the schema that is sent, and the only one accepted from other members."""
+"""Version of the schema of sent messages. Messages of other versions are not accepted."""
 READABLE = (1, 2, 3, 4)
-"""Versions of the schema that are read in files: all released ones."""
+"""Versions of the schema that can be read from files: all versions that were released."""
 SENT_TIME_SINCE = 2
-"""First version of the schema whose records contain their sending time."""
+"""First version of the schema whose records contain the time at which they were sent."""
 
 U64 = Annotated[int, Meta(ge=0)]
+"""A number from 0 to 2^64 - 1, such as the boot of a process."""
 TickNumber = Annotated[int, Meta(ge=0, lt=2**40)]
+"""Number of a tick, or another count of the same size."""
 Instant = Annotated[int, Meta(ge=-(2**59), lt=2**59)]
-"""Reading of a clock in ns, within eighteen years of 0.
+"""A reading of a clock in ns, within eighteen years of 0.
 
-The limit keeps sums and differences of a few readings within the integers of a payload.
+The limit ensures that sums and differences of a few readings are still integers that a message
+can contain.
 """
 Stamp = Annotated[list[Instant], Meta(min_length=3, max_length=3)]
+"""Three numbers about the arrival of a sample, see `State.rx` and `State.echo`."""
 MOST_PEERS = 32
 """Largest number of sites in a scenario."""
 
 
 class ModeMeaning(NamedTuple):
-    """Meaning of a site's mode for readers of its records.
+    """Meaning of a site's mode, such as "run" or "stopped", for programs that read records.
 
     Attributes:
-        mode: the mode.
-        does: verb that describes the site, in the present tense.
-        did: verb that describes the site, in the past tense.
-        follows: False if the site does not follow its peers.
-        rests: True if, under the rule `glide`, the arm comes to rest. Then the torque is not
-            that of the law alone, and the peers' samples do not enter the reference.
-        halted: True if the site resumes only on request.
+        mode: The mode.
+        does: Words that describe the site in the present tense.
+        did: Words that describe the site in the past tense.
+        follows: True if the site follows its peers.
+        rests: True if the arm comes to rest in this mode, under the rule `glide` for
+            interrupted connections. The torque is then not that of the control law alone, and
+            samples of the peers do not influence the reference.
+        halted: True if the site resumes only when a user requests it.
     """
 
     mode: Mode
@@ -73,11 +85,15 @@ MODES = {
 }
 """Meanings of the modes, by their names in records and messages."""
 MODE_WORDS = {meaning.mode: word for word, meaning in MODES.items()}
+"""Name of each mode in records and messages."""
 HALTED_MODES = tuple(word for word, meaning in MODES.items() if meaning.halted)
+"""Names of the modes from which a site resumes only on request."""
 RESTING_MODES = tuple(word for word, meaning in MODES.items() if meaning.rests)
+"""Names of the modes in which an arm comes to rest."""
 
 
 def _unit(unit: str, text: str, **limits: Any) -> Meta:
+    """Returns the annotation of a field with its unit, its description and its limits."""
     return Meta(description=text, extra_json_schema={"x-unit": unit}, **limits)
 
 
@@ -161,11 +177,12 @@ class State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 class PeerSample(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The part of a tick's record that peers need, sent at every tick.
+    """The state of an arm that its site sends to the peers in every tick.
 
-    Each field is bit for bit that of the tick's `State`. In task space, q, qd and tau_x are x,
-    xd and wrench of the `State`. Of `ch`, a peer reads the part for all peers and the part for
-    itself.
+    It is the part of the tick's `State` that peers need, and each field has exactly the same
+    value. If the sites exchange positions in task space, `q`, `qd` and `tau_x` contain `x`,
+    `xd` and `wrench` of the `State`. `ch` contains what the control law sends to the laws of
+    the peers: a part for all peers, and a part for each peer.
     """
 
     v: int
@@ -343,26 +360,28 @@ class RecorderStats(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
 
 class Info(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Identity of a member, sent in reply to a query.
+    """Identity of a member, with which it replies to queries.
 
     Attributes:
-        v: version of this schema.
-        member: name of the member.
-        boot: random number of the member's process start.
-        scenario_sha256: hash of the resolved scenario; "" for a recorder, which learns the
+        v: Version of this schema.
+        member: Name of the member.
+        boot: Random number that identifies this start of the member's process.
+        scenario_sha256: Hash of the resolved scenario. Empty for a recorder, which learns the
             scenario from the sites.
-        scenario: text of the resolved scenario; "" for a recorder.
-        host: name of the member's machine.
-        clock: identity of the member's monotonic clock.
-        fingerprint: fingerprint of the arithmetic on the member's platform.
-        needs_recorder: True if the member waits for a recorder.
-        running: True if the epoch of the member's session is fixed.
-        ticks: number of ticks that the member has made.
-        epoch_mono_ns: the epoch on the member's clock, once the epoch is fixed.
-        epoch_unix_ns: the epoch in Unix time.
-        boots: the members of the session and their boots.
-        grid_ns: the epoch on the member's clock from which its ticks count at present; this
-            instant follows the clock of the first site.
+        scenario: Text of the resolved scenario. Empty for a recorder.
+        host: Name of the member's machine.
+        clock: Identity of the member's monotonic clock. Members with the same clock run on the
+            same machine.
+        fingerprint: Fingerprint of the floating-point arithmetic on the member's platform.
+        needs_recorder: True if the member starts the session only when a recorder is present.
+        running: True if the epoch of the member's session, its common start time, is fixed.
+        ticks: Number of ticks that the member has executed.
+        epoch_mono_ns: The epoch on the member's clock, once it is fixed.
+        epoch_unix_ns: The epoch in Unix time.
+        boots: Boot of each member of the session, by name.
+        grid_ns: Time on the member's clock from which its ticks are counted at present. It
+            differs from the epoch if the member had to follow the drifting clock of the first
+            site.
     """
 
     v: int = VERSION
@@ -384,17 +403,21 @@ class Info(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
 TASK_VECTORS = ("x", "xd", "wrench")
 STATE_VECTORS = (*Layout().lengths(), *TASK_VECTORS, "ch", "hand", "bodies")
-"""Names of the vectors in a record; the site's `Layout` defines their lengths."""
+"""Names of the vectors in a record. The `Layout` of a site defines their lengths."""
 
 
 def json_schema(kind: type[msgspec.Struct]) -> dict[str, Any]:
-    """Returns the JSON Schema of a message type, with the root object that viewers need."""
+    """Returns the JSON Schema of a message type.
+
+    msgspec places the schema in a list of components. Programs that show logs expect it at the
+    root.
+    """
     (_,), components = msgspec.json.schema_components([kind])
     schema: dict[str, Any] = components[kind.__name__]
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
 
 
-# `python -OO` removes the docstrings, which the schemas of a log contain: restore them.
+# `python -OO` removes all docstrings. The schemas in a log contain them, so restore them here.
 if sys.flags.optimize > 1:
     for _node in ast.parse(Path(__file__).read_bytes()).body:
         if isinstance(_node, ast.ClassDef):
