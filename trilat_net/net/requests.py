@@ -1,11 +1,15 @@
-"""Messages between two parties: pings, changes, backfill, external arms, switches and hands.
+"""Define the messages that one process sends to one other process of a session.
+
+They are replies to pings, requests for changes, requests for lost messages, measurements of
+real arms, reports of dead-man switches, and goals of operators (the people or programs that
+move arms). Published messages, which everybody receives, are defined in `messages`.
 
 Invariant:
-    - No log contains these messages, but logs contain their effects: a change as an event, a
-      backfilled message as the message itself, a measurement as q and qd of the record of the
-      tick that used it, and a hand as `hand` of the records of the ticks in which it acts.
-    - At each tick, a site uses the newest measurement of the arm and the newest goal of the
-      hand.
+    - A log does not contain these messages, but their effects. A change is logged as an event,
+      a lost message as the message itself, a measurement as `q` and `qd` of the record of the
+      tick that used it, and a goal as `hand` of the records of the ticks in which it acts.
+    - In each tick, a site uses the newest measurement of the arm and the newest goal of the
+      operator.
 """
 
 import math
@@ -20,24 +24,25 @@ from .messages import U64, VERSION, Angles, Instant, Speeds, TickNumber, Torques
 BACKFILL_MESSAGES = 64
 """Largest number of messages in one `Backfill`."""
 BACKFILL_BYTES = 40_000
-"""Largest total size of the messages in one `Backfill`, unless a single message is larger."""
+"""Largest total size of the messages in one `Backfill`, unless one message alone is larger."""
 
 
 class Request(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Base of the messages between two parties, in the present version of the schema."""
+    """Base class of these messages, with the present version of the schema."""
 
     v: int = VERSION
 
 
 class Pong(Request, frozen=True, kw_only=True):
-    """A member's reply to a ping.
+    """Reply of a member to a ping, with two of the four time stamps of a round trip.
 
     Attributes:
-        member: name of the member.
-        boot: boot of the member.
-        clock: identity of the member's clock.
-        came_ns: arrival of the ping on that clock.
-        left_ns: sending of the reply on that clock.
+        member: Name of the member.
+        boot: Random number that identifies this start of the member's process.
+        clock: Identity of the member's clock. Members with the same clock run on the same
+            machine.
+        came_ns: Time at which the ping arrived, on that clock.
+        left_ns: Time at which the reply was sent, on that clock.
     """
 
     member: str
@@ -48,25 +53,27 @@ class Pong(Request, frozen=True, kw_only=True):
 
 
 OrderName = Literal["", "stop", "enable", "reset"]
-"""Orders that a site accepts from outside; "" stands for no order."""
+"""Orders that a site accepts from users. The empty text stands for no order."""
 
 
 class ChangeRequest(Request, frozen=True, kw_only=True):
-    """A request to a site for a change, as in a scenario's timeline, from the next tick on.
+    """Request to a site to change something from its next tick on.
 
-    A request sets exactly one of `link`, `dominance`, `stop_s`, `mark` and `order`.
+    The changes are those that a scenario can contain in its timeline. A request sets exactly
+    one of `link`, `dominance`, `stop_s`, `mark` and `order`.
 
     Attributes:
-        link: link whose settings change, as in "m1->s".
-        dominance: site whose row of dominance shares changes.
-        to: the new settings of the link, or the new shares.
-        ramp_s: duration of the transition to new shares, in s.
-        stop_s: time since the epoch, in s, before which the site's last tick lies.
-        mark: a text for the log.
-        order: an order, which the site executes in its next tick.
-        source: who requests the change, for people: a noun phrase such as "the experimenter",
-            which the site's event repeats. A request without a source has the same bytes as
-            one of a program that does not know the field.
+        link: Link whose settings change, as in "m1->s".
+        dominance: Site that changes the weights with which it follows its peers.
+        to: The new settings of the link, or the new weights.
+        ramp_s: Duration of the transition to the new weights, in s.
+        stop_s: Time since the epoch at which the run ends, in s. The last tick of the site is
+            before this time.
+        mark: Text for the log.
+        order: Order that the site executes in its next tick.
+        source: Who requests the change: a noun phrase such as "the experimenter", which the
+            event of the site repeats. A request without a source has the same bytes as that of
+            a program that does not know this field.
     """
 
     link: str = ""
@@ -80,11 +87,14 @@ class ChangeRequest(Request, frozen=True, kw_only=True):
 
 
 class ChangeReply(Request, frozen=True, kw_only=True):
-    """A site's reply to a `ChangeRequest`.
+    """Reply of a site to a `ChangeRequest`.
 
     Attributes:
-        text: the tick from which the change holds, or the reason for refusing it.
-        tick: first tick, at the site's rate, for which the change holds; -1 if refused.
+        member: Name of the site.
+        accepted: True if the site applies the change.
+        text: Tick from which the change holds, or the reason why it was refused.
+        tick: First tick, at the tick rate of the site, for which the change holds. It is -1 if
+            the change was refused.
     """
 
     member: str
@@ -94,13 +104,13 @@ class ChangeReply(Request, frozen=True, kw_only=True):
 
 
 class BackfillRequest(Request, frozen=True, kw_only=True):
-    """A recorder's request for missing messages of a site.
+    """Request of a recorder to a site, to send messages again that were lost on the way.
 
     The number of a record is its tick. Statistics and events are numbered from 0.
 
     Attributes:
-        channel: channel of the messages.
-        first, last: range of the numbers of the messages.
+        channel: Channel of the messages.
+        first, last: Range of the numbers of the messages.
     """
 
     channel: Literal["state", "link", "event"]
@@ -109,17 +119,17 @@ class BackfillRequest(Request, frozen=True, kw_only=True):
 
 
 class Backfill(Request, frozen=True, kw_only=True):
-    """Reply to a `BackfillRequest`: consecutive messages, as the site published them.
+    """Reply to a `BackfillRequest`: consecutive messages, exactly as the site published them.
 
     Attributes:
-        member: name of the site.
-        boot: boot of the site.
-        channel: channel of the messages.
-        first: number of the first message in this reply: the requested number, or that of the
-            oldest message that the site still has.
-        payloads: the messages, at most BACKFILL_MESSAGES; empty if the site has not published
-            them yet, or has them no longer.
-        made: number of messages of this channel that the site has published.
+        member: Name of the site.
+        boot: Random number that identifies this start of the site.
+        channel: Channel of the messages.
+        first: Number of the first message in this reply. It is the requested number, or that of
+            the oldest message that the site still stores.
+        payloads: The messages, at most `BACKFILL_MESSAGES`. Empty if the site has not published
+            them yet or no longer stores them.
+        made: Number of messages that the site has published on this channel.
     """
 
     member: str
@@ -131,18 +141,18 @@ class Backfill(Request, frozen=True, kw_only=True):
 
 
 class ArmMeasurement(Request, frozen=True, kw_only=True):
-    """One measurement of an external arm.
+    """One measurement of an external arm, from its driver to its site.
 
     Attributes:
-        site: name of the arm's site.
-        boot: random number of the start of the arm's program; a site follows one start.
-        n: number of the measurement since that start, from 0.
-        q: joint angles, rad.
-        qd: joint velocities, rad/s.
-        sent_ns: sending time on the program's monotonic clock, or time of the measurement on
-            the arm's clock, in ns. The time is compared with no other clock.
-        tau_x: torque of operator and environment in N m, with the sign of a record: the torque
-            ON the arm is the negative. Empty if the arm does not measure the torque.
+        site: Name of the site.
+        boot: Random number that identifies this start of the driver. A site follows one start.
+        n: Number of the measurement since that start, from 0.
+        q: Joint angles in rad.
+        qd: Joint velocities in rad/s.
+        sent_ns: Time of sending on the driver's monotonic clock, or time of the measurement on
+            the arm's clock, in ns. It is not compared with any other clock.
+        tau_x: Torque of the operator and the environment in N m, with the sign of a record: the
+            torque that acts ON the arm is the negative. Empty if the arm does not measure it.
     """
 
     site: str
@@ -163,15 +173,15 @@ class ArmMeasurement(Request, frozen=True, kw_only=True):
 
 
 class ArmEnable(Request, frozen=True, kw_only=True):
-    """Report of a dead-man switch of an external arm, sent at least ten times a second.
+    """Report of the dead-man switch of an external arm, sent at least ten times a second.
 
     Attributes:
-        site: name of the arm's site.
-        boot: random number of the start of the switch's program.
-        n: number of the message since that start, from 0.
-        held: True while somebody holds the switch. False releases the switch at once, without
-            waiting for its silence.
-        sent_ns: sending time on the program's monotonic clock, in ns.
+        site: Name of the site.
+        boot: Random number that identifies this start of the switch's program.
+        n: Number of the message since that start, from 0.
+        held: True while somebody holds the switch. False stops the arm at once. Without a
+            message, the site stops it only after some time of silence.
+        sent_ns: Time of sending on the program's monotonic clock, in ns.
     """
 
     site: str
@@ -182,18 +192,19 @@ class ArmEnable(Request, frozen=True, kw_only=True):
 
 
 class HandMessage(Request, frozen=True, kw_only=True):
-    """Goal of a hand at an arm, sent when it changes and repeated within `SILENCE_NS`.
+    """Goal of an operator for an arm, sent when it changes and repeated within `SILENCE_NS`.
 
     Attributes:
-        site: name of the arm's site.
-        boot: random number of the hand, above 0; one hand at a time holds an arm.
-        source: name of the person or program, for people.
-        n: number of the goal, from 0; a repeated number states that nothing has changed.
+        site: Name of the site of the arm.
+        boot: Random number above 0 that identifies the operator. Only one operator at a time
+            holds an arm.
+        source: Name of the person or program, for the users of the session.
+        n: Number of the goal, from 0. A repeated number means that nothing has changed.
         grip: False to release the arm.
-        target: target position of the end effector in m, or of the joints in rad; empty for a
-            hand that pushes.
-        force: force ON the end effector in N; empty for all other hands.
-        sent_ns: sending time on the program's monotonic clock, in ns.
+        target: Target position of the end effector in m, or of the joints in rad. Empty for an
+            operator who pushes.
+        force: Force ON the end effector in N. Empty for all other operators.
+        sent_ns: Time of sending on the program's monotonic clock, in ns.
     """
 
     site: str
@@ -207,7 +218,7 @@ class HandMessage(Request, frozen=True, kw_only=True):
 
 
 class PeerSeen(Request, frozen=True, kw_only=True):
-    """A peer as a hand sees it, in a `HandViewMessage`; the fields are those of `PeerView`."""
+    """State of a peer in a `HandViewMessage`. The fields are those of `PeerView`."""
 
     alpha: float
     tick: int
@@ -219,13 +230,13 @@ class PeerSeen(Request, frozen=True, kw_only=True):
 
 
 class HandViewMessage(Request, frozen=True, kw_only=True):
-    """State of a site at a tick, for a user's hand that runs in a separate process.
+    """State of a site in one tick, for a user's operator program in another process.
 
-    The fields other than `site` and `boot` are those of `HandView`.
+    The fields other than `site` and `boot` are those of `HandView`, which the program receives.
 
     Attributes:
-        site: name of the site whose arm the hand holds.
-        boot: boot of the site.
+        site: Name of the site whose arm the operator holds.
+        boot: Random number that identifies this start of the site.
     """
 
     site: str

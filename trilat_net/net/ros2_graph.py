@@ -1,17 +1,26 @@
-"""A node in the graph of ROS 2 over Zenoh, without an installation of ROS.
+"""Exchange messages with ROS 2 programs over Zenoh, without an installation of ROS.
 
-The node follows the wire format of rmw_zenoh. It has a separate Zenoh session, which is a
-client of ROS's router (rmw_zenohd) or of another Zenoh router.
+ROS 2 programs that use the middleware rmw_zenoh exchange their messages over Zenoh. `Ros2Graph`
+opens a Zenoh session of its own, as a client of ROS's router (rmw_zenohd) or of another Zenoh
+router, and follows the same wire format. ROS programs then see a node with topics and services,
+as if it was written with a ROS library.
+
+The wire format has three elements:
+
+- A key per topic: domain / name / DDS type / hash of the type's definition.
+- An attachment of 33 bytes to each message: its number, the time of sending, and an identifier
+  of the sender.
+- A liveliness token per node and per endpoint, from which other programs learn what exists.
 
 Source: ros2/rmw_zenoh, docs/design.md and rmw_zenoh_cpp/src/detail (at 99a6a2bd).
 
 Invariant:
-    - Every message has an attachment of 33 bytes, because a peer aborts at an attachment that
-      it cannot parse. The numbers of messages start at 1.
-    - A ROS name has no empty part, so that no token has an empty part either.
-    - Nothing that arrives from ROS raises an error here. Messages without an attachment are
-      counted and skipped.
-    - A publisher drops a message rather than delay its caller.
+    - Every message has an attachment, and its number is at least 1. A ROS program aborts if it
+      receives a message whose attachment it cannot parse.
+    - No part of a ROS name is empty, because a token must not have empty parts.
+    - Messages from ROS programs never raise an error in this process. Messages without an
+      attachment are counted and skipped.
+    - Publishing never delays the caller. If the network is too slow, messages are dropped.
 """
 
 import hashlib
@@ -63,17 +72,20 @@ TYPE_HASHES = {
         "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
     ),
 }
-"""SHA-256 of each type's definition (REP 2016), the same from Iron to Lyrical."""
+"""SHA-256 of each type's definition (REP 2016). It is the same from ROS 2 Iron to Lyrical."""
 DISTROS = ("humble", "jazzy", "kilted", "lyrical")
+"""Distributions of ROS 2 with which messages can be exchanged."""
 _NO_HASH = "TypeHashNotSupported"
-"""Text that Humble writes in place of a hash."""
+"""Text that ROS 2 Humble writes in place of a hash."""
 P = ParamSpec("P")
 _ATTACHMENT = struct.Struct("<qqB16s")
+"""Layout of an attachment: number, time of sending, length of the identifier, and identifier.
+"""
 _GID_BYTES = 16
 
 
 class EndpointKind(StrEnum):
-    """Kind of a node's endpoint, as its token states it."""
+    """Kind of an endpoint, as its liveliness token states it."""
 
     PUBLISHER = "MP"
     SUBSCRIPTION = "MS"
@@ -81,12 +93,12 @@ class EndpointKind(StrEnum):
 
 
 class QualityOfService(NamedTuple):
-    """Quality of service of an endpoint.
+    """Quality of service of a publisher, subscription or service, as ROS 2 defines it.
 
     Attributes:
-        reliable: True if messages are sent again until they arrive.
-        latched: True if late subscribers receive the last messages (transient local).
-        depth: number of messages that are kept.
+        reliable: True if lost messages are sent again until they arrive.
+        latched: True if late subscribers receive the last messages ("transient local").
+        depth: Number of messages that are kept.
     """
 
     reliable: bool = True
@@ -94,7 +106,7 @@ class QualityOfService(NamedTuple):
     depth: int = 10
 
     def encode(self) -> str:
-        """Returns the text in tokens, which leaves out the defaults of ROS 2."""
+        """Returns the text for tokens. Values that are the defaults of ROS 2 are left out."""
         reliability = "" if self.reliable else "2"
         durability = "1" if self.latched else ""
         depth = "" if self.depth == 42 else self.depth
@@ -102,12 +114,13 @@ class QualityOfService(NamedTuple):
 
 
 class Attachment(NamedTuple):
-    """Attachment of every message, request and reply.
+    """Attachment of every message, request and response.
 
     Attributes:
-        number: number of the message, from 1 on.
-        sent_unix_ns: sending time, Unix ns.
-        gid: 16 bytes that identify the sender; in a reply, the sender of the request.
+        number: Number of the message, from 1.
+        sent_unix_ns: Time of sending, in ns of Unix time.
+        gid: 16 bytes that identify the sender. In a response, they identify the sender of the
+            request.
     """
 
     number: int
@@ -120,7 +133,15 @@ class Attachment(NamedTuple):
 
 
 def parse_attachment(content: Any) -> Attachment | None:
-    """Returns the attachment in bytes, or in `ZBytes` of Zenoh; None if there is none."""
+    """Parses the attachment of a message.
+
+    Args:
+        content: The bytes, or the `ZBytes` object of Zenoh. None if the message has no
+            attachment.
+
+    Returns:
+        The attachment. None if there is none, or if it does not have the format of ROS.
+    """
     data = b"" if content is None else bytes(content)
     if len(data) != _ATTACHMENT.size or data[16] != _GID_BYTES:
         return None
@@ -129,32 +150,44 @@ def parse_attachment(content: Any) -> Attachment | None:
 
 
 def find_type_hash(kind: str, distro: str) -> str:
-    """Returns the hash of a message type in the form of a ROS 2 distribution."""
+    """Returns the hash of a message type, in the form that a ROS 2 distribution uses.
+
+    Args:
+        kind: Name of the type, such as "std_msgs/msg/String".
+        distro: Name of the distribution, one of `DISTROS`.
+    """
     return _NO_HASH if distro == "humble" else f"RIHS01_{TYPE_HASHES[kind]}"
 
 
 def name_dds_type(kind: str) -> str:
-    """Returns the name of a message type in keys and tokens.
+    """Returns the name of a message type as it is written in keys and tokens.
 
-    For std_msgs/msg/String that is std_msgs::msg::dds_::String_.
+    For "std_msgs/msg/String" it is "std_msgs::msg::dds_::String_".
     """
     package, group, name = kind.split("/")
     return f"{package}::{group}::dds_::{name}_"
 
 
 def topic_key(domain: int, name: str, kind: str, type_hash: str) -> str:
-    """Returns the Zenoh key of a topic, or of a service."""
+    """Returns the Zenoh key of a topic or a service.
+
+    Args:
+        domain: Domain of ROS (ROS_DOMAIN_ID).
+        name: Name of the topic or service.
+        kind: Name of its type.
+        type_hash: Hash of the type.
+    """
     return f"{domain}/{name}/{name_dds_type(kind)}/{type_hash}"
 
 
 class Ros2Member(NamedTuple):
-    """Address of a node in the graph of ROS.
+    """Address of a node, from which its liveliness tokens are composed.
 
     Attributes:
-        domain: domain of ROS (ROS_DOMAIN_ID).
-        zid: identity of the node's Zenoh session.
-        namespace: namespace of the node; "" for the root.
-        name: name of the node.
+        domain: Domain of ROS (ROS_DOMAIN_ID).
+        zid: Identity of the node's Zenoh session.
+        namespace: Namespace of the node. Empty for the root namespace.
+        name: Name of the node.
     """
 
     domain: int
@@ -163,7 +196,7 @@ class Ros2Member(NamedTuple):
     name: str
 
     def token(self) -> str:
-        """Returns the liveliness token by which other nodes see this node."""
+        """Returns the liveliness token from which other programs learn that the node exists."""
         return f"@ros2_lv/{self.domain}/{self.zid}/0/0/NN/{self._path()}"
 
     def endpoint_token(
@@ -175,38 +208,40 @@ class Ros2Member(NamedTuple):
         type_hash: str,
         qos: QualityOfService,
     ) -> str:
-        """Returns the liveliness token of one endpoint of the node.
+        """Returns the liveliness token of one publisher, subscription or service of the node.
 
         Args:
-            number: number of the endpoint, unique in the Zenoh session.
-            end: kind of the endpoint.
-            name: name of the topic or service.
-            kind: type of the messages.
-            type_hash: hash of that type.
-            qos: quality of service.
+            number: Number of the endpoint, unique in the Zenoh session.
+            end: Kind of the endpoint.
+            name: Name of the topic or service.
+            kind: Name of its type.
+            type_hash: Hash of that type.
+            qos: Quality of service.
         """
         node = f"@ros2_lv/{self.domain}/{self.zid}/0/{number}/{end}/{self._path()}"
         return f"{node}/{_mangle('/' + name)}/{name_dds_type(kind)}/{type_hash}/{qos.encode()}"
 
     def _path(self) -> str:
+        """Returns the part of a token that names the node."""
         namespace = _mangle("/" + self.namespace) if self.namespace else "%"
         return f"%/{namespace}/{self.name}"
 
 
 def _mangle(name: str) -> str:
+    """Returns a name with its slashes replaced, as names within tokens are written."""
     return name.replace("/", "%")
 
 
 def describe_mismatch(token: str, domain: int, kind: str) -> str:
-    """Returns how a publisher differs from an expected domain and message type.
+    """Describes why messages of a publisher do not arrive at a subscription.
 
     Args:
-        token: liveliness token of the publisher.
-        domain: expected domain.
-        kind: expected message type.
+        token: Liveliness token of the publisher.
+        domain: Domain of the subscription.
+        kind: Message type of the subscription.
 
     Returns:
-        The end of a sentence; "" if the publisher matches.
+        The end of a sentence that names the difference. Empty if the publisher matches.
     """
     _, token_domain, *_, token_type, token_hash, _ = token.split("/")
     if token_domain != str(domain):
@@ -219,31 +254,34 @@ def describe_mismatch(token: str, domain: int, kind: str) -> str:
 
 
 def make_gid(token: str) -> bytes:
-    """Returns 16 bytes that identify an endpoint."""
+    """Returns 16 bytes that identify an endpoint, computed from its token."""
     return hashlib.sha256(token.encode()).digest()[:_GID_BYTES]
 
 
 _SETTINGS = {"timestamping": {"enabled": {"client": True}}}
-"""Latched topics need time stamps: these tell which messages are the last."""
+"""Zenoh settings of the session.
+
+Messages need time stamps, which tell late subscribers of a latched topic the last messages.
+"""
 SENSOR = QualityOfService(reliable=False, depth=5)
-"""Quality of service of a subscription that matches every publisher."""
+"""Quality of service of a subscription, to which every publisher is compatible."""
 
 
 _MAX_REASONS = 64
-"""Number of refusal reasons that are counted separately.
+"""Number of reasons that are counted separately.
 
-The number is limited because reasons contain texts of strangers.
+It is limited because reasons contain texts from other programs, which may differ every time.
 """
 
 
 class Refusals:
-    """Counts of the messages from ROS that were refused, by reason.
+    """Counts the messages from ROS programs that were refused, by the reason.
 
     Args:
-        report: receives a text for the first refusal of each reason.
+        report: Function that receives a sentence when a reason occurs for the first time.
 
     Attributes:
-        counts: number of refusals by reason.
+        counts: Number of refusals by the reason.
     """
 
     def __init__(self, report: Callable[[str], None]) -> None:
@@ -252,7 +290,7 @@ class Refusals:
         self._lock = threading.Lock()
 
     def add(self, reason: str) -> None:
-        """Counts a refusal; may be called in any thread."""
+        """Counts a refusal. The method may be called in any thread."""
         with self._lock:
             if reason not in self.counts and len(self.counts) >= _MAX_REASONS:
                 reason = "further reasons, which are counted together"
@@ -262,7 +300,12 @@ class Refusals:
             self._report(f"refused: {reason}")
 
     def guard(self, topic: str, act: Callable[P, None]) -> Callable[P, None]:
-        """Returns a function that calls `act`, and counts its errors as refusals of a topic."""
+        """Returns a function like `act` that counts errors as refusals instead of raising them.
+
+        Args:
+            topic: Name of the topic, which the reason mentions.
+            act: Function that processes a message.
+        """
 
         def guarded(*args: P.args, **named: P.kwargs) -> None:
             try:
@@ -274,12 +317,12 @@ class Refusals:
 
 
 class TopicPublisher:
-    """Publisher of one topic.
+    """Publishes messages on one topic. `Ros2Graph.publisher` creates it.
 
     Args:
-        declared: Zenoh's publisher.
+        declared: The publisher object of Zenoh.
         gid: 16 bytes that identify the publisher.
-        clock: clock of the sending times.
+        clock: Clock for the times of sending.
         latched: True if late subscribers receive the last messages.
     """
 
@@ -292,34 +335,36 @@ class TopicPublisher:
 
     @property
     def has_subscribers(self) -> bool:
-        """True while there is a subscriber, or while the topic is latched.
+        """True while there is a subscriber, or if the topic is latched.
 
-        Otherwise the caller need not compose a message.
+        If it is False, the caller need not compose a message.
         """
         return self._latched or bool(self._declared.matching_status.matching)
 
     def put(self, data: bytes) -> None:
-        """Publishes a message."""
+        """Publishes a message, encoded in CDR, with the next number."""
         self._number += 1
         attachment = Attachment(self._number, self._clock.unix_ns(), self._gid)
         self._declared.put(data, attachment=attachment.encode())
 
 
 class Ros2Graph:
-    """The graph of ROS as one node sees it; a context manager, which removes the node on exit.
+    """A node among ROS 2 programs: its publishers, subscriptions and services.
+
+    The object is a context manager that removes the node at its end.
 
     Args:
-        refusals: counts the messages that are refused.
-        routers: endpoints of ROS's router; the first that answers is used.
-        namespace: namespace of the node.
-        name: name of the node.
-        clock: clock of the sending times.
-        domain: domain of ROS (ROS_DOMAIN_ID).
-        distro: the distribution of ROS 2, one of `DISTROS`, whose type hashes are written.
+        refusals: Counts the messages that are refused.
+        routers: Endpoints of the router of ROS. The first one that answers is used.
+        namespace: Namespace of the node.
+        name: Name of the node.
+        clock: Clock for the times of sending.
+        domain: Domain of ROS (ROS_DOMAIN_ID).
+        distro: Distribution of ROS 2, one of `DISTROS`. It determines the form of type hashes.
 
     Raises:
-        RouterSilent: no router answers, or no router answers yet.
-        UsageError: an endpoint is invalid, or belongs to a program that forwards nothing.
+        RouterSilent: No router answers (yet).
+        UsageError: An endpoint is not valid, or belongs to a program that is not a router.
     """
 
     def __init__(
@@ -352,10 +397,10 @@ class Ros2Graph:
         self._clock = clock
         self._endpoints = 0
         self.refusals = refusals
-        # Services do not use a thread of Zenoh: one that waits when the interpreter ends aborts
-        # the process.
+        # Services run in this thread and not in a thread of Zenoh. A thread of Zenoh that still
+        # waits when the interpreter ends would abort the process.
         self._service_thread = ThreadPoolExecutor(1, "services")
-        # Zenoh undeclares an object that is not referenced.
+        # The objects must stay referenced: Zenoh removes what Python has deleted.
         self._declarations: list[Any] = [
             self._session.liveliness().declare_token(self._node.token())
         ]
@@ -371,16 +416,22 @@ class Ros2Graph:
 
     @property
     def connected(self) -> bool:
-        """False while the router is away; the session reconnects when the router is back."""
+        """True while the router is connected.
+
+        The session reconnects when the router is back.
+        """
         return bool(self._session.info.routers_zid())
 
     def publisher(self, topic: str, kind: str, qos: QualityOfService) -> TopicPublisher:
-        """Returns a publisher of messages, encoded in CDR.
+        """Creates a publisher.
 
         Args:
-            topic: name of the topic.
-            kind: type of the messages.
-            qos: quality of service.
+            topic: Name of the topic.
+            kind: Name of the message type.
+            qos: Quality of service.
+
+        Returns:
+            The publisher, which sends messages that are encoded in CDR.
         """
         key, gid = self._declare(EndpointKind.PUBLISHER, topic, kind, qos)
         options: dict[str, Any] = {
@@ -399,16 +450,16 @@ class Ros2Graph:
     def subscribe(
         self, topic: str, kind: str, receive: Callable[[bytes, Attachment], None]
     ) -> None:
-        """Subscribes to a topic, with an entry in the graph.
+        """Subscribes to a topic, visibly for ROS programs.
 
-        Messages of publishers with another domain, type or definition do not arrive; such
-        publishers are reported once, by their tokens.
+        Messages of publishers with another domain, type or definition do not arrive. Such
+        publishers are reported once as refusals, when their token appears.
 
         Args:
-            topic: name of the topic.
-            kind: type of the messages.
-            receive: receives each payload and its attachment, in a thread of Zenoh; a message
-                for which it raises an error counts as refused.
+            topic: Name of the topic.
+            kind: Name of the message type.
+            receive: Function that receives the payload and the attachment of each message, in a
+                thread of Zenoh. If it raises an error, the message counts as refused.
         """
         self._declare(EndpointKind.SUBSCRIPTION, topic, kind, SENSOR)
         self._report_mismatches(topic, kind)
@@ -422,7 +473,7 @@ class Ros2Graph:
             self._declare_subscriber(key, topic, receive_sample)
 
     def _report_mismatches(self, topic: str, kind: str) -> None:
-        """Counts publishers of a topic with another domain or type as refusals."""
+        """Reports the publishers of a topic whose messages do not arrive here."""
 
         def check_publisher(sample: zenoh.Sample) -> None:
             mismatch = describe_mismatch(str(sample.key_expr), self._node.domain, kind)
@@ -436,23 +487,30 @@ class Ros2Graph:
         )
 
     def tap(self, topic: str, receive: Callable[[str, Attachment], None]) -> None:
-        """Receives a topic without an entry in the graph.
+        """Receives a topic without being visible for ROS programs.
 
         Args:
-            topic: name of the topic.
-            receive: receives the type and the attachment of every message, in a thread of
-                Zenoh.
+            topic: Name of the topic.
+            receive: Function that receives the type and the attachment of each message, in a
+                thread of Zenoh.
         """
 
         def receive_sample(sample: zenoh.Sample, attachment: Attachment) -> None:
-            receive(str(sample.key_expr).rsplit("/", 2)[1], attachment)
+            _, dds_type, _ = str(sample.key_expr).rsplit("/", 2)
+            receive(dds_type, attachment)
 
         self._declare_subscriber(f"{self._node.domain}/{topic}/*/*", topic, receive_sample)
 
     def _declare_subscriber(
         self, key: str, topic: str, receive: Callable[[zenoh.Sample, Attachment], None]
     ) -> None:
-        """Declares a Zenoh subscriber, which refuses messages without an attachment."""
+        """Creates a Zenoh subscriber that refuses messages without an attachment.
+
+        Args:
+            key: Zenoh key, which may contain wildcards.
+            topic: Name of the topic, for the reasons of refusals.
+            receive: Function that receives each other message.
+        """
 
         def receive_sample(sample: zenoh.Sample) -> None:
             attachment = parse_attachment(sample.attachment)
@@ -465,12 +523,12 @@ class Ros2Graph:
         self._declarations.append(self._session.declare_subscriber(key, handler))
 
     def serve(self, service: str, kind: str, answer: Callable[[bytes], bytes]) -> None:
-        """Serves a service, in a thread in which all services take turns.
+        """Offers a service. The requests of all services are processed one after another.
 
         Args:
-            service: name of the service.
-            kind: type of the service.
-            answer: returns the response to a request.
+            service: Name of the service.
+            kind: Name of its type.
+            answer: Function that returns the response to a request, both encoded in CDR.
         """
         key, _ = self._declare(EndpointKind.SERVER, service, kind, QualityOfService())
 
@@ -493,7 +551,17 @@ class Ros2Graph:
     def _declare(
         self, end: EndpointKind, name: str, kind: str, qos: QualityOfService
     ) -> tuple[str, bytes]:
-        """Declares the token of an endpoint; returns the endpoint's key and gid."""
+        """Declares the liveliness token of an endpoint, so that ROS programs see it.
+
+        Args:
+            end: Kind of the endpoint.
+            name: Name of the topic or service.
+            kind: Name of its type.
+            qos: Quality of service.
+
+        Returns:
+            The Zenoh key of the endpoint, and 16 bytes that identify it.
+        """
         self._endpoints += 1
         type_hash = find_type_hash(kind, self._distro)
         token = self._node.endpoint_token(

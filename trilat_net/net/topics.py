@@ -1,8 +1,13 @@
-"""Keys of the bus, and the numbers of the messages of each channel.
+"""Name the channels on which members of a session exchange messages, and number the messages.
 
-A key is trilat/<session>/<member>/<channel>. The key of a liveliness token, whose channel is
-"alive", ends in the boot of the member. The number of a record is its tick; statistics are
-numbered from 0.
+A member is a process of a session: a site or a recorder. Each message has a Zenoh key of the
+form trilat/<session>/<member>/<channel>, where the channel is the kind of the messages. The key
+of a liveliness token, which shows that a process is present, has the channel "alive" and ends
+with the boot of the process (a random number per start).
+
+Messages of a channel are numbered consecutively, so that a recorder notices lost messages. The
+number of a record is its tick. Statistics, which are published ten times a second, are numbered
+from 0.
 """
 
 from collections.abc import Iterator
@@ -11,34 +16,51 @@ from typing import NamedTuple
 from .bus import PresenceInbox
 
 ROOT = "trilat"
+"""Beginning of all keys."""
 RECORDER = "recorder"
+"""Name of every recorder as a member."""
 STATE = "state"
+"""Channel of the records that a site publishes for the recorder, one per tick."""
 LINK = "link"
+"""Channel of a site's statistics about its loop and its links."""
 EVENT = "event"
+"""Channel of events."""
 INFO = "info"
+"""Channel of the queries for a member's identity."""
 ALIVE = "alive"
+"""Channel of liveliness tokens."""
 PING = "ping"
+"""Channel of pings, which measure the offset between clocks."""
 SET = "set"
+"""Channel of requests for changes."""
 STOP = "stop"
-"""Channel of the order to stop, which all members may send; other changes use `SET`."""
+"""Channel of the order to stop, which all members may send. Other changes use `SET`."""
 SAMPLE = "sample"
+"""Channel of the samples that a site publishes for its peers, one per tick."""
 PAST = "past"
+"""Channel of a recorder's queries for lost messages."""
 STATS = "stats"
+"""Channel of a recorder's statistics."""
 MEASURED = "measured"
+"""Channel of the measurements of an external arm."""
 HAND = "hand"
+"""Channel of the goals of an operator, a person or program that moves an arm."""
 ENABLE = "enable"
+"""Channel of the reports of a dead-man switch."""
 VIEW = "view"
+"""Channel of a site's states for an operator program in another process."""
 STATS_PER_SECOND = 10
+"""Rate at which a site publishes statistics, in 1/s."""
 
 
 class KeyParts(NamedTuple):
-    """The parts of a key.
+    """Parts of a key.
 
     Attributes:
-        session: name of the session.
-        member: name of the member.
-        channel: name of the channel.
-        boot: boot of the member, in the key of a liveliness token; else "".
+        session: Name of the session.
+        member: Name of the member.
+        channel: Name of the channel.
+        boot: Boot of the member, in the key of a liveliness token. Empty in other keys.
     """
 
     session: str
@@ -48,17 +70,21 @@ class KeyParts(NamedTuple):
 
 
 def presence_key(session: str, member: str) -> str:
-    """Returns the key expression of the liveliness tokens of all starts of a member.
+    """Returns the key that matches the liveliness tokens of all starts of a member.
 
-    The member `*` stands for all members.
+    Args:
+        session: Name of the session.
+        member: Name of the member, or "*" for all members.
     """
     return f"{key(session, member, ALIVE)}/*"
 
 
 def read_presence(inbox: PresenceInbox) -> Iterator[tuple[KeyParts, bool]]:
-    """Yields the changes of presence that wait in a ring.
+    """Removes all waiting changes of presence from an inbox, and yields them.
 
-    Each change is (key of the token, True if the token is alive now).
+    Yields:
+        The parts of a token's key, and True if the token has appeared or False if it has
+        disappeared. Tokens of other programs are skipped.
     """
     while (change := inbox.poll()) is not None:
         token, is_alive = change
@@ -68,52 +94,76 @@ def read_presence(inbox: PresenceInbox) -> Iterator[tuple[KeyParts, bool]]:
 
 
 def key(session: str, member: str, channel: str) -> str:
-    """Returns the key of a member's channel; the member `*` stands for all members."""
+    """Returns the key of one channel of a member.
+
+    Args:
+        session: Name of the session.
+        member: Name of the member, or "*" for all members.
+        channel: Name of the channel.
+    """
     return f"{ROOT}/{session}/{member}/{channel}"
 
 
 def parse_key(key: str) -> KeyParts | None:
-    """Returns the parts of a key, or None if the key is not one of this program."""
+    """Splits a key into its parts. Returns None if the key belongs to another program."""
     root, _, rest = key.partition("/")
     parts = rest.split("/")
-    return KeyParts(*parts) if root == ROOT and len(parts) in (3, 4) else None
+    has_valid_length = len(parts) in (3, 4)  # with the boot, four
+    if root != ROOT or not has_valid_length:
+        return None
+    return KeyParts(*parts)
 
 
 def ticks_per_stats(rate_hz: int) -> int:
-    """Returns the number of ticks from one statistics message to the next."""
+    """Returns the number of ticks from one message with statistics to the next."""
     return max(1, rate_hz // STATS_PER_SECOND)
 
 
 def number_message(channel: str, tick: int, rate_hz: int) -> int:
-    """Returns the number of a tick's record, or of its statistics, in their channel."""
+    """Returns the number of the record of a tick, or of the statistics after it.
+
+    Args:
+        channel: `STATE` or `LINK`.
+        tick: The tick.
+        rate_hz: Tick rate of the site.
+    """
     return tick // ticks_per_stats(rate_hz) if channel == LINK else tick
 
 
 def count_messages(channel: str, ticks: int, rate_hz: int) -> int:
-    """Returns the number of records or statistics that a site publishes in `ticks` ticks."""
-    return -(-ticks // ticks_per_stats(rate_hz)) if channel == LINK else ticks
+    """Returns how many records, or statistics, a site publishes in its first ticks.
+
+    Args:
+        channel: `STATE` or `LINK`.
+        ticks: Number of ticks.
+        rate_hz: Tick rate of the site.
+    """
+    if channel != LINK:
+        return ticks
+    # Rounded up, as statistics are published after tick 0: -(-a // b) rounds a / b up.
+    return -(-ticks // ticks_per_stats(rate_hz))
 
 
 def count_under_way(channel: str, rate_hz: int) -> int:
-    """Returns the number of sent messages that may be lost with a killed site.
+    """Returns how many published messages may be lost if a site is killed.
 
-    These are the messages of 20 ms.
+    These are the messages of the last 20 ms, which may not have left the machine yet.
     """
     return 1 if channel == LINK else rate_hz // 50
 
 
 def skipped_numbers(channel: str, tick: int, skipped: int, rate_hz: int) -> tuple[int, int]:
-    """Returns the numbers of messages around ticks that a site skipped.
+    """Returns which numbers of messages belong to ticks that a site skipped.
 
     Args:
-        channel: the channel.
-        tick: the first tick after the skipped ones.
-        skipped: number of skipped ticks.
-        rate_hz: tick rate of the site.
+        channel: `STATE` or `LINK`.
+        tick: First tick after the skipped ones.
+        skipped: Number of skipped ticks.
+        rate_hz: Tick rate of the site.
 
     Returns:
         The number of the first message after the skipped ticks, and the number of messages
-        published before them: the arguments of `Account.mark_unpublished`.
+        published before them. These are the arguments of `Account.mark_unpublished`.
     """
     next_number = number_message(channel, tick, rate_hz)
     published = count_messages(channel, tick - skipped, rate_hz)
