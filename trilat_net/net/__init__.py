@@ -1,4 +1,8 @@
-"""Clocks, messages, the bus, and the start of a session.
+"""Exchange messages between the processes of a session over the network.
 
-The members of a session find each other over the bus and agree on an epoch.
+The package contains the network connection (`bus`, `zenoh_bus`, `connection`, `member_keys`),
+the messages and their encoding (`messages`, `requests`, `wire`, `topics`), the clocks and their
+comparison (`clock`, `pinging`, `offset`, `timing`), and the agreement of the processes on the
+start of a session (`membership`, `session`, `discovery`). Programs outside a session connect
+with `arm_client`, `known_sites` and `ros2_graph`.
 """

@@ -1,8 +1,9 @@
-"""Clocks: the only module that reads the time.
+"""Read the time. No other module reads a clock of the operating system.
 
 Invariant:
-    - Rule L1: code that needs the time takes a clock as an argument.
-    - Times are integer nanoseconds, never floating-point numbers.
+    - Rule L1: code that needs the time receives a clock as an argument, so that tests and
+      simulations can use a clock of their own.
+    - Times are integers in ns. Floating-point numbers would lose precision after a few months.
 """
 
 import platform
@@ -15,43 +16,50 @@ NS_PER_S = 1_000_000_000
 
 
 class Clock(Protocol):
-    """Interface of the clocks that drivers use."""
+    """Interface of the clocks of this program."""
 
     def monotonic_ns(self) -> int:
-        """Returns the reading of a clock that never steps, in ns; its zero is arbitrary."""
+        """Returns the reading of a clock that never steps, in ns. Its zero is arbitrary."""
 
     def unix_ns(self) -> int:
-        """Returns the time since 1970 in ns, by the machine's wall clock, which may step."""
+        """Returns the time since 1970 in ns, as the time of day of the machine. It may step."""
 
     def sleep_until(self, deadline_ns: int) -> None:
-        """Sleeps until `deadline_ns` of the monotonic clock, if that has not passed."""
+        """Sleeps until the monotonic clock reads `deadline_ns`.
+
+        Returns at once if that has passed.
+        """
 
     def identity(self) -> str:
-        """Returns the identity of the monotonic clock.
+        """Returns a text that identifies the monotonic clock.
 
-        Two processes may compare their readings only if their identities are equal.
+        Readings of two processes can be compared only if their clocks have the same identity.
         """
 
 
 class SystemClock:
-    """The machine's clocks."""
+    """The clocks of this machine."""
 
     monotonic_ns = staticmethod(time.perf_counter_ns)
     """The clock of `time.monotonic_ns`, except on Windows, where that clock steps by 16 ms."""
     unix_ns = staticmethod(time.time_ns)
 
     def sleep_until(self, deadline_ns: int) -> None:
-        """See `Clock`."""
+        """Sleeps until the monotonic clock reads `deadline_ns`.
+
+        Returns at once if that has passed.
+        """
         remaining_ns = deadline_ns - self.monotonic_ns()
         if remaining_ns > 0:
             # CPython sleeps until an absolute deadline, so signals do not shorten the sleep.
             time.sleep(remaining_ns * 1e-9)
 
     def identity(self) -> str:
-        """See `Clock`.
+        """Returns a text that identifies the monotonic clock of this machine.
 
-        On Linux, the identity is the boot of the kernel and the time namespace; elsewhere, it
-        is the machine's name.
+        On Linux it consists of the kernel's boot identifier and the time namespace, because
+        containers may have a clock of their own. On other systems it contains the name of the
+        machine.
         """
         try:
             boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
@@ -62,20 +70,21 @@ class SystemClock:
 
 
 class SkewedClock:
-    """A clock with an offset and a drift against another clock, for tests.
+    """A clock with an offset and a drift relative to another clock, for tests on one machine.
 
-    The clock stands for that of another machine. It reads
+    The clock behaves like the clock of another machine. It reads
 
         start + offset + (reading - start) (1 + drift),
 
-    where `start` is the reading of the other clock at the construction of this one. The wall
-    clock is not changed. The identity is unique and states the offset, the drift and the start,
-    so that readers of a log can convert the readings.
+    where `reading` is the present reading of the other clock, and `start` was its reading when
+    this object was created. The time of day is not changed. The identity of the clock is
+    unique. It states the offset, the drift and the start, so that readers of a log can convert
+    the readings.
 
     Args:
-        clock: the other clock.
-        offset_ns: offset against the other clock.
-        drift_ppb: drift against the other clock, ns/s.
+        clock: The other clock.
+        offset_ns: Offset relative to the other clock, in ns.
+        drift_ppb: Drift relative to the other clock, in ns/s.
     """
 
     def __init__(self, clock: Clock, offset_ns: int, drift_ppb: int) -> None:
@@ -85,7 +94,7 @@ class SkewedClock:
         self._start_ns = clock.monotonic_ns()
 
     def monotonic_ns(self) -> int:
-        """See `Clock`."""
+        """Returns the reading of the skewed clock, in ns."""
         passed_ns = self._clock.monotonic_ns() - self._start_ns
         return (
             self._start_ns
@@ -95,18 +104,18 @@ class SkewedClock:
         )
 
     def unix_ns(self) -> int:
-        """See `Clock`."""
+        """Returns the time of day of the other clock, in ns since 1970."""
         return self._clock.unix_ns()
 
     def sleep_until(self, deadline_ns: int) -> None:
-        """See `Clock`."""
+        """Sleeps until the skewed clock reads `deadline_ns`, with the sleep of the other clock."""
         passed_ns = deadline_ns - self._start_ns - self._offset_ns
-        self._clock.sleep_until(
-            self._start_ns - -passed_ns * NS_PER_S // (NS_PER_S + self._drift_ppb)
-        )
+        # -(-a // b) is a / b rounded up, so that the sleep does not end before the deadline.
+        other_passed_ns = -(-passed_ns * NS_PER_S // (NS_PER_S + self._drift_ppb))
+        self._clock.sleep_until(self._start_ns + other_passed_ns)
 
     def identity(self) -> str:
-        """See `Clock`."""
+        """Returns a text that identifies the skewed clock, with its offset, drift and start."""
         return (
             f"{self._clock.identity()}, skewed by {self._offset_ns} ns "
             f"and {self._drift_ppb} ns/s since {self._start_ns} ns"
@@ -114,7 +123,12 @@ class SkewedClock:
 
 
 def make_system_clock(offset_s: float = 0.0, drift_ppm: float = 0.0) -> Clock:
-    """Returns the machine's clock, for tests with an offset (s) and a drift (ppm)."""
+    """Returns the clock of this machine, or for tests a clock with an offset and a drift.
+
+    Args:
+        offset_s: Offset relative to the machine's clock, in s.
+        drift_ppm: Drift relative to the machine's clock, in parts per million.
+    """
     if not offset_s and not drift_ppm:
         return SystemClock()
     return SkewedClock(SystemClock(), round(offset_s * NS_PER_S), round(drift_ppm * 1000))

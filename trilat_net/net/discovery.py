@@ -1,11 +1,14 @@
-"""Discovery of a session from outside: find its members, connect to it, request a change.
+"""Find a running session from outside, connect to it, and send requests to its sites.
+
+Programs that are not part of a session use this module: the commands that stop arms, change
+links or measure the network, and a playback of a log.
 
 Invariant:
-    - `find_members` is the only way to query who is present.
-    - A session name belongs to one session: a playback under the name of a session with a
-      present site is refused.
-    - A change is requested once. The caller gets a reply, or an error that names the member
-      that did not reply.
+    - `find_members` is the only function that queries which members are present.
+    - A session name belongs to one session. A log cannot be played back under the name of a
+      session that has a site which is present.
+    - A change is requested only once, because a second request might apply it twice. The caller
+      receives either a reply, or an error that names the site that did not reply.
 """
 
 import math
@@ -35,14 +38,19 @@ from .requests import (
 from .wire import decode, encode
 
 POLL_NS = 5_000_000
+"""Time between two polls for replies, in ns."""
 REPLY_TIMEOUT_S = 3.0
+"""Longest wait for a reply, in s."""
 NAME_CHECK_S = 0.7
-"""Time to look for sites before a playback, in s: sites try to connect every half a second."""
+"""Time for which a playback looks for sites of a session with the same name, in s.
+
+Sites try to connect every half a second.
+"""
 
 SiteNamesOf = Callable[[str], tuple[str, ...]]
-"""Returns the names of the sites in a scenario's text, in order.
+"""Function that returns the names of the sites in the text of a scenario, in their order.
 
-Raises ScenarioError if the text is not a scenario.
+It raises `ScenarioError` if the text is not a scenario.
 """
 
 
@@ -54,17 +62,19 @@ def find_members(
     stopped: Callable[[], bool],
     timeout_s: float | None,
 ) -> Iterator[Info]:
-    """Yields identities of members as they arrive; the identity of one member repeatedly.
+    """Queries the members of a session, and yields their identities as they arrive.
+
+    The query is repeated, so that the identity of a member is yielded repeatedly.
 
     Args:
-        bus: a bus that reaches the session.
-        clock: clock of the caller.
-        session: name of the session.
-        stopped: returns True to end the search.
-        timeout_s: duration of the search in s; None for no limit.
+        bus: Network connection that reaches the session.
+        clock: Clock of the caller.
+        session: Name of the session.
+        stopped: Function that returns True to end the search.
+        timeout_s: Duration of the search, in s. None searches without a limit.
 
     Raises:
-        SessionError: the time is over, and all replies that arrived are unreadable.
+        SessionError: The time is over, and none of the replies that arrived could be decoded.
     """
     query = MemberQuery(bus, clock, session)
     has_readable_reply = False
@@ -92,27 +102,33 @@ def connect_to_session(
     say: Callable[[str], None] = lambda _: None,
     recorder_boot: int | None = None,
 ) -> Iterator[Bus | None]:
-    """Yields a bus that reaches a session's sites, or None if `stopped`; closes it at the end.
+    """Connects to the sites of a session, as a context manager that closes the connection.
 
-    If the connection's `connect` is None, the endpoints are found as follows. If all sites of
-    the session are known to run on this machine, their endpoints are used. Otherwise, the
-    session's first site, on this machine, is queried for the other sites.
+    If the endpoints are not known (`connection.connect` is None), they are found in two ways.
+    If all sites of the session are known to run on this machine, their endpoints are used.
+    Otherwise the first site of the session, at its default endpoint on this machine, is queried
+    for the names of the other sites, whose default endpoints follow from the names.
 
     Args:
-        connection: endpoints and mode of the caller.
-        clock: clock of the caller.
-        session: name of the session.
-        names: returns the sites of a scenario; if it returns no sites, the endpoint of the
-            first site is used.
-        stopped: returns True to give up.
-        timeout_s: time to wait for the first site, or for a router, in s; None for no limit.
-        say: receives messages for the user.
-        recorder_boot: boot of a recorder, which is announced meanwhile, so that the session
-            waits for the recorder; None for other callers.
+        connection: Endpoints and mode of the caller.
+        clock: Clock of the caller.
+        session: Name of the session.
+        names: Function that returns the names of the sites in a scenario. If it returns no
+            names, only the first site is connected.
+        stopped: Function that returns True to give up.
+        timeout_s: Longest wait for the first site or for a router, in s. None waits without a
+            limit.
+        say: Function that prints a line for the user.
+        recorder_boot: Boot of the caller, if the caller is a recorder. The recorder is
+            announced during the search, so that the session waits for it. None for other
+            callers.
+
+    Yields:
+        The network connection. None if `stopped` returned True.
 
     Raises:
-        SessionError: no site, or no router, replies in time.
-        UsageError: an endpoint cannot be used.
+        SessionError: No site, or no router, replies in time.
+        UsageError: An endpoint cannot be used.
     """
     with ExitStack() as stack:
 
@@ -155,10 +171,14 @@ def _query_sites(
     stopped: Callable[[], bool],
     timeout_s: float | None,
 ) -> tuple[str, ...] | None:
-    """Returns the sites of the first member's scenario, or None if `stopped`.
+    """Queries the members of a session for the names of its sites.
+
+    Returns:
+        The names, from the first reply that contains a scenario. None if `stopped` returned
+        True.
 
     Raises:
-        SessionError: no member with a scenario replies in time.
+        SessionError: No member with a scenario replies in time.
     """
     for info in find_members(bus, clock, session, stopped=stopped, timeout_s=timeout_s):
         try:
@@ -177,12 +197,16 @@ def _query_sites(
 def send_change(
     bus: Bus, clock: Clock, session: str, site: str, request: ChangeRequest
 ) -> ChangeReply:
-    """Sends a request to a site of a running session, and returns the site's reply.
+    """Sends a request to a site of a running session, and waits for the reply.
 
-    All members may send the order to stop.
+    With keys, only the operator's keys permit changes. The order to stop is permitted to all
+    members.
+
+    Returns:
+        The reply of the site, accepted or refused.
 
     Raises:
-        SessionError: the site does not reply.
+        SessionError: The site does not reply.
     """
     channel = topics.STOP if request.order == "stop" else topics.SET
     payload = _query_once(bus, clock, topics.key(session, site, channel), request)
@@ -210,7 +234,11 @@ def send_change(
 
 
 def _query_once(bus: Bus, clock: Clock, key: str, request: Request) -> bytes | None:
-    """Returns the payload of the first reply to a request, or None without a reply in time."""
+    """Sends a request once, and waits for the first reply.
+
+    Returns:
+        The payload of the reply. None if no reply arrives within `REPLY_TIMEOUT_S`.
+    """
     replies = bus.query(key, encode(request))
     deadline_ns = clock.monotonic_ns() + int(REPLY_TIMEOUT_S * 1e9)
     while clock.monotonic_ns() < deadline_ns:
@@ -222,15 +250,15 @@ def _query_once(bus: Bus, clock: Clock, key: str, request: Request) -> bytes | N
 
 
 def list_past_events(bus: Bus, clock: Clock, session: str, site: str) -> Iterator[Event]:
-    """Yields the events of a running site, in order.
+    """Queries a running site for the events that it has published, and yields them in order.
 
-    The events start with the oldest one that the site still has. They end early if the site
-    does not reply.
+    The first event is the oldest one that the site still stores. The iteration ends early if
+    the site does not reply.
     """
     key = topics.key(session, site, topics.PAST)
     first = 0
     published = 1
-    with suppress(WireError):  # a reply of a stranger
+    with suppress(WireError):  # a reply of another program ends the iteration
         while first < published:
             request = BackfillRequest(
                 channel="event", first=first, last=first + BACKFILL_MESSAGES - 1
@@ -239,7 +267,8 @@ def list_past_events(bus: Bus, clock: Clock, session: str, site: str) -> Iterato
             backfill = None if reply is None else decode(reply, Backfill)
             if backfill is None or not backfill.payloads:
                 return
-            yield from (decode(payload, Event) for payload in backfill.payloads)
+            for payload in backfill.payloads:
+                yield decode(payload, Event)
             first = backfill.first + len(backfill.payloads)
             published = backfill.made
 
@@ -251,11 +280,14 @@ def open_playback_bus(
     stopped: Callable[[], bool],
     say: Callable[[str], None],
 ) -> Bus | None:
-    """Returns the bus of a playback, or None if `stopped`.
+    """Opens the network connection of a playback, which publishes the messages of a log again.
+
+    Returns:
+        The connection. None if `stopped` returned True.
 
     Raises:
-        SessionError: a running session of that name uses the port.
-        UsageError: an endpoint cannot be used.
+        SessionError: The port is in use by a running session of the same name.
+        UsageError: An endpoint cannot be used.
     """
     try:
         return open_bus(
@@ -278,10 +310,10 @@ def open_playback_bus(
 def refuse_running_session(
     bus: Bus, clock: Clock, session: str, stopped: Callable[[], bool]
 ) -> None:
-    """Refuses the name of a session with a present site.
+    """Checks that no site of a session is present, before its name is used for a playback.
 
     Raises:
-        SessionError: a site of that session replies.
+        SessionError: A site of that session replies.
     """
     for info in find_members(bus, clock, session, stopped=stopped, timeout_s=NAME_CHECK_S):
         if info.member == topics.RECORDER:

@@ -1,10 +1,11 @@
-"""Check of the host names in endpoints, before anything connects.
+"""Check that host names in endpoints can be resolved, before a connection is opened.
 
-Zenoh would try to connect to a misspelt host name for ever.
+Zenoh would try to connect to a misspelt host name for ever, without an error.
 
 Invariant:
-    - Endpoints without a host name, such as numeric addresses and socket files, are skipped.
-    - Nothing connects here.
+    - Endpoints without a host name, such as numeric addresses and socket files, are not
+      checked.
+    - The check opens no connection. It only queries the name service.
 """
 
 import ipaddress
@@ -15,22 +16,22 @@ from collections.abc import Iterable
 from ..errors import UsageError
 
 _ENDPOINT = re.compile(r"[a-z]+(?:/|://)(\[[^\]]*\]|[^/?#]*):\d+(?:[/?#].*)?")
-"""Pattern of a Zenoh endpoint, or of a web address, with a host and a port."""
+"""Pattern of a Zenoh endpoint or a web address with a host and a port."""
 
 
 class UnknownHost(UsageError):  # noqa: N818 - it names an outcome
-    """An endpoint whose host name does not resolve."""
+    """The host name of an endpoint cannot be resolved."""
 
 
 def check_hosts(endpoints: Iterable[str]) -> None:
-    """Refuses endpoints whose host name does not resolve.
+    """Raises an error for the first endpoint whose host name cannot be resolved.
 
     Args:
-        endpoints: endpoints like tcp/arm.example:7447, or addresses like
+        endpoints: Endpoints such as tcp/arm.example:7447, or web addresses such as
             tcp://arm.example:8786.
 
     Raises:
-        UnknownHost: a host name does not resolve.
+        UnknownHost: A host name cannot be resolved.
     """
     for endpoint in endpoints:
         match = _ENDPOINT.fullmatch(endpoint)
@@ -40,6 +41,7 @@ def check_hosts(endpoints: Iterable[str]) -> None:
 
 
 def _is_address(host: str) -> bool:
+    """Returns True if a host is a numeric address."""
     try:
         ipaddress.ip_address(host.partition("%")[0])
     except ValueError:
@@ -48,6 +50,15 @@ def _is_address(host: str) -> bool:
 
 
 def _resolve(host: str, endpoint: str) -> None:
+    """Queries the name service for a host name.
+
+    Args:
+        host: The host name.
+        endpoint: Endpoint that contains it, for the error message.
+
+    Raises:
+        UnknownHost: The host name cannot be resolved.
+    """
     try:
         socket.getaddrinfo(host, None)
     except (OSError, UnicodeError) as error:

@@ -1,12 +1,15 @@
-"""Files that announce the sites running on this machine, and the short way of `trilat stop`.
+"""Remember which sites run on this machine, so that `trilat stop` reaches them immediately.
 
-Each running site has a small file with its endpoints. By these files `trilat stop` reaches the
-sites at once, without a search for the session.
+A site is a process that runs one arm. Each running site keeps a small file with its endpoints
+in the folder of its user. `trilat stop` reads these files and connects to the sites at once,
+instead of first searching for the session on the network.
 
 Invariant:
-    - A file is a hint: a site runs without it. Only the site's user may read the file, and a
-      file whose process is gone does not count.
-    - Whatever cannot be stopped at once is left to the long way of the command.
+    - The files are only a shortcut. A site runs without its file, and a file whose process is
+      gone is ignored.
+    - Only the user who runs the site can read the file.
+    - If the arms cannot be stopped in this way, the command continues with the search for the
+      session.
 """
 
 import os
@@ -30,28 +33,31 @@ if TYPE_CHECKING:
     from .connection import Connection
 
 QUERY_PERIOD_NS = 50_000_000
-"""Time between two queries to the sites that have not replied, in ns."""
+"""Time between two queries to the sites that have not replied yet, in ns."""
 POLL_NS = 1_000_000
+"""Time between two polls for replies, in ns."""
 PATIENCE_NS = 1_500_000_000
-"""Time after which the short way is given up, in ns."""
+"""Time after which the command continues with the search for the session, in ns."""
 AT_ONCE = {"scouting": {"delay": 0}}
-"""Settings of Zenoh that avoid its delay for scouting."""
+"""Settings of Zenoh that avoid its delay before the first message."""
 _NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL
+"""Flags that create a file, and fail if the file exists already."""
 
 
 class KnownSite(msgspec.Struct, frozen=True):
     """Content of the file of a site that runs on this machine.
 
     Attributes:
-        session: name of the session.
-        site: name of the site.
-        sites: names of all sites of the session.
-        mode: mode of the site's connection.
-        keyed: True if the site's links are encrypted by members' keys.
-        places: endpoints at which the site, and the members that it connects to, are reached.
-        stop: payload of the order to stop.
-        pid: process of the site.
-        machine: identity of the machine's clock, which differs after every start.
+        session: Name of the session.
+        site: Name of the site.
+        sites: Names of all sites of the session.
+        mode: Mode of the site's network connection.
+        keyed: True if the site encrypts its messages with keys.
+        places: Endpoints at which the site, and the members that it connects to, can be
+            reached.
+        stop: Payload of the order to stop.
+        pid: Process number of the site.
+        machine: Identity of the machine's clock. It changes when the machine is restarted.
     """
 
     session: str
@@ -66,6 +72,7 @@ class KnownSite(msgspec.Struct, frozen=True):
 
 
 def _find_folder() -> Path:
+    """Returns the folder of the files, following the XDG convention for state files."""
     state = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
     return Path(state) / "trilat-net" / "running"
 
@@ -79,17 +86,19 @@ def make_site_known(
     connection: "Connection",
     stop: bytes,
 ) -> Iterator[None]:
-    """Keeps the file of a site inside the block.
+    """Keeps the file of a site while the site runs, as a context manager.
 
-    There is no file if the site can only be reached with Zenoh settings of its user.
+    There is no file if the site can only be reached with Zenoh settings of its user, which are
+    not part of the file.
 
     Args:
-        session: name of the session.
-        site: name of the site.
-        sites: names of all sites of the session.
-        boot: boot of the site, which names the file.
-        connection: connection of the site.
-        stop: payload of the order to stop.
+        session: Name of the session.
+        site: Name of the site.
+        sites: Names of all sites of the session.
+        boot: Random number that identifies this start of the site. It is part of the file's
+            name.
+        connection: Network connection of the site.
+        stop: Payload of the order to stop.
     """
     endpoints = [*connection.listen, *(connection.connect or ())]
     known = KnownSite(
@@ -117,9 +126,12 @@ def make_site_known(
 
 
 def find_known_sites(session: str) -> list[KnownSite]:
-    """Returns the sites of a session that run on this machine.
+    """Lists the sites of a session that run on this machine.
 
-    Files of sites whose process is gone are removed.
+    The files of sites whose process is gone are removed.
+
+    Args:
+        session: Name of the session.
     """
     running = []
     machine = SystemClock().identity()
@@ -136,6 +148,7 @@ def find_known_sites(session: str) -> list[KnownSite]:
 
 
 def _is_alive(pid: int) -> bool:
+    """Returns True if a process exists. On other systems than POSIX, it is assumed to exist."""
     with suppress(PermissionError):
         try:
             if os.name == "posix":  # on other systems, `os.kill` would end the process
@@ -146,7 +159,7 @@ def _is_alive(pid: int) -> bool:
 
 
 def list_endpoints(known_sites: Sequence[KnownSite]) -> list[Endpoint]:
-    """Returns the endpoints at which sites are reached, each once."""
+    """Returns the endpoints at which sites can be reached, each endpoint once."""
     endpoints: list[Endpoint] = []
     for known in known_sites:
         for endpoint in known.places:
@@ -156,15 +169,15 @@ def list_endpoints(known_sites: Sequence[KnownSite]) -> list[Endpoint]:
 
 
 def find_known_endpoints(session: str, connection: "Connection") -> list[Endpoint] | None:
-    """Returns the endpoints of a session whose sites all run on this machine.
+    """Returns the endpoints of a session if all of its sites run on this machine.
 
     Args:
-        session: name of the session.
-        connection: connection of this member; sites with another mode, or with and without
-            keys, do not count.
+        session: Name of the session.
+        connection: Network connection of this process. Sites with another mode are ignored, and
+            so are sites that use keys if this process does not, or the reverse.
 
     Returns:
-        The endpoints; None if not all sites of the session are known.
+        The endpoints. None if not all sites of the session are known.
     """
     keyed = bool(connection.keys_of)
     known_sites = [
@@ -180,14 +193,14 @@ def find_known_endpoints(session: str, connection: "Connection") -> list[Endpoin
 
 
 def stop_at_once(arguments: Sequence[str]) -> int | list[str]:
-    """Stops arms as the arguments of `trilat stop` request.
+    """Stops arms immediately, as the command line of `trilat stop` requests.
 
     Args:
-        arguments: the command line after `trilat stop`.
+        arguments: Command line after `trilat stop`.
 
     Returns:
-        The exit code; or the arguments with which the long way of the command does, or
-        finishes, the work.
+        The exit code if all arms have been stopped, or if the keys are missing. Otherwise the
+        arguments with which the command has to continue.
     """
     options, sites, is_simple = _parse_arguments(arguments)
     session = options["--session"]
@@ -222,11 +235,13 @@ def stop_at_once(arguments: Sequence[str]) -> int | list[str]:
 
 
 def _parse_arguments(arguments: Sequence[str]) -> tuple[dict[str, str], list[str], bool]:
-    """Parses the command line after `trilat stop`.
+    """Parses the command line after `trilat stop`, without the full command-line library.
+
+    The library is not used because it takes time to load.
 
     Returns:
-        The values of --session and --keys ("" without them), all other arguments, and True if
-        none of these is an option.
+        The values of --session and --keys, empty if they are absent; all other arguments; and
+        True if the other arguments contain no option.
     """
     options = {"--session": "", "--keys": ""}
     others: list[str] = []
@@ -243,24 +258,28 @@ def _parse_arguments(arguments: Sequence[str]) -> tuple[dict[str, str], list[str
 
 
 def _print(text: object) -> None:
-    """Prints a text at once, without its control characters."""
+    """Prints a text immediately. Characters that cannot be printed are replaced.
+
+    Texts from the network might otherwise control the terminal.
+    """
     letters = (letter if letter.isprintable() else "\ufffd" for letter in str(text))
     print("".join(letters), flush=True)
 
 
 def _order_stop(known_sites: Sequence[KnownSite], sites: Sequence[str], keys: str) -> bool:
-    """Orders sites to stop until each site has replied, and prints the replies.
+    """Sends the order to stop to sites until each has replied, and prints the replies.
 
-    Two sessions with one name are both stopped: a query then has as many replies as there are
-    sites of the queried name.
+    If two sessions with the same name run on this machine, the sites of both are stopped. A
+    query is complete when as many replies have arrived as there are sites with the queried
+    name.
 
     Args:
-        known_sites: the known sites of the session.
-        sites: names of the sites to stop; empty for all sites.
-        keys: folder of the member's keys; "" without keys.
+        known_sites: The known sites of the session.
+        sites: Names of the sites to stop. Empty for all sites.
+        keys: Folder of the user's keys. Empty if there are none.
 
     Returns:
-        True if all sites replied that they stop.
+        True if all sites have replied that they stop.
     """
     settings: Any = AT_ONCE
     if keys:
@@ -279,8 +298,12 @@ def _order_stop(known_sites: Sequence[KnownSite], sites: Sequence[str], keys: st
     next_query_ns = begun_ns
     endpoints = list_endpoints(known_sites)
     with closing(ZenohBus([], endpoints, known_sites[0].mode, settings)) as bus:
-        while remaining and (now_ns := clock.monotonic_ns()) - begun_ns < PATIENCE_NS:
-            # The query is repeated, because it reaches only members that are connected by then.
+        while remaining:
+            now_ns = clock.monotonic_ns()
+            if now_ns - begun_ns >= PATIENCE_NS:
+                break
+            # A query reaches only the members that are connected already. It is repeated for
+            # those that connect later.
             if now_ns >= next_query_ns:
                 next_query_ns = now_ns + QUERY_PERIOD_NS
                 for site in remaining:

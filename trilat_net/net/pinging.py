@@ -1,12 +1,16 @@
-"""Repeated queries over a slow network, and pings, which measure the clocks of members.
+"""Measure the clocks of other members by pings, and repeat queries over an unreliable network.
 
-A member replies to a ping at once, in a thread of its bus, with the readings of its clock on
-receiving and on sending. The member that pinged then knows that clock to half the round trip,
-however far the two clocks differ.
+A member is a process that takes part in a session. A ping is a query to which a member replies
+at once, with the readings of its clock when the ping arrived and when the reply was sent. The
+difference between the member's clock and the local clock is then known to half the round trip,
+however large the difference is.
+
+Queries and replies may be lost, or may take longer than the time between two queries. Therefore
+a query is repeated, and replies to earlier copies still count.
 
 Invariant:
-    - A reply counts however late it arrives, as long as its query is one of the last
-      QUERIES_KEPT.
+    - A reply is accepted however late it arrives, as long as its query is among the last
+      QUERIES_KEPT ones.
 """
 
 from collections import deque
@@ -23,13 +27,19 @@ from .requests import Backfill, BackfillRequest, Pong
 from .wire import decode, encode
 
 QUERIES_KEPT = 128
-"""Number of queries whose replies still count."""
+"""Number of the latest copies of a query whose replies are accepted."""
 QUERY_PERIOD_NS = 200_000_000
 """Time between two queries for identities, in ns."""
 
 
 class RepeatedQuery:
-    """A query that is sent periodically; replies to its last QUERIES_KEPT copies count."""
+    """A query that is sent again and again.
+
+    Args:
+        bus: Network connection of the member that sends the query.
+        clock: Clock of that member.
+        key: Key of the query. Every member that serves a matching key replies.
+    """
 
     def __init__(self, bus: Bus, clock: Clock, key: str) -> None:
         self._bus = bus
@@ -38,7 +48,14 @@ class RepeatedQuery:
         self._pending: deque[tuple[int, Inbox]] = deque(maxlen=QUERIES_KEPT)
 
     def repeat(self, period_ns: int = QUERY_PERIOD_NS) -> bool:
-        """Sends the query if a period has passed since the last; True if it was sent."""
+        """Sends the query if enough time has passed since its last copy.
+
+        Args:
+            period_ns: Shortest time between two copies, in ns.
+
+        Returns:
+            True if the query was sent.
+        """
         now_ns = self._clock.monotonic_ns()
         is_due = not self._pending or now_ns - self._pending[-1][0] >= period_ns
         if is_due:
@@ -46,10 +63,11 @@ class RepeatedQuery:
         return is_due
 
     def poll(self) -> tuple[int, str, bytes] | None:
-        """Returns the next reply, or None if there is none yet; never waits.
+        """Returns the next reply that has arrived. The method does not wait.
 
         Returns:
-            The sending time of the query in ns, and the key and the payload of the reply.
+            The time at which the query was sent in ns, the key and the payload of the reply.
+            None if no reply has arrived.
         """
         for queried_ns, inbox in self._pending:
             reply = inbox.poll()
@@ -60,25 +78,33 @@ class RepeatedQuery:
 
 
 PINGS = 20
-"""Number of round trips after which a member's clock counts as known."""
+"""Number of round trips after which the clock of a member counts as known."""
 PINGS_PER_WINDOW = 5
-"""Number of round trips in a window, of which the tightest limits are kept."""
+"""Number of round trips in a window. Of each window, only the most precise limits are used."""
 PING_PACE_NS = 10_000_000
 """Time between two pings until all clocks are known, in ns."""
 PING_REST_NS = 250_000_000
-"""Time between two pings afterwards, so that the estimates stay fresh, in ns."""
+"""Time between two pings when all clocks are known, to keep the estimates up to date, in ns."""
 GLANCE_NS = 100_000
-"""Time between two polls while a reply is under way, in ns.
+"""Time between two polls while a reply is expected, in ns.
 
-It is short because replies are stamped when they are polled.
+It is short because the arrival of a reply is measured when it is polled.
 """
 _ROUND_TRIPS_KEPT = 10_000
+"""Number of the latest round trips that are kept for statistics."""
 _LATE_REPLY_NS = 20_000_000
-"""Time added to two round trips in which a reply is expected, in ns."""
+"""Margin for the time in which a reply is expected, in ns. Two round trips are added to it."""
 
 
 def answer_pings(bus: Bus, clock: Clock, session: str, info: Info) -> None:
-    """Replies to pings of a member, in a thread of the bus, until the bus is closed."""
+    """Replies to pings in a network thread, until the network connection is closed.
+
+    Args:
+        bus: Network connection of the member.
+        clock: Clock of the member.
+        session: Name of the session.
+        info: Identity of the member.
+    """
 
     def answer(_: bytes) -> bytes:
         received_ns = clock.monotonic_ns()
@@ -101,17 +127,19 @@ def answer_backfill(
     boot: int,
     find: Callable[[BackfillRequest], tuple[int, list[bytes], int]],
 ) -> int:
-    """Replies to a recorder's query for missing messages.
+    """Replies to a recorder's query for messages that were lost on the way.
 
     Args:
-        query: the query of the recorder.
-        member: name of the replying member.
-        boot: boot of that member.
-        find: returns the number of the first message found, the payloads of the messages, and
-            the number of messages that the member has published.
+        query: The query.
+        member: Name of the member that replies.
+        boot: Random number that identifies this start of the member.
+        find: Function that looks up the requested messages. It returns the number of the first
+            message, the payloads of consecutive messages, and the number of messages that the
+            member has published.
 
     Returns:
-        The number of messages sent; 0 for an unreadable query, which gets no reply.
+        The number of messages in the reply. 0 if the query cannot be decoded; it then gets no
+        reply.
     """
     try:
         request = decode(query.payload, BackfillRequest)
@@ -131,16 +159,20 @@ def answer_backfill(
 
 
 class RoundTrips:
-    """The round trips of pings to one start of a member.
+    """Round trips of the pings to one member, and the estimate of its clock's offset from them.
+
+    `Pinger` creates one object for each start of a member.
 
     Args:
-        required: number of agreeing round trips after which the member's clock is known.
+        required: Number of round trips without a contradiction after which the clock counts as
+            known.
 
     Attributes:
-        rtts_ns: the latest round trips, without the time between the member's two stamps.
-        shortest_ns: the shortest round trip; 0 before the first.
-        estimator: limits of the offset of the member's clock.
-        latest: the latest estimate of that offset; None before the first.
+        rtts_ns: The latest round trip times in ns, without the time between the member's two
+            stamps.
+        shortest_ns: The shortest round trip time in ns. 0 before the first round trip.
+        estimator: Collected limits of the offset of the member's clock.
+        latest: Latest estimate of that offset. None before the first estimate.
     """
 
     def __init__(self, required: int) -> None:
@@ -154,16 +186,19 @@ class RoundTrips:
 
     @property
     def is_known(self) -> bool:
-        """True once enough round trips agree."""
+        """True once enough round trips agree with each other."""
         return self._agreeing >= self._required
 
     def receive(self, pinged_ns: int, pong: Pong, now_ns: int) -> None:
-        """Receives the reply to a ping; an impossible reply is ignored.
+        """Evaluates the reply to a ping. A reply with impossible times is ignored.
+
+        The offset (member's clock minus local clock) is at most the arrival of the ping minus
+        its sending, and at least the sending of the reply minus its arrival.
 
         Args:
-            pinged_ns: sending time of the ping, on the local clock.
-            pong: the reply.
-            now_ns: arrival of the reply, on the local clock.
+            pinged_ns: Time at which the ping was sent, on the local clock, in ns.
+            pong: The reply.
+            now_ns: Time at which the reply arrived, on the local clock, in ns.
         """
         rtt_ns = now_ns - pinged_ns - (pong.left_ns - pong.came_ns)
         if rtt_ns < 0 or pong.left_ns < pong.came_ns:
@@ -177,7 +212,14 @@ class RoundTrips:
             self._close_window(now_ns)
 
     def _close_window(self, now_ns: int) -> None:
-        """Adds the tightest limits of the window to the estimator, and estimates the offset."""
+        """Estimates the offset from the tightest limits of the window, and starts a new one.
+
+        Limits of different times are compared after their extrapolation to the present, with
+        the last estimate of the drift.
+
+        Args:
+            now_ns: Present time on the local clock, in ns.
+        """
         drift_per_ns = self.latest.drift / NS_PER_S if self.latest else 0.0
 
         def extrapolate_limit(limit: OffsetLimit) -> float:
@@ -197,16 +239,19 @@ class RoundTrips:
 
 
 class Pinger:
-    """Pings the members of a session; call `poll` regularly.
+    """Sends pings to the members of a session, and estimates the offsets of their clocks.
+
+    The owner calls `poll` regularly.
 
     Args:
-        bus: connection of this member.
-        clock: clock of this member.
-        session: name of the session.
-        required: number of agreeing round trips after which a clock is known.
+        bus: Network connection of this member.
+        clock: Clock of this member.
+        session: Name of the session.
+        required: Number of round trips without a contradiction after which a clock counts as
+            known.
 
     Attributes:
-        trips: round trips by boot of the member.
+        trips: Round trips to each start of a member, by its boot (random number per start).
     """
 
     def __init__(self, bus: Bus, clock: Clock, session: str, required: int = PINGS) -> None:
@@ -217,10 +262,10 @@ class Pinger:
         self._reply_expected_until_ns = 0
 
     def poll(self, boots: Collection[int]) -> None:
-        """Sends a ping if it is due, and receives the replies of members.
+        """Sends a ping if it is due, and evaluates the replies that have arrived.
 
         Args:
-            boots: boots of the members whose replies count.
+            boots: Boots of the members whose replies are accepted.
         """
         period_ns = PING_REST_NS if self.knows_clocks(boots) else PING_PACE_NS
         if boots and self._query.repeat(period_ns):
@@ -233,19 +278,23 @@ class Pinger:
             try:
                 pong = decode(payload, Pong)
             except WireError:
-                continue  # a reply of a stranger
-            if parts is not None and parts.member == pong.member and pong.boot in boots:
+                continue  # a reply of another program
+            is_from_member = parts is not None and parts.member == pong.member
+            if is_from_member and pong.boot in boots:
                 trips = self.trips.setdefault(pong.boot, RoundTrips(self._required))
                 trips.receive(pinged_ns, pong, now_ns)
 
     def knows_clocks(self, boots: Collection[int]) -> bool:
-        """True if the clocks of all members with these boots are known."""
+        """Returns True if the clocks of all members with these boots are known."""
         return all(boot in self.trips and self.trips[boot].is_known for boot in boots)
 
     def estimate(self, boot: int) -> OffsetEstimate:
         """Returns the latest estimate of the offset of a member's clock.
 
-        Without any round trip, the member counts as sharing the local clock.
+        A member that has not replied to any ping is assumed to have the same clock.
+
+        Args:
+            boot: Boot of the member.
         """
         trips = self.trips.get(boot)
         if trips is None or trips.latest is None:
@@ -253,28 +302,42 @@ class Pinger:
         return trips.latest
 
     def estimator(self, boot: int) -> OffsetEstimator | None:
-        """Returns the limits of a member's clock, or None if it is the local clock."""
+        """Returns the collected limits of a member's clock, or None before its first reply.
+
+        Args:
+            boot: Boot of the member.
+        """
         trips = self.trips.get(boot)
         return None if trips is None else trips.estimator
 
     def slowest_ns(self) -> int:
-        """Returns the longest of the members' shortest round trips, ns; 0 before the first."""
+        """Returns the round trip time to the slowest member in ns, 0 if none is measured yet.
+
+        The round trip time of a member is the shortest one that was measured.
+        """
         return max((trips.shortest_ns for trips in self.trips.values()), default=0)
 
     def pause_ns(self, otherwise_ns: int) -> int:
-        """Returns the time until the next poll, in ns: `otherwise_ns` unless a reply is due."""
+        """Returns how long the caller may wait until the next poll, in ns.
+
+        Args:
+            otherwise_ns: Pause while no reply to a ping is expected, in ns.
+        """
         if self._clock.monotonic_ns() < self._reply_expected_until_ns:
             return min(GLANCE_NS, otherwise_ns)
         return otherwise_ns
 
 
 def describe_clocks(pinger: Pinger, boots: Mapping[str, int], local_ns: int) -> list[str]:
-    """Returns a sentence for every member on another clock.
+    """Describes the clocks of the members on other machines, for the user.
 
     Args:
-        pinger: the round trips to the members.
-        boots: boots of the members, by name.
-        local_ns: instant of the local clock for which the offsets are stated.
+        pinger: Round trips to the members.
+        boots: Boot of each member, by name.
+        local_ns: Time on the local clock for which the offsets are stated, in ns.
+
+    Returns:
+        One sentence for each of these members.
     """
     texts = []
     for name, boot in boots.items():

@@ -1,14 +1,18 @@
-"""Encoding and decoding of the messages that members exchange and logs store.
+"""Encode messages, and decode and check what arrives or what a log contains.
 
-A payload is a MessagePack map with string keys and plain lists. The types in `messages` and
-`requests` define its fields.
+A payload is a MessagePack map with the field names as keys. The classes in `messages` and
+`requests` define the fields. The records and samples that a site publishes in every tick are
+encoded directly from the output of the simulation kernel, which is faster than through a
+message object.
 
 Invariant:
-    - Decoding never trusts its input. Every payload yields either a message of an accepted
-      schema version, with finite numbers within their ranges, or a `WireError`.
-    - The reason of a `WireError` is one of a few short texts, because receivers count
-      refused payloads by reason.
-    - Encoding a record or a sample refuses numbers that are not finite, as decoding does.
+    - The decoder does not trust its input, because any program on the network can send
+      messages. Each payload yields either a valid message of an accepted schema version, in
+      which all numbers are finite and within their ranges, or a `WireError`.
+    - The reason of a `WireError` is one of a few short texts. Receivers count the payloads that
+      they drop by the reason.
+    - Records and samples with numbers that are not finite are not encoded. Receivers would
+      refuse them.
 """
 
 import math
@@ -39,9 +43,9 @@ from .messages import (
 from .requests import BACKFILL_BYTES, ArmMeasurement, Backfill, HandMessage, Request
 
 MAX_BYTES = 65_536
-"""Largest payload of a message, in bytes, except for `Info` and `Backfill`."""
+"""Largest payload of a message, in bytes. `Info` and `Backfill` may be larger."""
 MAX_INFO_BYTES = 64 * 1024 * 1024
-"""Largest payload of an `Info`, which holds a whole scenario with its traces, in bytes."""
+"""Largest payload of an `Info`, in bytes. It contains a scenario with its recorded delays."""
 MAX_PAST_BYTES = 2 * MAX_BYTES
 """Largest payload of a `Backfill`, in bytes."""
 SAMPLE_BYTES = 2_048
@@ -65,13 +69,19 @@ _SIZE_LIMITS: dict[type[msgspec.Struct], int] = {
     Info: MAX_INFO_BYTES,
     Backfill: MAX_PAST_BYTES,
 }
+"""Largest payloads of the messages that may be larger than `MAX_BYTES`."""
 _isfinite = math.isfinite
 _encode = msgspec.msgpack.Encoder().encode
 
 
 @cache
 def _list_vector_lengths(kind: type[msgspec.Struct], layout: Layout) -> dict[str, int]:
-    """Returns the names of the vectors in a kind of message, with their lengths."""
+    """Returns the vectors of a message type by name, with their lengths for a site.
+
+    Args:
+        kind: The message type.
+        layout: Numbers of joints, peers and parameters of the site that sends the message.
+    """
     if kind is State:
         return dict.fromkeys(STATE_VECTORS, 0) | layout.lengths()
     if kind is PeerSample:
@@ -95,22 +105,22 @@ def encode_state(
     sent_ns: int | None = None,
     echo: Sequence[Sequence[int]] = (),
 ) -> bytes:
-    """Returns the payload of the `State` record of one tick.
+    """Encodes the record of one tick, the payload of a `State`.
 
     Args:
-        site: name of the sending site.
-        boot: random number of the sender's process start.
-        peers: names of the site's peers, in the order of the tick record's `used`.
-        output: the tick record of the site.
-        arrivals: samples that the tick received, in the order accepted.
-        late_us: wake-up minus deadline of this tick.
-        busy_us: computing time of the previous tick.
-        sent_ns: sending time since the epoch on the sender's clock. None, as in virtual time,
-            stands for the nominal time of the tick.
-        echo: the newest sample received from each peer, see `State.echo`.
+        site: Name of the site.
+        boot: Random number that identifies this start of the site's process.
+        peers: Names of the site's peers, in the order of `used` in the output.
+        output: Output of the kernel for the tick.
+        arrivals: Samples that the tick used as inputs, in their order.
+        late_us: Time by which the tick began late, in us.
+        busy_us: Computing time of the previous tick, in us.
+        sent_ns: Time of sending, in ns since the epoch on the site's clock. None uses the
+            nominal time of the tick, as in simulations.
+        echo: Newest sample that arrived from each peer, see `State.echo`.
 
     Raises:
-        WireError: a number is not finite.
+        WireError: A number is not finite.
     """
     (
         tick,
@@ -132,11 +142,12 @@ def encode_state(
     x, xd, wrench, ch, hand, bodies = optional_vectors
     vectors = (q, qd, q_des, qd_des, tau, tau_x, theta_hat, mem, *optional_vectors)
     # A sum is finite only if all of its terms are, and one sum is faster than a check of each
-    # term. The second check accepts finite terms whose sum overflows.
-    if not _isfinite(sum(map(sum, vectors))) and not all(
-        map(_isfinite, chain.from_iterable(vectors))
-    ):
-        raise WireError("not finite", f"{site} at tick {tick}")
+    # term. The terms are checked one by one only if the sum is not finite, since the sum of
+    # finite terms may overflow.
+    if not _isfinite(sum(map(sum, vectors))):
+        numbers = chain.from_iterable(vectors)
+        if not all(map(_isfinite, numbers)):
+            raise WireError("not finite", f"{site} at tick {tick}")
     fields = {
         "v": VERSION,
         "site": site,
@@ -175,22 +186,22 @@ def encode_state(
 def encode_sample(
     site: str, boot: int, output: TickRecord, sent_ns: int, echo: Sequence[Sequence[int]]
 ) -> bytes:
-    """Returns the payload of the `PeerSample` of one tick.
+    """Encodes the sample of one tick for the peers, the payload of a `PeerSample`.
 
     Args:
-        site: name of the sending site.
-        boot: random number of the sender's process start.
-        output: the tick record of the site.
-        sent_ns: sending time since the epoch on the sender's clock.
-        echo: the newest sample received from each peer, see `State.echo`.
+        site: Name of the site.
+        boot: Random number that identifies this start of the site's process.
+        output: Output of the kernel for the tick.
+        sent_ns: Time of sending, in ns since the epoch on the site's clock.
+        echo: Newest sample that arrived from each peer, see `State.echo`.
 
     Raises:
-        WireError: a number is not finite.
+        WireError: A number is not finite.
     """
     (q, qd, tau_x) = output.shared()
     ch = output.ch
     total = sum(q) + sum(qd) + sum(tau_x) + sum(ch)
-    # See `encode_state` for the reason of the two checks.
+    # As in `encode_state`, the terms are checked only if their sum is not finite.
     if not _isfinite(total) and not all(map(_isfinite, [*q, *qd, *tau_x, *ch])):
         raise WireError("not finite", f"{site} at tick {output.tick}")
     fields = {
@@ -210,9 +221,11 @@ def encode_sample(
 
 
 def join_states(payloads: Sequence[bytes]) -> Iterator[bytes]:
-    """Yields blocks of consecutive records, each of at most `BACKFILL_BYTES`.
+    """Joins consecutive records into blocks, which cost less to send than single records.
 
-    A block with a single longer record is longer.
+    Yields:
+        Blocks of at most `BACKFILL_BYTES`. If a single record is longer, it forms a block
+        alone.
     """
     block: list[bytes] = []
     size = 0
@@ -228,10 +241,16 @@ def join_states(payloads: Sequence[bytes]) -> Iterator[bytes]:
 
 
 def split_states(block: bytes) -> Iterator[bytes]:
-    """Yields the payloads of the records in a block, without decoding them.
+    """Splits a block into the payloads of its records, without decoding them.
+
+    Args:
+        block: One or more encoded records, as `join_states` joins them.
+
+    Yields:
+        The payload of each record.
 
     Raises:
-        WireError: the block is too large, or ends in the middle of a record.
+        WireError: The block is too large, or ends in the middle of a record.
     """
     if len(block) > MAX_BYTES:
         raise WireError("oversized", f"{count_nouns(len(block), 'byte')}, at most {MAX_BYTES}")
@@ -249,7 +268,7 @@ def split_states(block: bytes) -> Iterator[bytes]:
 
 
 def encode(message: _Sendable) -> bytes:
-    """Returns the payload of a message other than a `State` or a `PeerSample`."""
+    """Encodes a message other than a `State` or a `PeerSample`."""
     return _encode(message)
 
 
@@ -262,17 +281,22 @@ def decode(
     versions: Collection[int] = (VERSION,),
     layout: Layout | None = None,
 ) -> M:
-    """Returns the message in a payload.
+    """Decodes a payload and checks the message.
 
     Args:
-        payload: the encoded message.
-        kind: the expected type of the message.
-        versions: accepted schema versions. Logs may also hold older versions, see `READABLE`.
-        layout: lengths of the sender's vectors. Without a layout, any length is accepted.
+        payload: The encoded message.
+        kind: Expected type of the message.
+        versions: Accepted versions of the schema. Logs may contain older versions, see
+            `READABLE`.
+        layout: Numbers of joints, peers and parameters of the sender, from which the lengths of
+            the vectors follow. None accepts vectors of any length.
+
+    Returns:
+        The message.
 
     Raises:
-        WireError: the payload is too large or malformed, has another schema version, holds a
-            number that is not finite, or has a vector of the wrong length.
+        WireError: The payload is too large or malformed, has another schema version, contains a
+            number that is not finite, or contains a vector of the wrong length.
     """
     return make_decoder(kind, tuple(versions), layout)(payload)  # type: ignore[no-any-return]
 
@@ -283,9 +307,16 @@ def make_decoder(
     versions: tuple[int, ...] = (VERSION,),
     layout: Layout | None = None,
 ) -> Callable[[bytes], Any]:
-    """Returns a function that decodes payloads of one kind of message, as `decode` does.
+    """Returns a function that decodes payloads of one message type, as `decode` does.
 
-    The decoder, the limits and the vector lengths are looked up once, not for every payload.
+    The decoder, the size limit and the lengths of the vectors are looked up only once, and not
+    for every payload.
+
+    Args:
+        kind: Expected type of the messages.
+        versions: Accepted versions of the schema.
+        layout: Numbers of joints, peers and parameters of the sender. None accepts vectors of
+            any length.
     """
     limit = _SIZE_LIMITS.get(kind, MAX_BYTES)
     parse = _DECODERS[kind].decode
@@ -311,7 +342,7 @@ def make_decoder(
             vectors = get_vectors(message)
             if lengths is not None and [*map(len, vectors)] != lengths:
                 _check_lengths(vectors, vector_lengths)
-            # See `encode_state`: finite terms whose sum overflows pass the second check.
+            # As in `encode_state`, the terms are checked only if their sum is not finite.
             if not _isfinite(sum(map(sum, vectors))):
                 _check_finite(message, vectors, vector_lengths)
         return message
@@ -322,9 +353,13 @@ def make_decoder(
 def make_reader(
     kind: type[msgspec.Struct], layout: Layout
 ) -> Callable[[bytes], Any | WireError]:
-    """Returns a function that decodes a payload, and returns its `WireError` if there is one.
+    """Returns a function that returns the decoded message, or the error as a `WireError`.
 
-    The function serves threads of the bus, in which nothing may be raised.
+    The function is called in network threads, in which an exception would be lost.
+
+    Args:
+        kind: Expected type of the messages.
+        layout: Numbers of joints, peers and parameters of the sender.
     """
     decoder = make_decoder(kind, layout=layout)
 
@@ -338,7 +373,16 @@ def make_reader(
 
 
 def _check_lengths(vectors: tuple[list[float], ...], lengths: dict[str, int]) -> None:
-    """Raises a `WireError` for the first vector whose length is not the required one."""
+    """Raises the error for the first vector whose length differs from the required length.
+
+    Args:
+        vectors: The vectors of a message.
+        lengths: Required lengths, by the name of the vector.
+
+    Raises:
+        WireError: A vector has another length. If it contains joint angles, the reason states
+            the number of joints.
+    """
     for vector, (name, length) in zip(vectors, lengths.items(), strict=True):
         count = len(vector)
         if count == length:
@@ -353,7 +397,16 @@ def _check_lengths(vectors: tuple[list[float], ...], lengths: dict[str, int]) ->
 def _check_finite(
     message: Any, vectors: tuple[list[float], ...], names: Collection[str]
 ) -> None:
-    """Raises a `WireError` for the first vector with a number that is not finite."""
+    """Raises the error for the first vector that contains a number that is not finite.
+
+    Args:
+        message: The message.
+        vectors: The vectors of the message.
+        names: Names of the vectors.
+
+    Raises:
+        WireError: A number is not finite.
+    """
     for name, vector in zip(names, vectors, strict=True):
         if not all(map(_isfinite, vector)):
             is_request = isinstance(message, ArmMeasurement | HandMessage)

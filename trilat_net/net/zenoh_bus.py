@@ -1,10 +1,14 @@
-"""The bus over Eclipse Zenoh. Only this module and `ros2_graph` import `zenoh`.
+"""Implement the network connection of a member (`Bus`) over Eclipse Zenoh.
+
+Only this module and `ros2_graph` import `zenoh`.
 
 Invariant:
-    - Nothing here waits for the network.
-    - A publisher drops a message rather than delay its caller, unless the publisher is patient.
-    - Replies go into a ring.
-    - A session that cannot be opened yet raises an error.
+    - No method waits for the network, because the control loop of an arm calls them.
+    - If the network is too slow, a publisher drops messages and does not delay its caller. Only
+      a patient publisher waits.
+    - Replies to a query are collected in a queue that the caller polls.
+    - If a connection cannot be opened yet, an error is raised. The caller decides whether to
+      try again.
 """
 
 import ctypes
@@ -34,15 +38,16 @@ from .bus import (
 from .zenoh_config import Endpoint, ZenohFile, ZenohMode, check_zenoh_file, make_zenoh_config
 
 QUERY_TIMEOUT_S = 3.0
+"""Time after which Zenoh discards a query without replies, in s."""
 SHARED_POOL = (
     "(rx:(worker_threads:4),tx:(handover:rx),acc:(handover:rx),"
     "net:(handover:rx),app:(handover:rx))"
 )
-"""Zenoh's runtime setting that makes all of its five pools share the threads of one."""
+"""Zenoh's runtime setting that makes its five thread pools share the threads of one."""
 MAX_DEPTH = 100
-"""Largest nesting of a configuration.
+"""Largest permitted nesting of a user's Zenoh file.
 
-Zenoh's recursive parser overflows its stack on deep nesting.
+Zenoh's recursive parser would overflow its stack if the nesting were too deep.
 """
 
 
@@ -50,28 +55,30 @@ T = TypeVar("T")
 
 
 def share_threads() -> None:
-    """Makes all of Zenoh use one pool of threads instead of five, from the first session on.
+    """Makes Zenoh use one thread pool instead of five, for all sessions opened from now on.
 
-    The threads of several pools wake one another, which costs time. One thread of the pool does
-    the work. Closing a connection whose peer never received its last bytes holds a thread for
-    up to 10 s (eclipse-zenoh/zenoh#1101); then the other threads serve the other members.
+    With several pools, their threads wake each other for each message, which costs time. The
+    pool has four threads although one is enough for the work: closing a connection whose peer
+    never received its last bytes blocks a thread for up to 10 s (eclipse-zenoh/zenoh#1101). The
+    other threads then continue to serve the other members.
 
-    Routers must not call this function: a router waits for room where it reads, and needs
-    another thread that sends meanwhile.
+    A router must not call this function. A router that waits for room in its output queue
+    blocks the thread that reads, and needs another pool to empty the queue.
     """
     os.environ.setdefault("ZENOH_RUNTIME", SHARED_POOL)
 
 
 class RouterSilent(SessionError):  # noqa: N818 - it names an outcome
-    """A router does not answer, or does not answer yet."""
+    """A router does not answer (yet)."""
 
 
 class _ZenohRing(Generic[T]):
-    """A ring of Zenoh.
+    """Queue of received Zenoh objects, converted when they are polled.
 
     Args:
-        channel: Zenoh's receiving channel.
-        read: converts a received object into an entry, or into None to skip the object.
+        channel: Channel of Zenoh into which the objects arrive.
+        read: Function that converts an object into an entry. If it returns None, the object is
+            skipped.
     """
 
     def __init__(self, channel: Any, read: Callable[[Any], T | None]) -> None:
@@ -80,6 +87,10 @@ class _ZenohRing(Generic[T]):
         self._read = read
 
     def poll(self) -> T | None:
+        """Removes the next entry from the queue and returns it.
+
+        Returns None if the queue is empty.
+        """
         try:
             while (received := self._try_recv()) is not None:
                 entry = self._read(received)
@@ -91,11 +102,12 @@ class _ZenohRing(Generic[T]):
 
 
 def _make_sample_handler(receive: Callable[[Any], None]) -> Any:
-    """Returns a Zenoh handler that calls `receive` with every sample, in threads of Zenoh.
+    """Returns a Zenoh handler that calls a function with every message, in threads of Zenoh.
 
-    Each thread keeps its CPython thread state. Otherwise CPython would create that state anew
-    for every message, and unmap it. A thread acquires the interpreter once more than it
-    releases the interpreter, so its state lives as long as the process.
+    CPython keeps a state for each thread. For a thread that it does not know, it creates the
+    state at each call and deletes it afterwards, which costs more than the call itself.
+    Therefore the handler acquires the interpreter once more than it releases it, so that the
+    state of the thread lives as long as the process.
     """
     thread_states = threading.local()
 
@@ -108,18 +120,23 @@ def _make_sample_handler(receive: Callable[[Any], None]) -> Any:
 
 
 def _read_sample(sample: Any) -> tuple[str, bytes]:
+    """Returns the key and the payload of a message."""
     return str(sample.key_expr), sample.payload.to_bytes()
 
 
 class _ZenohQuery(NamedTuple):
+    """A query that has arrived, with the key under which it is answered."""
+
     query: zenoh.Query
     key: str
 
     @property
     def payload(self) -> bytes:
+        """Payload of the query. Empty if there is none."""
         return b"" if self.query.payload is None else self.query.payload.to_bytes()
 
     def reply(self, payload: bytes) -> None:
+        """Replies to the query. Each query can be replied to once."""
         # A query ends for its sender only when the query object is dropped.
         with self.query as query:
             query.reply(self.key, payload)
@@ -132,18 +149,18 @@ def open_zenoh(
     settings: Mapping[str, Any] | None,
     silent: str,
 ) -> Any:
-    """Returns a Zenoh session with the settings of `make_zenoh_config`.
+    """Opens a Zenoh session with the settings of `make_zenoh_config`.
 
     Args:
-        listen: endpoints at which the session listens.
-        connect: endpoints to which the session connects.
+        listen: Endpoints at which the session listens.
+        connect: Endpoints to which the session connects.
         mode: "peer", "client" or "router".
-        settings: settings of a user's file, which replace the settings of the program.
-        silent: text of the error if no router answers, with {} in place of the endpoints.
+        settings: Settings that replace those of this program, from a user's file or from keys.
+        silent: Text of the error if no router answers, with {} in place of the endpoints.
 
     Raises:
-        UsageError: an endpoint is malformed, or the session cannot listen there.
-        RouterSilent: no router of a client answers.
+        UsageError: An endpoint is malformed, or the session cannot listen there.
+        RouterSilent: The session is a client, and no router answers.
     """
     # Logs nothing unless the environment has RUST_LOG.
     zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]
@@ -166,21 +183,22 @@ def open_zenoh(
 
 
 class ZenohBus:
-    """A `Bus` over a separate Zenoh session.
+    """Network connection of a member over a Zenoh session of its own, see `Bus`.
 
-    A peer or router retries until all endpoints answer. A client connects to the first endpoint
-    that answers at once, and reconnects if the connection is lost. Peers reach the members that
-    they connect to; clients and routers reach all members that a router reaches.
+    A peer or a router keeps trying until all endpoints answer. A client connects to the first
+    endpoint that answers at once, and connects again when the connection is lost. A peer
+    reaches the members to which it is connected. A client or a router reaches all members that
+    the router reaches.
 
     Args:
-        listen: endpoints at which the session listens.
-        connect: endpoints to which the session connects.
+        listen: Endpoints at which the session listens.
+        connect: Endpoints to which the session connects.
         mode: "peer", "client" or "router".
-        settings: settings of a user's file, which replace the settings of the program.
+        settings: Settings that replace those of this program, from a user's file or from keys.
 
     Raises:
-        UsageError: an endpoint is malformed, or the session cannot listen there.
-        RouterSilent: no router of a client answers.
+        UsageError: An endpoint is malformed, or the session cannot listen there.
+        RouterSilent: The session is a client, and no router answers.
     """
 
     def __init__(
@@ -202,9 +220,13 @@ class ZenohBus:
         self._tokens: set[str] = set()
 
     def publisher(self, key: str, *, patient: bool = False) -> Callable[[bytes], None]:
-        """See `Bus`.
+        """Returns a function that publishes payloads under a key.
 
-        A receiver that blocks a patient publisher for 5 s loses its connection.
+        Args:
+            key: The key.
+            patient: True if the function waits while the network is too slow, False if it drops
+                the message. A receiver that blocks a patient publisher for 5 s loses its
+                connection.
         """
         publisher = self._session.declare_publisher(
             key,
@@ -218,13 +240,21 @@ class ZenohBus:
         return put
 
     def _subscribe(self, key: str, handler: Any) -> Any:
+        """Creates a Zenoh subscriber, which ignores messages of this session itself."""
         return self._session.declare_subscriber(key, handler, allowed_origin=Locality.REMOTE)
 
     def _serve(self, key: str, handler: Any) -> Any:
+        """Creates a Zenoh object that receives queries, except those of this session itself."""
         return self._session.declare_queryable(key, handler, allowed_origin=Locality.REMOTE)
 
     def inbox(self, key: str, capacity: int = RING_CAPACITY) -> Inbox:
-        """See `Bus`."""
+        """Returns a queue of the messages under a key, which may contain wildcards.
+
+        Args:
+            key: The key.
+            capacity: Number of messages that the queue holds. If it is full, the oldest message
+                is dropped.
+        """
         return _ZenohRing(self._subscribe(key, handlers.RingChannel(capacity)), _read_sample)
 
     def stamped_inbox(
@@ -234,7 +264,16 @@ class ZenohBus:
         read: Callable[[bytes], T],
         capacity: int = RING_CAPACITY,
     ) -> StampedInbox[T]:
-        """See `Bus`."""
+        """Returns a queue of the messages under a key, each with its time of arrival.
+
+        Args:
+            key: The key.
+            now_ns: Function that reads the local clock, in ns.
+            read: Function that decodes a payload, in a thread of Zenoh. It must not raise an
+                error.
+            capacity: Number of messages that the queue holds. If it is full, the oldest message
+                is dropped.
+        """
         ring = StampingRing(now_ns, read, capacity)
         receive = ring.receive  # looked up once, not for every message
         handler = _make_sample_handler(lambda sample: receive(sample.payload.to_bytes()))
@@ -242,12 +281,12 @@ class ZenohBus:
         return ring
 
     def tap(self, key: str, callback: Callable[[str, bytes], None]) -> None:
-        """See `Bus`."""
+        """Calls a function with the key and payload of each message, in threads of Zenoh."""
         handler = _make_sample_handler(lambda sample: callback(*_read_sample(sample)))
         self._declarations.append(self._subscribe(key, handler))
 
     def query_inbox(self, key: str) -> QueryInbox:
-        """See `Bus`."""
+        """Returns a queue of the queries under a key, to which the caller replies."""
         # Polling a Python ring costs a loop less than polling a ring of Zenoh.
         ring: BoundedRing[_ZenohQuery] = BoundedRing(64)
         handler: Any = handlers.Callback(
@@ -257,7 +296,13 @@ class ZenohBus:
         return ring
 
     def respond(self, key: str, answer: Callable[[bytes], bytes | None]) -> None:
-        """See `Bus`."""
+        """Replies to the queries under a key at once, in a thread of Zenoh.
+
+        Args:
+            key: The key.
+            answer: Function that returns the payload of the reply to a payload. If it returns
+                None, there is no reply.
+        """
 
         def answer_at_once(query: zenoh.Query) -> None:
             # A query ends for its sender only when the query object is dropped.
@@ -271,7 +316,12 @@ class ZenohBus:
         )
 
     def query(self, key: str, payload: bytes = b"") -> Inbox:
-        """See `Bus`."""
+        """Sends a query, and returns a queue for the replies.
+
+        Args:
+            key: Key of the query. Every member that serves a matching key replies.
+            payload: Payload of the query.
+        """
         # Not a ring channel: it loses its replies when the last one has arrived.
         replies = self._session.get(
             key,
@@ -290,12 +340,20 @@ class ZenohBus:
         )
 
     def announce(self, key: str) -> None:
-        """See `Bus`."""
+        """Announces that this member is present, until the connection is closed or lost.
+
+        Args:
+            key: Key of the liveliness token by which other members see this member.
+        """
         self._tokens.add(key)
         self._declarations.append(self._session.liveliness().declare_token(key))
 
     def presence(self, key: str) -> PresenceInbox:
-        """See `Bus`."""
+        """Returns a queue of pairs: the key of a token, and True if the token has appeared.
+
+        The first entries are the tokens that exist already. The tokens of this session are left
+        out.
+        """
 
         def read(sample: zenoh.Sample) -> tuple[str, bool] | None:
             token = str(sample.key_expr)
@@ -310,17 +368,17 @@ class ZenohBus:
         return _ZenohRing(tokens, read)
 
     def close(self) -> None:
-        """See `Bus`."""
+        """Closes the connection. Calling it again has no effect."""
         if not self._session.is_closed():
             self._session.close()
         self._declarations.clear()
 
 
 def read_zenoh_file(path: Path) -> ZenohFile:
-    """Returns a user's Zenoh configuration from a file in JSON5 or JSON.
+    """Reads a user's Zenoh configuration from a file in JSON5 or JSON, and checks it.
 
     Raises:
-        UsageError: the file cannot be read, is not a configuration, or contradicts the
+        UsageError: The file cannot be read, is not a Zenoh configuration, or contradicts the
             requirements of a session.
     """
     try:
@@ -332,10 +390,22 @@ def read_zenoh_file(path: Path) -> ZenohFile:
 
 
 def _parse_json5(source: str, text: str) -> object:
-    """Returns the object in a JSON5 text, parsed by Zenoh.
+    """Parses a JSON5 text with the parser of Zenoh.
 
-    The key `metadata` of a Zenoh configuration may hold any value.
+    Zenoh can only parse whole configurations. The text is therefore parsed as part of the key
+    `metadata` of a configuration, which may have any value.
+
+    Args:
+        source: Name of the file, for error messages.
+        text: Content of the file.
+
+    Returns:
+        The object, which is a dict if the text is a configuration.
+
+    Raises:
+        UsageError: The text is not JSON5, is nested too deeply, or contains several objects.
     """
+    # Each opening bracket increases the nesting by 1, and each closing bracket decreases it.
     nesting = accumulate((character in "[{") - (character in "]}") for character in text)
     if max(nesting, default=0) > MAX_DEPTH:
         raise UsageError(f"{source}: no JSON5: nested deeper than {MAX_DEPTH}")
@@ -357,7 +427,7 @@ def _parse_json5(source: str, text: str) -> object:
 
 
 def _find_refusal(settings: Mapping[str, Any]) -> str:
-    """Returns Zenoh's reason for refusing settings, or "" if Zenoh accepts them."""
+    """Returns the reason why Zenoh refuses settings. Empty if it accepts them."""
     try:
         zenoh.Config.from_json5(json.dumps(settings))
     except zenoh.ZError as error:
@@ -366,9 +436,10 @@ def _find_refusal(settings: Mapping[str, Any]) -> str:
 
 
 def _first_line(error: zenoh.ZError) -> str:
-    """Returns the first line of an error, without its place in Zenoh's sources."""
+    """Returns the first line of a Zenoh error, without the position in Zenoh's source code."""
     return re.sub(r" at /\S+:\d+\.?", "", str(error).strip().splitlines()[0])[:400]
 
 
 def _endpoint_texts(endpoints: Sequence[Endpoint]) -> str:
+    """Returns endpoints as one text for messages to the user."""
     return ", ".join(map(str, endpoints))
