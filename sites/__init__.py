@@ -1,1 +1,1 @@
-"""The live driver: a process per site joins a session, runs the site's loop, and leaves."""
+"""Run live sessions: one process per arm joins a session, runs its control loop, and leaves."""

@@ -1,14 +1,19 @@
-"""Replies to change requests while the site runs.
+"""Reply to requests to change something while a site runs.
+
+Users change links, the weights with which a site follows its peers, and the end of the run.
+They stop and enable arms, and mark moments in the log. A site checks each request, replies, and
+applies the accepted changes in its next tick.
 
 Invariant:
-    - Every request gets a reply: it is refused with a reason, or accepted by the very next
+    - Every request gets a reply. It is refused with a reason, or accepted by the very next
       tick, whose record names the change.
-    - An accepted change holds for samples and ticks from `AHEAD_MS` later on, so it alters no
-      decision that has been made.
-    - In one tick a stop outweighs all other orders. `enable` and `reset` therefore wait for a
-      tick without earlier orders, and so do all requests behind them.
-    - A change of dominance takes at least `MIN_RAMP_S`, whatever the request says, so that no
-      reference jumps. The record has the ramp that holds.
+    - An accepted change takes effect `AHEAD_MS` later. It therefore does not alter decisions
+      that were already made, such as the delay of a sample that has been sent.
+    - Within one tick, the order to stop takes precedence over all others. The orders "enable"
+      and "reset" therefore wait for a tick without earlier orders, and the requests behind them
+      wait as well.
+    - A change of weights takes at least `MIN_RAMP_S`, whatever the request states, so that no
+      reference jumps. The record contains the actual duration.
 """
 
 from collections import Counter, deque
@@ -35,33 +40,34 @@ from trilat_net.scenario.run_changes import (
 from trilat_net.scenario.scenario_types import SiteOrder
 
 AHEAD_MS = 100
+"""Time from the acceptance of a change until it takes effect, in ms."""
 MIN_RAMP_S = 0.5
-"""Shortest change of dominance."""
+"""Shortest duration of a change of weights, in s."""
 MARKS_WAITING = 16
-"""Largest number of marks between two events of a site, which are 100 ms apart."""
+"""Largest number of marks that wait to be published. A site publishes them every 100 ms."""
 
 
 _NEEDED_MODES = {"reset": Mode.FAULT, "enable": Mode.STOPPED}
-"""The only mode in which an order has an effect."""
+"""Orders that have an effect only in one mode, with that mode."""
 
 
 class ChangeServer:
-    """The change requests to one site.
+    """Receives the requests to one site, checks them, and keeps what the site still has to do.
 
     Args:
-        scenario: the scenario of the session.
-        site: the name of the site.
-        queries: requests from the operator.
-        mode: returns the mode of the site after the last tick.
-        held: returns True if the dead-man switch is held, or if there is none. Without it, the
-            site refuses `enable` and `reset`.
-        stops: requests from members that may only stop the site.
+        scenario: Scenario of the session.
+        site: Name of the site.
+        queries: Requests of the operator, who may change everything.
+        mode: Function that returns the mode of the site after its last tick.
+        held: Function that returns True if the dead-man switch is held or if there is none. If
+            it is not held, the orders "enable" and "reset" are refused.
+        stops: Requests of other members, who may only stop the site. None if there are none.
 
     Attributes:
         stopped: True once the site has executed the last tick before a requested end.
-        marks: the marked moments that no event names yet: ticks and texts.
-        sources: who requested an accepted change, by the change's text in the record, until an
-            event names the source.
+        marks: Marks that are not published yet: pairs of a tick and a text.
+        sources: Who requested an accepted change, by the text of the change in the record. The
+            entry is removed when the change is published.
     """
 
     def __init__(
@@ -91,7 +97,14 @@ class ChangeServer:
         self.sources: dict[str, str] = {}
 
     def pop_changes(self, k: int) -> Sequence[CoreChange]:
-        """Replies to all requests, and returns the accepted changes for the next tick, `k`."""
+        """Replies to all waiting requests.
+
+        Args:
+            k: Next tick.
+
+        Returns:
+            The changes that the site applies in that tick.
+        """
         if self._stop_tick is not None:
             self.stopped = k + 1 >= self._stop_tick
         changes: list[CoreChange] = []
@@ -115,10 +128,19 @@ class ChangeServer:
         return changes
 
     def _accept(self, request: ChangeRequest, k: int) -> tuple[str, int, CoreChange | None]:
-        """Returns the reply's text, the tick from which the request holds, and its change.
+        """Accepts a request, or refuses it with an error.
+
+        Args:
+            request: The request.
+            k: Next tick.
+
+        Returns:
+            The text of the reply, the tick from which on the request has an effect, and the
+            change for the simulation kernel. The change is None for marks and for the end of
+            the run.
 
         Raises:
-            ScenarioError: the site refuses the request.
+            ScenarioError: The site refuses the request.
         """
         if request.stop_s is not None:
             text, tick = self._schedule_stop(k, request.stop_s)
@@ -135,7 +157,11 @@ class ChangeServer:
         return text, first, change
 
     def _poll(self) -> Query | None:
-        """Returns the next request: a stop, else a deferred one, else the operator's next."""
+        """Returns the next request. None if no request waits.
+
+        Orders to stop from other members come first, then the request that had to wait for a
+        tick without orders, and then the requests of the operator.
+        """
         query = self._poll_stop()
         if query is None:
             query = self._deferred or self._queries.poll()
@@ -143,22 +169,26 @@ class ChangeServer:
         return query
 
     def _poll_stop(self) -> Query | None:
-        """Returns the next request of a member that may only stop the site.
+        """Returns the next order to stop from a member that may send no other request.
 
-        Any other request of such a member is refused here.
+        Other requests of such a member are refused here. The order may name its source.
         """
         while self._stops is not None and (query := self._stops.poll()) is not None:
             with suppress(WireError):
                 request = decode(query.payload, ChangeRequest)
-                if msgspec.structs.replace(request, source=UNSET) == ChangeRequest(
-                    order="stop"
-                ):
+                without_source = msgspec.structs.replace(request, source=UNSET)
+                if without_source == ChangeRequest(order="stop"):
                     return query
             text = f"{self._site} can be asked to stop under this key, and nothing else"
             query.reply(encode(ChangeReply(member=self._site, accepted=False, text=text)))
         return None
 
     def _add_mark(self, k: int, text: str) -> str:
+        """Stores a mark until it is published, and returns the text of the reply.
+
+        Raises:
+            ScenarioError: Too many marks wait.
+        """
         if len(self.marks) >= MARKS_WAITING:
             raise ScenarioError(
                 f"at most {MARKS_WAITING} marks wait to be published; mark again in 100 ms"
@@ -167,8 +197,14 @@ class ChangeServer:
         return f"{self._site} marks tick {k}"
 
     def _make_order_change(self, k: int, order: SiteOrder) -> CoreChange:
+        """Returns the change with which an order takes effect in tick `k`.
+
+        Raises:
+            ScenarioError: The site is not in the mode that the order needs, or the dead-man
+                switch is not held.
+        """
         mode = self._read_mode()
-        needed = _NEEDED_MODES.get(order)
+        needed = _NEEDED_MODES.get(order)  # None for the order to stop
         if needed is not None and mode is not needed:
             raise ScenarioError(
                 f"{self._site} is in {MODE_WORDS[mode]}; "
@@ -182,7 +218,15 @@ class ChangeServer:
         return to_core_change(self._scenario, change)
 
     def _schedule_stop(self, k: int, stop_s: float) -> tuple[str, int]:
-        """Sets the tick before which the site ends, unless an earlier one is set."""
+        """Sets the end of the run, unless an earlier end is set already.
+
+        Args:
+            k: Next tick.
+            stop_s: Requested end, in s since the epoch.
+
+        Returns:
+            The text of the reply, and the tick before which the run ends.
+        """
         requested = first_tick_at(round(stop_s * 1e9), self._rate_hz)
         self._stop_tick = min(max(requested, k + 1), self._stop_tick or self._ticks)
         self.stopped = k + 1 >= self._stop_tick
@@ -190,10 +234,15 @@ class ChangeServer:
         return text, self._stop_tick
 
     def _make_change(self, request: ChangeRequest, first: int) -> CoreChange:
-        """Returns the requested change of a link or of dominance, valid from tick `first` on.
+        """Returns the requested change of a link or of the weights of the peers.
+
+        Args:
+            request: The request.
+            first: First tick for which the change holds.
 
         Raises:
-            ScenarioError: the change is invalid, comes too late, or exceeds a limit.
+            ScenarioError: The change is not valid, comes too late, or there have been too many
+                changes.
         """
         from_ns = tick_ns(first, self._rate_hz)
         self._links.advance_to(from_ns)  # applies the changes of the scenario's own timeline
@@ -201,6 +250,8 @@ class ChangeServer:
             raise ScenarioError(f"the run ends at tick {self._ticks}, before it could hold")
         if self._accepted_counts[request.link] >= MAX_CHANGES:
             raise ScenarioError(f"a run takes at most {MAX_CHANGES} changes of a link")
+
+        # The kernel stores a limited number of weight changes that have not begun yet.
         pending_ns = self._pending_ramps_ns
         while pending_ns and pending_ns[0] <= from_ns - AHEAD_MS * 1_000_000:
             pending_ns.popleft()
@@ -209,11 +260,13 @@ class ChangeServer:
                 f"at most {MAX_RAMPS} changes of shares wait to begin; "
                 f"ask again in {AHEAD_MS} ms"
             )
-        settings = {
-            key: value
-            for key in ("link", "dominance", "ramp_s")
-            if (value := getattr(request, key))
-        }
+
+        # The settings of a change in a scenario's timeline. Absent ones are left out.
+        settings = {}
+        for key in ("link", "dominance", "ramp_s"):
+            value = getattr(request, key)
+            if value:
+                settings[key] = value
         if request.dominance and request.ramp_s >= 0.0:
             settings["ramp_s"] = max(request.ramp_s, MIN_RAMP_S)
         change = resolve_change(
@@ -221,6 +274,7 @@ class ChangeServer:
         )
         if find_owner(change) != self._site:
             raise ScenarioError(f"{self._site} cannot do that; ask {find_owner(change)}")
+
         if change.link:
             self._accepted_counts[change.link] += 1
             self._links[change.link] = change.to

@@ -1,15 +1,21 @@
-"""Deadline budget and watchdog of a user's own code: a law, a hand, a plant.
+"""Limit the computing time of a user's own code: a control law, an operator or a plant.
 
-The code may use `SHARE` of the period at which it is called. Time beyond that adds to its
-overtime, which faster calls pay back; code whose overtime exceeds `OVERTIME_LIMIT_NS` is too
-slow. One call counts for at most `HICCUP_NS`, so that no single call fails. If the machine has
-preempted the thread, the thread's computing time counts instead of the elapsed time.
+The site calls such code in its control loop, so that slow code would make ticks late. The code
+may use 75 % (`SHARE`) of the period at which it is called. Additional time adds to its
+overtime, and time that it does not use reduces the overtime again. If the overtime exceeds
+`OVERTIME_LIMIT_NS`, the code is too slow and the run ends. A single call counts for at most
+`HICCUP_NS`, so that one slow call alone is never too slow.
+
+If the operating system has interrupted the thread during a call, the computing time of the
+thread counts instead of the elapsed time.
+
+Code that does not return at all is interrupted by a signal, see `CodeWatchdog`.
 
 Invariant:
-    - The watchdog judges the code's own computing time, never the lateness of the machine.
-    - It enters no number of the run.
-    - A single slow call is only counted. Code that is too slow, or does not return, fails and
-      is reported.
+    - The code is judged by its own computing time, and not by the load of the machine.
+    - The measurement does not influence any number of the run.
+    - A single slow call is only counted. Code that is too slow, or that does not return, fails
+      with an error that names the problem.
 """
 
 import signal
@@ -31,21 +37,25 @@ except ImportError:  # not on this platform: elapsed time counts
 
 T = TypeVar("T")
 SHARE = 0.75
+"""Fraction of a period that the code may use."""
 OVERTIME_LIMIT_NS = 500_000_000
+"""Overtime above which the code is too slow, in ns."""
 HICCUP_NS = 50_000_000
+"""Largest time that one call adds to the overtime, in ns."""
 CHECK_S = 1.0
+"""Time between two checks of whether the code still hangs in the same call, in s."""
 CHECKS = 3
+"""Number of checks in a row that must see the same call before it is interrupted."""
 FIRST_CHECKS = 61
-"""Code hangs if it is in the same call at `CHECKS` checks in a row, one every `CHECK_S`.
-
-In its first tick, in which it may compile, the limit is `FIRST_CHECKS`.
-"""
+"""The same number in the first tick, in which the code may still be compiled."""
 
 
 def read_thread_usage() -> tuple[int, int]:
-    """Returns this thread's computing time, ns, and its involuntary context switches.
+    """Returns how long this thread has computed, and how often it was interrupted.
 
-    Returns (0, -1) if they are unknown.
+    Returns:
+        The computing time in ns, and the number of involuntary context switches. The values are
+        0 and -1 if the platform does not report them.
     """
     if _THREAD is None:
         return 0, -1
@@ -54,19 +64,19 @@ def read_thread_usage() -> tuple[int, int]:
 
 
 class WatchedCode:
-    """A user's own code, called `rate_hz` times a second.
+    """A user's own code that is called once per tick, with a record of its computing time.
 
     Args:
-        name: the name of the code, as in "the law mylaw:MyLaw".
-        rate_hz: how often the code is called, 1/s.
-        fail: returns the error to raise, from a tick and a problem.
-        clock: the clock of this process.
-        usage: returns the thread's computing time and context switches.
+        name: Name of the code, as in "the law mylaw:MyLaw".
+        rate_hz: How often the code is called, in 1/s.
+        fail: Function that returns the error to raise, from a tick and a problem.
+        clock: Clock of this process.
+        usage: Function that returns the computing time and the context switches of the thread.
 
     Attributes:
-        hiccups: the number of calls that took longer than a period.
-        longest_ns: the duration of the longest call.
-        longest_tick: the tick of that call.
+        hiccups: Number of calls that took longer than a period.
+        longest_ns: Duration of the longest call, in ns.
+        longest_tick: Tick of that call. It is -1 before the first call.
     """
 
     def __init__(
@@ -85,7 +95,7 @@ class WatchedCode:
         self._clock = clock
         self._usage = usage
         self._period_ns = NS_PER_S // rate_hz
-        self._owed_ns = 0
+        self._overtime_ns = 0
         self._total_ns = 0
         self._calls = 0
         self._same_call_checks = 0
@@ -94,23 +104,31 @@ class WatchedCode:
         self._checked_count = -1  # the number of finished calls at the last check
 
     def run(self, k: int, call: Callable[[], T]) -> T:
-        """Returns the result of a call at tick `k`.
+        """Calls the code, and measures how long it takes.
+
+        Args:
+            k: The tick.
+            call: Function that calls the code.
+
+        Returns:
+            The result of the code.
 
         Raises:
-            Exception: the error of `fail` if the code is too slow; otherwise what the call
-                raises.
+            Exception: If the code is too slow, the error of `fail`. Otherwise the error that
+                the code raises.
         """
         computed_ns, switches = self._usage()
         begun_ns = self._clock.monotonic_ns()
         self._running_tick = k
-        self._first_tick = k if self._first_tick < 0 else self._first_tick
+        if self._first_tick < 0:
+            self._first_tick = k
         try:
             result = call()
         finally:
             self._running_tick = -1
         elapsed_ns = self._clock.monotonic_ns() - begun_ns
         if elapsed_ns > SHARE * self._period_ns:
-            # The thread was preempted if it was switched involuntarily.
+            # If the number of involuntary switches has changed, the thread was interrupted.
             computed_after_ns, switches_after = self._usage()
             if switches_after != switches:
                 elapsed_ns = min(elapsed_ns, computed_after_ns - computed_ns)
@@ -118,16 +136,26 @@ class WatchedCode:
         return result
 
     def _count_call(self, k: int, elapsed_ns: int) -> None:
-        """Counts a call and its overtime; raises an error if the code is too slow."""
+        """Adds a call to the statistics and to the overtime.
+
+        Args:
+            k: Tick of the call.
+            elapsed_ns: Time that the call took, in ns.
+
+        Raises:
+            Exception: The code is too slow.
+        """
         self.hiccups += elapsed_ns > self._period_ns
         self._total_ns += elapsed_ns
         self._calls += 1
         if elapsed_ns > self.longest_ns:
             self.longest_ns = elapsed_ns
             self.longest_tick = k
-        self._owed_ns += min(elapsed_ns, HICCUP_NS) - int(SHARE * self._period_ns)
-        self._owed_ns = max(self._owed_ns, 0)
-        if self._owed_ns > OVERTIME_LIMIT_NS:
+
+        permitted_ns = int(SHARE * self._period_ns)
+        self._overtime_ns += min(elapsed_ns, HICCUP_NS) - permitted_ns
+        self._overtime_ns = max(self._overtime_ns, 0)
+        if self._overtime_ns > OVERTIME_LIMIT_NS:
             mean_ms = self._total_ns / self._calls * 1e-6
             period_ms = self._period_ns * 1e-6
             problem = (
@@ -137,7 +165,10 @@ class WatchedCode:
             raise self._fail(k, problem)
 
     def describe_hiccups(self) -> str:
-        """Returns a sentence about the calls that took longer than a period, else ""."""
+        """Returns a sentence about the calls that took longer than a period.
+
+        Empty if there were none.
+        """
         if not self.hiccups:
             return ""
         return (
@@ -147,26 +178,36 @@ class WatchedCode:
         )
 
     def check(self) -> None:
-        """Interrupts user code that is still in the call seen at the previous checks.
+        """Interrupts the code if it is still in the call that the previous checks saw.
 
-        Checks missed while the process was suspended do not count.
+        The method is called by a signal handler while the code runs. Checks that are missed
+        because the process was suspended do not count.
 
         Raises:
-            Exception: the error of `fail`, out of the user's code.
+            Exception: The error of `fail`. It is raised inside of the user's code.
         """
         tick = self._running_tick
         is_same_call = tick >= 0 and self._calls == self._checked_count
         self._same_call_checks = self._same_call_checks + 1 if is_same_call else 0
         self._checked_count = self._calls if tick >= 0 else -1
-        limit = (FIRST_CHECKS if tick == self._first_tick else CHECKS) - 1
+        # The first check that sees the call does not count: it may have just begun.
+        checks = FIRST_CHECKS if tick == self._first_tick else CHECKS
+        limit = checks - 1
         if self._same_call_checks >= limit:
             raise self._fail(tick, f"it did not come back within {limit * CHECK_S:g} s")
 
 
 class CodeWatchdog:
-    """A context manager within which user code that hangs is interrupted.
+    """Context manager that interrupts user code that hangs inside the `with` block.
 
-    It uses SIGALRM, so it works in the main thread only.
+    It uses the signal SIGALRM, which Python handles in the main thread only. In other threads,
+    and on Windows, nothing is interrupted.
+
+    Args:
+        *codes: The code to watch.
+
+    Attributes:
+        codes: The code to watch. More can be added before the `with` block.
     """
 
     def __init__(self, *codes: WatchedCode) -> None:
@@ -187,5 +228,6 @@ class CodeWatchdog:
             self._handler_before = None
 
     def _check(self, _number: int, _frame: FrameType | None) -> None:
+        """Checks all code. It is the handler of SIGALRM."""
         for code in self.codes:
             code.check()

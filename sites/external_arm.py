@@ -1,15 +1,20 @@
-"""The site's side of an external arm (`plant = "external"`) and of its dead-man switch.
+"""Receive the measurements of an external arm and the state of its dead-man switch.
 
-`ExternalArm` receives the measurements of the arm's joints, and `DeadManSwitch` the messages of
-whoever holds the switch. Both turn silence into orders to the site.
+An arm is external (`plant = "external"` in the scenario) if it is a real arm, or a simulation
+in another program. Its driver sends the measured joint positions to the site, the process that
+computes the torque. A dead-man switch is a button that somebody must hold while the arm moves.
+`ExternalArm` and `DeadManSwitch` watch both for silence, and derive orders for the site from
+it: to hold the position, to stop, or to continue.
 
 Invariant:
-    - No received message can raise out of the loop, and the inbox is bounded.
-    - Only the newest measurement counts. The site does not start without a measurement, holds
-      after `HELD_SILENCE_NS` without any, and is in fault after `SILENCE_LIMIT_NS`.
-    - A measurement that the arm cannot have reached since the previous one is dropped and does
+    - A received message cannot raise an error in the control loop. The queue of messages is
+      bounded.
+    - Only the newest measurement counts. The site does not start without a measurement. It
+      holds its position after `HELD_SILENCE_NS` without one, and enters the mode "fault" after
+      `SILENCE_LIMIT_NS`.
+    - A measurement that the arm cannot have reached since the previous one is dropped, and does
       not count as received.
-    - A switch that sends nothing for `SWITCH_SILENCE_NS` is not held.
+    - A switch that has sent nothing for `SWITCH_SILENCE_NS` counts as released.
 """
 
 from collections import Counter
@@ -29,41 +34,43 @@ from trilat_net.scenario.scenario_types import SiteOrder
 from .site_loop import STEP_MARGIN_RAD
 
 MEASUREMENTS_KEPT = 64
-"""Capacity of the inbox: older measurements are useless."""
+"""Number of messages in a queue. Older measurements are useless."""
 HELD_SILENCE_NS = 30_000_000
-"""Silence of the arm after which the site holds."""
+"""Silence of the arm after which the site holds its position, in ns."""
 SILENCE_LIMIT_NS = 200_000_000
-"""Silence of the arm after which the site is in fault."""
+"""Silence of the arm after which the site enters the mode "fault", in ns."""
 SWITCH_SILENCE_NS = 100_000_000
-"""Silence of a dead-man switch after which the switch counts as released."""
+"""Silence of a dead-man switch after which it counts as released, in ns."""
 STARTS_KEPT = 64
-"""Number of programs at a switch whose state is kept.
+"""Number of switch programs whose state is stored.
 
-If there are more, a program that does not hold the switch is forgotten first.
+If there are more, one that does not hold the switch is forgotten.
 """
 START_POSE_TOLERANCE_RAD = 0.01
-"""Largest distance of the arm from its `q0_rad` at the start that is not reported."""
+"""Distance of the arm from its `q0_rad` at the start up to which there is no warning, in rad.
+"""
 POLL_NS = 5_000_000
+"""Time between two polls while the site waits for its arm, in ns."""
 _MAX_POLL_GAP_NS = 20_000_000
-"""Largest silence that one poll can add.
+"""Largest silence that one poll can add, in ns.
 
-A site that was suspended cannot know which messages it would have received in the meantime.
+If the site itself was suspended, it cannot know which messages it would have received.
 """
 
 
 class ExternalArm:
-    """The measurements of one external arm.
+    """Receives the measurements of one external arm, and measures its silence.
 
     Args:
-        site: the site of the arm.
-        ring: the inbox of the measurements.
-        clock: the clock of this machine.
-        dropped: counts dropped measurements by reason.
-        address: where the site waits for measurements, for messages to the user.
+        site: Site of the arm in the simulation kernel.
+        ring: Queue of the measurements.
+        clock: Clock of this machine.
+        dropped: Number of dropped measurements by reason. The counts are increased in place.
+        address: Where the site expects the measurements, for messages to the user.
 
     Attributes:
-        newest: the newest accepted measurement; None before the first.
-        accepted: the number of accepted measurements.
+        newest: Newest accepted measurement. None before the first one.
+        accepted: Number of accepted measurements.
     """
 
     def __init__(
@@ -95,10 +102,18 @@ class ExternalArm:
     def wait_for_first(
         self, stopped: Callable[[], bool], give_up_ns: int, say: Callable[[str], None]
     ) -> bool:
-        """Waits for the first measurement; returns False if `stopped` returns True first.
+        """Waits for the first measurement of the arm.
+
+        Args:
+            stopped: Function that returns True to end the wait.
+            give_up_ns: Time at which the site gives up, on the local clock, in ns.
+            say: Function that prints a line for the user.
+
+        Returns:
+            True if a measurement has arrived. False if `stopped` returned True.
 
         Raises:
-            SessionError: no measurement arrived before `give_up_ns`.
+            SessionError: No measurement arrived in time.
         """
         say(f"waiting for its arm on {self._address}")
         reported: set[str] = set()
@@ -106,6 +121,7 @@ class ExternalArm:
             self.poll()
             if self.newest is not None:
                 return True
+
             # A reason such as "of 6 joints; the scenario has 7" tells the user what to change.
             mismatches = [reason for reason in self._dropped if reason.startswith("of ")]
             for reason in mismatches:
@@ -114,26 +130,32 @@ class ExternalArm:
                     say(f"its arm sends measurements {reason}")
             now_ns = self._clock.monotonic_ns()
             if now_ns > give_up_ns:
-                dropped = ", ".join(
-                    f"{count} {reason}" for reason, count in self._dropped.items()
-                )
-                raise SessionError(
-                    f"{self._site} waited in vain for its arm: "
-                    f"no measurement came on {self._address}"
-                    + (f"; dropped: {dropped}" if dropped else "")
-                    + f"; see {find_page('external-arm.md')}"
-                )
+                raise self._describe_silence()
             self._clock.sleep_until(now_ns + POLL_NS)
         return False
 
+    def _describe_silence(self) -> SessionError:
+        """Returns the error for a site that has waited in vain for its arm."""
+        text = (
+            f"{self._site} waited in vain for its arm: no measurement came on {self._address}"
+        )
+        if self._dropped:
+            counts = [f"{count} {reason}" for reason, count in self._dropped.items()]
+            text += f"; dropped: {', '.join(counts)}"
+        return SessionError(f"{text}; see {find_page('external-arm.md')}")
+
     def bind(self, q0_rad: Sequence[float]) -> str:
-        """Accepts measurements only from the present program from now on.
+        """Accepts only measurements of the present driver from now on.
+
+        The site calls this method at the start of the session. If another program sends
+        measurements during the run, they are dropped.
 
         Args:
-            q0_rad: the start pose that the peers assume, rad, one angle per joint.
+            q0_rad: Joint angles in rad from which the arm starts according to the scenario. The
+                peers assume them.
 
         Returns:
-            A warning if the arm is off that start pose, else "".
+            A warning if the arm is elsewhere. Empty if it is there.
         """
         self.poll()
         self._is_bound = True
@@ -147,7 +169,7 @@ class ExternalArm:
         return warning if distance_rad > START_POSE_TOLERANCE_RAD else ""
 
     def poll(self) -> None:
-        """Accepts the measurements that have arrived, and updates the arm's silence."""
+        """Accepts the measurements that have arrived, and updates the time of silence."""
         now_ns = self._clock.monotonic_ns()
         accepted_before = self.accepted
         while (message := self._ring.poll()) is not None:
@@ -161,11 +183,15 @@ class ExternalArm:
         self._polled_ns = now_ns
 
     def pop_order(self, mode: Mode) -> SiteOrder:
-        """Returns the order that follows from the arm's silence, "" if nothing has changed.
+        """Returns the order to the site that follows from the arm's silence.
 
         Args:
-            mode: the present mode of the site. "arm_lost" is repeated until the site is in
-                fault.
+            mode: Present mode of the site. The order "arm_lost" is repeated until the mode is
+                "fault".
+
+        Returns:
+            "arm_silent" or "arm_lost" if the arm has been silent, "arm_back" if it has
+            returned. Empty if nothing has changed.
         """
         reported = self._reported_order
         self._reported_order = ""
@@ -178,12 +204,17 @@ class ExternalArm:
         return "arm_back" if reported == "arm_silent" else ""
 
     def _accept(self, payload: bytes) -> None:
+        """Checks one measurement, and stores it or counts the reason why it is dropped.
+
+        Args:
+            payload: The encoded measurement.
+        """
         try:
             message = decode(payload, ArmMeasurement, layout=self._layout)
         except WireError as error:
             self._dropped[error.reason] += 1
             return
-        # After so long a silence the arm's program may have been restarted with a new boot.
+        # After a long silence, the driver may have been restarted, with another boot.
         is_lost = self._silent_ns > SILENCE_LIMIT_NS
         is_other_boot = self._is_bound and not is_lost and message.boot != self._boot
         if message.site != self._site or is_other_boot:
@@ -209,7 +240,12 @@ class ExternalArm:
         self.accepted += 1
 
     def _is_plausible(self, q: Sequence[float], elapsed_s: float) -> bool:
-        """True if no joint has moved farther than its speed limit allows."""
+        """Returns True if each joint can have moved to its angle since the last measurement.
+
+        Args:
+            q: Joint angles in rad.
+            elapsed_s: Time since the previous accepted measurement, in s.
+        """
         if self.newest is None:
             return True
         reach = [limit * elapsed_s + STEP_MARGIN_RAD for limit in self._speed_limits]
@@ -219,13 +255,14 @@ class ExternalArm:
 
 @dataclass
 class _Holder:
-    """One start of a program at the switch.
+    """State of one program that reports whether somebody holds the switch.
 
     Attributes:
-        n: the number of its newest message.
-        pressed_ns: when its newest message "held" arrived; None while it does not hold.
-        counts: False if it still holds the switch since before another holder released it. It
-            then has to release the switch and press it again.
+        n: Number of its newest message.
+        pressed_ns: Time at which its newest report of a held switch arrived, in ns. None if it
+            does not hold the switch.
+        counts: False if another program has released the switch while this one held it. Then
+            the switch of this program has to be released and pressed again.
     """
 
     n: int = -1
@@ -234,17 +271,18 @@ class _Holder:
 
 
 class DeadManSwitch:
-    """The dead-man switch of one arm; the arm stops if any holder releases it or falls silent.
+    """The dead-man switch of one arm, for which several programs may report.
 
-    All other holders then have to release the switch and press it again. The age of a message
-    is measured on this machine's clock from its arrival, so the switch of a site that was
-    suspended is not held.
+    The arm stops if any program that holds the switch releases it or falls silent. The others
+    then have to release the switch and press it again. The age of a message is measured on the
+    clock of this machine from its arrival. The switch therefore counts as released if this
+    process was suspended.
 
     Args:
-        site: the site of the arm.
-        ring: the inbox of the switch's messages, with the times of their arrival.
-        clock: the clock of this machine.
-        dropped: counts dropped messages by reason.
+        site: Name of the site of the arm.
+        ring: Queue of the reports, with the times of their arrival.
+        clock: Clock of this machine.
+        dropped: Number of dropped messages by reason. The counts are increased in place.
     """
 
     def __init__(
@@ -258,6 +296,7 @@ class DeadManSwitch:
         self._was_released = False
 
     def _list_holders(self) -> list[_Holder]:
+        """Lists the programs that hold the switch and count."""
         return [
             program
             for program in self._programs.values()
@@ -265,29 +304,34 @@ class DeadManSwitch:
         ]
 
     def _is_silent(self, holder: _Holder) -> bool:
+        """Returns True if the newest report of a program is older than `SWITCH_SILENCE_NS`."""
         if holder.pressed_ns is None:
             return True
         return self._clock.monotonic_ns() - holder.pressed_ns > SWITCH_SILENCE_NS
 
     @property
     def held(self) -> bool:
-        """True if there is a holder and no holder is silent."""
+        """True if a program holds the switch, and no program that holds it is silent."""
         holders = self._list_holders()
         return bool(holders) and not any(map(self._is_silent, holders))
 
     def poll(self) -> None:
-        """Accepts the arrived messages, and releases the switch for silent holders."""
+        """Accepts the waiting reports, and releases the switch for silent programs."""
         while (message := self._ring.poll()) is not None:
             payload, received_ns = message
             self._accept(payload, received_ns)
         self._release([holder for holder in self._list_holders() if self._is_silent(holder)])
 
     def pop_order(self, mode: Mode, reason: LifeReason) -> SiteOrder:
-        """Returns the order that follows from the switch, "" if there is none.
+        """Returns the order to the site that follows from the switch.
 
         Args:
-            mode: the present mode of the site.
-            reason: the reason of that mode.
+            mode: Present mode of the site.
+            reason: Reason of that mode.
+
+        Returns:
+            "released" if the arm has to stop, "held" if it may move again. Empty if nothing
+            changes.
         """
         was_released = self._was_released
         self._was_released = False
@@ -296,7 +340,13 @@ class DeadManSwitch:
         return "held" if (mode, reason) == (Mode.STOPPED, LifeReason.RELEASED) else ""
 
     def _release(self, released: Sequence[_Holder]) -> None:
-        """Ends the hold of some holders; all others stop counting until they press again."""
+        """Releases the switch for some programs.
+
+        All others stop counting until they press it again.
+
+        Args:
+            released: The programs. If there are none, nothing changes.
+        """
         if not released:
             return
         for holder in released:
@@ -306,6 +356,12 @@ class DeadManSwitch:
         self._was_released = True
 
     def _accept(self, payload: bytes, received_ns: int) -> None:
+        """Checks one report of a program, and updates the state of that program.
+
+        Args:
+            payload: The encoded report.
+            received_ns: Time of its arrival on the local clock, in ns.
+        """
         try:
             message = decode(payload, ArmEnable)
         except WireError as error:
@@ -330,7 +386,7 @@ class DeadManSwitch:
         program.counts = True
 
     def _forget_program(self) -> None:
-        """Forgets the oldest program that does not hold the switch, else the oldest of all."""
+        """Forgets the oldest program that does not hold the switch, or the oldest of all."""
         idle = [boot for boot, program in self._programs.items() if program.pressed_ns is None]
         oldest = idle[0] if idle else next(iter(self._programs))
         del self._programs[oldest]

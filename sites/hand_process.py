@@ -1,12 +1,17 @@
-"""A hand of the user's own in a process of its own: what `trilat hand` runs.
+"""Run a user's own operator class as a process that moves the arm of a site.
+
+An operator moves an arm. A user can write one as a class whose method `act` receives a view,
+the state of the site, and returns a target or a force. The site sends a view several times a
+second over the network, and this process, the command `trilat hand`, replies with the decisions
+of the class.
 
 Invariant:
-    - The hand sees the views that the site sends, and nothing else of the session.
-    - Each decision names the tick of its view, so that the site applies it a fixed time after
-      that tick.
-    - Views that are too old to act in time are skipped.
-    - If the hand's class fails, the hand releases the arm and the process ends. If the process
-      is killed, the site notices the silence.
+    - The class sees only the views that the site sends, and nothing else of the session.
+    - Each decision names the tick of its view. The site applies it a fixed time after that
+      tick, so that delays on the network do not change the run.
+    - Views that are too old for a decision in time are skipped.
+    - If the class fails, the arm is released and the process ends. If the process is killed,
+      the site notices that its messages have stopped.
 """
 
 from collections import deque
@@ -34,24 +39,26 @@ from trilat_net.scenario.operators.program_hand import (
 )
 
 POLL_NS = 500_000
+"""Time between two polls for views, in ns."""
 ANNOUNCE_PERIOD_NS = 100_000_000
-"""Period at which the hand announces itself before it has received its first view."""
+"""Time between two announcements to the site before the first view has arrived, in ns."""
 VIEWS_KEPT = 64
+"""Number of views that the network queue holds."""
 
 
 class HandProcess(SiteClient):
-    """A user's own hand at the arm of a site.
+    """Connection between a user's operator class and the site whose arm it moves.
 
     Args:
-        hand_site: the site of the hand, and the settings of its class.
-        program: the hand.
-        bus: the bus to the session.
-        clock: the clock of this process.
-        session: the session's name.
+        hand_site: Site of the operator, and settings of the class.
+        program: The operator, an object of the user's class.
+        bus: Network connection to the session.
+        clock: Clock of this process.
+        session: Name of the session.
 
     Attributes:
-        asked: the number of views that the hand has decided on.
-        skipped: the number of views that were too old.
+        asked: Number of views to which the class has replied.
+        skipped: Number of views that were too old.
     """
 
     def __init__(
@@ -71,10 +78,12 @@ class HandProcess(SiteClient):
         self._max_waiting = max(1, int(hand_site.delay_s * hand_site.rate_hz))
 
     def serve(self) -> None:
-        """Decides on the next view, if there is one; before the first view, announces the hand.
+        """Replies to the oldest waiting view that is not too old.
+
+        Before the first view has arrived, it announces this process to the site regularly.
 
         Raises:
-            RunFailed: the hand's class failed; the arm has been released.
+            RunFailed: The class failed. The arm has been released.
         """
         views = self._waiting_views
         views.extend(read_messages(self._views, HandViewMessage))
@@ -89,6 +98,11 @@ class HandProcess(SiteClient):
             self._send(0, None)
 
     def _decide(self, message: HandViewMessage) -> None:
+        """Passes a view to the class, and sends its decision to the site.
+
+        Raises:
+            RunFailed: The class failed. The arm has been released.
+        """
         self.asked += 1
         try:
             goal = self._program.act(read_view(message))
@@ -103,20 +117,27 @@ class HandProcess(SiteClient):
         self._send(message.k, numbers)
 
     def _send(self, k: int, goal: list[float] | None) -> None:
-        """Sends the decision on the view of tick `k`; None releases the arm."""
-        fields = {"force" if self._pushes else "target": goal or [], "grip": goal is not None}
+        """Sends the decision of the class to the site.
+
+        Args:
+            k: Tick of the view.
+            goal: The target or force. None releases the arm.
+        """
+        goal_field = "force" if self._pushes else "target"
+        fields = {goal_field: goal or [], "grip": goal is not None}
         self._sender.send(HandMessage, source=self._code, n=k // self._every, **fields)
 
 
 def read_view(message: HandViewMessage) -> HandView:
-    """Returns the view of a message, with lists as arrays."""
+    """Converts a message to the view that the class receives. Lists become arrays."""
 
     def read_fields(source: Any, names: tuple[str, ...]) -> Any:
-        values = {name: getattr(source, name) for name in names if name != "peers"}
-        return {
-            name: np.array(value) if isinstance(value, list) else value
-            for name, value in values.items()
-        }
+        fields = {}
+        for name in names:
+            if name != "peers":
+                value = getattr(source, name)
+                fields[name] = np.array(value) if isinstance(value, list) else value
+        return fields
 
     peers = tuple(PeerView(**read_fields(peer, PeerView._fields)) for peer in message.peers)
     return HandView(**read_fields(message, HandView._fields), peers=peers)
@@ -131,21 +152,22 @@ def run_hand(
     say: Callable[[str], None],
     timeout_s: float,
 ) -> None:
-    """Runs the hand of a site until its session ends.
+    """Runs a user's operator class for a site until the session ends.
 
     Args:
-        scenario: the scenario of the session.
-        name: the site of the hand.
-        session: the session's name.
-        connection: the endpoints and keys.
-        interrupt: the signals of this process.
-        say: prints a line for the user.
-        timeout_s: longest wait for the first view, s.
+        scenario: Scenario of the session.
+        name: Name of the site.
+        session: Name of the session.
+        connection: Endpoints of the session, and keys.
+        interrupt: Handler of the signals of this process.
+        say: Function that prints a line for the user.
+        timeout_s: Longest wait for the first view, in s.
 
     Raises:
-        UsageError: the site has no hand of the user's own in a separate process.
-        SessionError: the site does not send a view in time.
-        RunFailed: the hand's class failed.
+        UsageError: The scenario has no operator class for this site that runs in a process of
+            its own.
+        SessionError: The site does not send a view in time.
+        RunFailed: The class failed.
     """
     hand_site = find_own_hand(scenario, name)
     if hand_site is None or not hand_site.has_separate_process:

@@ -1,9 +1,15 @@
-"""The messages of whoever holds a site's arm, as the site receives them.
+"""Receive the goals of the operator who moves the arm of a site.
+
+An operator is a person or a program. The operator's goals, target positions or forces, arrive
+as messages over the network. `HandServer` serves people and programs that connect to the
+session. `RemoteHand` serves a class of the user that runs in a process of its own, and that
+receives the state of the site in return.
 
 Invariant:
-    - No message can raise out of the loop, and a tick reads few of them.
-    - The site limits the motion of the hand, whatever the sender requests: `HandRules` and the
-      limits of the operator hold, and only one hand holds the arm at a time.
+    - A message cannot raise an error in the control loop, and a tick reads a limited number of
+      messages.
+    - The site limits the motion of the operator's target, whatever the sender requests: the
+      rules of the scenario apply, and only one operator at a time holds the arm.
     - Refused messages are counted by reason.
 """
 
@@ -29,29 +35,32 @@ from trilat_net.scenario.operators.kernel_operators import LiveHand
 from trilat_net.scenario.operators.program_hand import HandPlayer, HandSite
 
 MESSAGES_KEPT = 32
-"""Capacity of the inbox, and largest number of messages that a tick reads.
+"""Number of messages in the queue, and largest number of messages that a tick reads.
 
-Newer messages push older ones out.
+If the queue is full, the oldest message is dropped.
 """
 POLL_NS = 5_000_000
+"""Time between two polls while the site waits for the operator's process, in ns."""
 
 
 def _read_messages(
     inbox: Inbox, site: str, dropped: Counter[str], source: str | None = None
 ) -> Iterator[HandMessage]:
-    """Yields the hand messages to a site, and counts those that are dropped.
+    """Yields the waiting messages of an operator, and counts those that are dropped.
 
     Args:
-        inbox: the inbox of the hand messages.
-        site: the name of the site.
-        dropped: counts dropped messages by reason.
-        source: the only accepted sender; None accepts all.
+        inbox: Queue of the messages.
+        site: Name of the site to which the messages must be addressed.
+        dropped: Number of dropped messages by reason. The counts are increased in place.
+        source: Only accepted sender. None accepts all senders.
     """
     for _ in range(MESSAGES_KEPT):
-        if (waiting := inbox.poll()) is None:
+        waiting = inbox.poll()
+        if waiting is None:
             return
+        _, payload = waiting
         try:
-            message = decode(waiting[1], HandMessage)
+            message = decode(payload, HandMessage)
         except WireError as error:
             dropped[f"hand: {error.reason}"] += 1
             continue
@@ -62,19 +71,19 @@ def _read_messages(
 
 
 class HandServer:
-    """The live hand of one site.
+    """Moves the arm of a site as the people or programs request that connect to the session.
 
     Args:
-        site: the kernel's site.
-        hand: the live hand of the scenario.
-        arm: the arm of the site.
-        inbox: the inbox of the hand messages.
-        dropped: counts dropped messages by reason.
-        limits: the limits of the site's motion.
+        site: The site in the simulation kernel.
+        hand: Settings of the live operator in the scenario.
+        arm: Arm of the site.
+        inbox: Queue of the operator's messages.
+        dropped: Number of dropped messages by reason. The counts are increased in place.
+        limits: Limits of the motion of the site. None if there are none.
 
     Attributes:
-        news: who has taken hold of the arm or released it: ticks, and sentences that no event
-            holds yet.
+        news: Who has taken hold of the arm or released it: pairs of a tick and a sentence. The
+            site publishes them as events and empties the list.
     """
 
     def __init__(
@@ -100,9 +109,13 @@ class HandServer:
         self.news: list[tuple[int, str]] = []
 
     def track(self, _site: Site, k: int) -> list[float]:
-        """Returns the state of the hand at tick `k`, by the received messages.
+        """Returns the state of the operator in a tick, an input of the simulation kernel.
 
-        `HandInForce` describes the numbers of that state.
+        Args:
+            k: The tick.
+
+        Returns:
+            The numbers that `HandInForce` describes.
         """
         messages = _read_messages(self._inbox, self._site, self._dropped)
         parsed = [self._parse_command(message) for message in messages]
@@ -126,7 +139,12 @@ class HandServer:
         return step.vector
 
     def _parse_command(self, message: HandMessage) -> HandCommand | None:
-        """Returns the command of a message; None if it is refused."""
+        """Checks a message, and converts it to a command.
+
+        Returns:
+            The command. None if the message is refused: if it lacks the goal that the
+            scenario's operator needs, has another number of coordinates, or is out of range.
+        """
         if self._hand.mode == "force":
             noun = "force"
             goal = message.force
@@ -157,18 +175,21 @@ class HandServer:
 
 
 class RemoteHand(HandPlayer):
-    """A hand of the user's own that runs in a process of its own.
+    """Moves the arm of a site as a user's class decides that runs in a process of its own.
 
-    The site sends it views, and receives its decisions. Only messages of the program that the
-    scenario names are accepted. A decision that arrives too late acts at once, and is counted.
+    In some ticks, the site sends the process a view, the state of the site. The process replies
+    with its decision, which acts a fixed time after the tick of the view. A decision that
+    arrives too late acts at once and is counted. Only decisions of the class that the scenario
+    names are accepted.
 
     Args:
-        hand_site: the site of the hand, and the settings of its class.
-        boot: the boot of this process.
-        inbox: the inbox of the hand's decisions.
-        publish: publishes a view.
-        dropped: counts dropped and late messages by reason.
-        clock: the clock of this process.
+        hand_site: Site of the operator, and settings of the class.
+        boot: Random number that identifies this start of the site.
+        inbox: Queue of the decisions.
+        publish: Function that publishes a view.
+        dropped: Number of dropped and late messages by reason. The counts are increased in
+            place.
+        clock: Clock of this process.
     """
 
     def __init__(
@@ -190,13 +211,18 @@ class RemoteHand(HandPlayer):
         self._source = hand_site.source
 
     def track(self, site: Site, k: int) -> list[float]:
-        """Returns the state of the hand at tick `k`, by the received decisions."""
+        """Applies the waiting decisions, and returns the state of the operator in tick `k`."""
         for message in self._read_decisions():
             self._decide(k, message)
         return super().track(site, k)
 
     def request_action(self, k: int, arrays: SiteArrays) -> None:
-        """Sends the hand the view of tick `k`."""
+        """Sends the process the view of a tick.
+
+        Args:
+            k: The tick.
+            arrays: State of the site in the simulation kernel.
+        """
         view = self.view(k, arrays)
         fields = _list_numbers(view)
         fields["peers"] = [PeerSeen(**_list_numbers(peer)) for peer in view.peers]
@@ -206,10 +232,18 @@ class RemoteHand(HandPlayer):
     def wait_for_first(
         self, stopped: Callable[[], bool], give_up_ns: int, say: Callable[[str], None]
     ) -> bool:
-        """Waits for the hand's program; returns False if `stopped` returns True first.
+        """Waits until the operator's process announces itself.
+
+        Args:
+            stopped: Function that returns True to end the wait.
+            give_up_ns: Time at which the site gives up, on the local clock, in ns.
+            say: Function that prints a line for the user.
+
+        Returns:
+            True if the process has announced itself. False if `stopped` returned True.
 
         Raises:
-            SessionError: the program did not announce itself before `give_up_ns`.
+            SessionError: The process did not announce itself in time.
         """
         say(f"waits for its hand {self._code}: trilat hand {self._site} --scenario FILE")
         while not stopped():
@@ -221,18 +255,27 @@ class RemoteHand(HandPlayer):
         return False
 
     def _read_decisions(self) -> Iterator[HandMessage]:
+        """Yields the waiting decisions of the process."""
         return _read_messages(self._inbox, self._site, self._dropped, self._source)
 
     def _decide(self, k: int, message: HandMessage) -> None:
-        """Applies a decision at tick `k`; the message names the tick whose view it answers."""
+        """Applies a decision of the process.
+
+        Args:
+            k: Present tick.
+            message: The decision. Its number states the view that it answers.
+        """
         asked_tick = message.n * self.hand.period_ticks
-        # The announcement of the program may arrive after the first view; it decides nothing.
+        # The process announces itself with a message that contains no decision. It may arrive
+        # after the first view was sent.
         is_announcement = message.n == 0 and not message.grip
         if self.failure or is_announcement or asked_tick > self._asked_tick:
             return
         if asked_tick + self.hand.delay_ticks < k:
             self._dropped["hand: late"] += 1
-        goal = (message.target or message.force) if message.grip else None
+        goal = None
+        if message.grip:
+            goal = message.target or message.force
         try:
             self.hand.accept_decision(asked_tick, goal)
         except ValueError as error:
@@ -240,7 +283,7 @@ class RemoteHand(HandPlayer):
 
 
 def _list_numbers(view: Any) -> dict[str, Any]:
-    """Returns the fields of a view by name, with arrays as lists."""
+    """Returns the fields of a view by name. Arrays are converted to lists."""
     return {
         name: value.tolist() if isinstance(value, np.ndarray) else value
         for name, value in view._asdict().items()

@@ -1,8 +1,8 @@
-"""Load of this machine before a session begins: whether its processors have time left.
+"""Warn before a session if the processors of this machine are busy with other programs.
 
 Invariant:
-    - A measurement changes nothing and takes 0.2 s.
-    - There is no warning if the operating system does not report its load.
+    - The measurement changes nothing and takes 0.2 s.
+    - If the operating system does not report its load, there is no warning.
 """
 
 from contextlib import suppress
@@ -14,10 +14,14 @@ from trilat_net.errors import count_nouns
 from trilat_net.net.clock import Clock
 
 MEASURED_NS = 200_000_000
-"""Time over which the load is measured."""
+"""Time over which the load is measured, in ns."""
 BUSY_SHARE = 0.8
-"""Share of busy time above which a recorder, which has no priority, may get too little."""
+"""Fraction of busy time above which there is a warning.
+
+A recorder has no priority, and may then receive too little computing time.
+"""
 _STATISTICS = Path("/proc/stat")
+"""File in which Linux reports how much time the processors have spent on what."""
 _IDLE_COLUMNS = slice(3, 5)  # idle, and waiting for a disk
 _TIME_COLUMNS = slice(0, 8)  # without guests, whose time the column "user" includes
 
@@ -26,8 +30,8 @@ class ProcessorTimes(NamedTuple):
     """Time that all processors have spent since the start of the machine, in system ticks.
 
     Attributes:
-        idle: the time without work.
-        total: all time.
+        idle: Time without work.
+        total: Total time.
     """
 
     idle: int
@@ -35,13 +39,24 @@ class ProcessorTimes(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> "ProcessorTimes":
-        """Returns the times in the first line of /proc/stat (proc_stat(5))."""
+        """Parses the first line of /proc/stat, the sum of all processors (proc_stat(5)).
+
+        Args:
+            text: Content of the file.
+        """
         columns = [int(word) for word in text.splitlines()[0].split()[1:]]
         return cls(sum(columns[_IDLE_COLUMNS]), sum(columns[_TIME_COLUMNS]))
 
 
 def measure_busy_share(clock: Clock) -> float | None:
-    """Returns the share of time in which the processors are busy, 0 to 1; None if unknown."""
+    """Measures the fraction of time in which the processors of this machine are busy.
+
+    Args:
+        clock: Clock of this process.
+
+    Returns:
+        The fraction between 0 and 1. None if it is not known.
+    """
     with suppress(OSError, ValueError, IndexError):
         before = ProcessorTimes.parse(_STATISTICS.read_text(encoding="ascii"))
         clock.sleep_until(clock.monotonic_ns() + MEASURED_NS)
@@ -54,7 +69,11 @@ def measure_busy_share(clock: Clock) -> float | None:
 def describe_load(busy_share: float | None) -> str:
     """Returns a warning about a busy machine, with a remedy.
 
-    Returns "" if the machine has time left, or if its load is unknown.
+    Args:
+        busy_share: Fraction of time in which the processors are busy. None if it is not known.
+
+    Returns:
+        The warning. Empty if the machine has time left, or if the load is not known.
     """
     if busy_share is None or busy_share < BUSY_SHARE:
         return ""

@@ -1,11 +1,13 @@
-"""Real-time settings of a process, such as its priority and its locked memory.
+"""Request real-time settings from the operating system, such as priority and locked memory.
 
-The settings are processor affinity, timer slack, memory, scheduling and garbage collection.
+The settings reduce the time by which the ticks of a control loop are late: binding to a
+processor, precise sleeping (timer slack), memory that is not swapped to disk, real-time
+scheduling, and no garbage collection.
 
 Invariant:
-    - A setting that fails is reported, and the site continues.
-    - A loop without privileges runs as well as it can, and its log records the settings that it
-      obtained.
+    - A setting that the operating system refuses is reported, and the site continues without
+      it.
+    - A log contains the settings that its sites have obtained.
 """
 
 import ctypes
@@ -19,13 +21,17 @@ from trilat_net import process
 from trilat_net.errors import count_nouns
 
 FIFO_PRIORITY = 50
+"""Priority of the thread of the loop with real-time scheduling (SCHED_FIFO)."""
 NICE = -10
+"""Nice value that is requested if real-time scheduling is not permitted."""
 SITES_PER_PROCESSOR = 2
-"""Largest number of loops with priority on one processor.
+"""Largest number of loops per processor that receive priority.
 
-With more, Zenoh and the recorder would get too little time, and connections would be lost.
+If there were more, the network threads and the recorder would receive too little time, and
+connections would be lost.
 """
 
+# Constants of Linux, from sys/prctl.h and sys/mman.h.
 _PR_SET_TIMERSLACK = 29
 _MCL_CURRENT = 1
 _MCL_FUTURE = 2
@@ -33,11 +39,15 @@ _MCL_ONFAULT = 4
 
 
 def prepare(cpu: int | None, sites: int = 1) -> dict[str, str]:
-    """Requests every setting that helps a loop, and returns the obtained ones by name.
+    """Requests all real-time settings for this process.
 
     Args:
-        cpu: the processor to bind the process to; None for any.
-        sites: the number of sites of the session on this machine.
+        cpu: Processor to which the process is bound. None permits all processors.
+        sites: Number of sites of the session on this machine. If there are too many, the
+            scheduling stays normal.
+
+    Returns:
+        Description of each setting that was obtained, or of the reason why it was not, by name.
     """
     cpus = os.cpu_count() or 1
     has_room = sites <= SITES_PER_PROCESSOR * cpus
@@ -65,12 +75,24 @@ def prepare(cpu: int | None, sites: int = 1) -> dict[str, str]:
 
 
 def _set_affinity(cpu: int | None) -> str:
+    """Binds the process to a processor, and returns the processors that it may use."""
     if cpu is not None:
         os.sched_setaffinity(0, {cpu})
     return "cpu " + ",".join(str(n) for n in sorted(os.sched_getaffinity(0)))
 
 
 def _call_libc(obtained: str, function: str, *arguments: int) -> str:
+    """Calls a function of the C library that returns 0 on success.
+
+    Args:
+        obtained: Text to return on success.
+        function: Name of the function.
+        *arguments: Arguments of the function.
+
+    Raises:
+        AttributeError: The platform is not Linux.
+        OSError: The call has failed.
+    """
     if not sys.platform.startswith("linux"):
         raise AttributeError
     libc = ctypes.CDLL(None, use_errno=True)
@@ -81,6 +103,11 @@ def _call_libc(obtained: str, function: str, *arguments: int) -> str:
 
 
 def _set_scheduling() -> str:
+    """Requests real-time scheduling, or at least a better nice value.
+
+    Returns:
+        Description of the scheduling that was obtained.
+    """
     try:
         _set_threads(
             lambda thread: os.sched_setscheduler(
@@ -98,9 +125,13 @@ def _set_scheduling() -> str:
 
 
 def _set_threads(change: Callable[[int], None]) -> None:
-    """Applies a change to this thread and then to all threads of the process.
+    """Applies a change to this thread, and then to all other threads of the process.
 
-    Another thread that waits for a processor may hold the interpreter lock.
+    All threads are changed, because a thread that waits for a processor may hold the
+    interpreter lock, for which the loop would have to wait.
+
+    Args:
+        change: Function that changes the thread of a given number. 0 is the calling thread.
     """
     change(0)
     tasks = Path("/proc/self/task")
@@ -110,5 +141,6 @@ def _set_threads(change: Callable[[int], None]) -> None:
 
 
 def _stop_collector() -> str:
+    """Turns off garbage collection, whose pauses would make ticks late."""
     process.disable_gc()
     return "frozen and off"

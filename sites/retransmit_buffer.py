@@ -1,8 +1,13 @@
-"""Retransmission buffer of a site: recent messages, for recorders that missed them.
+"""Store the recent messages of a site, and send them again to recorders that missed them.
+
+Messages may be lost on the network. A recorder notices gaps in their numbers, and queries the
+site for the missing ones.
 
 Invariant (L6):
-    - The memory is bounded: it holds at most a minute of every channel.
-    - The time is bounded: each query is answered with one chunk, in the slack of a tick.
+    - The memory is bounded and allocated at the start. It holds at most a minute of every
+      channel.
+    - The computing time is bounded. The control loop answers one query at a time, with a
+      limited number of messages, and only if time is left in a tick.
 """
 
 from array import array
@@ -16,29 +21,35 @@ from trilat_net.net.requests import BACKFILL_BYTES, BACKFILL_MESSAGES, BackfillR
 from trilat_net.net.topics import STATS_PER_SECOND, count_messages, skipped_numbers
 
 KEPT_S = 60
+"""Time for which messages are stored, in s."""
 RECORDS_KEPT = 120_000
-"""Capacity in records: a minute at rates up to 2 kHz, less at higher rates."""
+"""Largest number of stored records: a minute at tick rates up to 2 kHz, less at higher rates.
+"""
 RECORD_BYTES = 640
-"""Mean size up to which a minute of records fits, for an arm of two joints."""
+"""Mean size of a record of a two-joint arm up to which a minute of records fits, in bytes."""
 FLOAT_BYTES = 9
+"""Size of an encoded floating-point number, in bytes."""
 STATISTICS_BYTES = 4_096
+"""Memory for one message with statistics, in bytes."""
 EVENTS_KEPT = 4_096
+"""Largest number of stored events."""
 EVENTS_BYTES = 4_000_000
+"""Memory for events, in bytes."""
 
 
 class ChannelBuffer:
-    """The last messages of one channel, numbered from 0 on.
+    """The latest messages of one channel, numbered consecutively.
 
-    The memory is a ring that is allocated at the start: nothing is allocated while the loop
-    runs.
+    The messages are stored in a ring of bytes that is allocated at the start, so that no memory
+    is allocated while the control loop runs.
 
     Args:
-        capacity: the largest number of messages.
-        size_bytes: the size of the memory; any single message must fit.
+        capacity: Largest number of messages.
+        size_bytes: Size of the memory, in bytes. It must be larger than any message.
 
     Attributes:
-        next_number: the number of the next message.
-        oldest: the number of the oldest message that is kept.
+        next_number: Number of the next message.
+        oldest: Number of the oldest message that is still stored.
     """
 
     def __init__(self, capacity: int, size_bytes: int) -> None:
@@ -50,16 +61,17 @@ class ChannelBuffer:
         self._bytes = bytearray().ljust(size_bytes, b"\xff")
         self._starts = array("q", bytes(8 * capacity))
         self._lengths = array("q", bytes(8 * capacity))
-        # Bytes written since the start, and those skipped at the end of the memory.
+        # Number of bytes written since the start, including those that were left unused at the
+        # end of the ring. The position in the ring is this number modulo the size.
         self._head = 0
 
     def start_at(self, number: int) -> None:
-        """Sets the number of the first message; the buffer must be empty."""
+        """Sets the number of the first message. The buffer must be empty."""
         self.next_number = number
         self.oldest = number
 
     def store(self, payload: bytes) -> None:
-        """Adds the next message, and drops the oldest ones to make room."""
+        """Adds the next message. The oldest messages are removed to make room for it."""
         length = len(payload)
         offset = self._head % self._size
         if offset + length > self._size:  # a message must be contiguous
@@ -76,12 +88,21 @@ class ChannelBuffer:
             self.oldest += 1
 
     def skip(self, count: int) -> None:
-        """Adds `count` empty messages for numbers that the site never publishes."""
+        """Adds empty messages, for numbers that the site never publishes.
+
+        Args:
+            count: Number of empty messages.
+        """
         for _ in range(count):
             self.store(b"")
 
     def read_chunk(self, first: int, last: int) -> tuple[int, list[bytes]]:
-        """Returns the kept messages from `first` to `last`, as many as one reply can hold.
+        """Returns as many consecutive stored messages as one reply can contain.
+
+        Args:
+            first: Number of the first requested message. If it is no longer stored, the reply
+                starts with the oldest stored message.
+            last: Number of the last requested message.
 
         Returns:
             The number of the first returned message, and the messages.
@@ -102,7 +123,16 @@ class ChannelBuffer:
 
 
 class RetransmitBuffer:
-    """The recently published messages of a site, by channel."""
+    """The recently published messages of a site, for the queries of recorders.
+
+    Args:
+        site: The site in the simulation kernel.
+        boot: Random number that identifies this start of the site.
+        queries: Queue of the queries.
+
+    Attributes:
+        channels: Stored messages of the records, statistics and events, by channel.
+    """
 
     def __init__(self, site: Site, boot: int, queries: QueryInbox) -> None:
         self._site = site
@@ -118,21 +148,27 @@ class RetransmitBuffer:
         }
 
     def start_at(self, tick: int) -> None:
-        """Sets the first tick of the site."""
+        """Sets the first tick of the site, before any message is stored."""
         link_number = count_messages(topics.LINK, tick, self._site.rate_hz)
         self.channels[topics.STATE].start_at(tick)
         self.channels[topics.LINK].start_at(link_number)
 
     def skip(self, first: int, next_tick: int) -> None:
-        """Adds empty messages for the skipped ticks `first` to `next_tick` - 1."""
-        self.channels[topics.STATE].skip(next_tick - first)
-        number, first_skipped = skipped_numbers(
-            topics.LINK, next_tick, next_tick - first, self._site.rate_hz
+        """Adds empty messages for skipped ticks, so that later messages have their numbers.
+
+        Args:
+            first: First skipped tick.
+            next_tick: First tick after the skipped ones.
+        """
+        skipped_ticks = next_tick - first
+        self.channels[topics.STATE].skip(skipped_ticks)
+        next_number, published = skipped_numbers(
+            topics.LINK, next_tick, skipped_ticks, self._site.rate_hz
         )
-        self.channels[topics.LINK].skip(max(0, number - first_skipped))
+        self.channels[topics.LINK].skip(max(0, next_number - published))
 
     def answer_query(self) -> bool:
-        """Answers the oldest query; returns False if there is none."""
+        """Answers the oldest query. Returns False if there is no query."""
         query = self._queries.poll()
         if query is None:
             return False
@@ -140,6 +176,7 @@ class RetransmitBuffer:
         return True
 
     def _find_messages(self, wanted: BackfillRequest) -> tuple[int, list[bytes], int]:
+        """Looks up the messages that a query requests, see `answer_backfill`."""
         buffer = self.channels[wanted.channel]
         first, payloads = buffer.read_chunk(wanted.first, wanted.last)
         return first, payloads, buffer.next_number

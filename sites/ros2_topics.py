@@ -1,9 +1,14 @@
-"""The topics of a session's sites in the graph of ROS 2.
+"""Publish the states of a session's sites as ROS 2 topics.
+
+A site is a process that runs one arm. Its joint states, poses, torques and statistics become
+standard ROS messages on topics below `/<session>/<site>`, and the poses of its links become
+part of `/tf`.
 
 Invariant:
-    - A message is packed only while somebody listens to its topic.
-    - The topics are named by `topic_names`, and their messages packed by `published`, as in a
-      bag.
+    - A message is composed only while a ROS program subscribes to its topic, because composing
+      it takes time.
+    - The names of the topics (`topic_names`) and the content of the messages (`published`) are
+      the same as in a ROS bag that is exported from a log.
 """
 
 from typing import NamedTuple
@@ -20,18 +25,20 @@ from trilat_net.scenario import Scenario
 from .running_session import ShareHistory
 
 RELIABLE = QualityOfService()
+"""Quality of service of most topics."""
 LATCHED = QualityOfService(latched=True, depth=1)
+"""Quality of service of topics whose last message late subscribers receive."""
 
 
 class BridgeEnds(NamedTuple):
-    """Both ends of the bridge: the graph of ROS, and the session.
+    """Both ends of the bridge between a session and ROS programs.
 
     Attributes:
-        graph: the graph of ROS 2.
-        bus: the bus to the session.
-        clock: the clock of this process.
-        session: the session's name.
-        table: the names of the topics.
+        graph: Connection to the ROS programs.
+        bus: Network connection to the session.
+        clock: Clock of this process.
+        session: Name of the session.
+        table: Names of the topics.
     """
 
     graph: Ros2Graph
@@ -41,24 +48,30 @@ class BridgeEnds(NamedTuple):
     table: TopicTable
 
     def topic(self, site: str, name: str) -> str:
-        """Returns the full name of a topic."""
+        """Returns the full name of a topic of a site.
+
+        Args:
+            site: Name of the site.
+            name: Short name of the topic, such as "joint_states".
+        """
         return self.table.find(self.session, site, name)
 
 
 class SiteTopics:
-    """The topics of one site under `/<session>/<site>`, and its part of `/tf`.
+    """Publisher of the topics of one site.
 
     Args:
-        ends: the graph and the session.
-        scenario: the scenario of the session.
-        site: the name of the site.
-        epoch_unix_ns: the session's epoch in Unix time; the stamps count from there.
-        frames: the publisher of `/tf`.
+        ends: Connections to ROS and to the session.
+        scenario: Scenario of the session.
+        site: Name of the site.
+        epoch_unix_ns: Start of the session in Unix time, in ns. Time stamps are counted from
+            it.
+        frames: Publisher of `/tf`, which all sites share.
 
     Attributes:
-        frame: the frame of the site's end effector.
-        shares: the shares of the site in its peers.
-        newest: the record that was published last.
+        frame: Name of the frame of the site's end effector.
+        shares: Weights with which the site follows its peers, over time.
+        newest: Record that was published last. None before the first one.
     """
 
     def __init__(
@@ -82,13 +95,18 @@ class SiteTopics:
         self.newest: State | None = None
 
     def _has_listener(self, topic: str) -> bool:
-        """Returns True if somebody listens to a topic of the site."""
+        """Returns True if a ROS program subscribes to a topic."""
         return self._publishers[topic].has_subscribers
 
     def publish(self, record: State, rate_hz: float) -> None:
-        """Publishes a record on the topics with listeners, at most `rate_hz` records a second.
+        """Publishes a record on all topics that have subscribers.
 
-        Records older than the newest published one of the same boot are ignored.
+        Records that are older than the newest published one of the same boot are ignored, and
+        so are records that would exceed the rate.
+
+        Args:
+            record: Result of one tick of the site.
+            rate_hz: Largest number of records that are published per second of the session.
         """
         newest = self.newest
         if newest is not None and record.boot == newest.boot:
@@ -105,7 +123,7 @@ class SiteTopics:
                 self._frames.put(data)
 
     def publish_statistics(self, stats: LinkStats) -> None:
-        """Publishes statistics of the site on the topics with listeners."""
+        """Publishes the statistics of the site on all topics that have subscribers."""
         for topic, data in self._messages.pack_statistics(stats):
             if self._has_listener(topic):
                 self._publishers[topic].put(data)

@@ -1,8 +1,14 @@
-"""The parts of a site that live from its start to its end, and its options.
+"""Create the parts of a site, which exist from the start of its process to its end.
+
+A site is a process that runs one arm and its control loop. `SiteParts` creates the site in the
+simulation kernel, the queues for incoming messages, the publishers, the buffer for lost
+messages, and whatever else the scenario requires. `site_process` then joins the session with
+these parts.
 
 Invariant:
-    - When `SiteParts` has been created, every subscription of the site is declared and its step
-      is compiled. A site that announces itself is therefore ready for its session.
+    - When a `SiteParts` object has been created, all subscriptions of the site are declared and
+      its control step is compiled. A site that announces itself is therefore ready for its
+      session.
 """
 
 from collections.abc import Callable
@@ -53,20 +59,22 @@ from .site_loop import StateBlock, make_sample_readers, may_hold_samples
 
 @dataclass(frozen=True, slots=True)
 class SiteOptions:
-    """How a site joins a session, and how long it waits.
+    """How a site joins a session, and how long it waits for others.
 
     Attributes:
-        session: the session's name.
-        connection: the endpoints and keys.
-        join_timeout_s: longest wait for the session to begin, s.
-        needs_recorder: whether the session begins only when a recorder is present.
-        cpu: the processor that the loop is bound to; None for any.
-        stay_s: longest time to stay after the run until the recorder has left, s.
-        clock_offset_s: offset added to this site's clock, s, to emulate another machine.
-        clock_drift_ppm: drift added to this site's clock, parts per million.
-        without: sites that the session does not wait for; they may join the running session.
-        leave_timeout_s: how long to continue after a peer has left and not returned, s; None
-            stands for the end of the run.
+        session: Name of the session.
+        connection: Endpoints of the site, and keys.
+        join_timeout_s: Longest wait for the start of the session, in s.
+        needs_recorder: True if the session starts only when a recorder is present.
+        cpu: Processor to which the control loop is bound. None permits all processors.
+        stay_s: Longest time for which the site stays after the run until the recorder has left,
+            in s.
+        clock_offset_s: Offset that is added to the clock of the site, to emulate another
+            machine, in s.
+        clock_drift_ppm: Drift that is added to the clock of the site, in parts per million.
+        without: Sites that the session does not wait for. They may join the running session.
+        leave_timeout_s: How long the site continues after a peer has left and not returned, in
+            s. None continues until the end of the run.
     """
 
     session: str
@@ -82,14 +90,29 @@ class SiteOptions:
 
 
 class SiteParts:
-    """All parts of one site. Parts that the scenario does not ask for are None.
+    """All parts of one site. A part that the scenario does not need is None.
+
+    Args:
+        scenario: Scenario of the session.
+        name: Name of the site.
+        options: How the site joins the session.
+        bus: Network connection of the site.
+        clock: Clock of the site.
+        interrupt: Handler of the signals of this process.
+        say: Function that prints a line for the user.
 
     Attributes:
-        arm: the external arm.
-        switch: the dead-man switch of that arm.
-        plant: the user's own plant.
-        hand: the live hand at the site's arm.
-        step: the site's step, under the watchdog if the law is a user's own.
+        arm: Connection to the driver of an external arm.
+        switch: Dead-man switch of that arm.
+        plant: The user's own simulation of the arm.
+        hand: The live operator, a person or program that moves the arm.
+        step: Function that computes one tick. If the control law is the user's own, the
+            watchdog measures its computing time.
+        rings: Queues of the samples from the peers, in the order of the links.
+        buffer: Recent messages, for recorders that missed them.
+        states: Records on their way to the recorders.
+        monitor: Presence of the other members of the session.
+        changes: Requests to change something during the run.
     """
 
     def __init__(
@@ -123,7 +146,8 @@ class SiteParts:
         self.switch: DeadManSwitch | None = None
         self._connect_outside_arm()
         self.plant: PlantPlayer | None = None
-        if isinstance(plant := scenario.sites[name].plant, OwnPlant):
+        plant = scenario.sites[name].plant
+        if isinstance(plant, OwnPlant):
             run_plant = self._watch_code(f"the plant {plant.code}", self.site.rate_hz)
             self.plant = PlantPlayer(scenario, name, plant, run_plant)
         self.hand: HandServer | HandPlayer | None = None
@@ -146,10 +170,19 @@ class SiteParts:
         warm_up(scenario, name, clock)
 
     def _key(self, channel: str, member: str = "") -> str:
-        """Returns the key of a channel of this site, or of another member of the session."""
+        """Returns the network key of a channel of this site or of another member.
+
+        Args:
+            channel: Name of the channel, see `topics`.
+            member: Name of the other member. Empty for this site.
+        """
         return topics.key(self.options.session, member or self.name, channel)
 
     def _make_publishers(self) -> None:
+        """Creates the publishers of samples, records and statistics.
+
+        Records and statistics are stored in the buffer for recorders that miss them.
+        """
         scenario = self.scenario
         self.publish_sample = self.bus.publisher(self._key(topics.SAMPLE))
         send_states = self._make_storing_publisher(topics.STATE)
@@ -171,17 +204,24 @@ class SiteParts:
     def _watch_code(self, name: str, rate_hz: int) -> Callable[..., Any]:
         """Returns a function that calls the user's code under the watchdog.
 
-        The call raises TimeoutError if the code is too slow.
+        Args:
+            name: Name of the code, as in "the plant myplant:MyPlant".
+            rate_hz: How often the code is called, in 1/s.
+
+        Returns:
+            A function of a tick and a call, see `WatchedCode.run`. It raises TimeoutError if
+            the code is too slow.
         """
         code = WatchedCode(name, rate_hz, lambda _, problem: TimeoutError(problem), self.clock)
         self.watchdog.codes.append(code)
         return code.run
 
     def _connect_hand(self) -> None:
-        """Creates the live hand of the site, if the scenario has one.
+        """Creates the live operator of the site, if the scenario has one.
 
-        A class of the user's own runs in this process (`HandPlayer`) or in its own
-        (`RemoteHand`); otherwise people and programs hold the arm (`HandServer`).
+        A user's class runs in this process (`HandPlayer`) or in a process of its own
+        (`RemoteHand`). Without such a class, people and programs may move the arm
+        (`HandServer`).
         """
         name = self.name
         live_hand = self.scenario.sites[name].find_live_hand()
@@ -213,13 +253,13 @@ class SiteParts:
         )
 
     def _connect_outside_arm(self) -> None:
-        """Creates the external arm and the dead-man switch, if the scenario has them."""
+        """Connects to the external arm and to its dead-man switch, if there are any."""
         name = self.name
         read_clock = self.clock.monotonic_ns
         if name in self.scenario.outside:
             key = self._key(topics.MEASURED)
             connection = self.options.connection
-            # The arm reaches the site at an endpoint of its own, else through a router.
+            # The driver connects to an endpoint of this site, or to the router of this site.
             endpoints = connection.reach(connection.listen or connection.connect or ())
             self.arm = ExternalArm(
                 site=self.site,
@@ -235,7 +275,11 @@ class SiteParts:
             self.switch = DeadManSwitch(name, ring, self.clock, self.stats.dropped)
 
     def _make_storing_publisher(self, channel: str) -> Callable[[list[bytes]], None]:
-        """Returns a function that stores messages for retransmission and publishes them."""
+        """Returns a function that publishes messages and stores them for retransmission.
+
+        Args:
+            channel: Channel of the messages.
+        """
         store = self.buffer.channels[channel].store
         publish = self.bus.publisher(self._key(channel))
 
@@ -248,10 +292,13 @@ class SiteParts:
         return store_and_publish
 
     def pop_changes(self, k: int) -> list[CoreChange]:
-        """Returns the changes that the site applies at tick `k`.
+        """Returns the changes that the site applies in a tick.
 
-        They are the accepted requests, and what the site observes about its own arm: skipped
-        ticks, silence, a released dead-man switch.
+        They are the accepted requests, and changes that follow from the state of an external
+        arm: skipped ticks, silence of the arm, and a released or held dead-man switch.
+
+        Args:
+            k: The tick.
         """
         changes = list(self.changes.pop_changes(k))
         if self.arm is None:
@@ -270,6 +317,13 @@ class SiteParts:
         return changes
 
     def _make_order_change(self, k: int, order: SiteOrder, skipped: int = 0) -> CoreChange:
+        """Returns the change with which an order takes effect in a tick.
+
+        Args:
+            k: The tick.
+            order: The order.
+            skipped: Number of skipped ticks, for the order "overrun".
+        """
         change = make_site_order(
             scenario=self.scenario,
             site=self.name,
@@ -281,13 +335,21 @@ class SiteParts:
 
 
 WARM_UP_TICKS = 200
+"""Number of ticks in which all code of a tick is used at least once."""
 
 
 def warm_up(scenario: Scenario, name: str, clock: Clock | None = None) -> None:
-    """Steps a throw-away site, so that all code of a tick is compiled and in memory.
+    """Executes some ticks of a temporary site, so that all code is compiled and in memory.
+
+    The first ticks of the actual site would otherwise be late.
+
+    Args:
+        scenario: The scenario.
+        name: Name of the site.
+        clock: Clock of this process. None creates one.
 
     Raises:
-        LawFailed: the user's law fails even with every arm at rest at its start.
+        LawFailed: The user's law fails although all arms are at rest at their start.
     """
     setup = scenario.setup(name)
     site = Site(setup)
@@ -305,9 +367,16 @@ def warm_up(scenario: Scenario, name: str, clock: Clock | None = None) -> None:
 def watch_law(
     scenario: Scenario, site: Site, clock: Clock
 ) -> tuple[CodeWatchdog, Callable[[TickInput], TickRecord]]:
-    """Returns a watchdog for the site's law, and the step of the site.
+    """Returns a watchdog for the control law of a site, and the function that computes a tick.
 
-    The watchdog watches nothing if the law is not a user's own.
+    Args:
+        scenario: The scenario.
+        site: The site in the simulation kernel.
+        clock: Clock of this process.
+
+    Returns:
+        The watchdog and the function. If the law is not the user's own, the watchdog watches
+        nothing, and the function is the step of the kernel.
     """
     law = scenario.sites[site.name].control
     if not isinstance(law, ImportedLaw):
@@ -321,25 +390,28 @@ def watch_law(
 
 
 def _run_warm_up(setup: SiteSetup, site: Site, step: Callable[[TickInput], TickRecord]) -> None:
+    """Executes ticks with samples of all peers, and encodes and decodes their messages.
+
+    Args:
+        setup: Settings of the site.
+        site: The site in the simulation kernel.
+        step: Function that computes a tick of the site.
+    """
     site.start_at(first_tick_at(0, site.rate_hz))
     site.release_tick(0, 0)  # as when a site joins late
     estimator = OffsetEstimator()
     measured = PlantState(setup.q0, setup.qd0) if setup.external else None
     for k in range(WARM_UP_TICKS):
-        arrivals = [
-            Arrival(
-                j, k - 1, link.q0, (0.0,) * len(link.q0), ch=(0.0,) * link.channel.received_size
-            )
-            for j, link in enumerate(setup.links)
-            if k > 0
-        ]
+        arrivals = []
+        if k > 0:
+            for index, link in enumerate(setup.links):
+                speeds = (0.0,) * len(link.q0)
+                channel = (0.0,) * link.channel.received_size
+                arrivals.append(Arrival(index, k - 1, link.q0, speeds, ch=channel))
         output = step(TickInput(k, arrivals, (), measured))
         echo = [(arrival.peer, arrival.tick, k) for arrival in arrivals]
-        decode(
-            encode_sample(site=setup.name, boot=0, output=output, sent_ns=k, echo=echo),
-            PeerSample,
-            layout=site.layout,
-        )
+        sample = encode_sample(site=setup.name, boot=0, output=output, sent_ns=k, echo=echo)
+        decode(sample, PeerSample, layout=site.layout)
         encode_state(
             site=setup.name,
             boot=0,

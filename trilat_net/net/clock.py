@@ -108,7 +108,7 @@ class SkewedClock:
         return self._clock.unix_ns()
 
     def sleep_until(self, deadline_ns: int) -> None:
-        """Sleeps until the skewed clock reads `deadline_ns`, with the sleep of the other clock."""
+        """Sleeps until the skewed clock reads `deadline_ns`, if that is in the future."""
         passed_ns = deadline_ns - self._start_ns - self._offset_ns
         # -(-a // b) is a / b rounded up, so that the sleep does not end before the deadline.
         other_passed_ns = -(-passed_ns * NS_PER_S // (NS_PER_S + self._drift_ppb))
