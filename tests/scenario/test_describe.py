@@ -152,7 +152,7 @@ RAMP = [{"at_s": 1.0, "dominance": "s", "to": {"m1": 0.1, "m2": 0.9}, "ramp_s": 
         (
             {"law": "wave"},
             {"timeline": RAMP},
-            ["s: lines stay as they are at the start, whatever the timeline says"],
+            ["s: the impedances of the lines stay as at the start, whatever the timeline says"],
         ),
     ],
 )

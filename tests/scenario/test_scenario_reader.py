@@ -195,7 +195,7 @@ def test_an_override_reaches_into_lists_by_number() -> None:
             "sites.s.environment.wall",
             "it has 1, counted from 0",
         ),
-        ("sites.m.environment.0.stiffness_n_m", "sites.m.environment.0", "it has none"),
+        ("sites.m.environment.0.stiffness_n_m", "sites.m.environment.0", "the list is empty"),
         ("sites.s.q0_rad.2", "sites.s.q0_rad.2", "it has 2, counted from 0"),
         ("sites.s.q0_rad.0.x", "sites.s.q0_rad.0", "is a value, not a table"),
         (

@@ -128,7 +128,8 @@ class Arm(fields.Frozen, frozen=True):
 
     def planar_links(self) -> ArmLinks:
         """Returns the lengths and masses of the planar arm."""
-        return ArmLinks(*(getattr(self, name) for name in ArmLinks._fields))
+        values = {name: getattr(self, name) for name in ArmLinks._fields}
+        return ArmLinks(**values)
 
 
 def start_margin(joint: ChainJoint) -> float:
@@ -195,9 +196,9 @@ class Task(fields.Frozen, frozen=True, omit_defaults=True):
         """The task in the form of the core; None if the sites share joint angles."""
         if not self.shared:
             return None
-        axes = tuple(
-            float(not self.axes or axis in self.axes) for axis in TASK_AXES[: self.shared]
-        )
+        shared_axes = TASK_AXES[: self.shared]
+        followed_axes = self.axes or shared_axes
+        axes = tuple(float(axis in followed_axes) for axis in shared_axes)
         return TaskSetup(
             axes=axes,
             scale=self.scale,
@@ -237,11 +238,10 @@ class ArmModel(NamedTuple):
         """Name and unit of each parameter, in the order of `theta`."""
         if self.chain is None:
             return [(f"theta_{n + 1}", unit) for n, unit in enumerate(PLANAR_UNITS)]
-        return [
-            (f"{link}.{name}", unit)
-            for link in self.link_names
-            for name, unit in BODY_UNITS.items()
-        ]
+        parameters = []
+        for link in self.link_names:
+            parameters += [(f"{link}.{name}", unit) for name, unit in BODY_UNITS.items()]
+        return parameters
 
     def widen_stops(self, q0: Vector) -> "ArmModel":
         """Returns the arm with stops moved to its start pose, where it starts beyond them.
@@ -282,11 +282,11 @@ class ArmModel(NamedTuple):
         """
         if self.chain is None:
             l1, l2 = self.lengths_m
+            upper_arm = q[0]
             forearm = q[0] + q[1]
-            return [
-                l1 * math.cos(q[0]) + l2 * math.cos(forearm),
-                l1 * math.sin(q[0]) + l2 * math.sin(forearm),
-            ]
+            x = l1 * math.cos(upper_arm) + l2 * math.cos(forearm)
+            y = l1 * math.sin(upper_arm) + l2 * math.sin(forearm)
+            return [x, y]
         return list(place_end_effector(self._place_links(q), np.array(self.chain.tip_m)))
 
     def _place_links(self, q: Vector | Array) -> RowArray:
@@ -317,25 +317,23 @@ class ArmModel(NamedTuple):
         if self.chain is None:
             l1, l2 = self.lengths_m
             return HandReach((0.0, 0.0), abs(l1 - l2), l1 + l2)
-        first_joint, *other_joints = self.chain.joints
-        offsets_m = [joint.origin_m for joint in other_joints]
+        joints = self.chain.joints
+        offsets_m = [joint.origin_m for joint in joints[1:]]
         offsets_m.append(self.chain.tip_m)
         lengths_m = [math.sqrt(sum(x * x for x in offset)) for offset in offsets_m]
-        travels_m = [
-            max(abs(joint.lower), abs(joint.upper))
-            for joint in self.chain.joints
-            if joint.prismatic
-        ]
+        sliding_joints = [joint for joint in joints if joint.prismatic]
+        travels_m = [max(abs(joint.lower), abs(joint.upper)) for joint in sliding_joints]
         outer_m = sum(lengths_m) + sum(travels_m)
         inner_m = 0.0
         if not travels_m:
             inner_m = max(0.0, 2.0 * max(lengths_m) - sum(lengths_m))
-        return HandReach(first_joint.origin_m, inner_m, outer_m)
+        return HandReach(joints[0].origin_m, inner_m, outer_m)
 
     def find_joint_reach(self, limits: MotionLimits) -> HandReach:
         """Returns the range of each joint between its stops and its limits of position."""
-        low = np.broadcast_to(np.array(limits.q_min, dtype=np.float64), self.counts.joints)
-        high = np.broadcast_to(np.array(limits.q_max, dtype=np.float64), self.counts.joints)
+        joints = self.counts.joints
+        low = np.broadcast_to(np.array(limits.q_min, dtype=np.float64), joints)
+        high = np.broadcast_to(np.array(limits.q_max, dtype=np.float64), joints)
         if self.chain is not None:
             low = np.maximum(low, [joint.lower for joint in self.chain.joints])
             high = np.minimum(high, [joint.upper for joint in self.chain.joints])
@@ -398,7 +396,7 @@ def build_arm(arm: Arm, task: Task, urdf_texts: Mapping[str, str], chains: bool)
         arm: the arm's table.
         task: the task of its site.
         urdf_texts: the texts of URDF files, by name.
-        chains: whether the arms of the scenario are chains; the planar arm is then one, too.
+        chains: True if all arms of the scenario are chains, the planar arm included.
 
     Raises:
         ScenarioError: the arm's file cannot be used, or the planar arm has a singular inertia
@@ -409,7 +407,7 @@ def build_arm(arm: Arm, task: Task, urdf_texts: Mapping[str, str], chains: bool)
     theta = theta_from_links(arm.planar_links())
     if not is_positive_definite(theta):
         raise ScenarioError(
-            "its inertia matrix is singular in some pose: give the links mass away from their "
+            "the inertia matrix is singular in some pose: give the links mass away from their "
             "joints"
         )
     counts = fields.VectorCounts()
@@ -470,7 +468,7 @@ def read_arm(arm: Arm, urdf_texts: Mapping[str, str]) -> UrdfChain:
         raise ScenarioError(f"names no file of the scenario: {arm.urdf!r}", path="urdf")
     for key in ("payload_com_m", "payload_inertia_kg_m2"):
         if any(getattr(arm, key)) and not arm.payload_kg:
-            raise ScenarioError("is of a payload without mass: give payload_kg", path=key)
+            raise ScenarioError("needs the mass of the payload: set payload_kg", path=key)
     payload = UrdfPayload(arm.payload_kg, arm.payload_com_m, arm.payload_inertia_kg_m2)
     try:
         return _read_cached(
@@ -491,8 +489,9 @@ def read_arm(arm: Arm, urdf_texts: Mapping[str, str]) -> UrdfChain:
 
 
 _KEYS_OF_SUBJECTS = {"base": "base", "tip": "tip", "payload": "payload_inertia_kg_m2"}
-"""Keys of the arm by the subject of a problem that `read_urdf` states. Other problems are the
-file's.
+"""Keys of the arm by the subject of a problem that `read_urdf` reports.
+
+Problems with another subject are those of the file.
 """
 
 
@@ -506,8 +505,14 @@ def _read_cached(
     *,
     balance: bool,
 ) -> UrdfChain:
+    """Returns the chain of a URDF, see `read_urdf`; equal arguments are read once."""
     return read_urdf(
-        text=text, base=base, tip=tip, payload=payload, links=dict(links), balance=balance
+        text=text,
+        base=base,
+        tip=tip,
+        payload=payload,
+        links=dict(links),
+        balance=balance,
     )
 
 
@@ -521,16 +526,18 @@ def _place_base(
     if not (any(arm.base_xyz_m) or any(arm.base_rpy_rad)):
         return joints, gravity
     roll, pitch, yaw = arm.base_rpy_rad
-    pitch_and_roll = multiply(
-        rotation_matrix((0.0, pitch, 0.0)), rotation_matrix((roll, 0.0, 0.0))
-    )
-    base = multiply(rotation_matrix((0.0, 0.0, yaw)), pitch_and_roll)
+    R_x = rotation_matrix((roll, 0.0, 0.0))
+    R_y = rotation_matrix((0.0, pitch, 0.0))
+    R_z = rotation_matrix((0.0, 0.0, yaw))
+    base = multiply(R_z, multiply(R_y, R_x))
     first = joints[0]
     x, y, z = arm.base_xyz_m
     turned = apply(base, first.origin_m)
-    origin_m = (turned[0] + x, turned[1] + y, turned[2] + z)
-    first = first._replace(rotation=multiply(base, first.rotation), origin_m=origin_m)
-    return (first, *joints[1:]), apply(base, gravity)
+    placed = first._replace(
+        rotation=multiply(base, first.rotation),
+        origin_m=(turned[0] + x, turned[1] + y, turned[2] + z),
+    )
+    return (placed, *joints[1:]), apply(base, gravity)
 
 
 def _build_chain_model(arm: Arm, task: Task, urdf_chain: UrdfChain) -> ArmModel:
@@ -628,7 +635,7 @@ def compute_rest_gains(
         law_damping: the damping of the law per joint, N m s/rad, shape (n,).
         limit_nm: the largest torque, N m; one number or one per joint.
         rate_hz: the tick rate, Hz.
-        known: false: the parameters of the model are not those of the arm.
+        known: False if the parameters of the model are not those of the arm.
     """
     if arm.chain is None:
         a, b, c = arm.theta[:3].tolist()
@@ -638,7 +645,8 @@ def compute_rest_gains(
     inertia = np.diag(M)
     # diag(M) M^-1 has the eigenvalues of the symmetric diag(M)^(1/2) M^-1 diag(M)^(1/2).
     root = np.sqrt(inertia)
-    fastest = np.linalg.eigvalsh(root * np.linalg.inv(M) * root[:, None])[-1]
+    symmetric = root * np.linalg.inv(M) * root[:, None]
+    fastest = np.linalg.eigvalsh(symmetric)[-1]
     # Eigenvalues differ in the last bit between machines; whole milliseconds do not.
     rounded_s = math.ceil(1e3 * BRAKE_TICKS * fastest / rate_hz) * 1e-3
     time_s = max(BRAKE_S, rounded_s)
@@ -646,7 +654,8 @@ def compute_rest_gains(
         time_s = UNKNOWN_BRAKE_S
         inertia = np.where(law_damping > 0.0, law_damping * time_s, inertia)
     damping = inertia / time_s
-    deceleration = BRAKE_TORQUE_SHARE * np.broadcast_to(limit_nm, inertia.shape) / inertia
+    limits_nm = np.broadcast_to(limit_nm, inertia.shape)
+    deceleration = BRAKE_TORQUE_SHARE * limits_nm / inertia
     return RestGains(tuple(damping.tolist()), time_s, tuple(deceleration.tolist()))
 
 
@@ -688,8 +697,9 @@ def _bound_planar_parameters(
     outer = min(T_1, T_2) / g_m_s2
     inner = T_1 / g_m_s2
     l1, l2 = arm.lengths_m
-    high = np.array([l1 * inner + l2 * outer, l1 * outer, l2 * outer, inner, outer])
-    return np.zeros(5), high
+    second_moments = [l1 * inner + l2 * outer, l1 * outer, l2 * outer]
+    first_moments = [inner, outer]
+    return np.zeros(5), np.array([*second_moments, *first_moments])
 
 
 def _bound_chain_parameters(

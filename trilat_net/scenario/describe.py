@@ -1,4 +1,4 @@
-"""Describe a scenario in lines of text, and list the differences between scenarios.
+"""Descriptions of scenarios in lines of text, and differences between scenarios.
 
 Invariant:
     - A difference that several sites or links share is one entry. A law of another kind is one
@@ -31,7 +31,7 @@ from .scenario_types import Scenario
 from .urdf import UrdfJoint
 
 COUPLED_OPERATORS = (
-    "beta differs between sites: it weighs operators of one site each, and says nothing of "
+    "beta differs between sites: it weighs the operators of single sites, and does not cover "
     "hands that are coupled to one another (one user at two handles)"
 )
 IRREVERSIBLE_SHARES = (
@@ -42,9 +42,10 @@ IRREVERSIBLE_SHARES = (
 
 
 def lacks_detailed_balance(scenario: Scenario) -> bool:
-    """True if no D > 0 makes D (I - alpha) symmetric, for laws that exchange positions.
+    """Returns True if no diagonal D > 0 makes D (I - alpha) symmetric.
 
-    False if a law exchanges anything else than positions, or does not compensate gravity.
+    The result is False if some law exchanges more than positions, or does not compensate
+    gravity.
     """
     laws = [spec.control for spec in scenario.sites.values()]
     if not all(law.exchanges_positions() for law in laws):
@@ -61,18 +62,23 @@ def _find_link_delays(links: Mapping[str, LinkBase], rates_hz: Mapping[str, int]
     delay_s = np.zeros((len(names), len(names)))
     for name, link in links.items():
         sender, _, receiver = name.partition("->")
+        index = (names.index(receiver), names.index(sender))
         model = link.to_core_model()
+        if model.kind != DelayKind.CONSTANT or link.loss or link.measured:
+            delay_s[index] = np.nan
+            continue
         rate_hz = rates_hz[receiver]
-        is_constant = model.kind == DelayKind.CONSTANT and not link.loss and not link.measured
         delay_us = max(round(model.location), model.playout_us)
         ticks = max(1, -(-delay_us * rate_hz // 1_000_000))
-        index = (names.index(receiver), names.index(sender))
-        delay_s[index] = ticks / rate_hz if is_constant else np.nan
+        delay_s[index] = ticks / rate_hz
     return delay_s
 
 
 def _find_hold_time(scenario: Scenario) -> float:
-    """Returns how long a torque is held, s; 0 unless digital, NaN if tick rates differ."""
+    """Returns the time in s for which a torque is held; NaN if the tick rates differ.
+
+    The time is 0 in a scheme that is not digital.
+    """
     if scenario.scheme != "digital":
         return 0.0
     periods_s = {1.0 / site.rate_hz for site in scenario.sites.values()}
@@ -109,7 +115,7 @@ def describe_law_conditions(scenario: Scenario) -> list[str]:
         condition = law.condition(situation)
         if condition:
             owners.setdefault((law.tag, condition), []).append(name)
-    verdicts = {True: "holds", False: "does not hold", None: "is not decided here"}
+    verdicts = {True: "holds", False: "does not hold", None: "is undecided"}
     return [
         f"condition of {tag} at {', '.join(sites)} {verdicts[condition.holds]}: "
         f"{condition.text}"
@@ -124,7 +130,9 @@ def _describe_idle_shares(scenario: Scenario) -> list[str]:
     for name, law, situation in _list_situations(scenario):
         reason = law.explain_idle_shares(situation)
         if not reason and name in ramped_sites and law.fixed_shares:
-            reason = "lines stay as they are at the start, whatever the timeline says"
+            reason = (
+                "the impedances of the lines stay as at the start, whatever the timeline says"
+            )
         if reason:
             owners.setdefault(reason, []).append(name)
     return [
@@ -141,12 +149,12 @@ def describe_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> li
     """
     scenario = load_scenario(scenario)
     names = ", ".join(scenario.names)
-    ticks = ", ".join(
+    tick_counts = [
         f"{count_nouns(scenario.ticks(name), 'tick')} of {name}" for name in scenario.names
-    )
+    ]
     lines = [
         f"{scenario.name}: valid, sha256 {scenario.sha256[:16]}",
-        f"sites: {names}; {scenario.duration_s:g} s, {ticks}",
+        f"sites: {names}; {scenario.duration_s:g} s, {', '.join(tick_counts)}",
         *_describe_links(scenario),
         *_describe_shares(scenario),
         *describe_law_conditions(scenario),
@@ -183,10 +191,8 @@ def _describe_shares(scenario: Scenario) -> list[str]:
     beta = scenario.beta
     weights = "none: alpha is reducible, some site's weight is zero"
     if beta is not None:
-        weights = ", ".join(
-            f"{name} {len(beta) * pi:.4g}"
-            for name, pi in zip(scenario.names, beta, strict=True)
-        )
+        pairs = zip(scenario.names, beta, strict=True)
+        weights = ", ".join(f"{name} {len(beta) * pi:.4g}" for name, pi in pairs)
     lines = [
         "pi, the left null vector of Upsilon, sum N (beta_i = pi_i / c_i with Kd_i = c_i "
         f"Kbar): {weights}"
@@ -205,10 +211,10 @@ def _describe_arms(scenario: Scenario) -> list[str]:
         chain = read_arm(arm, scenario.urdf)
         model = scenario.arms[owners[0]]
         mass_kg = sum(joint.inertia[0] for joint in chain.joints)
+        joints = count_nouns(len(chain.joints), "joint")
         lines.append(
-            f"arm of {', '.join(owners)}: {arm.urdf}, "
-            f"{count_nouns(len(chain.joints), 'joint')} from {chain.base} to {chain.tip}, "
-            f"{mass_kg:.4g} kg move"
+            f"arm of {', '.join(owners)}: {arm.urdf}, {joints} from {chain.base} to "
+            f"{chain.tip}, {mass_kg:.4g} kg move"
         )
         assert model.chain is not None
         for joint, drive in zip(chain.joints, model.chain.joints, strict=True):
@@ -250,11 +256,10 @@ def _group_chains(scenario: Scenario) -> list[tuple[Arm, list[str]]]:
 
 def list_arm_notes(scenario: Scenario) -> list[str]:
     """Returns sentences on how the arms of a run differ from their files, with the sites."""
-    notes = [
-        f"arm of {', '.join(owners)}: {note}"
-        for arm, owners in _group_chains(scenario)
-        for note in read_arm(arm, scenario.urdf).notes
-    ]
+    notes = []
+    for arm, owners in _group_chains(scenario):
+        subject = f"arm of {', '.join(owners)}"
+        notes += [f"{subject}: {note}" for note in read_arm(arm, scenario.urdf).notes]
     return notes + _list_start_notes(scenario)
 
 
@@ -291,14 +296,15 @@ def _list_limit_notes(scenario: Scenario, name: str) -> list[str]:
     units = model.joint_units("rad")
     stated = spec.limits.motion
     in_force = scenario.motion_limits(name)
-    shape = (len(spec.q0_rad),)
-    notes = []
-    for key, stated_limit, limit_in_force in (
+    limits = (
         ("q_min_rad", stated.q_min, in_force.q_min),
         ("q_max_rad", stated.q_max, in_force.q_max),
-    ):
-        before = np.broadcast_to(stated_limit, shape)
-        after = np.broadcast_to(limit_in_force, shape)
+    )
+    joints = len(spec.q0_rad)
+    notes = []
+    for key, stated_limit, limit_in_force in limits:
+        before = np.broadcast_to(stated_limit, joints)
+        after = np.broadcast_to(limit_in_force, joints)
         notes += [
             f"{name} starts beyond {key} of joint {model.joint_names[n]}: the limit lies at "
             f"{float(after[n]):.4g} {units[n]} in this run"
@@ -316,15 +322,14 @@ def _describe_tasks(scenario: Scenario) -> list[str]:
         spec = scenario.sites[name]
         is_followed = np.array(model.axes) > 0.0
         J = model.task_jacobian(spec.q0_rad)[is_followed]
-        least = np.linalg.svd(J, compute_uv=False)[-1]
+        singular_values = np.linalg.svd(J, compute_uv=False)
+        least = singular_values[-1]
         bound = spec.task.singular_value
         consequence = ", so that its inverse is damped there" if least < bound else ""
-        axes = ", ".join(
-            axis for axis, follows in zip(TASK_AXES, is_followed, strict=False) if follows
-        )
+        axes = [TASK_AXES[n] for n in np.flatnonzero(is_followed)]
         lines.append(
-            f"{name} follows along {axes}: least singular value of its start pose {least:.3g}, "
-            f"damped below {bound:g}{consequence}"
+            f"{name} follows along {', '.join(axes)}: least singular value of its start pose "
+            f"{least:.3g}, damped below {bound:g}{consequence}"
         )
     return lines
 
@@ -355,11 +360,11 @@ def _describe_silences(scenario: Scenario) -> list[str]:
             per_minute = 60.0 * count / scenario.duration_s
             advice = ""
             if per_minute > 1.0:
-                advice = "; a play-out (playout_ms) or a longer silence_ms lessens that"
+                advice = "; a play-out (playout_ms) or a longer silence_ms makes this rarer"
             lines.append(
                 f"{name} will hold {per_minute:.3g} times a minute: "
                 f"{spec.on_stale.silence_ms:g} ms without a new sample of {peer}, outages "
-                f"aside{advice}"
+                f"not counted{advice}"
             )
     return lines
 
@@ -367,13 +372,14 @@ def _describe_silences(scenario: Scenario) -> list[str]:
 def _describe_stops(scenario: Scenario) -> list[str]:
     """Returns lines on how arms with the stale rule `glide` come to rest.
 
-    Sites about which the same can be said share a line.
+    Sites with the same text share a line.
     """
     owners: dict[str, list[str]] = {}
     for name, spec in scenario.sites.items():
-        if spec.on_stale.action == "glide":
-            for text in _describe_stop(scenario, name):
-                owners.setdefault(text, []).append(name)
+        if spec.on_stale.action != "glide":
+            continue
+        for text in _describe_stop(scenario, name):
+            owners.setdefault(text, []).append(name)
     return [f"arms of {', '.join(names)} {text}" for text, names in owners.items()]
 
 
@@ -428,21 +434,23 @@ def compare_scenarios(scenarios: Sequence[Scenario]) -> list[ScenarioDifference]
     if len(set(site_lists)) > 1:
         differences.append(ScenarioDifference("sites", (), tuple(site_lists)))
     tables: list[dict[str, Any]] = [msgspec.to_builtins(scenario) for scenario in scenarios]
-    differences += _compare_tables(
-        [
-            {key: value for key, value in table.items() if key not in _NOT_COMPARED}
-            for table in tables
-        ]
-    )
+    common_tables = [_omit_keys(table, _NOT_COMPARED) for table in tables]
+    differences += _compare_tables(common_tables)
     owners: dict[tuple[str, tuple[str, ...]], list[str]] = {}
     for site in scenarios[0].names:
         if not all(site in other.sites for other in scenarios):
             continue
-        for difference in _compare_tables([table["sites"][site] for table in tables]):
+        site_tables = [table["sites"][site] for table in tables]
+        for difference in _compare_tables(site_tables):
             owners.setdefault((difference.key, difference.values), []).append(site)
     for (key, values), sites in owners.items():
         differences.append(ScenarioDifference(key, tuple(sites), values))
     return differences + _compare_links(scenarios)
+
+
+def _omit_keys(table: Mapping[str, Any], keys: Sequence[str]) -> dict[str, Any]:
+    """Returns a table without some keys."""
+    return {key: value for key, value in table.items() if key not in keys}
 
 
 def _compare_tables(tables: Sequence[Mapping[str, Any]]) -> list[ScenarioDifference]:
@@ -450,9 +458,7 @@ def _compare_tables(tables: Sequence[Mapping[str, Any]]) -> list[ScenarioDiffere
     laws = {table.get("control", {}).get("law") for table in tables}
     if len(laws) > 1:
         descriptions = tuple(describe_law(table["control"]) for table in tables)
-        rest = [
-            {key: value for key, value in table.items() if key != "control"} for table in tables
-        ]
+        rest = [_omit_keys(table, ["control"]) for table in tables]
         return [ScenarioDifference("control", (), descriptions), *_compare_tables(rest)]
     flat_tables = [dict(flatten_table(table)) for table in tables]
     keys = dict.fromkeys(key for table in flat_tables for key in table)
@@ -460,16 +466,17 @@ def _compare_tables(tables: Sequence[Mapping[str, Any]]) -> list[ScenarioDiffere
     for key in keys:
         values = [table.get(key) for table in flat_tables]
         if any(value != values[0] for value in values):
-            differences.append(ScenarioDifference(key, (), tuple(map(describe_value, values))))
+            texts = tuple(describe_value(value) for value in values)
+            differences.append(ScenarioDifference(key, (), texts))
     return differences
 
 
 def _compare_links(scenarios: Sequence[Scenario]) -> list[ScenarioDifference]:
     """Returns the differences between links; links that differ alike are one entry."""
     names_by_values: dict[tuple[str, ...], list[str]] = {}
-    common_names = [
-        name for name in scenarios[0].links if all(name in other.links for other in scenarios)
-    ]
+    common_names = list(scenarios[0].links)
+    for other in scenarios[1:]:
+        common_names = [name for name in common_names if name in other.links]
     for name in common_names:
         links = [scenario.links[name] for scenario in scenarios]
         if any(link != links[0] for link in links):
@@ -502,7 +509,7 @@ def describe_law(control: Mapping[str, Any]) -> str:
         gains = control.get("settings", {})
     else:
         name = str(control["law"])
-        gains = {key: value for key, value in control.items() if key != "law"}
+        gains = _omit_keys(control, ["law"])
     text = ", ".join(f"{key} {describe_value(value)}" for key, value in gains.items())
     return f"{name} ({text})" if text or "code" not in control else name
 
@@ -512,10 +519,11 @@ def describe_value(value: Any) -> str:
     if value is None or value == [] or value == ():
         return "none"
     if isinstance(value, dict):
-        return " ".join(
-            describe_value(entry) if key == "kind" else f"{key} {describe_value(entry)}"
-            for key, entry in value.items()
-        )
+        texts = []
+        for key, entry in value.items():
+            text = describe_value(entry)
+            texts.append(text if key == "kind" else f"{key} {text}")
+        return " ".join(texts)
     if isinstance(value, list | tuple):
         entries = [describe_value(entry) for entry in value]
         is_uniform = isinstance(value[0], int | float) and len(set(entries)) == 1

@@ -25,7 +25,7 @@ _MAX_LIST_LENGTH = 64
 class Distribution(Frozen, frozen=True, omit_defaults=True, kw_only=True):
     """The origin of a number: a normal or a uniform distribution.
 
-    A pose that follows the start pose has neither of the two.
+    A pose that follows a drawn start pose has neither distribution.
 
     Attributes:
         normal: mean and standard deviation.
@@ -39,11 +39,12 @@ class Distribution(Frozen, frozen=True, omit_defaults=True, kw_only=True):
 
     def draw(self, seed: int, key: str) -> float:
         """Returns the number that a seed draws for a dotted key."""
-        # Imported here: it takes some milliseconds, and few scenarios need it.
+        # Few scenarios need this import, which takes some milliseconds.
         from statistics import NormalDist
 
-        # 52 bits of the key, in the middle of an interval: never 0 or 1.
-        uniform_number = ((link_key(seed, key) >> 12) + 0.5) / 2.0**52
+        # 52 bits select one of 2^52 intervals; its middle is never 0 or 1.
+        interval = link_key(seed, key) >> 12
+        uniform_number = (interval + 0.5) / 2.0**52
         if self.normal is not None:
             mean, deviation = self.normal
             number = mean + deviation * NormalDist().inv_cdf(uniform_number)
@@ -97,10 +98,11 @@ class Draws:
         Other values are returned as they are.
         """
         if isinstance(value, list) and len(value) <= _MAX_LIST_LENGTH:
-            return [
-                entry if isinstance(entry, list) else self._draw_entry(entry, f"{path}[{n}]")
-                for n, entry in enumerate(value)
-            ]
+            entries = []
+            for n, entry in enumerate(value):
+                is_nested = isinstance(entry, list)
+                entries.append(entry if is_nested else self._draw_entry(entry, f"{path}[{n}]"))
+            return entries
         key = dotted_key(path)
         known = self._known.get(key)
         if is_distribution(value):

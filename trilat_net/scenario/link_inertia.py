@@ -1,7 +1,10 @@
-"""Masses and inertias that a scenario gives the links of a URDF, and their balancing.
+"""Masses and inertias that a scenario sets for the links of a URDF, and their balancing.
+
+Some files state inertias that no body can have. Balancing replaces such an inertia by the
+nearest possible one.
 
 Invariant:
-    - A key that a scenario gives replaces the file's value; a key that it leaves out keeps it.
+    - A key in the scenario replaces the file's value. Without the key, the file's value stays.
     - Balancing uses sums, products, quotients and square roots in a fixed order, so that a
       balanced tensor has the same bits on every machine.
     - Balancing does not change a tensor that a body can have.
@@ -17,8 +20,9 @@ from .. import fields
 from ..core.chain import Matrix
 
 JACOBI_SWEEPS = 12
-"""Sweeps of Jacobi's method. A symmetric 3 x 3 matrix is diagonal to rounding after six or
-seven sweeps.
+"""Sweeps of Jacobi's method.
+
+A symmetric 3 x 3 matrix is diagonal to rounding after six or seven sweeps.
 """
 
 ThreeReals = Annotated[tuple[fields.Real, ...], Meta(min_length=3, max_length=3)]
@@ -43,9 +47,8 @@ class LinkInertia(fields.Frozen, frozen=True, omit_defaults=True):
 
     def list_given_keys(self) -> list[str]:
         """Returns the keys that the scenario gives."""
-        return [
-            key for key in fields.field_names(LinkInertia) if getattr(self, key) is not None
-        ]
+        keys = fields.field_names(LinkInertia)
+        return [key for key in keys if getattr(self, key) is not None]
 
 
 def fill_tensor(entries: Sequence[float]) -> Matrix:
@@ -57,12 +60,18 @@ def fill_tensor(entries: Sequence[float]) -> Matrix:
 def balance_tensor(tensor: Matrix) -> Matrix:
     """Returns the inertia tensor of the nearest mass distribution that a body can have.
 
-    With the principal moments I_1, I_2, I_3, the mass of a body has the second moments s_k =
-    (I_1 + I_2 + I_3) / 2 - I_k along its principal axes. A tensor is that of a body if no s_k
-    is negative. Negative s_k are set to zero, which is the projection onto the cone of such
-    distributions, and the moments are composed again: I_k = s_1 + s_2 + s_3 - s_k. The
-    principal axes do not change. If only the triangle inequality failed, the largest moment
-    does not change either, and the two smaller ones grow equally.
+    With the principal moments I_1, I_2, I_3, the second moments of the mass along the principal
+    axes are
+
+        s_k = (I_1 + I_2 + I_3) / 2 - I_k.
+
+    A body can have the tensor if no s_k is negative. Negative s_k are set to zero, which is the
+    projection onto the cone of possible distributions, and the moments are composed again:
+
+        I_k = s_1 + s_2 + s_3 - s_k.
+
+    The principal axes do not change. If only the triangle inequality failed, the largest moment
+    does not change either, and the two smaller moments grow equally.
 
     Args:
         tensor: symmetric, kg m^2.
@@ -71,20 +80,19 @@ def balance_tensor(tensor: Matrix) -> Matrix:
     half_sum = 0.5 * (moments[0] + moments[1] + moments[2])
     if all(half_sum - moment >= 0.0 for moment in moments):
         return tensor
-    seconds = [max(half_sum - moment, 0.0) for moment in moments]
-    total = seconds[0] + seconds[1] + seconds[2]
-    balanced = [total - second for second in seconds]
+    second_moments = [max(half_sum - moment, 0.0) for moment in moments]
+    total = second_moments[0] + second_moments[1] + second_moments[2]
+    balanced = [total - second for second in second_moments]
 
-    def entry(i: int, j: int) -> float:
-        return (
-            axes[i][0] * balanced[0] * axes[j][0]
-            + axes[i][1] * balanced[1] * axes[j][1]
-            + axes[i][2] * balanced[2] * axes[j][2]
-        )
+    def compute_entry(i: int, j: int) -> float:
+        """Returns the entry (i, j) of axes diag(balanced) axes'."""
+        first = axes[i][0] * balanced[0] * axes[j][0]
+        second = axes[i][1] * balanced[1] * axes[j][1]
+        third = axes[i][2] * balanced[2] * axes[j][2]
+        return first + second + third
 
-    return fill_tensor(
-        [entry(0, 0), entry(0, 1), entry(1, 1), entry(0, 2), entry(1, 2), entry(2, 2)]
-    )
+    lower_triangle = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2))
+    return fill_tensor([compute_entry(i, j) for i, j in lower_triangle])
 
 
 def _diagonalise(tensor: Matrix) -> tuple[list[float], list[list[float]]]:
@@ -101,17 +109,23 @@ def _diagonalise(tensor: Matrix) -> tuple[list[float], list[list[float]]]:
                 continue
             # The rotation by which a[p][q] becomes zero; the smaller of the two angles.
             theta = (a[q][q] - a[p][p]) / (2.0 * a[p][q])
-            tangent = math.copysign(1.0, theta) / (abs(theta) + math.sqrt(theta * theta + 1.0))
+            root = math.sqrt(theta * theta + 1.0)
+            tangent = math.copysign(1.0, theta) / (abs(theta) + root)
             cosine = 1.0 / math.sqrt(tangent * tangent + 1.0)
             sine = tangent * cosine
             _rotate_columns(matrix=a, p=p, q=q, cosine=cosine, sine=sine)
-            for k in range(3):
-                upper = a[p][k]
-                lower = a[q][k]
-                a[p][k] = cosine * upper - sine * lower
-                a[q][k] = sine * upper + cosine * lower
+            _rotate_rows(matrix=a, p=p, q=q, cosine=cosine, sine=sine)
             _rotate_columns(matrix=axes, p=p, q=q, cosine=cosine, sine=sine)
     return [a[0][0], a[1][1], a[2][2]], axes
+
+
+def _rotate_rows(matrix: list[list[float]], p: int, q: int, cosine: float, sine: float) -> None:
+    """Rotates the rows `p` and `q` of a matrix into each other, in place."""
+    for column in range(3):
+        upper = matrix[p][column]
+        lower = matrix[q][column]
+        matrix[p][column] = cosine * upper - sine * lower
+        matrix[q][column] = sine * upper + cosine * lower
 
 
 def _rotate_columns(

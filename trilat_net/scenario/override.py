@@ -41,11 +41,12 @@ def expand_overrides(scenario: Scenario, pairs: Sequence[Override]) -> dict[str,
     single_values: dict[str, Any] = {}
     for key, value in flat_pairs:
         group, _, name = key.partition(".")
-        if key == "rate_hz":
-            group_values |= {f"sites.{site}.rate_hz": value for site in scenario.names}
-        elif group in SITE_GROUPS and name:
-            first_key = _split_entry(name)[0].split(".")[0]
+        is_site_group = group in SITE_GROUPS and bool(name)
+        if is_site_group:
+            vector, _ = _split_entry(name)
+            first_key = vector.split(".")[0]
             check_keys({first_key: value}, field_names(SITE_GROUPS[group]), group)
+        if is_site_group or key == "rate_hz":
             group_values |= {f"sites.{site}.{key}": value for site in scenario.names}
         elif group in _KIND_KEYS and name:
             members = _expand_group(scenario, group, name, overridden)
@@ -99,38 +100,33 @@ def _expand_group(
     kinds, keys_by_kind = _list_group_kinds(scenario, group, overridden)
     if name in _KIND_KEYS[group]:
         return [f"{path}.{name}" for path in kinds]
-    user_laws = {
-        path: law
-        for path, law in kinds.items()
-        if group == "control" and (law == _USER_LAW or ":" in law)
-    }
-    built_in = {path: kind for path, kind in kinds.items() if path not in user_laws}
     valid_keys = sorted({key for keys in keys_by_kind.values() for key in keys})
-    vector = _split_entry(name)[0]
-    members = [
-        f"{path}.{name}"
-        for path, kind in built_in.items()
-        if vector in keys_by_kind.get(kind, valid_keys)
-    ]
-    if user_laws and not members:
-        return [
-            _user_law_key(path, name) if law == _USER_LAW else f"{path}.{name}"
-            for path, law in user_laws.items()
-        ]
+    vector, _ = _split_entry(name)
+    members = []
+    user_law_members = []
+    for path, kind in kinds.items():
+        if group == "control" and kind == _USER_LAW:
+            user_law_members.append(_user_law_key(path, name))
+        elif group == "control" and ":" in kind:
+            user_law_members.append(f"{path}.{name}")
+        elif vector in keys_by_kind.get(kind, valid_keys):
+            # An unknown kind is refused when the tables are resolved.
+            members.append(f"{path}.{name}")
+    # A key that no built-in law of the scenario has is a setting of the users' laws.
+    if members or user_law_members:
+        return members or user_law_members
     if vector not in valid_keys:
         hint = suggest_nearest(vector, [*_KIND_KEYS[group], *valid_keys])
         hint = hint or f"; valid are {', '.join(valid_keys)}"
         raise ScenarioError(f"unknown key{hint}", path=f"{group}.{name}")
-    if not members:
-        kind_key = _KIND_KEYS[group][0]
-        owners = ", ".join(kind for kind, keys in keys_by_kind.items() if vector in keys)
-        present = ", ".join(dict.fromkeys(kinds.values()))
-        raise ScenarioError(
-            f"belongs to {kind_key} {owners}, and here is only {present}: set "
-            f"{group}.{kind_key} too",
-            path=f"{group}.{name}",
-        )
-    return members
+    kind_key = _KIND_KEYS[group][0]
+    owners = ", ".join(kind for kind, keys in keys_by_kind.items() if vector in keys)
+    present = ", ".join(dict.fromkeys(kinds.values()))
+    raise ScenarioError(
+        f"belongs to {kind_key} {owners}, but the scenario has only {present}: set "
+        f"{group}.{kind_key} too",
+        path=f"{group}.{name}",
+    )
 
 
 def _list_group_kinds(
@@ -138,36 +134,39 @@ def _list_group_kinds(
 ) -> tuple[dict[str, str], dict[str, tuple[str, ...]]]:
     """Returns the kind of each law or link by its path, and the keys of each built-in kind."""
     if group == "control":
-        laws = {
-            f"sites.{site}.control": str(_find_law(scenario, site, overridden))
-            for site in scenario.names
-        }
+        laws = {}
+        for site in scenario.names:
+            laws[f"sites.{site}.control"] = str(_find_law(scenario, site, overridden))
         gains = {law: field_names(kind) for law, kind in LAWS.items() if law != _USER_LAW}
         return laws, gains
-    models = {
-        f"links.{link}": str(_find_model(scenario, link, overridden)) for link in scenario.links
-    }
+    models = {}
+    for link in scenario.links:
+        models[f"links.{link}"] = str(_find_model(scenario, link, overridden))
     keys = {model: field_names(kind) for model, kind in DELAY_MODELS.items()}
     keys["trace"] = (*keys["trace"], *TRACE_KEYS)
     return models, keys
 
 
 def _split_entry(key: str) -> tuple[str, str]:
-    """Returns the key of a list and the number of an entry; the key itself and "" for others.
+    """Splits the key of an entry, as in "q0_rad.1", into that of its list and its number.
 
-    "q0_rad.1" is split into "q0_rad" and "1".
+    Returns:
+        Key of the list and number of the entry; for other keys the key itself and "".
     """
     vector, _, entry = key.rpartition(".")
-    return (vector, entry) if vector and entry.isdecimal() else (key, "")
+    if vector and entry.isdecimal():
+        return vector, entry
+    return key, ""
 
 
 def split_entries(
     tables: TomlTable, pairs: Sequence[Override]
 ) -> tuple[dict[str, Any], list[Override]]:
-    """Returns overrides that apply to an author's tables, and those that must wait.
+    """Returns overrides that apply to an author's tables, and overrides that must wait.
 
-    An override of an entry of a vector waits if the tables do not write the vector out: it may
-    be a single number, or that of a group, and has entries only in the resolved scenario.
+    An override of an entry of a vector waits if the tables do not write the vector out. The
+    vector may be a single number, or the value of a group; only the resolved scenario has its
+    entries.
     """
     applicable = {}
     waiting = []
@@ -184,17 +183,21 @@ def _find_value(tables: TomlTable, key: str) -> Any:
     """Returns the value at a dotted key, in which a number is an entry of a list; or None."""
     value: Any = tables
     for name in key.split("."):
-        if isinstance(value, list) and name.isdecimal() and int(name) < len(value):
+        if isinstance(value, dict):
+            value = value.get(name)
+        elif isinstance(value, list) and name.isdecimal() and int(name) < len(value):
             value = value[int(name)]
         else:
-            value = value.get(name) if isinstance(value, dict) else None
+            return None
     return value
 
 
 def _find_law(scenario: Scenario, site: str, overridden: Mapping[str, Any]) -> Any:
     """Returns the name of a site's law after the overrides."""
-    current = scenario.sites[site].control.__struct_config__.tag
-    return overridden.get(f"sites.{site}.control.law", overridden.get("control.law", current))
+    for path in (f"sites.{site}.control.law", "control.law"):
+        if path in overridden:
+            return overridden[path]
+    return scenario.sites[site].control.__struct_config__.tag
 
 
 def _find_model(scenario: Scenario, link: str, overridden: Mapping[str, Any]) -> Any:
@@ -217,6 +220,13 @@ def apply_overrides(tables: TomlTable, overrides: Mapping[str, Any] | Sequence[s
     A number in a key is an entry of a list, counted from 0, as in
     sites.s.environment.0.stiffness_n_m. A key that names a kind (a link's model or preset, a
     law, an arm's urdf) removes the other keys of its table, which belong to another kind.
+
+    Args:
+        tables: the tables.
+        overrides: a mapping, or texts KEY=VALUE.
+
+    Raises:
+        ScenarioError: an override has no such form, or its key does not exist.
     """
     pairs = parse_overrides(overrides)
     overridden_keys = {key for key, _ in pairs}
@@ -277,7 +287,7 @@ def _reach_table(tables: TomlTable, parents: Sequence[str], last: str) -> TomlTa
 def _list_index(entries: list[Any], name: str, path: str) -> int:
     """Returns the number of an entry of a list; refuses an entry that does not exist."""
     if not name.isdecimal() or int(name) >= len(entries):
-        counted = f"it has {len(entries)}, counted from 0" if entries else "it has none"
+        counted = f"it has {len(entries)}, counted from 0" if entries else "the list is empty"
         raise ScenarioError(f"no such entry: {counted}", path=path)
     return int(name)
 
@@ -314,6 +324,6 @@ def split_assignment(text: str) -> Override | None:
         return None
     try:
         return key.strip(), tomllib.loads(f"value = {value}")["value"]
-    # TOMLDecodeError is a ValueError; a number of 5000 digits raises another one.
+    # TOMLDecodeError is a ValueError; a number of 5000 digits raises a plain ValueError.
     except ValueError:
         return key.strip(), value.strip()

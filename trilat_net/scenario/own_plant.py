@@ -35,7 +35,7 @@ _POSE_NUMBERS = 7
 
 
 class PlantContext(NamedTuple):
-    """The facts with which a user's own plant is made.
+    """The facts that the class of a user's own plant receives.
 
     >>> class Scene:
     ...     def __init__(self, facts: tn.PlantContext) -> None:
@@ -158,7 +158,7 @@ def _check_bodies(written: Any, path: str) -> Any:
 
 
 def _is_box_size(size: Any) -> bool:
-    """True for a list of three lengths, m, that a body may have."""
+    """Returns True for a list of three lengths in m that a body may have."""
     if not isinstance(size, list | tuple) or len(size) != 3:
         return False
     return all(is_number(length) and 0.0 < length <= _MAX_SIZE_M for length in size)
@@ -167,9 +167,19 @@ def _is_box_size(size: Any) -> bool:
 class PlantPlayer:
     """Runs a user's own plant at its site, tick by tick.
 
+    Args:
+        scenario: the scenario.
+        site: name of the site.
+        plant: the plant of the site.
+        watch: calls the code of the plant.
+
     Attributes:
         state: the state of the arm at the next tick.
         rate_hz: the tick rate of the site, Hz.
+
+    Raises:
+        ScenarioError: the class cannot be used, or lacks a method.
+        PlantFailed: the first poses of the bodies are wrong.
     """
 
     def __init__(
@@ -184,7 +194,8 @@ class PlantPlayer:
         kind = import_class(CodeKey.of(plant), path, plant.method)
         if plant.bodies and not hasattr(kind, "poses"):
             raise ScenarioError(
-                f"{plant.code} has no poses(), which says where they are", path=f"{path}.bodies"
+                f"{plant.code} has no poses(), which must return their poses",
+                path=f"{path}.bodies",
             )
         context = PlantContext(
             site=site,
@@ -230,7 +241,8 @@ class PlantPlayer:
     def _step(self, tau: Sequence[float]) -> list[list[float]]:
         """Returns q, qd and, if the plant knows it, tau_x after a period."""
         q, qd, *others = self._program.step(np.array(tau), 1.0 / self.rate_hz)
-        return [[float(number) for number in vector] for vector in (q, qd, *others[:1])]
+        vectors = [q, qd, *others[:1]]
+        return [[float(number) for number in vector] for vector in vectors]
 
     def _read_poses(self) -> list[float]:
         """Returns the poses of all bodies, one after the other, seven numbers each."""
@@ -261,6 +273,7 @@ class PlantPlayer:
             raise self._make_error(tick, f"{type(error).__name__}: {error}") from error
 
     def _make_error(self, tick: int, problem: str) -> PlantFailed:
+        """Returns the error for a problem of the plant at a tick."""
         return PlantFailed(problem, site=self._site, code=self._code, tick=tick)
 
 

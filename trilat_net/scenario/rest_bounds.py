@@ -1,8 +1,8 @@
 """Bounds of a stop: how long it takes, how fast joints may get, and what motors bear.
 
-The bounds follow from the model of the arm, the limits of its torques and the way in which it
-comes to rest (`core.resting`). docs/links.md derives them; the numbers of its equations stand
-beside the lines.
+The bounds follow from the model of the arm, the limits of its torques, and the rule by which
+the arm comes to rest (`core.resting`). docs/links.md derives them; comments give the numbers of
+its equations.
 
 Invariant:
     - The same scenario has the same bounds: poses are drawn with a fixed seed.
@@ -25,9 +25,7 @@ from .scenario_types import Scenario
 AT_REST_RAD_S = 0.05
 """Speed of the joints below which an arm is at rest."""
 SETTLE_TIMES = 10.0
-"""Number of time constants `RestGains.time_s` until the state that the torque at rest took over
-has died away.
-"""
+"""Time constants `RestGains.time_s` within which the torque at rest forgets its start."""
 _POSES = 100
 _LEAST_NM = 1e-300
 """Keeps a divisor above zero."""
@@ -89,17 +87,22 @@ def find_rest_bounds(scenario: Scenario, site: str, qd: Array | None = None) -> 
         samples = _sample_planar_arm(spec.arm, speed)
     beyond_gravity_nm = np.maximum(limit_nm - samples.G, 0.0)
     shares = beyond_gravity_nm / np.maximum(samples.coriolis, _LEAST_NM)
-    kinetic_j = max(
-        float(0.5 * v @ M @ v) for M in samples.M for v in speed * _list_patterns(joints)
-    )
+    velocities = speed * _list_patterns(joints)
+    kinetic_j = max(float(0.5 * v @ M @ v) for M in samples.M for v in velocities)
     damping = np.broadcast_to(setup.rest.damping, joints)
     blend_j = float((0.5 * limit_nm**2 / damping).sum()) / setup.rate_hz  # (5)
-    mobility = np.linalg.inv(samples.M).diagonal(axis1=1, axis2=2).max(axis=0)
+    inverse_inertias = np.linalg.inv(samples.M)
+    mobility = inverse_inertias.diagonal(axis1=1, axis2=2).max(axis=0)
     energy_j = kinetic_j + blend_j
+    rest_s = _bound_rest_time(
+        setup=setup,
+        speed=speed,
+        limit_nm=limit_nm,
+        samples=samples,
+        energy_j=energy_j,
+    )
     return RestBounds(
-        rest_s=_bound_rest_time(
-            setup=setup, speed=speed, limit_nm=limit_nm, samples=samples, energy_j=energy_j
-        ),
+        rest_s=rest_s,
         bearable_share=math.sqrt(float(shares.min())),  # (7)
         kinetic_j=kinetic_j,
         blend_j=blend_j,
@@ -123,14 +126,23 @@ def _bound_rest_time(
     available_nm = limit_nm - gravity_nm
     if np.any(available_nm <= 0.0):
         return math.inf
+
+    # The motors brake the joints against the available torque.
     scaled_inertia = samples.M / np.outer(available_nm, available_nm)
-    slowness = float(np.linalg.eigvalsh(scaled_inertia)[:, -1].max())
+    largest_eigenvalues = np.linalg.eigvalsh(scaled_inertia)[:, -1]
+    slowness = float(largest_eigenvalues.max())
     braking_s = float(setup.rest.stop_s(speed)) + math.sqrt(2.0 * energy_j * slowness)
+
+    # The joints return to the pose that they hold, with an exponential rate.
     adapts = setup.gains.law is Law.ADAPTIVE and not setup.layout.task
     rate_1_s = float(np.min(setup.gains.Lambda)) if adapts else REST_RATE_1_S
     time_s = setup.rest.time_s
-    deviation_rad = 2.0 * time_s * float((limit_nm / setup.rest.damping).max())
-    returning_s = math.log(max(1.0, rate_1_s * deviation_rad / AT_REST_RAD_S)) / rate_1_s
+    fastest_rad_s = float((limit_nm / setup.rest.damping).max())
+    deviation_rad = 2.0 * time_s * fastest_rad_s
+    initial_ratio = rate_1_s * deviation_rad / AT_REST_RAD_S
+    returning_s = math.log(max(1.0, initial_ratio)) / rate_1_s
+
+    # The limit on the torque's rate delays the torque that holds gravity.
     ramp_s = float((gravity_nm / np.asarray(setup.limits.tau_rate)).max())
     return braking_s + SETTLE_TIMES * time_s + returning_s + ramp_s
 
@@ -141,8 +153,9 @@ def _list_patterns(joints: int) -> Array:
     The first joint's direction is always 1, because the opposite pattern has the same energy
     and the same Coriolis torques.
     """
-    patterns = product((1.0, -1.0), repeat=joints - 1)
-    return np.array([(1.0, *pattern) for pattern in islice(patterns, _MAX_PATTERNS)])
+    all_patterns = product((1.0, -1.0), repeat=joints - 1)
+    patterns = islice(all_patterns, _MAX_PATTERNS)
+    return np.array([(1.0, *pattern) for pattern in patterns])
 
 
 def _draw_poses(model: ArmModel, q0: Array) -> Array:
@@ -153,7 +166,8 @@ def _draw_poses(model: ArmModel, q0: Array) -> Array:
     for joint in model.chain.joints:
         low.append(joint.lower if math.isfinite(joint.lower) else -math.pi)
         high.append(joint.upper if math.isfinite(joint.upper) else math.pi)
-    poses = np.random.default_rng(0).uniform(low, high, (_POSES, len(q0)))
+    generator = np.random.default_rng(0)
+    poses = generator.uniform(low, high, (_POSES, len(q0)))
     return np.vstack([q0, poses])
 
 
@@ -171,7 +185,9 @@ def _sample_planar_arm(arm: Arm, speed: Array) -> _ArmSamples:
     upper_nm = abs(first) * arm.g_m_s2
     lower_nm = abs(second) * arm.g_m_s2
     slope = np.abs(b * np.sin(elbow))
-    speed_products = np.array([2.0 * speed[0] * speed[1] + speed[1] ** 2, speed[0] ** 2])
+    shoulder_product = 2.0 * speed[0] * speed[1] + speed[1] ** 2
+    elbow_product = speed[0] ** 2
+    speed_products = np.array([shoulder_product, elbow_product])
     return _ArmSamples(
         M=np.moveaxis(M, 2, 0),
         G=np.broadcast_to([upper_nm + lower_nm, lower_nm], (len(elbow), 2)),
@@ -186,29 +202,33 @@ def _sample_chain(model: ArmModel, q0: Array, speed: Array) -> _ArmSamples:
     """
     assert model.chain is not None
     gravity = np.array(model.chain.gravity_m_s2)
-    rows = build_chain(
-        [joint._replace(viscous=0.0, coulomb=0.0) for joint in model.chain.joints]
-    )
+    frictionless = [joint._replace(viscous=0.0, coulomb=0.0) for joint in model.chain.joints]
+    rows = build_chain(frictionless)
     joints = len(q0)
     still = np.zeros(joints)
-    torque = np.zeros(joints)
     velocities = speed * _list_patterns(joints)
+
+    def compute_torque(v: Array) -> Array:
+        """Returns the torque of the motion at `v` without acceleration, in the current pose."""
+        torque = np.zeros(joints)
+        propagate_motion(chain=rows, gravity=gravity, qd=v, v=v, a=still)
+        inverse_dynamics(chain=rows, theta=model.theta, v=v, a=still, torque=torque)
+        return torque
+
     inertias = []
     gravity_torques = []
     coriolis_torques = []
     for q in _draw_poses(model, q0):
         inertias.append(model.inertia(q))
         place_joints(rows, q)
-        propagate_motion(chain=rows, gravity=gravity, qd=still, v=still, a=still)
-        inverse_dynamics(chain=rows, theta=model.theta, v=still, a=still, torque=torque)
-        G = torque.copy()
+        G = compute_torque(still)
         coriolis = np.zeros(joints)
         for v in velocities:
-            propagate_motion(chain=rows, gravity=gravity, qd=v, v=v, a=still)
-            inverse_dynamics(chain=rows, theta=model.theta, v=v, a=still, torque=torque)
-            coriolis = np.maximum(coriolis, np.abs(torque - G))
+            coriolis = np.maximum(coriolis, np.abs(compute_torque(v) - G))
         gravity_torques.append(np.abs(G))
         coriolis_torques.append(coriolis)
     return _ArmSamples(
-        M=np.array(inertias), G=np.array(gravity_torques), coriolis=np.array(coriolis_torques)
+        M=np.array(inertias),
+        G=np.array(gravity_torques),
+        coriolis=np.array(coriolis_torques),
     )

@@ -1,11 +1,11 @@
-"""Compute which samples of a peer a site uses, and which samples its user is shown.
+"""Samples of its peers that a site uses, and samples that its user sees.
 
 Delays and losses are drawn as a run draws them, so that a forecast before a run holds in the
 run.
 
 Invariant:
     - The draws are those of the link's key.
-    - The samples that a user is shown are a function of scenario, seed and ticks. A log
+    - The samples that a user sees are a function of scenario, seed and ticks. A log
       therefore need not record them.
 """
 
@@ -31,8 +31,11 @@ _BLOCK = 8192
 class LinkSchedule:
     """The due times of the samples of a link, computed with a row of the core's link.
 
-    All models and outages stand in the row from the start: a model applies from its first stamp
-    on, which no sample has reached yet.
+    The row has all models and outages from the start. A model applies from its first stamp on.
+
+    Args:
+        setup: the link.
+        changed_models: models that changes of the run bring into force later.
 
     Attributes:
         models: the models of the link, in the order of their first stamps.
@@ -45,10 +48,11 @@ class LinkSchedule:
         for model, trace in zip(setup.models, setup.traces, strict=True):
             if trace is not None:
                 model = model._replace(trace_first=len(points), trace_count=len(trace))
-                points += [(int(t_us), int(delay_us)) for t_us, delay_us in trace]
+                for t_us, delay_us in trace:
+                    points.append((int(t_us), int(delay_us)))
             models.append(model)
         models += changed_models
-        # Stable: of two models with one first stamp the changed one applies.
+        # The sort is stable: of two models with one first stamp, the changed model applies.
         models.sort(key=lambda model: model.from_ns)
         self.models = np.array(models, LINK_MODEL_DTYPE)
         self._points = np.array([*points, *setup.outages], dtype=np.int64).reshape(-1, 2)
@@ -64,9 +68,9 @@ class LinkSchedule:
         self._block = np.empty(_BLOCK, dtype=np.int64)
 
     def draw(self, end: int) -> IntArray:
-        """Returns the due times of the next samples, before sample `end`, ns; LOST if lost.
+        """Returns the due times of the samples before `end`, in ns; LOST for a lost sample.
 
-        The first of them is the sample after the last one of the previous call.
+        The first of these samples is the sample after the last sample of the previous call.
         """
         first = int(self.row.scheduled) + 1
         due_ns = np.empty(max(0, end - first), dtype=np.int64)
@@ -79,11 +83,12 @@ class LinkSchedule:
                 dues=self._block,
                 points=self._points,
             )
-            due_ns[start - first : stop - first] = self._block[np.arange(start, stop) % _BLOCK]
+            positions = np.arange(start, stop) % _BLOCK
+            due_ns[start - first : stop - first] = self._block[positions]
         return due_ns
 
     def draw_releases(self, end: int, receiver_hz: int) -> tuple[IntArray, IntArray]:
-        """Returns the next samples that are not lost, and the ticks at which they are released.
+        """Returns the next samples that are not lost, and the ticks of their release.
 
         Args:
             end: the sample after the last one to draw.
@@ -102,7 +107,7 @@ class LinkSchedule:
 
 
 def first_ticks(due_ns: IntArray, rate_hz: int) -> IntArray:
-    """Returns the first ticks at or after times, ns; `core.ticks.first_tick_at` for arrays."""
+    """Returns the first ticks at or after times in ns, as `core.ticks.first_tick_at` does."""
     return -(-due_ns * rate_hz // NS_PER_S)
 
 
@@ -131,9 +136,8 @@ def draw_used_samples(
         models=(link.to_core_model(),),
         traces=(link.points,),
     )
-    samples, releases = LinkSchedule(setup).draw_releases(
-        round(duration_s * sender_hz), receiver_hz
-    )
+    sent = round(duration_s * sender_hz)
+    samples, releases = LinkSchedule(setup).draw_releases(sent, receiver_hz)
     ticks = max(2, round(duration_s * receiver_hz))
     used = _list_newest(samples, releases, ticks)
     used.flags.writeable = False
@@ -161,16 +165,23 @@ def count_silences(used: IntArray, receiver_hz: int, silence_ns: int) -> int:
     new_sample_ticks = np.flatnonzero(np.diff(used, prepend=-1) > 0)
     if not len(new_sample_ticks):
         return 0
-    gaps_ns = np.diff(new_sample_ticks, append=len(used)) * NS_PER_S // receiver_hz
-    return int(np.count_nonzero(gaps_ns - NS_PER_S // receiver_hz > silence_ns))
+    gap_ticks = np.diff(new_sample_ticks, append=len(used))
+    gaps_ns = gap_ticks * NS_PER_S // receiver_hz
+    period_ns = NS_PER_S // receiver_hz
+    return int(np.count_nonzero(gaps_ns - period_ns > silence_ns))
 
 
 class PictureDelay:
     """The delay of the picture in which a site's user sees its peers: `[sites.NAME.view]`.
 
-    The picture has a link of its own beside the haptic link. A peer's sample is shown from the
-    site's first tick at or after its arrival over that link (L2), drawn by a key of its own
-    (L4), until a newer sample is shown. Without a view the samples in use are shown.
+    The picture has a link of its own beside the haptic link, with random draws of its own (L4).
+    The user sees a peer's sample from the site's first tick at or after the arrival of the
+    sample over that link (L2), until a newer sample is shown. Without a view, the user sees the
+    samples in use.
+
+    Args:
+        scenario: the scenario.
+        site: name of the site.
     """
 
     def __init__(self, scenario: Scenario, site: str) -> None:
@@ -181,9 +192,9 @@ class PictureDelay:
         for peer in peers:
             assert view is not None
             rate_hz = scenario.sites[peer].rate_hz
-            outages = tuple(
-                (round(start_s * 1e9), round(end_s * 1e9)) for start_s, end_s in view.outages_s
-            )
+            outages = []
+            for start_s, end_s in view.outages_s:
+                outages.append((round(start_s * 1e9), round(end_s * 1e9)))
             setup = LinkSetup(
                 peer=peer,
                 alpha=1.0,
@@ -192,10 +203,10 @@ class PictureDelay:
                 key=link_key(scenario.seed, f"view {peer}->{site}"),
                 models=(view.to_core_model(),),
                 traces=(view.points,),
-                outages=outages,
+                outages=tuple(outages),
             )
             self._links[peer] = (rate_hz, LinkSchedule(setup))
-        # Rows of samples and their releases that lie after the tick of the last call.
+        # Samples and their release ticks after the tick of the last call, shape (2, samples).
         self._waiting = {peer: np.empty((2, 0), dtype=np.int64) for peer in self._links}
         self._shown = dict.fromkeys(self._links, -1)
 
@@ -211,9 +222,11 @@ class PictureDelay:
         """
         for peer, releases in self._draw_until(tick):
             samples, ticks = np.concatenate((self._waiting[peer], releases), axis=1)
-            self._waiting[peer] = np.stack((samples, ticks))[:, ticks > tick]
-            last_released = samples[ticks <= tick][-1:].tolist()
-            self._shown[peer] = max([self._shown[peer], *last_released])
+            is_released = ticks <= tick
+            self._waiting[peer] = np.stack((samples, ticks))[:, ~is_released]
+            released = samples[is_released]
+            if len(released):
+                self._shown[peer] = max(self._shown[peer], int(released[-1]))
         return {**used, **self._shown}
 
     def list_shown_samples(self, ticks: int) -> dict[str, IntArray]:

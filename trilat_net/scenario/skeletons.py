@@ -1,9 +1,9 @@
-"""Skeletons of users' code: a law, a hand or a plant that works, and its test.
+"""Skeletons of users' code: a working law, hand or plant, and its test.
 
 Invariant:
     - A skeleton is a file of this package, such as `scenarios/_law.txt`. The file mylaw.py gets
       the class MyLaw.
-    - The code that is written runs as it is, and its test passes.
+    - The written code runs as it is, and its test passes.
 """
 
 import keyword
@@ -23,8 +23,8 @@ def new_law(path: str | Path, *, force: bool = False) -> list[Path]:
     ['mylaw.py', 'test_mylaw.py']
 
     Args:
-        path: the file; its name becomes that of the module, and mylaw.py has the class MyLaw.
-        force: whether files of these names may be replaced.
+        path: the file, which becomes a module; mylaw.py has the class MyLaw.
+        force: True if existing files of these names may be replaced.
 
     Returns:
         The files that were written.
@@ -60,7 +60,8 @@ def new_plant(path: str | Path, *, force: bool = False) -> list[Path]:
 def _write_skeleton(kind: str, file: Path, *, force: bool) -> list[Path]:
     """Writes the skeleton of a law, hand or plant and its test; returns the two files."""
     module = file.stem
-    if file.suffix != ".py" or not module.isidentifier() or keyword.iskeyword(module):
+    is_module_name = module.isidentifier() and not keyword.iskeyword(module)
+    if file.suffix != ".py" or not is_module_name:
         examples = f"my{kind}.py or my_{kind}.py"
         raise UsageError(
             f"{file}: a {kind} is in a Python module, whose name is as in {examples}"
@@ -71,19 +72,24 @@ def _write_skeleton(kind: str, file: Path, *, force: bool) -> list[Path]:
     }
     for new_file in templates:
         refuse_existing(new_file, force=force)
-    spec = find_spec(module)
-    if spec is not None:
-        is_this_file = spec.origin is not None and file.exists() and file.samefile(spec.origin)
-        if not is_this_file:
-            raise UsageError(
-                f"{file}: Python has a module {module} already; choose another name"
-            )
+    if _is_other_module(module, file):
+        raise UsageError(f"{file}: Python has a module {module} already; choose another name")
     for new_file, template in templates.items():
         text = (SHIPPED_FOLDER / template).read_text(encoding="utf-8")
         text = text.replace(f"My{kind.title()}", name_skeleton_class(module, kind))
         text = text.replace(f"my{kind}", module)
         write_whole(new_file, text, force=force)
     return list(templates)
+
+
+def _is_other_module(module: str, file: Path) -> bool:
+    """Returns True if Python finds a module of this name in another file."""
+    spec = find_spec(module)
+    if spec is None:
+        return False
+    if spec.origin is None or not file.exists():
+        return True
+    return not file.samefile(spec.origin)
 
 
 def name_skeleton_class(module: str, kind: str = "law") -> str:
