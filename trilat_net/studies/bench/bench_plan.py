@@ -584,8 +584,7 @@ def plan_bench(
         study: a key of `STUDIES`.
         tasks: names of the selected tasks; empty: all of the study.
         laws: names of the selected laws; empty: all of the study.
-        links: names of the selected links, of which any of `LINKS` will do; empty: all of the
-            study.
+        links: names of the selected links, any keys of `LINKS`; empty: all links of the study.
         seeds: number of seeds; None: that of the study.
 
     Raises:

@@ -604,9 +604,12 @@ def _build_row(result: CellResult) -> dict[str, Any]:
     row["share_high"] = share_high
     for quantity in QUANTITIES:
         mean = result.compute_mean(quantity)
-        has_interval = isinstance(mean, MeanInterval)
-        row[quantity] = mean.mean if has_interval else mean
-        row[f"{quantity}_half"] = mean.half if has_interval else None
+        if isinstance(mean, MeanInterval):
+            row[quantity] = mean.mean
+            row[f"{quantity}_half"] = mean.half
+        else:
+            row[quantity] = mean
+            row[f"{quantity}_half"] = None
     row |= dict.fromkeys(_FORMER_KEYS)
     row |= {
         "judgement": result.judgement.value,
