@@ -83,7 +83,8 @@ def plain_cells_per_s(tasks: list[CellItem]) -> float:
         for share in (tasks[:WARMED], tasks):
             began = time.perf_counter()
             parts = [
-                executor.submit(run_batch, run_cell, share[n::WORKERS]) for n in range(WORKERS)
+                executor.submit(run_batch, run_cell, share[n::WORKERS], None, {})
+                for n in range(WORKERS)
             ]
             for part in parts:
                 part.result()
@@ -92,7 +93,7 @@ def plain_cells_per_s(tasks: list[CellItem]) -> float:
 
 def run() -> list[str]:
     sweep = plan_sweep("free", ["duration_s=20.0"], over=[OVER], longest_s=20.0)
-    tasks = [sweep.task(n, sweep.seeds[0]) for n in range(sweep.cells)]
+    tasks = [CellItem(sweep, sweep.cell(n), sweep.seeds[0]) for n in range(sweep.cells)]
     for task in tasks[:3]:
         run_cell(task)
     rounds = [

@@ -33,7 +33,7 @@ def send(folder: str, *places: str) -> None:
     settings = [None, read_member_keys(Path(folder) / "m1").settings]
     with ExitStack() as stack:
         buses = [
-            stack.enter_context(closing(ZenohBus([], [place], own=own)))
+            stack.enter_context(closing(ZenohBus([], [place], settings=own)))
             for place, own in zip(places, settings, strict=True)
         ]
         publish = [bus.publisher(_KEY) for bus in buses]
@@ -68,7 +68,7 @@ def measure_us() -> "list[np.ndarray[tuple[int, int], np.dtype[np.float64]]]":
         for place, own in zip(
             places, (None, read_member_keys(folder / "s").settings), strict=True
         ):
-            stack.enter_context(closing(ZenohBus([place], own=own))).tap(_KEY, take)
+            stack.enter_context(closing(ZenohBus([place], settings=own))).tap(_KEY, take)
         program = "import sys; from benchmarks.tls import send; send(*sys.argv[1:])"
         subprocess.run([sys.executable, "-c", program, str(folder), *places], check=True)
     ways_us = np.full(2 * ROUNDS * SAMPLES, np.nan)
