@@ -1,7 +1,8 @@
-"""The view of a session in a terminal: `trilat demo` and `trilat watch` show a row per site.
+"""Show a running session in a terminal, with one row per site.
 
-A terminal shows a table that is refreshed; other outputs receive the same rows as lines every
-two seconds.
+The commands `trilat demo` and `trilat watch` use this module. In a terminal, the rows form a
+table that is refreshed four times a second. If the output is a file or a pipe, the same rows
+are printed as lines every two seconds.
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,18 +27,22 @@ from trilat_net.net.messages import Event, LinkStats, State
 from trilat_net.scenario import Scenario
 
 AGES = "age of each peer's sample"
+"""Heading of the column with the ages of the peers' samples."""
 HEADS = ("site", "time", "mode", "angles", "|e|", "torque", AGES, "held", "late", "overruns")
+"""Headings of the columns of the table."""
 NUMBERS = frozenset(("time", "|e|", "torque", "late", "overruns"))
+"""Headings of the columns that are aligned to the right."""
 TABLE_NS = NS_PER_S // 4
+"""Time between two updates of the table, in ns."""
 LINES_NS = 2 * NS_PER_S
-"""Time between two updates of the table, and between two updates of the lines."""
+"""Time between two updates of the lines, in ns."""
 LOUD_EVENTS = frozenset(
     ("lost", "left", "join", "unheard", "heard", "diverged", "failed", "refused", "clock fault")
 )
-"""Kinds of events that are printed for the person who watches."""
+"""Kinds of events whose sentences are printed."""
 
 SiteRow = Mapping[str, str]
-"""The texts of a site's row, by the names in `HEADS`."""
+"""Texts of the row of a site, by the headings in `HEADS`."""
 
 
 def describe_site(
@@ -49,22 +54,26 @@ def describe_site(
     ended: bool = False,
     silent_s: float = 0.0,
 ) -> SiteRow:
-    """Returns the row of a site, from its newest record and statistics.
+    """Composes the row of a site from its newest record and statistics.
 
     Args:
-        scenario: the scenario of the session.
-        name: the site.
-        record: the newest record; None before the first.
-        stats: the newest statistics; None before the first.
-        ended: whether the site has published its end.
-        silent_s: the time since the site was heard, s; 0.0 if that was a moment ago.
+        scenario: Scenario of the session.
+        name: Name of the site.
+        record: Result of the site's newest tick. None if none has arrived.
+        stats: Newest statistics of the site. None if none have arrived.
+        ended: True if the site has published its end.
+        silent_s: Time since a message of the site arrived, in s. 0 if one has just arrived.
+
+    Returns:
+        The texts by the headings of the columns. Unknown ones are empty.
     """
     row = dict.fromkeys(HEADS, "") | {"site": name, "mode": "braked"}
     if stats is not None:
-        ages = [
-            f"{peer} {age_us / 1000:.0f} ms" if age_us >= 0 else f"{peer} none"
-            for peer, age_us in stats.age_us.items()
-        ]
+        ages = []
+        for peer, age_us in stats.age_us.items():
+            has_arrived = age_us >= 0
+            age = f"{age_us / 1000:.0f} ms" if has_arrived else "none"
+            ages.append(f"{peer} {age}")
         row |= {
             "time": f"{stats.t_ns / NS_PER_S:.1f} s",
             "mode": stats.mode,
@@ -75,12 +84,14 @@ def describe_site(
     if record is not None:
         row |= _describe_record(scenario, name, record)
     if ended:
-        return row | {"mode": "ended"}
-    return row | {"mode": f"silent {silent_s:.0f} s"} if silent_s > 0.0 else row
+        row["mode"] = "ended"
+    elif silent_s > 0.0:
+        row["mode"] = f"silent {silent_s:.0f} s"
+    return row
 
 
 def _describe_record(scenario: Scenario, name: str, record: State) -> SiteRow:
-    """Returns the texts of a row that follow from a record."""
+    """Returns those texts of a row that follow from a record."""
     position = np.array([record.x or record.q])
     desired = np.array([record.q_des])
     if record.x:
@@ -101,20 +112,30 @@ def _describe_record(scenario: Scenario, name: str, record: State) -> SiteRow:
 
 
 def _describe_hold(hand: HandInForce | None) -> str:
+    """Returns whether somebody holds the arm: "yes", "fades" after a release, "free", or empty.
+
+    Args:
+        hand: State of the operator in the record. None if the scenario has no live operator.
+    """
     if hand is None:
         return ""
     if hand.source:
         return "yes"
-    return "fades" if hand.grip else "free"
+    is_fading = hand.grip > 0.0
+    return "fades" if is_fading else "free"
 
 
 def describe_angles(q: Sequence[float]) -> str:
-    """Returns the text of joint angles, rad."""
+    """Returns the text of joint angles.
+
+    Args:
+        q: Joint angles in rad.
+    """
     return " ".join(f"{angle:+.3f}" for angle in q) + " rad"
 
 
 def describe_row(row: SiteRow) -> str:
-    """Returns a site's row as a line of text."""
+    """Returns the row of a site as a line of text, with the most important columns."""
     keys = {"|e|": "|e|", "torque": "torque", "age": AGES, "hand": "held", "late": "late"}
     parts = [f"{row['site']} {row['time']} {row['mode']}".strip(), row["angles"]]
     parts += [f"{word} {row[key]}" for word, key in keys.items() if row[key]]
@@ -122,9 +143,13 @@ def describe_row(row: SiteRow) -> str:
 
 
 def frame_alarms(alarms: Sequence[tuple[str, LifeAlarm]]) -> list[Panel]:
-    """Returns a panel for each alarm of a site.
+    """Returns a coloured panel for each alarm of a site.
 
-    A panel is red if the arm is stopped or in fault, and yellow if it continues by itself.
+    A panel is red if the arm stays stopped until a user acts. It is yellow if the arm continues
+    by itself.
+
+    Args:
+        alarms: Name of the site, and the alarm.
     """
     blocks = []
     for name, alarm in alarms:
@@ -138,7 +163,14 @@ def frame_alarms(alarms: Sequence[tuple[str, LifeAlarm]]) -> list[Panel]:
 
 
 class SessionDisplay:
-    """Shows the rows of all sites; a context manager that restores the terminal."""
+    """Terminal output of a session: a table of the sites, and lines above it.
+
+    The object is a context manager that restores the terminal.
+
+    Args:
+        console: The terminal.
+        clock: Clock of this process.
+    """
 
     def __init__(self, console: Console, clock: Clock) -> None:
         self._console = console
@@ -168,7 +200,13 @@ class SessionDisplay:
     def show(
         self, title: str, rows: Sequence[SiteRow], alarms: Sequence[tuple[str, LifeAlarm]] = ()
     ) -> None:
-        """Shows the rows of all sites, with the alarms above them."""
+        """Shows the rows of all sites, with the alarms above them.
+
+        Args:
+            title: Title of the table.
+            rows: Rows of the sites.
+            alarms: Name of the site and the alarm, for each alarm that is present.
+        """
         self._updated_ns = self._clock.monotonic_ns()
         if self._live is None:
             alarm_lines = [f"*** {name} {alarm}" for name, alarm in alarms]
@@ -183,13 +221,25 @@ class SessionDisplay:
             table.add_column(head, justify="right" if head in NUMBERS else "left")
         for row in rows:
             table.add_row(*map(escape, row.values()))
-        # Started only here: a signal before the first update would not restore the terminal.
+        # The table is started only now. If it was started before the `with` block, a signal
+        # before the first update would leave the terminal in a wrong state.
         self._live.start()
         self._live.update(Group(*frame_alarms(alarms), table), refresh=True)
 
 
 class SessionMonitor:
-    """Receives the messages of the sites, and shows them on a display."""
+    """Receives the messages of all sites of a session, and shows them on a display.
+
+    Args:
+        bus: Network connection that reaches the session.
+        session: Name of the session.
+        scenario: Scenario of the session.
+        display: Display for the rows of the sites.
+
+    Attributes:
+        latest: Newest statistics of each site, by name.
+        records: Newest record of each site, by name.
+    """
 
     def __init__(
         self, bus: Bus, session: str, scenario: Scenario, display: SessionDisplay
