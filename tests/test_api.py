@@ -152,11 +152,15 @@ class _Texts(HTMLParser):
 
     def __init__(self, page: str) -> None:
         super().__init__()
-        self.words: list[str] = []
+        self._text = ""
         self.feed(page)
+        self.words = self._text.split()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self._text += "" if tag == "span" else " "  # a span may stand within a word
 
     def handle_data(self, data: str) -> None:
-        self.words += data.split()
+        self._text += data
 
 
 RESULTS: dict[str, Callable[[Path], Result]] = {

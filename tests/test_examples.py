@@ -218,7 +218,7 @@ def test_a_switch_is_let_go_when_its_program_ends(monkeypatch: pytest.MonkeyPatc
     os.write(ends[1], b"pressed\n")
     os.close(ends[1])
     switch = PressedSwitch(1000)
-    monkeypatch.setattr(SwitchClient, "connected", lambda *_: nullcontext(switch))
+    monkeypatch.setattr(SwitchClient, "connected", lambda *_, **__: nullcontext(switch))
     monkeypatch.setattr(
         sys, "argv", ["dead_man_switch.py", "play", "s", "--connect", "tcp/127.0.0.1:1"]
     )

@@ -46,7 +46,7 @@ def lag_command(
     """Measures how far the slave lags, seed by seed."""
     with RunJournal(Path("lag.jsonl"), scenario, Lag, "make room") as journal, open_worker_pool(1) as pool:
         left = [(scenario, seed) for seed in range(seeds) if (scenario, seed) not in journal.done]
-        journal.run_pending(pool, measure_lag, left, seeds - len(left), seeds, lambda *_: None)
+        journal.run_pending(pool, measure_lag, left, seeds - len(left), seeds, lambda *_, **__: None)
         rows = {str(one.seed): one.rms_error_rad for one in journal.done.values()}
     terminal.print_json({"made": len(left), "rows": rows})
 '''

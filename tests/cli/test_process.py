@@ -186,7 +186,7 @@ def test_a_closed_pipe_and_a_bad_name_as_on_windows(
     def fail() -> None:
         raise OSError(errno.EINVAL, "Invalid argument", *name)
 
-    monkeypatch.setattr(cli, "os", replace_os(dup2=lambda *_: None))
+    monkeypatch.setattr(cli, "os", replace_os(dup2=lambda *_, **__: None))
     monkeypatch.setattr(cli, "app", fail)
     with pytest.raises(SystemExit) as ended:
         cli.main()

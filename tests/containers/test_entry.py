@@ -105,7 +105,7 @@ def test_who_may_not_write_is_told_who_and_where(
 ) -> None:
     monkeypatch.setattr(os, "getuid", lambda: 1234)
     monkeypatch.setattr(os, "getgid", lambda: 1235)
-    monkeypatch.setattr(os, "access", lambda *_: False)
+    monkeypatch.setattr(os, "access", lambda *_, **__: False)
     with pytest.raises(SystemExit) as end:
         entry.hand_over(tmp_path, mark)
     assert end.value.code == 2

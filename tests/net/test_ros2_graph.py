@@ -290,7 +290,7 @@ def test_a_message_that_raises_is_refused_and_the_next_comes(wire: Wire) -> None
 
 
 def test_publishers_that_do_not_fit_are_named_as_they_appear(wire: Wire) -> None:
-    wire.graph.subscribe("a", STRING, lambda *_: None)
+    wire.graph.subscribe("a", STRING, lambda *_, **__: None)
     place = Ros2Member(3, str(wire.stranger.zid()), "", "talker")
     token = place.endpoint_token(
         1, EndpointKind.PUBLISHER, "a", STRING, STRING_HASH, QualityOfService()

@@ -146,7 +146,7 @@ def test_trial_whose_log_was_in_place_counts_after_a_kill(
 
     with monkeypatch.context() as patch:
         patch.setattr(ExperimentTrial, "settle", killed)
-        patch.setattr(SyntheticTrial, "settle", lambda *_: None)
+        patch.setattr(SyntheticTrial, "settle", lambda *_, **__: None)
         with pytest.raises(Killed):
             People(experiment).run()
     (path,) = (experiment.folder / "logs").iterdir()

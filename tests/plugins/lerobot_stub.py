@@ -66,7 +66,7 @@ def _device(name: str) -> type:
     def begin(self: Any, config: Any) -> None:
         self.id = config.id
 
-    methods = {method: abc.abstractmethod(lambda *_: None) for method in ABSTRACT[name]}
+    methods = {method: abc.abstractmethod(lambda *_, **__: None) for method in ABSTRACT[name]}
     return abc.ABCMeta(name, (), {"__init__": begin, **methods})
 
 

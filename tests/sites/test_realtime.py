@@ -45,7 +45,7 @@ def test_a_processor_that_is_not_there_is_a_warning(
     cpu: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for step in ("_call_libc", "_set_scheduling", "_stop_collector"):
-        monkeypatch.setattr(realtime, step, lambda *_: "")
+        monkeypatch.setattr(realtime, step, lambda *_, **__: "")
     assert realtime.prepare(cpu)["affinity"].startswith("not obtained (")
 
 
@@ -74,7 +74,7 @@ def test_many_sites_leave_processors_to_recorders(
     sites: int, crowded: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for step in ("_call_libc", "_set_affinity", "_set_scheduling", "_stop_collector"):
-        monkeypatch.setattr(realtime, step, lambda *_: "as asked")
+        monkeypatch.setattr(realtime, step, lambda *_, **__: "as asked")
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
     expected = "normal (5 sites share 2 processors)" if crowded else "as asked"
     assert realtime.prepare(None, sites)["scheduling"] == expected

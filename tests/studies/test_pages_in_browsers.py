@@ -95,8 +95,8 @@ PLANES: dict[str, MapPlane] = {
     "panels": drawn(link__playout_ms=(0.0, 400.0)),
     "six panels": drawn(rate_hz=tuple(float(n) for n in range(1, 7))),
     "seeds": drawn(lambda x, y, seed: by_the_line(x, y - 0.3 * seed), seeds=4),
-    "no edge": drawn(lambda *_: CellClass.CONVERGED),
-    "all diverged": drawn(lambda *_: CellClass.DIVERGED),
+    "no edge": drawn(lambda *_, **__: CellClass.CONVERGED),
+    "all diverged": drawn(lambda *_, **__: CellClass.DIVERGED),
     "uneven axis": UNEVEN._replace(x=UNEVEN.x._replace(values=(8, 68, 136, 272, 1088))),
     "missing cell": build_plane([row for row in rows() if row["cell"] != 12], KEYS, P_D),
     "exponents": build_plane(

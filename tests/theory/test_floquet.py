@@ -282,7 +282,7 @@ def test_what_drifts_at_any_delays_is_told_from_what_stays(
     hand_made = CoupledTicks(
         S, {(1, 0): effect}, ("m.q1", "m.qd1", "s.q1", "s.qd1"), np.array([0, 0, 1, 1]), 0
     )
-    monkeypatch.setattr(floquet, "couple_ticks", lambda *_: hand_made)
+    monkeypatch.setattr(floquet, "couple_ticks", lambda *_, **__: hand_made)
     found = at_rest("two_sites", {"rate_hz": 100, "control.law": "p_d", "link": SINE}).found
     assert (found.zeros, found.drifting, found.verdict) == (2, 1, "at the edge")
     assert found.rightmost is not None

@@ -111,7 +111,7 @@ def test_two_sites_turn_stable_at_4_d_d(seed: int) -> None:
 )
 def test_two_like_arms_turn_stable_at_their_round_trip(seed: int) -> None:
     """d1/K2 + d2/K1 = T1 + T2: no more than 4 d1 d2 asks for, by two means of the terms."""
-    scenario, (K1, K2, T, d1, d2) = heavy_pair(seed, lambda *_: 1.0)
+    scenario, (K1, K2, T, d1, d2) = heavy_pair(seed, lambda *_, **__: 1.0)
     exact = K1 * (T - d1 / K2)
     found = next(
         iterate_linear_edges(scenario, "sites.s.control.d", 0.7 * exact, 1.4 * exact, points=3),

@@ -95,7 +95,7 @@ def test_what_failed_confirms_nothing(tmp_path: Path) -> None:
     found = confirm_cell(row, torn)
     assert (found.same, found.live) == (False, None)
     assert "cell-3" in found.text
-    missing = confirm_cell(row, lambda *_: (tmp_path / "missing.mcap", []))
+    missing = confirm_cell(row, lambda *_, **__: (tmp_path / "missing.mcap", []))
     assert (missing.same, missing.log) == (False, None)
 
 
@@ -134,7 +134,7 @@ def test_undecided_cells_are_not_run_and_edge_is_beyond_them() -> None:
     found = choose_cells_near_edges(list(rows(band)), KEYS, 3)
     assert [stable(row) for row in found] == [True] * 3 + [False] * 3
     with pytest.raises(UsageError, match="no edge"):
-        choose_cells_near_edges(list(rows(lambda *_: CellClass.UNDECIDED)), KEYS, 1)
+        choose_cells_near_edges(list(rows(lambda *_, **__: CellClass.UNDECIDED)), KEYS, 1)
 
 
 def test_another_seed_or_law_is_no_neighbour() -> None:

@@ -53,7 +53,7 @@ def by_the_line(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def without_roots(monkeypatch: pytest.MonkeyPatch) -> None:
     """No linear analysis, which takes seconds."""
-    monkeypatch.setattr(margin_search, "find_root_crossings", lambda *_: ((), ""))
+    monkeypatch.setattr(margin_search, "find_root_crossings", lambda *_, **__: ((), ""))
 
 
 @pytest.mark.usefixtures("by_the_line")

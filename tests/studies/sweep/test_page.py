@@ -107,7 +107,7 @@ def test_a_line_that_is_not_there_has_no_difference() -> None:
 
 
 def test_a_map_without_an_edge_has_no_table() -> None:
-    plane = drawn(lambda *_: CellClass.CONVERGED)
+    plane = drawn(lambda *_, **__: CellClass.CONVERGED)
     assert tabulate_edges(plane, plane.panels[0], (EXACT,)).rows == []
 
 
@@ -166,7 +166,7 @@ def test_lines_are_drawn_where_they_are_and_named() -> None:
 
 
 def test_the_legend_has_only_what_occurs() -> None:
-    (legend,) = figure(drawn(lambda *_: CellClass.UNDECIDED)).legends
+    (legend,) = figure(drawn(lambda *_, **__: CellClass.UNDECIDED)).legends
     assert [text.get_text() for text in legend.get_texts()] == ["undecided"]
 
 

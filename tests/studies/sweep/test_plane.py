@@ -28,7 +28,7 @@ def test_every_run_is_counted_once_in_whatever_order_they_come(
     order: list[int], chance: int
 ) -> None:
     random = np.random.default_rng(chance)
-    made = list(rows(lambda *_: CELL_CLASSES[random.integers(4)], seeds=2))
+    made = list(rows(lambda *_, **__: CELL_CLASSES[random.integers(4)], seeds=2))
     found = build_plane([made[n] for n in order], KEYS, P_D)
     (panel,) = found.panels
     assert panel.counts.sum() == 50
@@ -52,7 +52,7 @@ def test_the_share_is_of_decided_runs() -> None:
 
 
 def test_nothing_decided_has_no_share() -> None:
-    assert np.isnan(drawn(lambda *_: CellClass.UNDECIDED).panels[0].share).all()
+    assert np.isnan(drawn(lambda *_, **__: CellClass.UNDECIDED).panels[0].share).all()
 
 
 def test_words_and_further_axes_make_panels() -> None:

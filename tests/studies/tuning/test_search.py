@@ -68,7 +68,9 @@ def test_the_first_half_samples_every_slice_of_every_range(
     law: str, budget: int, seed: int
 ) -> None:
     """What makes a Latin hypercube of it (McKay, Beckman and Conover 1979)."""
-    first = CandidateSearch(SEARCH_SPACES[law], budget, seed, Objective.ERROR).propose_candidates(0)
+    first = CandidateSearch(
+        SEARCH_SPACES[law], budget, seed, Objective.ERROR
+    ).propose_candidates(0)
     for knob in SEARCH_SPACES[law].knobs:
         share = np.log([gains[knob.name] / knob.low for gains in first]) / math.log(
             knob.high / knob.low
@@ -94,7 +96,9 @@ def test_refinement_comes_nearer_than_the_hypercube_of_all(law: str) -> None:
     spread = [
         min(
             bowl(gains).error_rad or 0.0
-            for gains in CandidateSearch(SEARCH_SPACES[law], 128, seed, Objective.ERROR).propose_candidates(0)
+            for gains in CandidateSearch(
+                SEARCH_SPACES[law], 128, seed, Objective.ERROR
+            ).propose_candidates(0)
         )
         for seed in range(10)
     ]

@@ -52,7 +52,7 @@ def test_clamp_and_all_but_law_are_same_for_every_candidate(found: TuningResult)
             scenario = found.candidate(one, place).scenario
             limits = tuple(site.limits for site in scenario.sites.values())
             starts = tuple(
-                (site.q0_rad, site.arm, site.rate_hz, site.hands)
+                (site.q0_rad, repr(site.arm), site.rate_hz, site.hands)
                 for site in scenario.sites.values()
             )
             shared.add(
