@@ -1,8 +1,14 @@
-"""Figures of a linear loop: its roots; transmitted impedance and passivity of its ports over
-frequency.
+"""Figures of computed loops: ports, roots, network delays and gains of arms.
 
-Invariant: free is solid and clamped dashed, in the colour of the operator's site; bands that
-fail are shaded.
+- Ports of a linear loop: the transmitted impedance and the passivity over frequency.
+- Roots of a linear loop, continuous and sampled.
+- One-way delays of a network benchmark.
+- The largest stable gain of an arm over the delay of the links.
+
+Invariant:
+    - A line of a port has the colour of the operator's site. The line is solid while the other
+      site is free, and dashed while it is clamped.
+    - Bands of frequency in which a criterion fails are shaded.
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,94 +40,136 @@ _PROOF: dict[str, Any] = {
     "linestyle": (0, (5, 1.5, 1, 1.5)),
 }
 _MAX_SHOWN_PARAMETER = 2.5
-"""Llewellyn's parameter is drawn up to here: values far above 1 do not differ in meaning."""
+"""Upper end of the axis of Llewellyn's parameter; values far above 1 mean the same."""
+_CROWDED_TICKS_HZ = (0.1, 1.0, 10.0)
+"""Ticks of a narrow panel. Ticks at its ends would meet those of the next panel."""
 
 
 def draw_port_impedance(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns magnitude and phase of the transmitted impedance, free and clamped, a column for
-    each joint.
+    """Returns the figure of the transmitted impedance of every joint over frequency.
 
-    The joints of larger arms stand in several rows of both.
+    A joint has a panel of the magnitude above a panel of the phase. The panels of many joints
+    are arranged in several rows.
+
+    Args:
+        ports: the analysed ports.
+        size: size of the figure.
     """
     if "unstable" in (ports.verdict, ports.clamped_verdict):
         return style.empty_figure("The loop is unstable: it has no impedance.", size)
-    joints = sorted({one.joint for one in ports.transparency})
-    sites = dict.fromkeys(one.operator_site for one in ports.transparency)
+
+    joints = sorted({response.joint for response in ports.transparency})
     rows = style.arrange_joints(len(joints), size.narrow)
-    blocks = len(rows)
     columns = min(len(rows[0]), len(joints))
-    crowded = size.narrow or columns > 2
-    with style.styled_figure(size, 3.8 * blocks) as figure:
-        grid = style.add_panels(figure, 2 * blocks, columns, sharex=True, sharey="row")
-        for place, joint in enumerate(joints):
-            top = 2 * (place // columns)
-            column = place % columns
-            of_joint = [one for one in ports.transparency if one.joint == joint]
-            magnitude, phase = grid[top : top + 2, column]
-            _plot_impedance(ports, of_joint, magnitude, phase)
-            magnitude.set_title(
-                ports.name_port(joint) + ("" if crowded else _describe_ratios(of_joint))
-            )
-            if place + columns >= len(joints):
+    is_crowded = size.narrow or columns > 2
+    with style.styled_figure(size, 3.8 * len(rows)) as figure:
+        grid = style.add_panels(figure, 2 * len(rows), columns, sharex=True, sharey="row")
+        for index, joint in enumerate(joints):
+            row, column = divmod(index, columns)
+            magnitude = grid[2 * row, column]
+            phase = grid[2 * row + 1, column]
+            responses = [response for response in ports.transparency if response.joint == joint]
+            _plot_impedance(ports, responses, magnitude, phase)
+
+            title = ports.name_port(joint)
+            if is_crowded:
+                phase.set_xticks(_CROWDED_TICKS_HZ)
+            else:
+                title += _describe_ratios(responses)
+            magnitude.set_title(title)
+            is_lowest_in_column = index + columns >= len(joints)
+            if is_lowest_in_column:
                 phase.set_xlabel("frequency (Hz)")
                 phase.xaxis.set_tick_params(labelbottom=True)
-            if crowded:
-                phase.set_xticks((0.1, 1.0, 10.0))  # those at the ends meet the next panel's
-            if not column:
+            if column == 0:
                 magnitude.set_ylabel(f"|Z| ({ports.impedance_unit(joint)})")
                 phase.set_ylabel("phase (degrees)")
                 phase.yaxis.set_major_locator(MultipleLocator(45.0))
-        for column in range(len(joints) - columns * (blocks - 1), columns):
-            grid[-2, column].set_visible(False)
-            grid[-1, column].set_visible(False)
-        of = ports.transparency[0].other_site
-        entries: list[tuple[str, dict[str, Any]]] = [
-            *((f"felt at {site}", {"color": _colour(ports, site)}) for site in sites),
-            (f"{of} free", {"color": style.REFERENCE}),
-            (f"{of} clamped", {"color": style.REFERENCE, "linestyle": _CLAMPED}),
-            ("band of the ratio", {**_BAND, "alpha": 0.4, "linewidth": 6.0}),
-        ]
-        style.add_legend(figure, entries)
+
+        # the last row can have fewer joints than columns
+        joints_in_last_row = len(joints) - columns * (len(rows) - 1)
+        for axes in grid[-2:, joints_in_last_row:].flat:
+            axes.set_visible(False)
+        style.add_legend(figure, _list_impedance_entries(ports))
     return figure
 
 
+def _list_impedance_entries(ports: PortAnalysis) -> list[tuple[str, dict[str, Any]]]:
+    """Returns the entries of the legend of impedances."""
+    operator_sites = dict.fromkeys(response.operator_site for response in ports.transparency)
+    entries: list[tuple[str, dict[str, Any]]] = [
+        (f"felt at {site}", {"color": _site_colour(ports, site)}) for site in operator_sites
+    ]
+    other_site = ports.transparency[0].other_site
+    clamped = {"color": style.REFERENCE, "linestyle": _CLAMPED}
+    entries.append((f"{other_site} free", {"color": style.REFERENCE}))
+    entries.append((f"{other_site} clamped", clamped))
+    entries.append(("band of the ratio", {**_BAND, "alpha": 0.4, "linewidth": 6.0}))
+    return entries
+
+
 def _plot_impedance(
-    ports: PortAnalysis, transparency: Sequence[Transparency], magnitude: Axes, phase: Axes
+    ports: PortAnalysis, responses: Sequence[Transparency], magnitude: Axes, phase: Axes
 ) -> None:
-    for n, one in enumerate(transparency):
-        hz = one.w_rad_s / (2.0 * np.pi)
-        for Z, dashes in ((one.free, "-"), (one.clamped, _CLAMPED)):
+    """Plots the impedances along one joint, free and clamped, at the sites of the operators.
+
+    Args:
+        ports: the analysed ports.
+        responses: the impedances of the joint, at least one.
+        magnitude: the panel of the magnitude.
+        phase: the panel of the phase.
+    """
+    for index, response in enumerate(responses):
+        hz = _convert_to_hz(response.w_rad_s)
+        width = 1.1
+        if len(responses) > 1:
+            # later lines are thinner, so that equal lines all stay visible
+            width = 2.0 - 1.2 * index / (len(responses) - 1)
+        for impedance, dashes in ((response.free, "-"), (response.clamped, _CLAMPED)):
             line: dict[str, Any] = {
-                "color": _colour(ports, one.operator_site),
+                "color": _site_colour(ports, response.operator_site),
                 "linestyle": dashes,
+                "linewidth": width,
             }
-            line["linewidth"] = (
-                2.0 - 1.2 * n / (len(transparency) - 1) if len(transparency) > 1 else 1.1
-            )
-            magnitude.loglog(hz, np.abs(Z), **line)
-            # from -180 to 180 degrees on
-            phase.semilogx(hz, np.rad2deg(np.unwrap(np.angle(Z))), **line)
+            magnitude.loglog(hz, np.abs(impedance), **line)
+            # continuous from a first value between -180 and 180 degrees on
+            angle_rad = np.unwrap(np.angle(impedance))
+            phase.semilogx(hz, np.rad2deg(angle_rad), **line)
     for axes in (magnitude, phase):
-        axes.axvspan(*transparency[0].band_hz, **_BAND)
+        axes.axvspan(*responses[0].band_hz, **_BAND)
         axes.set_xlim(hz[0], hz[-1])
 
 
-def _describe_ratios(transparency: Sequence[Transparency]) -> str:
-    ratios = ", ".join(f"{one.operator_site} {one.ratio_db:+.1f} dB" for one in transparency)
-    return f"\nclamped / free {ratios}".replace("-", "\N{MINUS SIGN}")
+def _describe_ratios(responses: Sequence[Transparency]) -> str:
+    """Returns a line of a title with the ratio of clamped to free impedance at each site."""
+    ratios = [f"{response.operator_site} {response.ratio_db:+.1f} dB" for response in responses]
+    text = f"\nclamped / free {', '.join(ratios)}"
+    return text.replace("-", "\N{MINUS SIGN}")
 
 
-def _colour(ports: PortAnalysis, site: str) -> str:
-    return list_site_colours(ports.scenario)[ports.sites.index(site) % len(SITE_COLOURS)]
+def _site_colour(ports: PortAnalysis, site: str) -> str:
+    """Returns the colour of a site."""
+    index = ports.sites.index(site) % len(SITE_COLOURS)
+    return list_site_colours(ports.scenario)[index]
+
+
+def _convert_to_hz(w_rad_s: Array) -> Array:
+    """Returns angular frequencies, rad/s, in Hz."""
+    return w_rad_s / (2.0 * np.pi)
 
 
 def draw_port_passivity(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns the least eigenvalue of Y + Y^H, and below it the criterion for any passive
-    operators.
+    """Returns the figure of passivity, and of stability with any operators, over frequency.
 
-    The eigenvalue is drawn over 2 norm(Y), its bound: -1 is a network that returns all energy.
-    The criterion is Llewellyn's parameter of each joint for two sites, and the margin under the
-    best weights for more.
+    The upper panel has the least eigenvalue of Y + Y^H, divided by its bound 2 norm(Y). A loop
+    with the value -1 returns all energy that an operator puts in.
+
+    The lower panel has the criterion for stability with any passive operators: for two sites
+    Llewellyn's parameter of each joint, and for more sites the margin under the best weights.
+
+    Args:
+        ports: the analysed ports.
+        size: size of the figure.
     """
     if ports.verdict == "unstable":
         return style.empty_figure(
@@ -130,58 +178,77 @@ def draw_port_passivity(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> 
     with style.styled_figure(size, 3.9) as figure:
         above, below = style.add_panels(figure, 2, 1, sharex=True)[:, 0]
         _plot_eigenvalues(ports, above)
-        (_plot_parameters if len(ports.sites) == 2 else _plot_margin)(ports, below)
+        if len(ports.sites) == 2:
+            _plot_parameters(ports, below)
+        else:
+            _plot_margin(ports, below)
         below.set(xlim=ports.band_hz, xlabel="frequency (Hz)")
         figure.align_ylabels()
-        every = "axes" if ports.axes else "joints"
-        proof = [] if ports.proof is None else [(f"all {every}, in r (weighted)", _PROOF)]
-        joints = [
-            (f"{ports.name_port(joint)} alone", _joint_line(joint)) for joint in ports.joints
-        ]
-        fails = ("fails", {**_FAILS, "linewidth": 6.0})
-        style.add_legend(figure, [(f"all {every}", _ALL), *joints, *proof, fails])
+        style.add_legend(figure, _list_passivity_entries(ports))
     return figure
 
 
-def _joint_line(joint: int) -> dict[str, Any]:
-    colour = SITE_COLOURS[joint % len(SITE_COLOURS)]
+def _list_passivity_entries(ports: PortAnalysis) -> list[tuple[str, dict[str, Any]]]:
+    """Returns the entries of the legend of passivity."""
+    noun = "axes" if ports.axes else "joints"
+    entries = [(f"all {noun}", _ALL)]
+    entries += [
+        (f"{ports.name_port(joint)} alone", _style_joint(joint)) for joint in ports.joints
+    ]
+    if ports.proof is not None:
+        entries.append((f"all {noun}, in r (weighted)", _PROOF))
+    entries.append(("fails", {**_FAILS, "linewidth": 6.0}))
+    return entries
+
+
+def _style_joint(joint: int) -> dict[str, Any]:
+    """Returns the options of the line of a joint."""
     return {
-        "color": colour,
+        "color": SITE_COLOURS[joint % len(SITE_COLOURS)],
         "linestyle": style.DASHES[joint % len(style.DASHES)],
         "linewidth": 1.0,
     }
 
 
-def _plot(axes: Axes, minima: Minima, values: Array, **options: Any) -> None:
-    axes.semilogx(minima.w_rad_s / (2.0 * np.pi), values, **options)
+def _plot_over_hz(axes: Axes, minima: Minima, values: Array, **options: Any) -> None:
+    """Plots values, shape (F,), over the frequencies of `minima`."""
+    axes.semilogx(_convert_to_hz(minima.w_rad_s), values, **options)
 
 
-def _shade(axes: Axes, minima: Minima) -> None:
-    for span in minima.below:
-        axes.axvspan(*span, **_FAILS)
+def _shade_failures(axes: Axes, minima: Minima) -> None:
+    """Shades the bands of frequency in which a curve lies below its level."""
+    for band in minima.below:
+        axes.axvspan(*band, **_FAILS)
 
 
 def _plot_eigenvalues(ports: PortAnalysis, axes: Axes) -> None:
-    curves = [(one, _joint_line(joint)) for joint, one in ports.joints.items()]
-    curves += [] if ports.proof is None else [(ports.proof, _PROOF)]
-    for one, line in [*curves, (ports.velocity, _ALL)]:
-        _plot(axes, one.minima, one.minima.values / (2.0 * one.size), **line)
-    _shade(axes, ports.velocity.minima)
+    """Plots the least eigenvalues of Y + Y^H over their bound, for joints and for all ports."""
+    curves = [(passivity, _style_joint(joint)) for joint, passivity in ports.joints.items()]
+    if ports.proof is not None:
+        curves.append((ports.proof, _PROOF))
+    curves.append((ports.velocity, _ALL))
+    for passivity, line in curves:
+        relative = passivity.minima.values / (2.0 * passivity.size)
+        _plot_over_hz(axes, passivity.minima, relative, **line)
+    _shade_failures(axes, ports.velocity.minima)
     axes.axhline(0.0, **style.LIMIT_LINE)
     axes.set(ylim=(-1.08, 1.08), ylabel=r"$\lambda_{\min}(Y+Y^{\mathrm{H}})\,/\,2\|Y\|$")
 
 
 def _plot_parameters(ports: PortAnalysis, axes: Axes) -> None:
-    for one in ports.two_ports:
-        _plot(axes, one.minima, one.minima.values, **_joint_line(one.joint))
-        _shade(axes, one.minima)
+    """Plots Llewellyn's parameter of every two-port, with the limit 1."""
+    for two_port in ports.two_ports:
+        line = _style_joint(two_port.joint)
+        _plot_over_hz(axes, two_port.minima, two_port.minima.values, **line)
+        _shade_failures(axes, two_port.minima)
     axes.axhline(1.0, **style.LIMIT_LINE)
     axes.set(ylim=(-1.2, _MAX_SHOWN_PARAMETER), ylabel="Llewellyn's parameter")
 
 
 def _plot_margin(ports: PortAnalysis, axes: Axes) -> None:
-    _plot(axes, ports.absolute, ports.absolute.values, **_ALL)
-    _shade(axes, ports.absolute)
+    """Plots the least eigenvalue under the best weights, with the limit 0."""
+    _plot_over_hz(axes, ports.absolute, ports.absolute.values, **_ALL)
+    _shade_failures(axes, ports.absolute)
     axes.axhline(0.0, **style.LIMIT_LINE)
     axes.set_ylabel("margin, best weights")
 
@@ -192,7 +259,7 @@ _UNSTABLE: Any = {"color": "#cc3311", "alpha": 0.08, "linewidth": 0.0, "zorder":
 
 
 def draw_root_map(analysis: LinearAnalysis) -> Figure:
-    """Returns the map of continuous and sampled roots."""
+    """Returns the map of the continuous and sampled roots, with the unstable half shaded."""
     with style.styled_figure(_SIZE, _HEIGHT_IN) as figure:
         axes = figure.add_subplot()
         _plot_roots(
@@ -210,8 +277,8 @@ def draw_root_map(analysis: LinearAnalysis) -> Figure:
                 colour=SITE_COLOURS[1],
                 label="as computed",
             )
-        if zeros := analysis.decisive.zeros:
-            label = f"zero by structure ({zeros})"
+        zeros = analysis.decisive.zeros
+        if zeros:
             axes.plot(
                 [0.0],
                 [0.0],
@@ -219,7 +286,7 @@ def draw_root_map(analysis: LinearAnalysis) -> Figure:
                 markersize=9.0,
                 fillstyle="none",
                 color=style.FAINT,
-                label=label,
+                label=f"zero by structure ({zeros})",
             )
         low, high = axes.get_xlim()
         high = max(high, 0.06 * (high - low), 0.0)
@@ -231,118 +298,195 @@ def draw_root_map(analysis: LinearAnalysis) -> Figure:
 
 
 def _plot_roots(axes: Axes, spectrum: Spectrum, mark: str, colour: str, label: str) -> None:
+    """Plots the roots of a spectrum and their complex conjugates."""
     roots = [root.s for root in spectrum.roots]
-    both = np.array([*roots, *(s.conjugate() for s in roots if s.imag)])
+    conjugates = [root.conjugate() for root in roots if root.imag]
+    points = np.array([*roots, *conjugates])
     axes.plot(
-        both.real, both.imag, mark, markersize=4.5, fillstyle="none", color=colour, label=label
+        points.real,
+        points.imag,
+        mark,
+        markersize=4.5,
+        fillstyle="none",
+        color=colour,
+        label=label,
     )
 
 
 _MARKS = ("o", "s", "^", "v")
 _LOST: Any = {"marker": "x", "color": "#cc3311", "linestyle": "none", "markersize": 5.0}
+_TRANSPORT_STEP = 0.22
+"""Distance between the transports of one case, in distances between cases."""
 
 
 def draw_network_delays(facts: Mapping[str, Any]) -> Figure:
-    """Returns the figure of a benchmark's values, see `NetworkBenchmark.to_dict`."""
+    """Returns the figure of the one-way delays of a network benchmark, ms.
+
+    A case is a size and a rate of samples. The case of the benchmark's scenario is shaded.
+
+    Args:
+        facts: the values of `NetworkBenchmark.to_dict`.
+    """
     rows = facts["rows"]
     needs = facts["needs"]
     cases = list(dict.fromkeys((row["bytes"], row["rate_hz"]) for row in rows))
     transports = list(dict.fromkeys(row["transport"] for row in rows))
+    middle = (len(transports) - 1) / 2
     with style.styled_figure(REPORT_SIZE, _HEIGHT_IN) as figure:
         axes = figure.add_subplot()
         for row in rows:
-            number = transports.index(row["transport"])
-            at = cases.index((row["bytes"], row["rate_hz"])) + 0.22 * (
-                number - (len(transports) - 1) / 2
-            )
-            _plot_case(axes, at, row, number)
+            transport = transports.index(row["transport"])
+            case = cases.index((row["bytes"], row["rate_hz"]))
+            x = case + _TRANSPORT_STEP * (transport - middle)
+            _plot_case(axes, x, row, transport)
         _plot_bounds(axes, facts)
         axes.set_yscale("log")
+
         labels = [f"{size} B\n{rate:g} Hz" for size, rate in cases]
-        own = cases.index((needs["sample_bytes"], needs["rate_hz"]))
+        needed = cases.index((needs["sample_bytes"], needs["rate_hz"]))
+        labels[needed] += f"\n{facts['scenario']}"
         axes.axvspan(
-            own - 0.45, own + 0.45, color=style.FAINT, alpha=0.15, linewidth=0.0, zorder=0.3
+            needed - 0.45,
+            needed + 0.45,
+            color=style.FAINT,
+            alpha=0.15,
+            linewidth=0.0,
+            zorder=0.3,
         )
-        labels[own] += f"\n{facts['scenario']}"
         axes.set_xticks(range(len(cases)), labels)
         axes.set(xlim=(-0.5, len(cases) - 0.5), ylabel="one way: p50, p99, largest (ms)")
         axes.grid(visible=False, axis="x")
-        handles = [
-            Line2D(
-                [], [], label=name, color=SITE_COLOURS[n], marker=_MARKS[n % 4], linewidth=1.1
-            )
-            for n, name in enumerate(transports)
-        ]
-        lost = (
-            [Line2D([], [], label="lost some", **_LOST)]
-            if any(row["lost"] for row in rows)
-            else []
-        )
-        style.place_legend(figure, [*handles, *lost])
+        style.place_legend(figure, _list_network_handles(rows, transports))
     return figure
 
 
-def _plot_case(axes: Axes, at: float, row: Mapping[str, Any], number: int) -> None:
-    times = row["one_way_us"]
-    if times is not None:
-        p50, p99, most = (times[key] / 1e3 for key in ("p50", "p99", "max"))
-        colour = SITE_COLOURS[number % len(SITE_COLOURS)]
-        axes.plot([at, at], [p50, most], color=colour, linewidth=0.8)
-        axes.plot([at, at], [p50, p99], color=colour, linewidth=2.6, solid_capstyle="butt")
-        axes.plot([at], [p50], marker=_MARKS[number % 4], color=colour, markersize=4.5)
-        axes.plot([at], [most], marker="_", color=colour, markersize=6.0)
+def _list_network_handles(
+    rows: Sequence[Mapping[str, Any]], transports: Sequence[str]
+) -> list[Line2D]:
+    """Returns the handles of the legend of network delays."""
+    handles = []
+    for number, name in enumerate(transports):
+        handles.append(
+            Line2D(
+                [],
+                [],
+                label=name,
+                color=SITE_COLOURS[number],
+                marker=_MARKS[number % len(_MARKS)],
+                linewidth=1.1,
+            )
+        )
+    if any(row["lost"] for row in rows):
+        handles.append(Line2D([], [], label="some lost", **_LOST))
+    return handles
+
+
+def _plot_case(axes: Axes, x: float, row: Mapping[str, Any], transport: int) -> None:
+    """Plots the delays of one transport in one case, and a cross if samples were lost.
+
+    Args:
+        axes: the panel.
+        x: position of the delays along the axis of cases.
+        row: the row of the benchmark.
+        transport: number of the transport, which decides on its colour and mark.
+    """
+    times_us = row["one_way_us"]
+    if times_us is not None:
+        p50_ms = times_us["p50"] / 1e3
+        p99_ms = times_us["p99"] / 1e3
+        largest_ms = times_us["max"] / 1e3
+        colour = SITE_COLOURS[transport % len(SITE_COLOURS)]
+        mark = _MARKS[transport % len(_MARKS)]
+        axes.plot([x, x], [p50_ms, largest_ms], color=colour, linewidth=0.8)
+        axes.plot([x, x], [p50_ms, p99_ms], color=colour, linewidth=2.6, solid_capstyle="butt")
+        axes.plot([x], [p50_ms], marker=mark, color=colour, markersize=4.5)
+        axes.plot([x], [largest_ms], marker="_", color=colour, markersize=6.0)
     if row["lost"]:
-        axes.plot([at], [0.04], transform=axes.get_xaxis_transform(), **_LOST)
+        axes.plot([x], [0.04], transform=axes.get_xaxis_transform(), **_LOST)
 
 
 def _plot_bounds(axes: Axes, facts: Mapping[str, Any]) -> None:
+    """Plots the times that a delay is compared with as horizontal lines, ms.
+
+    They are the period of the scenario, the time for which its links hold samples, and the ends
+    of the first interval of stable delays and of the intervals that contain a measured age.
+    """
     needs = facts["needs"]
+    stable_ms = needs["stable_ms"] or []
+    ages_ms = [
+        transport["age_ms"]
+        for transport in facts["transports"]
+        if transport["age_ms"] is not None
+    ]
     bounds = [
         ("one period", 1e3 / needs["rate_hz"], "center"),
         ("held by links", needs["held_ms"], "top"),
     ]
-    ages = [one["age_ms"] for one in facts["transports"] if one["age_ms"] is not None]
-    for low, high in needs["stable_ms"] or []:
-        if any(low <= age <= high for age in ages) or [low, high] == needs["stable_ms"][0]:
-            bounds.append((f"stable from {low:.4g} ms", low, "top"))
-            shown = high if high < 1e3 * MAX_COMMON_DELAY_S else 0.0
-            bounds.append((f"stable up to {high:.4g} ms", shown, "bottom"))
-    for label, at, where in bounds:
-        if at:
-            axes.axhline(at, **style.LIMIT_LINE)
+    for interval in stable_ms:
+        low_ms, high_ms = interval
+        has_age = any(low_ms <= age_ms <= high_ms for age_ms in ages_ms)
+        if not has_age and interval != stable_ms[0]:
+            continue
+        bounds.append((f"stable from {low_ms:.4g} ms", low_ms, "top"))
+        # an interval that ends where the search ended has no upper edge
+        if high_ms < 1e3 * MAX_COMMON_DELAY_S:
+            bounds.append((f"stable up to {high_ms:.4g} ms", high_ms, "bottom"))
+    for label, time_ms, alignment in bounds:
+        # the logarithmic axis has no zero
+        if time_ms:
+            axes.axhline(time_ms, **style.LIMIT_LINE)
             axes.annotate(
                 label,
-                (1.01, at),
+                (1.01, time_ms),
                 xycoords=("axes fraction", "data"),
-                va=where,
+                va=alignment,
                 fontsize=REPORT_SIZE.tick_pt,
             )
 
 
+_RUN_MARKS = {
+    True: ("o", "run decays"),
+    False: ("x", "run grows"),
+    None: ("s", "run undecided"),
+}
+"""Mark and label of a run by `stable`."""
+
+
 def draw_arm_gains(facts: Mapping[str, Any]) -> Figure:
-    """Returns k at the edge over the delay, with the gains and the runs, see
-    `ArmGains.to_dict`.
+    """Returns the figure of the largest stable gain of an arm over the delay of each link.
+
+    The gain is k = K / inertia, 1/s^2. The chosen gains and the runs that checked them are
+    marked at the delay of the study.
+
+    Args:
+        facts: the values of `ArmGains.to_dict`.
     """
     edge = facts["edge"]
     margin = facts["margin"]
-    delay_ms, k = np.array(facts["curve"]).T * [[1e3], [1.0]]
-    runs = [run for run in facts["runs"] if run["share"]]
-    marks = {
-        True: ("o", "run decays"),
-        False: ("x", "run grows"),
-        None: ("s", "run tells nothing"),
-    }
+    curve = np.array(facts["curve"])
+    delay_ms = 1e3 * curve[:, 0]
+    k = curve[:, 1]
+    used_k = edge["used_per_s2"] / margin
+    marks = [(used_k, "D", f"the gains, margin {margin:g}")]
+    for run in facts["runs"]:
+        if run["share"]:
+            mark, label = _RUN_MARKS[run["stable"]]
+            marks.append((run["share"] * edge["k_per_s2"], mark, label))
+
     with style.styled_figure(_SIZE, _HEIGHT_IN) as figure:
         axes = figure.add_subplot()
         axes.loglog(
             delay_ms, k, color=SITE_COLOURS[0], linewidth=1.4, label="edge, constant delay"
         )
         axes.fill_between(delay_ms, k, 10.0 * k.max(), **_UNSTABLE)
-        used = (edge["used_per_s2"] / margin, "D", f"the gains, margin {margin:g}")
-        shown = [(run["share"] * edge["k_per_s2"], *marks[run["stable"]]) for run in runs]
-        for at, mark, label in (used, *shown):
+        for marked_k, mark, label in marks:
             axes.plot(
-                facts["age_ms"], at, mark, color=SITE_COLOURS[1], markersize=4.5, label=label
+                facts["age_ms"],
+                marked_k,
+                mark,
+                color=SITE_COLOURS[1],
+                markersize=4.5,
+                label=label,
             )
         axes.set(xlim=(delay_ms[0], delay_ms[-1]), ylim=(0.3 * k.min(), 3.0 * k.max()))
         axes.set(xlabel="delay of each link (ms)", ylabel=r"K / inertia (1/s$^2$)")

@@ -1,14 +1,19 @@
-"""The difference between a run and its pushed twins over time, above the speed of the run
-itself.
+"""Figure of the differences between a run and its pushed twins over time.
 
-Invariant: what is drawn is measured; the dashed line is the rate that the words state, over the
-part that it was fitted to. A twin that was pushed anew begins a new line.
+The upper panel has the differences of the joint velocities on a logarithmic axis. A dashed line
+beside them has the rate of growth that the headline states. The lower panel has the speed of
+the run itself.
+
+Invariant:
+    - The differences are drawn as they were measured.
+    - The dashed line covers the times that its rate was fitted to.
+    - The line of a twin that was pushed again is interrupted at the new push.
 """
 
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib import colormaps
@@ -28,13 +33,16 @@ from ...analysis.twin_growth import (
 from ...core.ticks import BUCKETS_PER_S
 from ...core.vectors import Array
 from ...execution.fused import explain_not_repeatable
-from ...execution.twins import SMALLEST, TwinPath
+from ...execution.twins import SMALLEST, TwinPath, Twins
+from ...log.log_reader import Log
 from .. import style
 from ..appearance import REPORT_SIZE, FigureSize
 from .figure_entry import draws
 
 _POINTS = 150
-"""Of a line, about: each is the largest of the time around it."""
+"""Approximate number of points of a line; each is the largest value around its time."""
+_SEVERAL_JOINTS_COLOUR = "#7a7a7a"
+_ESTIMATES_COLOUR = "#999933"
 _ROUNDING: dict[str, Any] = {
     "color": style.FAINT,
     "alpha": 0.18,
@@ -47,163 +55,252 @@ _PAPER = {
     "edgecolor": "none",
     "alpha": 0.75,
 }
-_WORDS: dict[str, Any] = {
+_NOTE: dict[str, Any] = {
     "textcoords": "offset points",
     "color": style.REFERENCE,
     "bbox": _PAPER,
 }
-_Line = tuple[str, TwinPath, list[int], dict[str, Any]]
-"""Name, twin, joints, and how it is drawn."""
 
 
-def draw_twins(found: PushedTwins, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns the differences of velocities, rad/s, a line per push, or per joint of a single
-    push.
+class _DifferenceLine(NamedTuple):
+    """A line of the upper panel.
 
-    Twins of which there are none give a figure with the reason.
+    Attributes:
+        label: text of the line in the legend.
+        path: the difference between a twin and its run.
+        joints: indices of the joints that the drawn amplitude covers.
+        options: colour, width and dashes of the line.
     """
-    log = found.log
-    growth = found.growth
-    twins = found.growth.twins
-    worst = found.growth.worst
-    if twins is None or worst is None:
+
+    label: str
+    path: TwinPath
+    joints: list[int]
+    options: dict[str, Any]
+
+
+def draw_twins(pushed: PushedTwins, form: FigureSize = REPORT_SIZE) -> Figure:
+    """Returns the figure of the differences of velocities, rad/s, above the speed of the run.
+
+    The figure has a line per push, or a line per joint if there was a single push. Without
+    twins it shows the reason why there are none.
+
+    Args:
+        pushed: a run and its pushed twins.
+        form: size of the figure.
+    """
+    growth = pushed.growth
+    if growth.twins is None or growth.worst is None:
         return style.empty_figure(growth.text, form)
-    with style.time_figure(log, form, 5.4 if form.narrow else 4.4) as plot:
-        above, below = style.add_panels(
-            plot.figure, 2, 1, sharex=True, height_ratios=(4.0, 1.0)
-        )[:, 0]
-        lines = list(_list_lines(found))
-        step = max(1, int((growth.to_s - found.at_s) * BUCKETS_PER_S / _POINTS))
-        drawn = [_trace(path, joints, growth.to_s, step) for _, path, joints, _ in lines]
-        above.set_yscale("log")
-        for (_, _, _, line), (t_s, values) in zip(lines, drawn, strict=True):
-            above.plot(t_s, values, **line)
-        shown = worst if found.linear is None else growth.pushes[0]
-        own = [
-            one
-            for (_, path, _, _), one in zip(lines, drawn, strict=True)
-            if path.push is shown.push
-        ]
-        _draw_rate(
-            axes=above,
-            found=found,
-            one=shown,
-            t_s=own[0][0],
-            values=np.fmax.reduce([values for _, values in own]),
-        )
-        _mark(above, found, form)
-        place = 0
-        from_s = max(0.0, found.at_s - 0.08 * (growth.to_s - found.at_s))
-        t_s = twins.paths[0].t_s
-        for site in log.sites:
-            speed = twins.speed[
-                :, place : (place := place + log.scenario.layout(site).joints)
-            ].max(axis=1)
-            below.plot(t_s, speed, **{**style.site_line(log, site, 0.9), "alpha": 0.6})
-        below.set_ylim(0.0, 1.1 * float(twins.speed[t_s >= from_s].max(initial=0.0)) or 1.0)
-        below.set_ylabel("run (rad/s)")
-        plot.mark(above, log.sites)
-        words = textwrap.fill(found.headline(), 62 if form.narrow else 110)
-        plot.finish(
-            [below], [(name, line) for name, _, _, line in lines], title=style.typeset(words)
-        )
+
+    height_in = 5.4 if form.narrow else 4.4
+    with style.time_figure(pushed.log, form, height_in) as plot:
+        panels = style.add_panels(plot.figure, 2, 1, sharex=True, height_ratios=(4.0, 1.0))
+        above, below = panels[:, 0]
+        lines = list(_list_lines(pushed, growth.twins))
+        rated = growth.worst if pushed.linear is None else growth.pushes[0]
+        _draw_differences(above, pushed, lines, rated)
+        _limit_differences(above, form)
+        _mark_push(above, pushed.at_s, form)
+
+        margin_s = 0.08 * (growth.to_s - pushed.at_s)
+        from_s = max(0.0, pushed.at_s - margin_s)
+        _draw_speeds(below, pushed.log, growth.twins, from_s)
+
+        plot.mark(above, pushed.log.sites)
+        entries = [(line.label, line.options) for line in lines]
+        title = textwrap.fill(pushed.headline(), 62 if form.narrow else 110)
+        plot.finish([below], entries, title=style.typeset(title))
         below.set_xlim(from_s, growth.to_s)
     return plot.figure
 
 
-draws(
-    "twins", "what became of small pushes of the run", explain_not_repeatable, in_report=True
-)(
-    lambda log, form: draw_twins(
-        PushedTwins(log, 0.0, measure_twins(log, classify_log_end(log))), form
-    )
-)
+@draws("twins", "growth or decay of small pushes", explain_not_repeatable, in_report=True)
+def _draw_log_twins(log: Log, form: FigureSize) -> Figure:
+    """Returns the figure of twins of a log that are pushed at its start."""
+    growth = measure_twins(log, classify_log_end(log))
+    return draw_twins(PushedTwins(log, 0.0, growth), form)
 
 
-def _list_lines(found: PushedTwins) -> Iterator[_Line]:
-    twins = found.growth.twins
-    assert twins is not None
-    paths = twins.paths
-    every = list(range(len(twins.joints)))
-    styles = {}  # of each joint: the colour of its site, and dashes
-    for name in twins.joints:
+def _list_lines(pushed: PushedTwins, twins: Twins) -> Iterator[_DifferenceLine]:
+    """Yields the lines of the upper panel.
+
+    - A search for the sizes for which a push is linear has a line per size, light to dark.
+    - Several pushes have a line each. The push of one joint has the style of that joint.
+    - A single push has a line per joint that it moved.
+    """
+    all_joints = list(range(len(twins.joints)))
+    joint_styles = _style_joints(pushed.log, twins.joints)
+    shades = colormaps["viridis"](np.linspace(0.9, 0.0, len(twins.paths)))
+    for number, path in enumerate(twins.paths):
+        size, _, target = path.push.name.partition(" at ")
+        if pushed.linear is not None:
+            shade = {"color": tuple(shades[number]), "linewidth": 1.3}
+            yield _DifferenceLine(size, path, all_joints, shade)
+        elif len(twins.paths) > 1:
+            plain = {
+                "color": _SEVERAL_JOINTS_COLOUR if target else _ESTIMATES_COLOUR,
+                "linewidth": 1.0,
+                "linestyle": style.DASHES[number % len(style.DASHES)],
+            }
+            options = joint_styles.get(target, plain)
+            yield _DifferenceLine(path.push.name, path, all_joints, options)
+        else:
+            for joint, name in enumerate(twins.joints):
+                if np.isfinite(path.largest[:, joint]).any():
+                    yield _DifferenceLine(name, path, [joint], joint_styles[name])
+
+
+def _style_joints(log: Log, joints: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Returns the style of each joint: the colour of its site, and dashes by its number."""
+    styles = {}
+    for name in joints:
         site, _, number = name.partition(" joint ")
         dashes = style.DASHES[(int(number) - 1) % len(style.DASHES)]
-        styles[name] = {**style.site_line(found.log, site), "linestyle": dashes}
-    shades = colormaps["viridis"](np.linspace(0.9, 0.0, len(paths)))
-    for n, path in enumerate(paths):
-        what, _, where = path.push.name.partition(" at ")
-        dashes = style.DASHES[n % len(style.DASHES)]
-        if found.linear is not None:
-            yield what, path, every, {"color": tuple(shades[n]), "linewidth": 1.3}
-        elif len(paths) > 1:
-            other = {
-                "color": "#7a7a7a" if where else "#999933",
-                "linewidth": 1.0,
-                "linestyle": dashes,
-            }
-            yield path.push.name, path, every, styles.get(where, other)
-        else:
-            moved = [joint for joint in every if np.isfinite(path.largest[:, joint]).any()]
-            yield from ((twins.joints[j], path, [j], styles[twins.joints[j]]) for j in moved)
+        styles[name] = {**style.site_line(log, site), "linestyle": dashes}
+    return styles
 
 
-def _trace(path: TwinPath, joints: list[int], to_s: float, step: int) -> tuple[Array, Array]:
-    amplitude = measure_amplitude(path, joints)
+def _draw_differences(
+    axes: Axes, pushed: PushedTwins, lines: Sequence[_DifferenceLine], rated: PushGrowth
+) -> None:
+    """Draws the lines of all differences, and the rate of one push beside its lines."""
+    growth = pushed.growth
+    drawn_s = growth.to_s - pushed.at_s
+    step = max(1, int(drawn_s * BUCKETS_PER_S / _POINTS))
+    axes.set_yscale("log")
+    rated_traces = []
+    for line in lines:
+        t_s, values = _trace_amplitude(line, growth.to_s, step)
+        axes.plot(t_s, values, **line.options)
+        if line.path.push is rated.push:
+            rated_traces.append((t_s, values))
+
+    # the lines of one push belong to one twin and have equal times
+    rated_t_s = rated_traces[0][0]
+    envelope = np.fmax.reduce([values for _, values in rated_traces])
+    _draw_rate(axes, pushed, rated, rated_t_s, envelope)
+
+
+def _trace_amplitude(line: _DifferenceLine, to_s: float, step: int) -> tuple[Array, Array]:
+    """Returns the times, s, and amplitudes, rad/s, of a line, shape (K,) each.
+
+    A NaN after each push's part interrupts the line.
+
+    Args:
+        line: the line.
+        to_s: end of the line, in s.
+        step: number of intervals of the twin that a point of the line covers.
+    """
+    path = line.path
+    amplitude = measure_amplitude(path, line.joints)
     end = int(np.searchsorted(path.t_s, to_s))
+    end = max(end, path.pushed[-1] + 1)
     t_s = np.zeros(0)
-    values = np.zeros(0)
-    for first, last in pairwise([*path.pushed, max(end, path.pushed[-1] + 1)]):
+    logarithms = np.zeros(0)
+    for first, last in pairwise([*path.pushed, end]):
         starts = np.arange(first, last, step)
-        t_s = np.r_[t_s, path.t_s[np.minimum(starts + step // 2, last - 1)], np.nan]
-        values = np.r_[values, np.maximum.reduceat(amplitude[:last], starts), -np.inf]
-    return t_s, np.where(np.isfinite(values), np.exp(np.minimum(values, MOST_LOG)), np.nan)
+        middles = np.minimum(starts + step // 2, last - 1)
+        peaks = np.maximum.reduceat(amplitude[:last], starts)
+        t_s = np.r_[t_s, path.t_s[middles], np.nan]
+        logarithms = np.r_[logarithms, peaks, -np.inf]
+    amplitudes = np.exp(np.minimum(logarithms, MOST_LOG))
+    return t_s, np.where(np.isfinite(logarithms), amplitudes, np.nan)
 
 
 def _draw_rate(
-    axes: Axes, found: PushedTwins, one: PushGrowth, t_s: Array, values: Array
+    axes: Axes, pushed: PushedTwins, rated: PushGrowth, t_s: Array, values: Array
 ) -> None:
-    end_s = found.growth.to_s if one.ended_s is None else one.ended_s
-    from_s = found.growth.from_s if one.ended_s is None else 0.5 * (found.at_s + end_s)
-    rows = (t_s >= from_s) & (t_s <= end_s) & (values > 0.0)
-    if (
-        not rows.any()
-        or not np.isfinite(one.rate_per_s)
-        or one.trend is EnvelopeTrend.UNDECIDED
-    ):
+    """Draws a dashed line with the rate of a push, just above the differences, and its value.
+
+    A push without a rate or without a clear trend has no such line.
+
+    Args:
+        axes: the panel.
+        pushed: a run and its pushed twins.
+        rated: growth of the push.
+        t_s: times of the differences, s, shape (K,).
+        values: largest differences of all joints, rad/s, shape (K,).
+    """
+    if not np.isfinite(rated.rate_per_s) or rated.trend is EnvelopeTrend.UNDECIDED:
         return
-    t_s = t_s[rows]
-    falls = one.rate_per_s < 0.0
-    level = float(np.max(np.log(1.15 * values[rows]) - one.rate_per_s * t_s))
-    line = np.exp(np.minimum(level + one.rate_per_s * t_s, MOST_LOG))
-    axes.plot(t_s, line, **{**style.LIMIT_LINE, "linewidth": 1.0, "zorder": 4.0})
-    words = f"{one.rate_per_s:+.3g} /s".replace("-", "\u2212")
-    at = len(t_s) // 2
+    from_s = pushed.growth.from_s
+    to_s = pushed.growth.to_s
+    if rated.ended_s is not None:
+        # the rate of a twin that ended early was fitted to the second half of its time
+        from_s = 0.5 * (pushed.at_s + rated.ended_s)
+        to_s = rated.ended_s
+    rows = (t_s >= from_s) & (t_s <= to_s) & (values > 0.0)
+    if not rows.any():
+        return
+
+    line_t_s = t_s[rows]
+    # the lowest line of this slope that stays 15 % above all values
+    heights = np.log(1.15 * values[rows]) - rated.rate_per_s * line_t_s
+    level = float(np.max(heights))
+    line = np.exp(np.minimum(level + rated.rate_per_s * line_t_s, MOST_LOG))
+    options = {**style.LIMIT_LINE, "linewidth": 1.0, "zorder": 4.0}
+    axes.plot(line_t_s, line, **options)
+
+    label = f"{rated.rate_per_s:+.3g} /s".replace("-", "\N{MINUS SIGN}")
+    middle = len(line_t_s) // 2
+    falls = rated.rate_per_s < 0.0
     axes.annotate(
-        words, (t_s[at], line[at]), (0.0, 3.0), ha="left" if falls else "right", **_WORDS
+        label,
+        xy=(line_t_s[middle], line[middle]),
+        xytext=(0.0, 3.0),
+        ha="left" if falls else "right",
+        **_NOTE,
     )
 
 
-def _mark(axes: Axes, found: PushedTwins, form: FigureSize) -> None:
-    """Names the axis, marks the push, and shades what is rounding, if a line comes near it."""
+def _limit_differences(axes: Axes, form: FigureSize) -> None:
+    """Labels and limits the axis of differences, and shades rounding near any line."""
     axes.set_ylabel("difference of velocities (rad/s)")
     low, high = axes.get_ylim()
     if low < 10.0 * SMALLEST:
         low = SMALLEST / 10.0
-        top = (0.0, SMALLEST)
         axes.axhspan(low, SMALLEST, **_ROUNDING)
         axes.annotate(
             "rounding",
-            top,
-            (3.0, -9.0),
-            axes.get_yaxis_transform(),
+            xy=(0.0, SMALLEST),
+            xycoords=axes.get_yaxis_transform(),
+            xytext=(3.0, -9.0),
             fontsize=form.small_pt,
-            **_WORDS,
+            **_NOTE,
         )
     axes.set_ylim(min(low, high / 30.0), high)
     axes.yaxis.set_minor_formatter(NullFormatter())
-    top = (found.at_s, 1.0)
-    axes.axvline(found.at_s, color=style.REFERENCE, linewidth=0.8)
+
+
+def _mark_push(axes: Axes, at_s: float, form: FigureSize) -> None:
+    """Marks the time of the pushes with a vertical line."""
+    axes.axvline(at_s, color=style.REFERENCE, linewidth=0.8)
     axes.annotate(
-        "push", top, (3.0, -8.0), axes.get_xaxis_transform(), fontsize=form.small_pt, **_WORDS
+        "push",
+        xy=(at_s, 1.0),
+        xycoords=axes.get_xaxis_transform(),
+        xytext=(3.0, -8.0),
+        fontsize=form.small_pt,
+        **_NOTE,
     )
+
+
+def _draw_speeds(axes: Axes, log: Log, twins: Twins, from_s: float) -> None:
+    """Draws the speed of the fastest joint of every site of the run, rad/s.
+
+    Args:
+        axes: the panel.
+        log: the log of the run.
+        twins: the twins of the run, with the speeds of the run.
+        from_s: start of the time axis, in s.
+    """
+    t_s = twins.paths[0].t_s
+    first = 0
+    for site in log.sites:
+        end = first + log.scenario.layout(site).joints
+        speed = twins.speed[:, first:end].max(axis=1)
+        axes.plot(t_s, speed, **{**style.site_line(log, site, 0.9), "alpha": 0.6})
+        first = end
+    largest = float(twins.speed[t_s >= from_s].max(initial=0.0))
+    axes.set_ylim(0.0, 1.1 * largest or 1.0)
+    axes.set_ylabel("run (rad/s)")
