@@ -1,9 +1,11 @@
-"""Poses of the arms at a few instants: base, joints and end effector; a figure of them, and SVG
-for the page.
+"""Poses of the arms at a few times of a run, as a Matplotlib figure and as SVG for the page.
 
-Invariant: forward kinematics are those of the core; the reference pose is dashed behind each
-arm. A chain is seen along parallel lines from one fixed direction, with up where gravity does
-not pull.
+A planar arm is drawn in its plane. A chain is drawn as seen from one fixed direction, in
+parallel projection, with up opposite to gravity.
+
+Invariant:
+    - The positions of the joints are those of the core's forward kinematics.
+    - The reference pose of each arm is dashed.
 """
 
 from collections.abc import Iterable, Sequence
@@ -28,10 +30,10 @@ from .figure_entry import draws
 INSTANTS = 6
 _NARROW_INSTANTS = 3
 _PATH_POINTS = 400
-_AZIMUTH, _ELEVATION = np.deg2rad((-50.0, 22.0))
-"""Direction from which chains are seen: about the vertical from the base's x axis on, and above
-the floor.
-"""
+_AZIMUTH = np.deg2rad(-50.0)
+"""Direction from which chains are seen, about the vertical from the base's x axis on, rad."""
+_ELEVATION = np.deg2rad(22.0)
+"""Direction from which chains are seen, above the floor, rad."""
 _SHADOW: dict[str, Any] = {
     "color": "#c9c9c9",
     "linewidth": 1.6,
@@ -44,14 +46,13 @@ _DESIRED: dict[str, Any] = {
     "linewidth": 0.8,
 }
 PictureBox = tuple[float, float, float, float]
-"""Left, right, bottom and top."""
-_BOX_PATH = 0.5 * np.array(
-    [
-        [1 - 2 * (n >> axis & 1) for axis in range(3)]
-        for n in (0, 1, 3, 2, 0, 4, 5, 1, 5, 7, 3, 7, 6, 2, 6, 4)
-    ]
-)
-"""Along all edges of a box of sides 1."""
+"""Left, right, bottom and top of a picture."""
+_CORNERS_ON_PATH = np.array([0, 1, 3, 2, 0, 4, 5, 1, 5, 7, 3, 7, 6, 2, 6, 4])
+"""Corners of a box along a path over all of its edges. The bits of a corner's number are its
+sides along x, y and z.
+"""
+_BOX_PATH = 0.5 - (_CORNERS_ON_PATH[:, np.newaxis] >> np.arange(3) & 1)
+"""The same path as points of a box with sides of length 1, shape (16, 3)."""
 _BASE: dict[str, Any] = {
     "linestyle": "none",
     "marker": "s",
@@ -61,11 +62,15 @@ _BASE: dict[str, Any] = {
 
 
 class ArmPose(NamedTuple):
-    """A site at an instant: its base, joints and end effector, (L, 2), and the path of the
-    last, (P, 2), m.
+    """The pose of a site at some time, as points in the plane of a picture.
 
-    `shadow` is what a light straight above would cast onto a floor at the base: that of a
-    chain, (L, 2), or nothing, (0, 2). `bodies` are those of its plant, see `trace_bodies_m`.
+    Attributes:
+        actual: base, joints and end effector, shape (L, 2), m.
+        desired: the same for the reference pose, shape (L, 2), m.
+        path: path of the end effector until then, shape (P, 2), m.
+        shadow: shadow of a chain on a floor at its base, with light from straight above, shape
+            (L, 2), m; shape (0, 2) for a planar arm.
+        bodies: edges of the bodies of the site's plant as paths, shape (16, 2) each, m.
     """
 
     actual: Array
@@ -74,34 +79,59 @@ class ArmPose(NamedTuple):
     shadow: Array
     bodies: Sequence[Array] = ()
 
+    def scale(self, factor: float) -> "ArmPose":
+        """Returns the pose with all points multiplied by a factor."""
+        return ArmPose(
+            actual=factor * self.actual,
+            desired=factor * self.desired,
+            path=factor * self.path,
+            shadow=factor * self.shadow,
+            bodies=[factor * path for path in self.bodies],
+        )
+
+    def list_points(self) -> Array:
+        """Returns all points of the pose, shape (K, 2), m."""
+        parts = [self.actual, self.desired, self.path, self.shadow, *self.bodies]
+        return np.concatenate(parts)
+
 
 def trace_bodies_m(
     arm: ArmModel, sizes_m: Iterable[Sequence[float]], poses: Array
 ) -> list[Array]:
-    """Returns the edges of the boxes of a plant's bodies as paths in the plane of a picture,
-    (K, P, 2), m.
+    """Returns the edges of the bodies of a plant as paths in the plane of a picture.
 
     Args:
-        arm: of the site.
-        sizes_m: of each body, along its own axes, m.
-        poses: as records have them, shape (K, 7 b).
+        arm: the arm of the site.
+        sizes_m: size of each of the b bodies along its own axes, m.
+        poses: poses of the bodies in K records, shape (K, 7 b): position, m, and unit
+            quaternion, w first.
+
+    Returns:
+        A path per body, shape (K, 16, 2), m.
     """
-    found = []
-    for size, pose in zip(sizes_m, np.split(poses, poses.shape[1] // 7, axis=1), strict=True):
+    paths = []
+    body_count = poses.shape[1] // 7
+    for size, pose in zip(sizes_m, np.split(poses, body_count, axis=1), strict=True):
+        position = pose[:, np.newaxis, :3]
         w = pose[:, np.newaxis, 3:4]
         v = pose[:, np.newaxis, 4:]
-        corners = np.broadcast_to(_BOX_PATH * np.asarray(size), (len(pose), *_BOX_PATH.shape))
-        turned = corners + 2.0 * np.cross(v, np.cross(v, corners) + w * corners)
-        edges = turned + pose[:, np.newaxis, :3]
-        found.append(edges[..., :2] if arm.chain is None else project_arm_m(arm, edges))
-    return found
+        box = _BOX_PATH * np.asarray(size)
+        corners = np.broadcast_to(box, (len(pose), *box.shape))
+        # rotation of p by the quaternion (w, v): p + 2 v x (v x p + w p)
+        rotated = corners + 2.0 * np.cross(v, np.cross(v, corners) + w * corners)
+        edges = rotated + position
+        paths.append(edges[..., :2] if arm.chain is None else project_arm_m(arm, edges))
+    return paths
 
 
 def project_arm_m(arm: ArmModel, points: Array, *, onto_floor: bool = False) -> Array:
-    """Returns points of an arm in the plane of a picture, shape (..., 2), m: a planar arm's are
-    that already.
+    """Returns points of an arm in the plane of a picture, shape (..., 2), m.
 
-    `onto_floor`: those of their shadows.
+    Args:
+        arm: the arm.
+        points: points in the base's frame, m, shape (..., 3); of a planar arm (..., 2), which
+            are returned as they are.
+        onto_floor: True to return the shadows of the points on a floor at the base.
     """
     if arm.chain is None:
         return points
@@ -109,195 +139,226 @@ def project_arm_m(arm: ArmModel, points: Array, *, onto_floor: bool = False) -> 
     across = y * np.cos(_AZIMUTH) - x * np.sin(_AZIMUTH)
     towards = x * np.cos(_AZIMUTH) + y * np.sin(_AZIMUTH)
     height = np.zeros_like(z) if onto_floor else z
-    return np.stack(
-        [across, height * np.cos(_ELEVATION) - towards * np.sin(_ELEVATION)], axis=-1
-    )
+    up = height * np.cos(_ELEVATION) - towards * np.sin(_ELEVATION)
+    return np.stack([across, up], axis=-1)
 
 
 def choose_instants_s(log: Log, count: int = INSTANTS) -> list[float]:
-    """Returns instants to draw, first and last included, s: half by the clock, half by how much
-    moves.
+    """Returns times at which to draw the arms, in s, with the first and the last time.
 
-    Equal steps of time alone would spend most of a row on arms at rest.
+    The times are equally spaced in a progress to which time and motion contribute one half
+    each. Equal steps of time alone would mostly show arms at rest.
+
+    Args:
+        log: the log.
+        count: largest number of times.
     """
     end_s = recorded_end_s(log)
-    grid = np.linspace(0.0, end_s, 1001)
-    moved = np.zeros_like(grid)
-    for name in log.sites:
-        part = log[name]
+    grid_s = np.linspace(0.0, end_s, 1001)
+    moved_rad = np.zeros_like(grid_s)
+    for site in log.sites:
+        part = log[site]
         if len(part):
-            step = np.abs(
-                np.diff(site_signals.joint_angles(part), axis=0, prepend=part.q[:1])
-            ).sum(axis=1)
-            moved += np.interp(grid, part.t_s, np.cumsum(step))
-    share = grid / end_s + (moved / moved[-1] if moved[-1] > 0.0 else 0.0)
-    chosen = np.interp(np.linspace(0.0, share[-1], count), share, grid)
+            angles = site_signals.joint_angles(part)
+            steps = np.abs(np.diff(angles, axis=0, prepend=part.q[:1])).sum(axis=1)
+            moved_rad += np.interp(grid_s, part.t_s, np.cumsum(steps))
+
+    progress = grid_s / end_s
+    if moved_rad[-1] > 0.0:
+        progress += moved_rad / moved_rad[-1]
+    chosen_s = np.interp(np.linspace(0.0, progress[-1], count), progress, grid_s)
+
+    # rounded to two or three digits, for short titles
     step_s = 10.0 ** np.floor(np.log10(end_s / 50.0))
-    inner = (float(np.round(t / step_s) * step_s) for t in chosen[1:-1])
-    return sorted({0.0, *(round(t, 6) for t in inner if t < end_s), end_s})
+    times_s = {0.0, end_s}
+    for time_s in chosen_s[1:-1]:
+        rounded_s = float(np.round(time_s / step_s) * step_s)
+        if rounded_s < end_s:
+            times_s.add(round(rounded_s, 6))
+    return sorted(times_s)
 
 
 def find_pose(log: Log, site: str, t_s: float) -> ArmPose | None:
-    """Returns the pose of a site at an instant: that of its last record until then; None
-    without one.
+    """Returns the pose of a site in its last record until a time; None without a record.
+
+    Args:
+        log: the log.
+        site: name of the site.
+        t_s: the time, in s.
     """
     part = log[site]
     arm = log.scenario.arms[site]
     last = int(np.searchsorted(part.t_s, t_s + 1e-9, side="right")) - 1
     if last < 0:
         return None
+
     rows = np.unique(np.linspace(0, last, _PATH_POINTS).astype(np.int64))
-    found = joint_positions_m(arm, part.q[rows])
-    actual = project_arm_m(arm, found)
-    desired = project_arm_m(
-        arm, joint_positions_m(arm, reference_angles(part)[last : last + 1])[0]
-    )
-    shadow = project_arm_m(arm, found[-1 if arm.chain else len(found) :][:1], onto_floor=True)
+    positions = joint_positions_m(arm, part.q[rows])
+    actual = project_arm_m(arm, positions)
+    reference = reference_angles(part)[last : last + 1]
+    desired = project_arm_m(arm, joint_positions_m(arm, reference)[0])
+
+    shadow: Array = np.zeros((0, 2))
+    if arm.chain is not None:
+        shadow = project_arm_m(arm, positions[-1:], onto_floor=True)[0]
+    bodies: list[Array] = []
     sizes_m = log.scenario.bodies_m(site).values()
-    bodies = (
-        [path[0] for path in trace_bodies_m(arm, sizes_m, part.bodies[last : last + 1])]
-        if sizes_m
-        else ()
-    )
+    if sizes_m:
+        paths = trace_bodies_m(arm, sizes_m, part.bodies[last : last + 1])
+        bodies = [path[0] for path in paths]
     return ArmPose(
-        actual=actual[-1],
-        desired=desired,
-        path=actual[:, -1],
-        shadow=shadow.reshape(-1, 2),
-        bodies=bodies,
+        actual=actual[-1], desired=desired, path=actual[:, -1], shadow=shadow, bodies=bodies
     )
 
 
 def compute_pose_box_m(poses: Sequence[ArmPose | None]) -> PictureBox:
-    """Returns left, right, bottom and top of a box around poses with a margin, m; the base is
-    inside.
+    """Returns a box around poses and the base, with a margin, m.
+
+    The box is at least 70 % as wide as it is high, and at least 70 % as high as it is wide,
+    before the margin is added.
     """
-    points = [np.concatenate([*one[:4], *one.bodies]) for one in poses if one is not None]
-    every = np.concatenate([*points, np.zeros((1, 2))])
-    low = every.min(axis=0)
-    high = every.max(axis=0)
+    parts = [pose.list_points() for pose in poses if pose is not None]
+    base = np.zeros((1, 2))
+    points = np.concatenate([*parts, base])
+    low = points.min(axis=0)
+    high = points.max(axis=0)
     centre = (low + high) / 2.0
     extent = max(float((high - low).max()), 0.1)
     half = np.maximum((high - low) / 2.0, 0.35 * extent) + 0.08 * extent
-    (left, bottom) = centre - half
-    (right, top) = centre + half
-    return float(left), float(right), float(bottom), float(top)
+    left, bottom = (centre - half).tolist()
+    right, top = (centre + half).tolist()
+    return left, right, bottom, top
 
 
 @draws("arms", "the arms at a few instants", in_report=True)
 def draw_arms(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns the arms of all sites at a few instants: a row per site, a column per instant,
-    axes in m.
+    """Returns the figure of all arms at a few times, with axes in m.
+
+    The figure has a row per site and a column per time.
     """
-    times = choose_instants_s(log, _NARROW_INSTANTS if form.narrow else INSTANTS)
-    drawn = {site: [find_pose(log, site, t) for t in times] for site in log.sites}
-    planar = all(arm.chain is None for arm in log.scenario.arms.values())
-    left, right, bottom, top = compute_pose_box_m([p for row in drawn.values() for p in row])
-    side_in = (form.width_in - 0.6) / len(times)
-    height_in = 0.75 + len(log.sites) * (side_in * (top - bottom) / (right - left) + 0.08)
-    with style.styled_figure(form, height_in) as figure:
-        grid = style.add_panels(figure, len(log.sites), len(times), sharex=True, sharey=True)
+    times_s = choose_instants_s(log, _NARROW_INSTANTS if form.narrow else INSTANTS)
+    poses = {site: [find_pose(log, site, t_s) for t_s in times_s] for site in log.sites}
+    all_poses = [pose for row in poses.values() for pose in row]
+    left, right, bottom, top = compute_pose_box_m(all_poses)
+    is_planar = all(arm.chain is None for arm in log.scenario.arms.values())
+
+    width_in = (form.width_in - 0.6) / len(times_s)
+    row_in = width_in * (top - bottom) / (right - left) + 0.08
+    with style.styled_figure(form, 0.75 + len(log.sites) * row_in) as figure:
+        grid = style.add_panels(figure, len(log.sites), len(times_s), sharex=True, sharey=True)
         for site, row in zip(log.sites, grid, strict=True):
-            for axes, one in zip(row, drawn[site], strict=True):
-                _arm(axes, one, style.site_colour(log, site))
-            row[0].set_ylabel(f"{site}: y (m)" if planar else f"{site}: up (m)")
-        for axes, t_s in zip(grid[0], times, strict=True):
+            for axes, pose in zip(row, poses[site], strict=True):
+                _draw_pose(axes, pose, style.site_colour(log, site))
+            row[0].set_ylabel(f"{site}: y (m)" if is_planar else f"{site}: up (m)")
+        for axes, t_s in zip(grid[0], times_s, strict=True):
             axes.set_title(f"t = {t_s:.4g} s")
         for axes in grid[-1]:
-            axes.set_xlabel("x (m)" if planar else "across (m)")
+            axes.set_xlabel("x (m)" if is_planar else "across (m)")
         grid[0, 0].set(xlim=(left, right), ylim=(bottom, top))
-        sites = [
-            (style.site_title(log, s), {"color": style.site_colour(log, s), "linewidth": 2.0})
-            for s in log.sites
-        ]
-        shadow = [] if planar else [("shadow", _SHADOW)]
-        style.add_legend(figure, [*sites, ("desired", _DESIRED), ("base", _BASE), *shadow])
+
+        entries: list[tuple[str, dict[str, Any]]] = []
+        for site in log.sites:
+            line = {"color": style.site_colour(log, site), "linewidth": 2.0}
+            entries.append((style.site_title(log, site), line))
+        entries += [("desired", _DESIRED), ("base", _BASE)]
+        if not is_planar:
+            entries.append(("shadow", _SHADOW))
+        style.add_legend(figure, entries)
     return figure
 
 
-def _arm(axes: Axes, drawn: ArmPose | None, colour: str) -> None:
+def _draw_pose(axes: Axes, pose: ArmPose | None, colour: str) -> None:
+    """Draws a pose; None is a site without a record until then."""
     axes.set_aspect("equal")
-    if drawn is None:
+    if pose is None:
         style.annotate_empty_panel(axes, "no record")
         return
-    if len(drawn.shadow):
-        axes.plot(*drawn.shadow.T, **_SHADOW)
-    for path in drawn.bodies:
+    if len(pose.shadow):
+        axes.plot(*pose.shadow.T, **_SHADOW)
+    for path in pose.bodies:
         axes.plot(*path.T, color=style.REFERENCE, linewidth=0.8)
-    axes.plot(*drawn.path.T, color=colour, linewidth=0.6, alpha=0.55)
-    axes.plot(*drawn.desired.T, **_DESIRED)
+    axes.plot(*pose.path.T, color=colour, linewidth=0.6, alpha=0.55)
+    axes.plot(*pose.desired.T, **_DESIRED)
     axes.plot(
-        *drawn.actual.T,
+        *pose.actual.T,
         color=colour,
         linewidth=2.0,
         solid_capstyle="round",
         solid_joinstyle="round",
     )
-    axes.plot(*drawn.actual[1:].T, linestyle="none", marker="o", markersize=2.6, color=colour)
+    joints = pose.actual[1:]
+    axes.plot(*joints.T, linestyle="none", marker="o", markersize=2.6, color=colour)
     axes.plot(0.0, 0.0, **_BASE)
 
 
 def render_arms_svg(log: Log, bounds_m: PictureBox, factor: float) -> str:
-    """Returns HTML with a row per site that has a record, and a column per instant.
+    """Returns HTML with pictures of the arms: a row per site, and a column per time.
+
+    Sites without records are left out.
 
     Args:
         log: the log.
         bounds_m: left, right, bottom and top of every picture, m.
         factor: units of a picture per m.
     """
-    left, right, bottom, top = (factor * bound for bound in bounds_m)
-    times = choose_instants_s(log)
-    cells = ["<span></span>", *(f'<span class="head">t = {t:.4g} s</span>' for t in times)]
+    left_m, right_m, bottom_m, top_m = bounds_m
+    bounds = (factor * left_m, factor * right_m, factor * bottom_m, factor * top_m)
+    times_s = choose_instants_s(log)
+    cells = ["<span></span>"]
+    cells += [f'<span class="head">t = {t_s:.4g} s</span>' for t_s in times_s]
     for index, site in enumerate(log.sites):
         if not len(log[site]):
             continue
         cells.append(f'<span class="head">{escape(site)}</span>')
-        for t in times:
-            drawn = find_pose(log, site, t)
-            scaled = None
-            if drawn is not None:
-                bodies = [factor * path for path in drawn.bodies]
-                scaled = ArmPose._make([*(factor * points for points in drawn[:4]), bodies])
-            cells.append(
-                _render_picture(
-                    scaled, index, (left, right, bottom, top), f"{site} at {t:.4g} s"
-                )
-            )
-    note = "Gray: the shadow on a floor at the base; up is where gravity does not pull."
-    chains = any(arm.chain for arm in log.scenario.arms.values())
-    columns = f"grid-template-columns: max-content repeat({len(times)}, 1fr)"
+        for t_s in times_s:
+            pose = find_pose(log, site, t_s)
+            scaled = None if pose is None else pose.scale(factor)
+            label = f"{site} at {t_s:.4g} s"
+            cells.append(_render_picture(scaled, index, bounds, label))
+    columns = f"grid-template-columns: max-content repeat({len(times_s)}, 1fr)"
+    html = f'<div class="strip" style="{columns}">{"".join(cells)}</div>'
+    if any(arm.chain for arm in log.scenario.arms.values()):
+        html += (
+            '<p class="note">Gray: the shadow on a floor at the base. '
+            "Up is opposite to gravity.</p>"
+        )
+    return html
+
+
+def _render_picture(pose: ArmPose | None, index: int, bounds: PictureBox, label: str) -> str:
+    """Returns a picture of a pose as SVG.
+
+    Args:
+        pose: the pose in units of the picture; None for a picture without an arm.
+        index: index of the site, on which its colour depends.
+        bounds: left, right, bottom and top of the picture.
+        label: description of the picture for screen readers.
+    """
+    left, right, bottom, top = bounds
+    ground = f'<line class="ground" x1="{left:.3f}" x2="{right:.3f}" y1="0" y2="0"/>'
+    base = '<rect class="base" x="-.06" y="-.06" width=".12" height=".12"/>'
+    drawing = ""
+    if pose is not None:
+        paths = [
+            (f"path site-{index}", pose.path),
+            ("desired", pose.desired),
+            (f"arm site-{index}", pose.actual),
+        ]
+        paths += [("body", path) for path in pose.bodies]
+        if len(pose.shadow):
+            ground = ""
+            paths.insert(0, ("shadow", pose.shadow))
+        for kind, path in paths:
+            drawing += f'<polyline class="{kind}" points="{_format_points(path)}"/>'
+        for x, y in pose.actual[1:]:
+            drawing += f'<circle class="fill-{index}" cx="{x:.3f}" cy="{-y:.3f}" r=".055"/>'
+    box = f"{left:.3f} {-top:.3f} {right - left:.3f} {top - bottom:.3f}"
     return (
-        f'<div class="strip" style="{columns}">{"".join(cells)}</div>'
-        + f'<p class="note">{note}</p>' * chains
+        f'<svg viewBox="{box}" role="img" aria-label="{escape(label)}">'
+        f"{ground}{drawing}{base}</svg>"
     )
 
 
-def _render_picture(drawn: ArmPose | None, index: int, bounds: PictureBox, label: str) -> str:
-    left, right, bottom, top = bounds
-    box = f"{left:.3f} {-top:.3f} {right - left:.3f} {top - bottom:.3f}"
-    ground = f'<line class="ground" x1="{left:.3f}" x2="{right:.3f}" y1="0" y2="0"/>'
-    base = '<rect class="base" x="-.06" y="-.06" width=".12" height=".12"/>'
-    inside = ""
-    if drawn is not None:
-        paths = [
-            (f"path site-{index}", drawn.path),
-            ("desired", drawn.desired),
-            (f"arm site-{index}", drawn.actual),
-            *(("body", path) for path in drawn.bodies),
-        ]
-        if len(drawn.shadow):
-            ground = ""
-            paths.insert(0, ("shadow", drawn.shadow))
-        inside = "".join(
-            f'<polyline class="{kind}" points="{_svg_points(path)}"/>' for kind, path in paths
-        )
-        inside += "".join(
-            f'<circle class="fill-{index}" cx="{x:.3f}" cy="{-y:.3f}" r=".055"/>'
-            for x, y in drawn.actual[1:]
-        )
-    return f'<svg viewBox="{box}" role="img" aria-label="{escape(label)}">{ground}{inside}{base}</svg>'
-
-
-def _svg_points(xy: Array) -> str:
-    """Returns points for SVG, whose y grows downwards, m."""
-    return " ".join(f"{x:.3f},{-y:.3f}" for x, y in xy)
+def _format_points(points: Array) -> str:
+    """Returns points, shape (K, 2), as SVG, whose y axis points downwards."""
+    return " ".join(f"{x:.3f},{-y:.3f}" for x, y in points)

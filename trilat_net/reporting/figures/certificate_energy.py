@@ -1,10 +1,11 @@
-"""Figures of the certificate's energies.
+"""Figures of the energies that the certificate judges, in J over the time of the run.
 
-V and its parts, dissipation and work, and the residual of the balance; the energies that laws
-declare.
+- The functional V: its sites, its parts, dissipation and work, and the residual of the balance.
+- The energies that control laws declare.
 
-Invariant: energies in J over the time of the whole run; spans without complete records are
-shaded, the largest rise is marked.
+Invariant:
+    - Spans of V without complete records are shaded.
+    - The largest rise of V is marked.
 """
 
 from typing import Any
@@ -23,16 +24,23 @@ from .. import style
 from ..appearance import REPORT_SIZE, FigureSize
 from .figure_entry import draws, unless
 
-_PARTS = {
+_PART_LABELS = {
     "kinetic": "r'Mr / 2",
     "parameter": "parameter error",
     "position": "e'ΛKd e / 2",
     "delay": "under way",
 }
-_TAKEN = {"damping": "taken: r'Kp r", "disagreement": "taken: disagreement"}
-_COLOURS = ("#117733", "#aa4499", "#999933", "#882255", "#44aa99", "#661100")
+_DISSIPATION_LABELS = {
+    "damping": "taken: r'Kp r",
+    "disagreement": "taken: disagreement",
+}
+_WORK_COLOURS = ("#117733", "#aa4499", "#999933", "#882255", "#44aa99", "#661100")
 _TOTAL: dict[str, Any] = {"color": style.REFERENCE, "linewidth": 1.6}
-_ONES: dict[str, Any] = {"color": style.REFERENCE, "linewidth": 0.9, "linestyle": (0, (4, 2))}
+_PAPER_TOTAL: dict[str, Any] = {
+    "color": style.REFERENCE,
+    "linewidth": 0.9,
+    "linestyle": (0, (4, 2)),
+}
 _RISE: dict[str, Any] = {"color": "#cc3311", "alpha": 0.25, "linewidth": 0.0, "zorder": 0.4}
 _UNJUDGED: dict[str, Any] = {
     "color": style.FAINT,
@@ -40,160 +48,218 @@ _UNJUDGED: dict[str, Any] = {
     "linewidth": 0.0,
     "zorder": 0.3,
 }
+_DISSIPATED: dict[str, Any] = {"color": style.REFERENCE, "linestyle": style.DASHES[1]}
 _HEIGHTS = (1.5, 1.2, 1.3, 1.0)
+"""Relative heights of the panels of V."""
 _OBSERVED_PANELS = {
     "line": "in the lines (J)",
     "known": "known of them (J)",
     "store": "stored (J)",
     "given": "given, taken (J)",
 }
+"""Label of the panel of each kind of declared energy. The panel "given" also has "taken"."""
 
 
 def draw_functional(
     log: Log, certificate: Certificate, form: FigureSize = REPORT_SIZE
 ) -> Figure:
-    """Returns V with its sites, its parts, dissipation and work, and the residual of the
-    balance, J.
+    """Returns the figure of V and its energy balance over time, in J.
 
-    A certificate without a balance gives a figure with the reason.
+    The panels are, from the top: V and the share of each site; the parts of V; dissipation and
+    work; and the residual of the balance. Without a balance the figure shows the reason.
+
+    Args:
+        log: the log.
+        certificate: the certificate of the log.
+        form: size of the figure.
     """
     balance = certificate.balance
     if balance is None:
         return style.empty_figure(certificate.verdict.text, form)
-    with style.time_figure(log, form, 7.2 if form.narrow else 6.4) as plot:
-        rows = style.add_panels(plot.figure, 4, 1, sharex=True, height_ratios=_HEIGHTS)[:, 0]
-        _draw(balance, rows[0], balance.V, **_TOTAL)
-        if (ones := certificate.paper_balance) is not None:
-            _draw(ones, rows[0], ones.V, **_ONES)
-        for site, values in balance.sites.items():
-            _draw(balance, rows[0], values, **style.site_line(log, site, 1.0))
-        rows[0].set_ylim(bottom=0.0)
-        rows[0].set_ylabel(r"V and its $\beta_i V_i$ (J)")
-        for (name, values), line in zip(balance.parts.items(), style.DASHES, strict=True):
-            _draw(
-                balance,
-                rows[1],
-                values,
-                label=_PARTS[name],
-                color=style.REFERENCE,
-                linestyle=line,
-            )
-        rows[1].set_ylabel("parts of V (J)")
-        _add_panel_legend(rows[1], form)
-        _draw_work(balance, rows[2], form)
-        _draw_residual(balance, rows[3], form)
-        for axes in rows:
-            plot.mark(axes, log.sites, numbered=axes is rows[0])  # others have a legend there
+
+    height_in = 7.2 if form.narrow else 6.4
+    with style.time_figure(log, form, height_in) as plot:
+        panels = style.add_panels(plot.figure, 4, 1, sharex=True, height_ratios=_HEIGHTS)
+        total, parts, work, residual = panels[:, 0]
+        _draw_total(total, log, certificate, balance)
+        _draw_parts(parts, balance, form)
+        _draw_work(work, balance, form)
+        _draw_residual(residual, balance, form)
+        for axes in (total, parts, work, residual):
+            # the lower panels have a legend where the numbers would be
+            plot.mark(axes, log.sites, numbered=axes is total)
             for from_s, to_s in find_unjudged_spans(balance):
                 axes.axvspan(from_s, to_s, **_UNJUDGED)
         rise = certificate.verdict.rise
         if rise is not None:
-            rows[0].axvspan(rise.from_s, rise.at_s, **_RISE)
-            rows[0].axvline(rise.at_s, color=_RISE["color"], linewidth=0.8)
-        by_ones = [] if ones is None else [("V with the paper's ones", _ONES)]
-        plot.finish(
-            [rows[-1]], [*style.site_legend_entries(log, log.sites), ("V", _TOTAL), *by_ones]
-        )
+            total.axvspan(rise.from_s, rise.at_s, **_RISE)
+            total.axvline(rise.at_s, color=_RISE["color"], linewidth=0.8)
+
+        entries = [*style.site_legend_entries(log, log.sites), ("V", _TOTAL)]
+        if certificate.paper_balance is not None:
+            entries.append(("V with the paper's ones", _PAPER_TOTAL))
+        plot.finish([residual], entries)
     return plot.figure
 
 
-draws(
+@draws(
     "certificate",
     "V, its parts, who changed it, the energy balance",
     lambda log: explain_no_functional(log.scenario),
     in_report=True,
-)(lambda log, form: draw_functional(log, certify(log), form))
+)
+def _draw_certificate(log: Log, form: FigureSize) -> Figure:
+    """Returns the figure of V of a log."""
+    return draw_functional(log, certify(log), form)
 
 
 def draw_observed_energy(
     log: Log, observed: ObservedEnergy, form: FigureSize = REPORT_SIZE
 ) -> Figure:
-    """Returns the energies that the laws declare: lines and what is known of them, stores,
-    arms' work, J.
+    """Returns the figure of the energies that the control laws declare, in J over time.
 
-    A line has the color of the site that it comes to.
+    The panels are: energy in the lines between sites; the part of it that the receivers know;
+    stored energy; and energy that the arms gave to the laws or that the laws dissipated. A
+    line between sites has the colour of its receiver.
+
+    Args:
+        log: the log.
+        observed: the declared energies, at least one.
+        form: size of the figure.
     """
-    kinds = {one.kind for one in observed.curves}
-    panels = [kind for kind in _OBSERVED_PANELS if kind in kinds]
-    with style.time_figure(
-        log, form, (1.6 if form.narrow else 1.4) * len(panels) + 0.8
-    ) as plot:
-        rows = style.add_panels(plot.figure, len(panels), 1, sharex=True)[:, 0]
-        at = dict(zip(panels, rows, strict=True))
-        for one in observed.curves:
-            taken = {"linestyle": style.DASHES[1]} if one.kind == "taken" else {}
-            axes = at["given" if taken else one.kind]
-            line = {**style.site_line(log, one.site), **taken}
-            style.plot_decimated(axes, np.arange(len(one.t_s)), one.t_s, one.energy_j, **line)
-        for kind, axes in at.items():
+    kinds = {curve.kind for curve in observed.curves}
+    panel_kinds = [kind for kind in _OBSERVED_PANELS if kind in kinds]
+    panel_in = 1.6 if form.narrow else 1.4
+    height_in = panel_in * len(panel_kinds) + 0.8
+    with style.time_figure(log, form, height_in) as plot:
+        rows = style.add_panels(plot.figure, len(panel_kinds), 1, sharex=True)[:, 0]
+        panels = dict(zip(panel_kinds, rows, strict=True))
+        for curve in observed.curves:
+            axes = panels["given" if curve.kind == "taken" else curve.kind]
+            line = style.site_line(log, curve.site)
+            if curve.kind == "taken":
+                line["linestyle"] = _DISSIPATED["linestyle"]
+            ticks = np.arange(len(curve.t_s))
+            style.plot_decimated(axes, ticks, curve.t_s, curve.energy_j, **line)
+        for kind, axes in panels.items():
             axes.set_ylabel(_OBSERVED_PANELS[kind])
             plot.mark(axes, log.sites, numbered=axes is rows[0])
-        dashed = ("taken by the law", {"color": style.REFERENCE, "linestyle": style.DASHES[1]})
-        plot.finish([rows[-1]], [*style.site_legend_entries(log, log.sites), dashed])
+        entries = style.site_legend_entries(log, log.sites)
+        plot.finish([rows[-1]], [*entries, ("taken by the law", _DISSIPATED)])
     return plot.figure
+
+
+def _has_declared_energies(log: Log) -> bool:
+    """True if a law of the run declares energies."""
+    observed = observe_energies(log)
+    return observed is not None and bool(observed.curves)
 
 
 @draws(
     "observed_energy",
     "energies that the control laws declare: lines, observers, tanks",
-    unless(
-        lambda log: (found := observe_energies(log)) and found.curves,
-        "the laws of this run declare no energies",
-    ),
+    unless(_has_declared_energies, "the laws of this run declare no energies"),
     in_report=True,
 )
 def _draw_observed(log: Log, form: FigureSize) -> Figure:
-    found = observe_energies(log)
-    assert found is not None
-    return draw_observed_energy(log, found, form)
+    """Returns the figure of the energies that the control laws of a log declare."""
+    observed = observe_energies(log)
+    assert observed is not None
+    return draw_observed_energy(log, observed, form)
 
 
-def _draw(balance: EnergyBalance, axes: Axes, values: Array, **options: Any) -> None:
-    style.plot_decimated(axes, np.arange(len(balance.t_s)), balance.t_s, values, **options)
+def _draw_line(balance: EnergyBalance, axes: Axes, values: Array, **options: Any) -> None:
+    """Draws values at the ticks of a balance, shape (T,)."""
+    ticks = np.arange(len(balance.t_s))
+    style.plot_decimated(axes, ticks, balance.t_s, values, **options)
 
 
 def _add_panel_legend(axes: Axes, form: FigureSize) -> None:
-    low, high = axes.get_ylim()
+    """Adds a legend inside a panel, and room for it above the lines."""
+    handles, _ = axes.get_legend_handles_labels()
     columns = 2 if form.narrow else 4
-    rows = -(-len(axes.get_legend_handles_labels()[0]) // columns)
+    rows = -(-len(handles) // columns)
     room = 0.25 * rows if form.narrow else 0.35
+    low, high = axes.get_ylim()
     axes.set_ylim(low, high + room * (high - low))
-    axes.legend(loc="upper left", ncols=columns, fontsize=_legend_pt(form))
+    axes.legend(loc="upper left", ncols=columns, fontsize=_choose_legend_pt(form))
 
 
-def _legend_pt(form: FigureSize) -> float:
-    return form.small_pt if form.small_pt == form.tick_pt else form.small_pt + 0.5
+def _choose_legend_pt(form: FigureSize) -> float:
+    """Returns the size of the type of a legend inside a panel, in pt."""
+    is_uniform = form.small_pt == form.tick_pt
+    return form.small_pt if is_uniform else form.small_pt + 0.5
 
 
-def _draw_work(balance: EnergyBalance, axes: Axes, form: FigureSize) -> None:
-    for (name, values), line in zip(balance.dissipation.items(), style.DASHES, strict=False):
-        label = _TAKEN.get(name, f"taken: {name}")
-        _draw(balance, axes, values, label=label, color=style.REFERENCE, linestyle=line)
-    links = np.sum([x for name, x in balance.work.items() if "->" in name], axis=0)
-    given = {name: x for name, x in balance.work.items() if "->" not in name}
-    shown = {"hands": given.pop("hands"), "walls": given.pop("walls"), "links": links, **given}
-    shown["sampling"] = balance.sampling
+def _draw_total(axes: Axes, log: Log, certificate: Certificate, balance: EnergyBalance) -> None:
+    """Draws V, V with the paper's weights if these are wrong, and the share of each site."""
+    _draw_line(balance, axes, balance.V, **_TOTAL)
+    paper_balance = certificate.paper_balance
+    if paper_balance is not None:
+        _draw_line(paper_balance, axes, paper_balance.V, **_PAPER_TOTAL)
+    for site, values in balance.sites.items():
+        _draw_line(balance, axes, values, **style.site_line(log, site, 1.0))
+    axes.set_ylim(bottom=0.0)
+    axes.set_ylabel(r"V and its $\beta_i V_i$ (J)")
+
+
+def _draw_parts(axes: Axes, balance: EnergyBalance, form: FigureSize) -> None:
+    """Draws the parts of V."""
+    for (name, values), dashes in zip(balance.parts.items(), style.DASHES, strict=True):
+        _draw_line(
+            balance,
+            axes,
+            values,
+            label=_PART_LABELS[name],
+            color=style.REFERENCE,
+            linestyle=dashes,
+        )
+    axes.set_ylabel("parts of V (J)")
+    _add_panel_legend(axes, form)
+
+
+def _draw_work(axes: Axes, balance: EnergyBalance, form: FigureSize) -> None:
+    """Draws the dissipated energy by kind, and the work of every source that matters.
+
+    The work of all links is drawn as one line.
+    """
+    for (name, values), dashes in zip(balance.dissipation.items(), style.DASHES, strict=False):
+        label = _DISSIPATION_LABELS.get(name, f"taken: {name}")
+        _draw_line(balance, axes, values, label=label, color=style.REFERENCE, linestyle=dashes)
+
+    link_works = [work for name, work in balance.work.items() if "->" in name]
+    other_works = {name: work for name, work in balance.work.items() if "->" not in name}
+    works = {
+        "hands": other_works.pop("hands"),
+        "walls": other_works.pop("walls"),
+        "links": np.sum(link_works, axis=0),
+        **other_works,
+        "sampling": balance.sampling,
+    }
     least = 1e-4 * balance.scale
-    for (name, values), colour in zip(shown.items(), (*_COLOURS, *_COLOURS), strict=False):
+    for (name, values), colour in zip(works.items(), 2 * _WORK_COLOURS, strict=False):
         if np.abs(values).max() > least:
-            _draw(balance, axes, values, label=f"given: {name}", color=colour)
+            _draw_line(balance, axes, values, label=f"given: {name}", color=colour)
     _add_panel_legend(axes, form)
     axes.set_ylabel("taken and given (J)")
 
 
-def _draw_residual(balance: EnergyBalance, axes: Axes, form: FigureSize) -> None:
+def _draw_residual(axes: Axes, balance: EnergyBalance, form: FigureSize) -> None:
+    """Draws the residual of the balance, with and without the work of sampling."""
     scale = balance.scale or 1.0
     floor = 1e-9 * scale
-    for label, values, line in (
+    residuals = (
         ("V - V(0) + taken - given", balance.residual, "-"),
         ("with sampling booked", balance.unexplained, (0, (1, 1))),
-    ):
-        positive = np.maximum(np.abs(values), floor)
-        _draw(balance, axes, positive, label=label, color=style.REFERENCE, linestyle=line)
-    axes.axhline(scale, color=style.FAINT, linewidth=0.9, label="largest energy")
-    axes.set(
-        yscale="log",
-        ylabel="residual (J)",
-        ylim=(floor, (1e12 if form.narrow else 1e4) * scale),
     )
-    axes.legend(loc="upper left", ncols=1 if form.narrow else 3, fontsize=_legend_pt(form))
+    for label, values, dashes in residuals:
+        magnitude = np.maximum(np.abs(values), floor)
+        _draw_line(
+            balance, axes, magnitude, label=label, color=style.REFERENCE, linestyle=dashes
+        )
+    axes.axhline(scale, color=style.FAINT, linewidth=0.9, label="largest energy")
+    # a narrow legend is higher and needs more room above the lines
+    room = 1e12 if form.narrow else 1e4
+    axes.set(yscale="log", ylabel="residual (J)", ylim=(floor, room * scale))
+    columns = 1 if form.narrow else 3
+    axes.legend(loc="upper left", ncols=columns, fontsize=_choose_legend_pt(form))
