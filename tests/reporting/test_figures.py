@@ -273,7 +273,7 @@ def test_overlaid_runs_share_sites_and_kind():
         np.abs(paper[site].tau).max() for site in paper.sites
     )
     assert [text.get_text() for text in made.legends[0].get_texts()] == ["one", "two"]
-    with pytest.raises(UsageError, match="of one kind"):
+    with pytest.raises(UsageError, match="in the same unit"):
         run_overview.draw_overlay({"a": paper, "b": task})
 
 

@@ -1,8 +1,10 @@
-"""Figures of links and loops: age of the samples in use, delays, lateness and computing time.
+"""Figures of links and loops: ages and delays of samples, lateness and computing time of ticks.
 
-Invariant: a measured link has no line of stated delay; a log of constant links has no
-distributions. Virtual time reads no clock, so its figure of the loops gives that reason in
-place of zeros.
+Invariant:
+    - A link that follows a measured trace has no line of a stated delay.
+    - A run whose links are all stated as one constant delay has no figure of distributions.
+    - A run in virtual time reads no clock. Its figure of the loops states that reason instead
+      of drawing zeros.
 """
 
 from typing import Any, NamedTuple
@@ -28,17 +30,26 @@ from ..appearance import REPORT_SIZE, FigureSize
 from .figure_entry import draws, unless
 
 _POINTS = 400
-_TALL = 6.0
+"""Number of points of a distribution."""
+_RARE_RATIO = 6.0
+"""An axis is logarithmic if the largest value exceeds the 95th percentile by this factor."""
 _STEP_MS = 1.5
-"""A fall of an age by more is no sample more at a tick."""
+"""An age that falls by more than this from one tick to the next counts as a fluctuation. An
+additional sample at a tick makes the age fall by less.
+"""
 NO_LOOP_CLOCK = "virtual time: no clock was read, so no loop was late and no tick was timed"
 NO_LOOP_TIMES = "no lateness and no computing time in this log"
 _BINS_PER_DECADE = 20
 
 
 class DelayDistribution(NamedTuple):
-    """Delays of a link's samples, by its model or else measured, and ages in use at the
-    receiver's ticks.
+    """Delays and ages on one link.
+
+    Attributes:
+        peer: the sender.
+        site: the receiver.
+        delay_ms: delays of the samples, shape (S,), by the link's model, or else as measured.
+        age_ms: age of the sample in use at the receiver's ticks, shape (K,).
     """
 
     peer: str
@@ -49,46 +60,70 @@ class DelayDistribution(NamedTuple):
 
 @draws("sample_age", "age of the samples in use, per link", in_report=True)
 def draw_sample_age(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns the age of the sample in use on every link over time, ms: a row per receiver."""
-    lines = {
-        link: trace_stated_delay(log, states) for link, states in _stated_models(log).items()
+    """Returns the figure of the age of the sample in use on every link over time, in ms.
+
+    The figure has a row per receiver. An age that fluctuates is drawn as a band.
+    """
+    ages_ms = _read_ages_ms(log)
+    stated = {
+        link: trace_stated_delay(log, models) for link, models in _list_link_models(log).items()
     }
+    has_bands = False
     with style.time_figure(log, form, 0.6 + 1.05 * len(log.sites)) as plot:
-        grid = style.add_panels(
-            plot.figure, len(log.sites), len(log.sites) - 1, sharex=True, sharey=True
-        )
-        drawn: list[Array] = []
-        spread = False
-        for site, row in zip(log.sites, grid, strict=True):
-            for peer, age_ms, axes in zip(
-                log[site].peers, sample_ages_ms(log, site).T, row, strict=True
-            ):
-                line = lines[f"{peer}->{site}"]
-                plot.mark(axes, [site], f"{peer}->{site}")
-                line_of = style.site_line(log, peer, 1.4)
-                if is_unsteady(age_ms):
-                    spread = True
-                    style.plot_spread(axes, log[site].t_s, age_ms, **line_of)
-                else:
-                    plot.trace(axes, site, age_ms, **line_of)
-                axes.plot(*line, **style.LIMIT_LINE)
-                _title_link(axes, peer, site)
-                if not np.any(np.isfinite(age_ms)):
-                    style.annotate_empty_panel(axes, "no sample in use")
-                drawn += [age_ms, line[1]]
+        grid, panels = _add_link_panels(plot.figure, log)
+        for (peer, site), axes in panels.items():
+            age_ms = ages_ms[peer, site]
+            line = style.site_line(log, peer, 1.4)
+            plot.mark(axes, [site], f"{peer}->{site}")
+            if is_unsteady(age_ms):
+                has_bands = True
+                style.plot_spread(axes, log[site].t_s, age_ms, **line)
+            else:
+                plot.trace(axes, site, age_ms, **line)
+            axes.plot(*stated[f"{peer}->{site}"], **style.LIMIT_LINE)
+            if not np.any(np.isfinite(age_ms)):
+                style.annotate_empty_panel(axes, "no sample in use")
         for axes in grid[:, 0]:
             axes.set_ylabel("age (ms)")
-        _age_axis(grid[0, 0], np.concatenate(drawn))
-        known = any(np.any(np.isfinite(values)) for _, values in lines.values())
-        stated = [("mean delay as stated", style.LIMIT_LINE)] if known else []
-        bands = [("least to largest, with median", style.SPREAD)] if spread else []
-        plot.finish(grid[-1], [*_senders(log), *stated, *bands], links=True)
+
+        stated_ms = np.concatenate([delay_ms for _, delay_ms in stated.values()])
+        _scale_age_axis(grid[0, 0], np.concatenate([*ages_ms.values(), stated_ms]))
+        entries = _list_sender_entries(log)
+        if np.any(np.isfinite(stated_ms)):
+            entries.append(("mean delay as stated", style.LIMIT_LINE))
+        if has_bands:
+            entries.append(("least to largest, with median", style.SPREAD))
+        plot.finish(grid[-1], entries, links=True)
     return plot.figure
 
 
+def _read_ages_ms(log: Log) -> dict[tuple[str, str], Array]:
+    """Returns the age of the sample in use, shape (K,), ms, by sender and receiver."""
+    ages_ms = {}
+    for site in log.sites:
+        columns = sample_ages_ms(log, site).T
+        for peer, age_ms in zip(log[site].peers, columns, strict=True):
+            ages_ms[peer, site] = age_ms
+    return ages_ms
+
+
+def _add_link_panels(
+    figure: Figure, log: Log
+) -> tuple[style.AxesGrid, dict[tuple[str, str], Axes]]:
+    """Returns a panel per link, as a grid with a row per receiver, and by link."""
+    count = len(log.sites)
+    grid = style.add_panels(figure, count, count - 1, sharex=True, sharey=True)
+    panels = {}
+    for site, row in zip(log.sites, grid, strict=True):
+        for peer, axes in zip(log[site].peers, row, strict=True):
+            axes.set_title(f"{peer} → {site}", loc="left", pad=2.0)
+            panels[peer, site] = axes
+    return grid, panels
+
+
 def has_varying_delay(log: Log) -> bool:
-    """True if some link is stated as more than one constant delay."""
-    return not all(map(has_one_constant_delay, _stated_models(log).values()))
+    """True if some link is not stated as a single constant delay."""
+    return not all(map(has_one_constant_delay, _list_link_models(log).values()))
 
 
 @draws(
@@ -98,129 +133,139 @@ def has_varying_delay(log: Log) -> bool:
     in_report=True,
 )
 def draw_delay_distributions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns the distributions of delay and age on every link: a row per receiver.
+    """Returns the figure of the distributions of delay and age on every link.
 
-    A curve is the percentage of samples, or of ticks, with at most that delay or age.
+    A curve is the percentage of samples, or of ticks, with at most that delay or age. The
+    figure has a row per receiver.
     """
-    found = {(d.peer, d.site): d for d in measure_delay_distributions(log)}
+    links = measure_delay_distributions(log)
+    x_ms = choose_delay_axis_ms(links)
     with style.styled_figure(form, 0.6 + 1.05 * len(log.sites)) as figure:
-        grid = style.add_panels(
-            figure, len(log.sites), len(log.sites) - 1, sharex=True, sharey=True
-        )
-        x_ms = choose_delay_axis_ms(list(found.values()))
-        for site, row in zip(log.sites, grid, strict=True):
-            for peer, axes in zip(log[site].peers, row, strict=True):
-                link = found[peer, site]
-                axes.plot(
-                    x_ms,
-                    compute_cumulative_percent(link.age_ms, x_ms),
-                    **style.site_line(log, peer, 1.8),
-                )
-                axes.plot(
-                    x_ms, compute_cumulative_percent(link.delay_ms, x_ms), **style.LIMIT_LINE
-                )
-                _title_link(axes, peer, site)
+        grid, panels = _add_link_panels(figure, log)
+        for link in links:
+            axes = panels[link.peer, link.site]
+            age_percent = compute_cumulative_percent(link.age_ms, x_ms)
+            delay_percent = compute_cumulative_percent(link.delay_ms, x_ms)
+            axes.plot(x_ms, age_percent, **style.site_line(log, link.peer, 1.8))
+            axes.plot(x_ms, delay_percent, **style.LIMIT_LINE)
         for axes in grid[:, 0]:
             axes.set_ylabel("cumulative (%)")
         for axes in grid[-1]:
             axes.set_xlabel("delay or age (ms)")
-        grid[0, 0].set(ylim=(0.0, 104.0), xlim=(x_ms[0], x_ms[-1]))
-        if x_ms[0] > 0.0:
-            grid[0, 0].set_xscale("log")
-            style.set_plain_log_axis(
-                grid[0, 0].xaxis, (1.0,) if form.narrow else (1.0, 2.0, 5.0)
-            )
-        entries = [(f"age, {text}", options) for text, options in _senders(log)]
+
+        first = grid[0, 0]
+        first.set(ylim=(0.0, 104.0), xlim=(x_ms[0], x_ms[-1]))
+        is_logarithmic = x_ms[0] > 0.0
+        if is_logarithmic:
+            first.set_xscale("log")
+            style.set_plain_log_axis(first.xaxis, (1.0,) if form.narrow else (1.0, 2.0, 5.0))
+        entries = [(f"age, {text}", line) for text, line in _list_sender_entries(log)]
         style.add_legend(figure, [*entries, ("delay of the samples", style.LIMIT_LINE)])
     return figure
 
 
-def _stated_models(log: Log) -> dict[str, list[StatedModel]]:
-    changed = list_changes(log)
-    return {link: list_stated_models(log, link, changed) for link in log.scenario.links}
+def _list_link_models(log: Log) -> dict[str, list[StatedModel]]:
+    """Returns the models of every link, the first one and one after every change."""
+    changes = list_changes(log)
+    return {link: list_stated_models(log, link, changes) for link in log.scenario.links}
 
 
 def measure_delay_distributions(log: Log) -> list[DelayDistribution]:
-    """Returns delays and ages of every link, by receiver and then by peer."""
-    found = []
+    """Returns the delays and ages of every link, by receiver and then by peer."""
+    distributions = []
     for site in log.sites:
-        for peer, came in read_arrivals(log, site).items():
-            count = count_sent(log, peer, int(came.sample.max(initial=-1)))
-            delay_ms = predict_delivery(log, peer, site, count).drawn_ms
+        for peer, arrivals in read_arrivals(log, site).items():
+            newest = int(arrivals.sample.max(initial=-1))
+            sent_count = count_sent(log, peer, newest)
+            delay_ms = predict_delivery(log, peer, site, sent_count).drawn_ms
             if not len(delay_ms) and log.driver == "live":
-                delay_ms = came.delay_us / 1e3
-            found.append(
-                DelayDistribution(peer, site, delay_ms, sample_ages_ns(log, peer, site) / 1e6)
-            )
-    return found
+                delay_ms = arrivals.delay_us / 1e3
+            age_ms = sample_ages_ns(log, peer, site) / 1e6
+            distributions.append(DelayDistribution(peer, site, delay_ms, age_ms))
+    return distributions
 
 
-def choose_delay_axis_ms(found: list[DelayDistribution]) -> Array:
-    """Returns the delays at which distributions are drawn, ms, to the longest; by logarithm if
-    it is rare.
+def choose_delay_axis_ms(links: list[DelayDistribution]) -> Array:
+    """Returns the delays at which distributions are drawn, in ms.
+
+    They reach up to the longest delay or age. Their steps are equal, or equal on a logarithmic
+    axis if few values are long.
     """
-    values = np.concatenate(
-        [part for d in found for part in (d.delay_ms, d.age_ms)] or [np.zeros(0)]
-    )
+    parts: list[Array] = [np.zeros(0)]
+    for link in links:
+        parts += [link.delay_ms, link.age_ms]
+    values = np.concatenate(parts)
     known = values[np.isfinite(values)]
     end_ms = 1.05 * max(float(known.max(initial=0.0)), 1.0)
     if not needs_log_axis(known):
         return np.linspace(0.0, end_ms, _POINTS)
-    return np.geomspace(max(0.5 * float(np.percentile(known, 1.0)), 0.1), end_ms, _POINTS)
+    shortest_ms = float(np.percentile(known, 1.0))
+    return np.geomspace(max(0.5 * shortest_ms, 0.1), end_ms, _POINTS)
 
 
 def compute_cumulative_percent(values: Array, limits: Array) -> Array:
-    """Returns the percentage of values that are at most as large as each limit; NaN without
-    values.
+    """Returns the percentage of values that do not exceed each limit; NaN without values.
+
+    Args:
+        values: the values, shape (K,).
+        limits: the limits, shape (P,).
     """
     if not len(values):
         return np.full(len(limits), np.nan)
-    return 100.0 * np.searchsorted(np.sort(values), limits, side="right") / len(values)
+    counts = np.searchsorted(np.sort(values), limits, side="right")
+    return 100.0 * counts / len(values)
 
 
-def trace_stated_delay(log: Log, states: list[StatedModel]) -> tuple[Array, Array]:
-    """Returns the stated mean delay over time as a line: times, s, and delays, ms; NaN between
-    states.
+def trace_stated_delay(log: Log, models: list[StatedModel]) -> tuple[Array, Array]:
+    """Returns the stated mean delay of a link over time, as the points of a line.
+
+    Args:
+        log: the log.
+        models: the models of the link, at least one.
+
+    Returns:
+        Times, s, and mean delays, ms, shape (3 M,) each for M models: start and end of each
+        model, and a NaN that interrupts the line.
     """
-    starts = [state.from_s for state in states]
-    ends = [*starts[1:], max(recorded_end_s(log), starts[-1])]
-    times = [t for start, end in zip(starts, ends, strict=True) for t in (start, end, end)]
-    means = [
-        mean for state in states for mean in (*(state.link.moments().mean_ms,) * 2, np.nan)
-    ]
-    return np.array(times), np.array(means)
+    starts_s = [model.from_s for model in models]
+    last_s = max(recorded_end_s(log), starts_s[-1])
+    ends_s = [*starts_s[1:], last_s]
+    times_s: list[float] = []
+    means_ms: list[float] = []
+    for model, end_s in zip(models, ends_s, strict=True):
+        mean_ms = model.link.moments().mean_ms
+        times_s += [model.from_s, end_s, end_s]
+        means_ms += [mean_ms, mean_ms, np.nan]
+    return np.array(times_s), np.array(means_ms)
 
 
 def needs_log_axis(ages_ms: Array) -> bool:
-    """True if a few ages, as after an outage, would press all others into a line at the bottom."""
+    """True if few ages, as after an outage, are so long that a linear axis hides the others."""
     known = ages_ms[np.isfinite(ages_ms)]
-    return len(known) > 0 and bool(known.max() > _TALL * np.percentile(known, 95.0))
+    if not len(known):
+        return False
+    return bool(known.max() > _RARE_RATIO * np.percentile(known, 95.0))
 
 
 def is_unsteady(ages_ms: Array) -> bool:
-    """True if ages go up and down within what a pixel shows, so that a line would fill all
-    between.
-    """
+    """True if ages fall so often that a line would fill the area between its extremes."""
     falls = np.flatnonzero(np.diff(ages_ms) < -_STEP_MS)
     return len(falls) > style.SPREAD_BUCKETS
 
 
-def _age_axis(axes: Axes, values: Array) -> None:
-    known = values[np.isfinite(values)]
+def _scale_age_axis(axes: Axes, values_ms: Array) -> None:
+    """Scales the axis of ages to all values, shape (K,), NaN for unknown values."""
+    known = values_ms[np.isfinite(values_ms)]
     if needs_log_axis(known):
-        axes.set(
-            yscale="log", ylim=(0.7 * float(known[known > 0.0].min()), 2.0 * float(known.max()))
-        )
+        least_ms = float(known[known > 0.0].min())
+        axes.set(yscale="log", ylim=(0.7 * least_ms, 2.0 * float(known.max())))
         style.set_plain_log_axis(axes.yaxis, (1.0, 3.0))
     else:
         axes.set_ylim(0.0, 1.25 * max(float(known.max(initial=0.0)), 1.0))
 
 
-def _title_link(axes: Axes, peer: str, site: str) -> None:
-    axes.set_title(f"{peer} → {site}", loc="left", pad=2.0)
-
-
-def _senders(log: Log) -> list[tuple[str, dict[str, Any]]]:
+def _list_sender_entries(log: Log) -> list[tuple[str, dict[str, Any]]]:
+    """Returns the entries of a legend of senders."""
     return [
         (f"from {style.site_title(log, site)}", style.site_line(log, site, 1.8))
         for site in log.sites
@@ -228,38 +273,31 @@ def _senders(log: Log) -> list[tuple[str, dict[str, Any]]]:
 
 
 def explain_missing_loop_times(log: Log) -> str:
-    """Returns why there are no times to draw; "" if a lateness or a computing time is not zero."""
-    if any(np.any(log[name].late_us) or np.any(log[name].busy_us) for name in log.sites):
+    """Returns the reason why a log has no lateness and no computing time; "" if it has some."""
+    if any(np.any(log[site].late_us) or np.any(log[site].busy_us) for site in log.sites):
         return ""
     return NO_LOOP_CLOCK if log.driver == "virtual" else NO_LOOP_TIMES
 
 
 def choose_bin_edges_us(log: Log) -> Array:
-    """Returns the edges of the histograms of a log, shape (B + 1,), us, equal steps of the
-    logarithm.
+    """Returns the edges of the histograms of a log, in us, shape (B + 1,).
 
-    The last edge lies above every time in the log; times below the first, 1 us, count in the
-    first bin.
+    The edges have equal steps on a logarithmic axis, from 1 us to above all times of the log.
+    Times below 1 us count in the first bin.
     """
-    largest = max(
-        (
-            int(times.max())
-            for s in log.sites
-            for times in (log[s].late_us, log[s].busy_us)
-            if len(times)
-        ),
-        default=1,
-    )
-    decades = np.log10(max(largest, 10) * 1.1)
+    largest_us = 0
+    for site in log.sites:
+        for times_us in (log[site].late_us, log[site].busy_us):
+            largest_us = max(largest_us, int(times_us.max(initial=0)))
+    decades = np.log10(max(largest_us, 10) * 1.1)
     count = int(np.ceil(decades * _BINS_PER_DECADE))
     return np.power(10.0, np.arange(count + 1) / _BINS_PER_DECADE)
 
 
-def bin_loop_times(times_us: Ints, edges: Array) -> Ints:
-    """Returns how many times, shape (K,), us, lie in each bin between `edges`, shape (B + 1,),
-    us.
-    """
-    return np.histogram(np.maximum(times_us, 1), edges)[0].astype(np.int64)
+def bin_loop_times(times_us: Ints, edges_us: Array) -> Ints:
+    """Returns the number of times, shape (K,), in each bin between edges, shape (B + 1,)."""
+    counts, _ = np.histogram(np.maximum(times_us, 1), edges_us)
+    return counts.astype(np.int64)
 
 
 @draws(
@@ -269,55 +307,43 @@ def bin_loop_times(times_us: Ints, edges: Array) -> Ints:
     in_report=True,
 )
 def draw_loop_timing(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns histograms of each site's lateness and computing time, us."""
-    edges = choose_bin_edges_us(log)
-    labels = ("lateness", "computing time")
-    if not form.narrow:
-        labels = ("wake-up after the deadline", "computing time of a tick")
-    with style.styled_figure(
-        form, 0.6 + (1.3 if form.narrow else 1.05) * len(log.sites)
-    ) as figure:
+    """Returns the figure of histograms of each site's lateness and computing time, in us."""
+    edges_us = choose_bin_edges_us(log)
+    labels = ("wake-up after the deadline", "computing time of a tick")
+    if form.narrow:
+        labels = ("lateness", "computing time")
+    row_in = 1.3 if form.narrow else 1.05
+    with style.styled_figure(form, 0.6 + row_in * len(log.sites)) as figure:
         grid = style.add_panels(figure, len(log.sites), 2, sharex=True, sharey=True)
         for site, (late, busy) in zip(log.sites, grid, strict=True):
-            _bars(
-                log=log,
-                site=site,
-                axes=late,
-                times_us=log[site].late_us,
-                edges=edges,
-                form=form,
-            )
-            _bars(
-                log=log,
-                site=site,
-                axes=busy,
-                times_us=log[site].busy_us,
-                edges=edges,
-                form=form,
-            )
+            records = log[site]
+            for axes, times_us in ((late, records.late_us), (busy, records.busy_us)):
+                colour = style.site_colour(log, site)
+                _draw_histogram(axes, times_us, edges_us, colour)
+                axes.axvline(1e6 / log.scenario.sites[site].rate_hz, **style.LIMIT_LINE)
+                _title_histogram(axes, site, times_us, form)
             late.set_ylabel("ticks (count)")
         grid[0, 0].set_ylim(bottom=0.7)
-        for axes, text in zip(grid[-1], labels, strict=True):
-            axes.set_xlabel(f"{text} (µs)")
+        for axes, label in zip(grid[-1], labels, strict=True):
+            axes.set_xlabel(f"{label} (µs)")
         style.add_legend(figure, [("one period", style.LIMIT_LINE)])
     return figure
 
 
-def _bars(
-    log: Log, site: str, axes: Axes, times_us: Ints, edges: Array, form: FigureSize
-) -> None:
+def _draw_histogram(axes: Axes, times_us: Ints, edges_us: Array, colour: str) -> None:
+    """Draws the histogram of times on logarithmic axes."""
     axes.set(xscale="log", yscale="log")
-    counts = bin_loop_times(times_us, edges)
-    colour = style.site_colour(log, site)
-    axes.stairs(counts, edges, baseline=0.5, fill=True, color=colour)
-    axes.axvline(1e6 / log.scenario.sites[site].rate_hz, **style.LIMIT_LINE)
+    counts = bin_loop_times(times_us, edges_us)
+    axes.stairs(counts, edges_us, baseline=0.5, fill=True, color=colour)
+
+
+def _title_histogram(axes: Axes, site: str, times_us: Ints, form: FigureSize) -> None:
+    """Titles a histogram with the site and the percentiles of its times, shape (K,)."""
     if not len(times_us):
         style.annotate_empty_panel(axes, f"no times of {site}")
         return
-    p50, p99, largest = (
-        f"{value:.0f}" for value in np.percentile(times_us, (50.0, 99.0, 100.0))
-    )
-    between = "\n" if form.narrow else " "
-    axes.set_title(
-        f"{site}: p50 {p50}, p99 {p99},{between}max {largest} µs", loc="left", pad=2.0
-    )
+    percentiles = np.percentile(times_us, (50.0, 99.0, 100.0))
+    p50, p99, largest = (f"{value_us:.0f}" for value_us in percentiles)
+    separator = "\n" if form.narrow else " "
+    title = f"{site}: p50 {p50}, p99 {p99},{separator}max {largest} µs"
+    axes.set_title(title, loc="left", pad=2.0)

@@ -1,8 +1,12 @@
-"""A run in four panels, errors, speeds, torques and ages; and several runs over one another in
-the same.
+"""Figure of one run, or of several runs over one another, in four panels.
 
-Invariant: a line of one run is a site's, a line of several is a run's: the largest of its sites
-at any time.
+The panels have the largest error, the largest speed, the largest torque and the oldest sample
+in use over time.
+
+Invariant:
+    - In the figure of one run, a line is a site.
+    - In the figure of several runs, a line is a run: the largest value of its sites at any
+      time.
 """
 
 import textwrap
@@ -27,133 +31,188 @@ from .figure_entry import draws
 _HEIGHT_IN = 3.9
 _NARROW_HEIGHT_IN = 5.6
 _DECADES = 6.0
-"""Of an axis of errors, at most: what is smaller has settled long ago."""
+"""Largest range of the axis of errors. An error below it has settled long ago."""
 _LETTERS_PER_IN = 15.0
-_SPANS = 1_000
-"""Of time, at most, in a line of several sites."""
+_MAX_SPANS = 1_000
+"""Largest number of spans of time in the line of a run with several sites."""
 
 
 class _Panel(NamedTuple):
-    """What a panel shows: its name, its unit in a log, and the column of a site, shape (K,)."""
+    """A quantity that is shown in a panel.
+
+    Attributes:
+        name: name of the quantity.
+        find_unit: function that returns the unit of the quantity in a log.
+        compute: function that returns the quantity at the K records of a site, shape (K,).
+        log_scale: True to draw the quantity on a logarithmic axis.
+    """
 
     name: str
-    unit: Callable[[Log], str]
-    column: Callable[[Log, str], Array]
+    find_unit: Callable[[Log], str]
+    compute: Callable[[Log, str], Array]
     log_scale: bool = False
 
 
-def _oldest_sample_ms(log: Log, site: str) -> Array:
+def _compute_largest_error(log: Log, site: str) -> Array:
+    """Returns the largest error of any joint or axis, shape (K,)."""
+    return largest_magnitude(log[site].e)
+
+
+def _compute_largest_speed(log: Log, site: str) -> Array:
+    """Returns the largest speed of any joint, shape (K,), rad/s."""
+    return largest_magnitude(log[site].qd)
+
+
+def _compute_largest_torque(log: Log, site: str) -> Array:
+    """Returns the largest torque of the controller at any joint, shape (K,), N m."""
+    return largest_magnitude(log[site].tau)
+
+
+def _compute_oldest_sample_ms(log: Log, site: str) -> Array:
+    """Returns the age of the oldest sample in use, shape (K,), ms; NaN without any sample."""
     ages_ms = site_signals.sample_ages_ms(log, site)
-    found: Array = np.where(np.isnan(ages_ms), -np.inf, ages_ms).max(axis=1, initial=-np.inf)
-    return np.where(np.isfinite(found), found, np.nan)
+    # numpy warns of a row without a number, so -inf stands for the unknown ages
+    known_ms = np.where(np.isnan(ages_ms), -np.inf, ages_ms)
+    oldest_ms: Array = known_ms.max(axis=1, initial=-np.inf)
+    return np.where(np.isfinite(oldest_ms), oldest_ms, np.nan)
 
 
 _PANELS = (
-    _Panel(
-        "largest error",
-        site_signals.shared_unit,
-        lambda log, site: largest_magnitude(log[site].e),
-        log_scale=True,
-    ),
-    _Panel(
-        "largest speed", lambda _: "rad/s", lambda log, site: largest_magnitude(log[site].qd)
-    ),
-    _Panel(
-        "largest torque", lambda _: "N m", lambda log, site: largest_magnitude(log[site].tau)
-    ),
-    _Panel("oldest sample", lambda _: "ms", _oldest_sample_ms),
+    _Panel("largest error", site_signals.shared_unit, _compute_largest_error, log_scale=True),
+    _Panel("largest speed", lambda _: "rad/s", _compute_largest_speed),
+    _Panel("largest torque", lambda _: "N m", _compute_largest_torque),
+    _Panel("oldest sample", lambda _: "ms", _compute_oldest_sample_ms),
 )
 
 
 @draws("overview", "errors, speeds, torques and ages of a run at a glance")
 def draw_overview(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns a run in four panels, a line per site, with what the certificate says of it."""
+    """Returns the figure of a run in four panels, with a line per site.
+
+    The title has the stability that the certificate states, and the settling time.
+    """
     height_in = _NARROW_HEIGHT_IN if form.narrow else _HEIGHT_IN
     with style.time_figure(log, form, height_in) as plot:
         panels = _add_panels(plot.figure, log, form)
         for panel, axes in zip(_PANELS, panels, strict=True):
-            columns = {site: panel.column(log, site) for site in log.sites}
-            _scale(axes, panel, [*columns.values()])
+            columns = {site: panel.compute(log, site) for site in log.sites}
+            _scale_axis(axes, panel, list(columns.values()))
             for site, values in columns.items():
-                plot.trace(axes, site, style.positive(values) if panel.log_scale else values)
+                plot.trace(axes, site, _select_drawable(panel, values))
             plot.mark(axes, log.sites)
-        last = settling_time_of_all_s(
-            [site_signals.settling_time_s(log[site]) for site in log.sites]
+        plot.finish(
+            _list_lowest(panels, form),
+            style.site_legend_entries(log, log.sites),
+            title=_compose_title(log, form),
         )
-        when = "not settled" if last is None else f"settled at {last:.1f} s"
-        words = (
-            f"{log.scenario.title or log.scenario.name}: {certify_run(log).stability}, {when}"
-        )
-        title = "\n".join(textwrap.wrap(words, round(_LETTERS_PER_IN * form.width_in)))
-        entries = style.site_legend_entries(log, log.sites)
-        plot.finish(panels[3:] if form.narrow else panels[2:], entries, title=title)
     return plot.figure
 
 
+def _compose_title(log: Log, form: FigureSize) -> str:
+    """Returns the title of a run: its name, its stability and its settling time."""
+    settling_times_s = [site_signals.settling_time_s(log[site]) for site in log.sites]
+    settled_s = settling_time_of_all_s(settling_times_s)
+    settling = "not settled" if settled_s is None else f"settled at {settled_s:.1f} s"
+    name = log.scenario.title or log.scenario.name
+    title = f"{name}: {certify_run(log).stability}, {settling}"
+    letters = round(_LETTERS_PER_IN * form.width_in)
+    return "\n".join(textwrap.wrap(title, letters))
+
+
 def draw_overlay(logs: Mapping[str, Log], form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns several runs, by their names in the legend, over one another in the panels of an
-    overview.
+    """Returns the figure of several runs over one another, with a line per run.
+
+    Args:
+        logs: the logs of the runs, by the names in the legend.
+        form: size of the figure.
 
     Raises:
-        UsageError: there is no log, or their sites follow each other in different units.
+        UsageError: there is no log, or the errors of the runs have different units.
     """
     units = {site_signals.shared_unit(log) for log in logs.values()}
-    if len(units) != 1:
-        found = f"errors in {' and '.join(sorted(units))}" if units else "no log"
+    if not units:
+        raise UsageError("there is no run to draw")
+    if len(units) > 1:
         raise UsageError(
-            f"only runs of one kind are drawn over one another, and these have {found}"
+            "only runs with errors in the same unit can be drawn over one another; "
+            f"these have errors in {' and '.join(sorted(units))}"
         )
-    first = next(iter(logs.values()))
-    end_s = max(map(recorded_end_s, logs.values()))
-    with style.styled_figure(form, _NARROW_HEIGHT_IN if form.narrow else _HEIGHT_IN) as figure:
-        panels = _add_panels(figure, first, form)
-        lines = {name: _line(n) for n, name in enumerate(logs)}
+    height_in = _NARROW_HEIGHT_IN if form.narrow else _HEIGHT_IN
+    with style.styled_figure(form, height_in) as figure:
+        first_log = next(iter(logs.values()))
+        panels = _add_panels(figure, first_log, form)
+        lines = {name: _style_run(number) for number, name in enumerate(logs)}
+        end_s = max(recorded_end_s(log) for log in logs.values())
         for panel, axes in zip(_PANELS, panels, strict=True):
-            envelopes = {name: _find_envelope(panel, log) for name, log in logs.items()}
-            _scale(axes, panel, [values for _, values in envelopes.values()])
+            envelopes = {name: _compute_envelope(panel, log) for name, log in logs.items()}
+            _scale_axis(axes, panel, [values for _, values in envelopes.values()])
             for name, (t_s, values) in envelopes.items():
-                axes.plot(
-                    t_s, style.positive(values) if panel.log_scale else values, **lines[name]
-                )
+                axes.plot(t_s, _select_drawable(panel, values), **lines[name])
             axes.set_xlim(0.0, end_s)
-        for axes in panels[3:] if form.narrow else panels[2:]:
+        for axes in _list_lowest(panels, form):
             axes.set_xlabel("time (s)")
-        style.add_legend(figure, [*lines.items()])
+        style.add_legend(figure, list(lines.items()))
     return figure
 
 
 def _add_panels(figure: Figure, log: Log, form: FigureSize) -> list[Axes]:
-    grid = style.add_panels(figure, *((4, 1) if form.narrow else (2, 2)), sharex=True)
-    panels = [*grid.flat]
+    """Returns the four panels with labels: two rows of two, or one below another if narrow."""
+    rows = 4 if form.narrow else 2
+    columns = len(_PANELS) // rows
+    panels = list(style.add_panels(figure, rows, columns, sharex=True).flat)
     for panel, axes in zip(_PANELS, panels, strict=True):
         name = panel.name.replace(" ", "\n") if form.narrow else panel.name
-        axes.set_ylabel(f"{name} ({panel.unit(log)})")
+        axes.set_ylabel(f"{name} ({panel.find_unit(log)})")
     return panels
 
 
-def _line(n: int) -> dict[str, Any]:
-    dashes = style.DASHES[n // len(SITE_COLOURS) % len(style.DASHES)]
-    return {"color": SITE_COLOURS[n % len(SITE_COLOURS)], "linestyle": dashes, "linewidth": 1.2}
+def _list_lowest(panels: list[Axes], form: FigureSize) -> list[Axes]:
+    """Returns the lowest panel of each column."""
+    return panels[3:] if form.narrow else panels[2:]
 
 
-def _find_envelope(panel: _Panel, log: Log) -> tuple[Array, Array]:
-    """Returns the largest of all sites in even spans of time, NaN without any, after their
-    middles, s.
+def _style_run(number: int) -> dict[str, Any]:
+    """Returns the options of the line of a run: all colours solid, then again with dashes."""
+    repetition = number // len(SITE_COLOURS)
+    return {
+        "color": SITE_COLOURS[number % len(SITE_COLOURS)],
+        "linestyle": style.DASHES[repetition % len(style.DASHES)],
+        "linewidth": 1.2,
+    }
+
+
+def _compute_envelope(panel: _Panel, log: Log) -> tuple[Array, Array]:
+    """Returns the largest value of all sites of a run in equal spans of time.
+
+    Returns:
+        Middles of the spans, s, and largest values, NaN in a span without records, shape (S,)
+        each.
     """
-    count = max(1, min(_SPANS, *(len(log[site]) // 2 for site in log.sites)))
-    edges = np.linspace(0.0, recorded_end_s(log), count + 1)
-    found = np.full(count, np.nan)
+    # at least two records of every site per span, on average
+    record_counts = [len(log[site]) for site in log.sites]
+    span_count = max(1, min(_MAX_SPANS, min(record_counts) // 2))
+    edges_s = np.linspace(0.0, recorded_end_s(log), span_count + 1)
+    largest = np.full(span_count, np.nan)
     for site in log.sites:
-        spans = np.clip(np.searchsorted(edges, log[site].t_s, side="right") - 1, 0, count - 1)
-        np.fmax.at(found, spans, panel.column(log, site))
-    return 0.5 * (edges[1:] + edges[:-1]), found
+        last_edges = np.searchsorted(edges_s, log[site].t_s, side="right") - 1
+        spans = np.clip(last_edges, 0, span_count - 1)
+        np.fmax.at(largest, spans, panel.compute(log, site))
+    middles_s = 0.5 * (edges_s[1:] + edges_s[:-1])
+    return middles_s, largest
 
 
-def _scale(axes: Axes, panel: _Panel, columns: list[Array]) -> None:
+def _select_drawable(panel: _Panel, values: Array) -> Array:
+    """Returns values with NaN in place of those that a logarithmic axis cannot show."""
+    return style.positive(values) if panel.log_scale else values
+
+
+def _scale_axis(axes: Axes, panel: _Panel, columns: list[Array]) -> None:
+    """Scales the axis of values of a panel to all of its lines."""
     known = np.concatenate([values[np.isfinite(values)] for values in columns])
-    most = float(known.max(initial=0.0))
+    largest = float(known.max(initial=0.0))
     if not panel.log_scale:
-        axes.set_ylim(0.0, 1.08 * most if most > 0.0 else 1.0)
-    elif most > 0.0:
-        least = max(float(known[known > 0.0].min()), most * 10.0**-_DECADES)
-        axes.set(yscale="log", ylim=(0.7 * least, 1.5 * most))
+        axes.set_ylim(0.0, 1.08 * largest if largest > 0.0 else 1.0)
+    elif largest > 0.0:
+        smallest = float(known[known > 0.0].min())
+        low = max(smallest, largest * 10.0**-_DECADES)
+        axes.set(yscale="log", ylim=(0.7 * low, 1.5 * largest))
