@@ -1,10 +1,11 @@
-"""Register functions that draw figures of a log, with names, contents and conditions.
+"""Registers the functions that draw figures of a log, each under a name.
 
     @draws("positions", "actual and desired angles (Fig. 4)", in_report=True)
     def draw_positions(log, form): ...
 
 Invariant:
-    - `list_figures` lists all registered figures in the order in which a paper has them.
+    - Every name has one figure.
+    - Registered figures are listed in the order in which a paper has them.
 """
 
 from collections.abc import Callable
@@ -38,7 +39,7 @@ class FigureEntry(NamedTuple):
 
 
 _ENTRIES: dict[str, FigureEntry] = {}
-_SHOWN = (
+_PAPER_ORDER = (
     "overview", "operation", "operator_torques", "positions", "tracking_errors", "settling",
     "phase", "parameter_estimates", "control_torques", "hands_moved", "contact", "authority",
     "certificate", "observed_energy", "twins", "arms", "paths", "sample_age",
@@ -62,7 +63,7 @@ def draws(
         ValueError: the figure is already registered.
     """
 
-    def declare(draw: Drawing) -> Drawing:
+    def register(draw: Drawing) -> Drawing:
         other = _ENTRIES.get(name)
         if other is not None:
             modules = f"{other.draw.__module__} and {draw.__module__}"
@@ -70,16 +71,21 @@ def draws(
         _ENTRIES[name] = FigureEntry(about, draw, absent, in_report)
         return draw
 
-    return declare
+    return register
 
 
 def unless(shows: Callable[[Log], object], reason: str) -> Absent:
-    """Returns a function that returns `reason` for a log for which `shows` is false."""
+    """Returns a function that explains why the figure of a log would be empty.
+
+    Args:
+        shows: function that returns a true value for a log with something to draw.
+        reason: the explanation for other logs.
+    """
     return lambda log: "" if shows(log) else reason
 
 
 def list_figures() -> dict[str, FigureEntry]:
     """Returns all figures by name, in the order in which a paper has them."""
-    ranks = {name: rank for rank, name in enumerate(_SHOWN)}
+    ranks = {name: rank for rank, name in enumerate(_PAPER_ORDER)}
     names = sorted(_ENTRIES, key=lambda name: ranks.get(name, len(ranks)))
     return {name: _ENTRIES[name] for name in names}

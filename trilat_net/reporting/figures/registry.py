@@ -1,4 +1,4 @@
-"""Registry of all figures of a log, drawn by name for a paper or written with the report.
+"""Draws the figures of a log by name, and writes them for a paper or with the report.
 
     trilat_net.figure(log, "settling").savefig("settling.pdf")
 
@@ -40,12 +40,17 @@ FIGURES = list_figures()
 def figure(
     log: str | Path | Log, name: str = "positions", width_in: float = COLUMN_IN
 ) -> Figure:
-    """Returns a figure of a log for a paper, one of `FIGURES`: 3.5 or 7 in wide, type 8 pt.
+    """Returns a figure of a log for a paper, with type of 8 pt.
 
     A notebook shows the figure as a picture. The command is `trilat figure`.
 
     >>> drawn = tn.figure(tn.simulate("two_sites", duration_s=0.1), "positions")
     >>> drawn.savefig("positions.pdf")
+
+    Args:
+        log: the log, or its path.
+        name: name of the figure, one of `FIGURES`.
+        width_in: width of the figure, 3.5 or 7 in: one column or two.
 
     Raises:
         UsageError: the figure or the width does not exist, or the log has nothing to show in
@@ -87,10 +92,17 @@ def write_figures(
             in a figure, or a file exists.
     """
     form = make_print_size(width_in)
-    wanted = list(dict.fromkeys(names)) or list_drawable_figures(log)
-    chosen = {name: partial(_find_figure(log, name).draw, log, form) for name in wanted}
+    unique_names = list(dict.fromkeys(names))
+    drawings: dict[str, Callable[[], Figure]] = {}
+    for name in unique_names or list_drawable_figures(log):
+        drawings[name] = partial(_find_figure(log, name).draw, log, form)
     return _write(
-        chosen=chosen, folder=folder, form=form, formats=formats, progress=progress, force=force
+        drawings=drawings,
+        folder=folder,
+        form=form,
+        formats=formats,
+        progress=progress,
+        force=force,
     )
 
 
@@ -116,8 +128,8 @@ def write_overlay(
             exists.
     """
     form = make_print_size(width_in)
-    chosen = {"overlay": partial(draw_overlay, logs, form)}
-    return _write(chosen, folder, form, formats, force=force)
+    drawings = {"overlay": partial(draw_overlay, logs, form)}
+    return _write(drawings, folder, form, formats, force=force)
 
 
 def write_report_figures(
@@ -139,24 +151,25 @@ def write_report_figures(
         progress: called with the number of drawn figures and the number of all figures.
         pushed: growth of pushed twins that were already computed; None to compute it.
     """
-    chosen: dict[str, Callable[[], Figure]] = {
-        name: partial(FIGURES[name].draw, log, REPORT_SIZE)
-        for name in list_drawable_figures(log)
-        if FIGURES[name].in_report
-    }
+    drawings: dict[str, Callable[[], Figure]] = {}
+    for name in list_drawable_figures(log):
+        entry = FIGURES[name]
+        if entry.in_report:
+            drawings[name] = partial(entry.draw, log, REPORT_SIZE)
+    # these two need runs that the caller may have executed already
     if twin is None:
-        chosen.pop("hands_moved", None)
+        drawings.pop("hands_moved", None)
     else:
-        chosen["hands_moved"] = partial(draw_operator_displacement, log, twin=twin)
-    if pushed is not None and "twins" in chosen:
-        chosen["twins"] = partial(draw_twins, PushedTwins(log, 0.0, pushed))
+        drawings["hands_moved"] = partial(draw_operator_displacement, log, twin=twin)
+    if pushed is not None and "twins" in drawings:
+        drawings["twins"] = partial(draw_twins, PushedTwins(log, 0.0, pushed))
     return _write(
-        chosen=chosen, folder=folder, form=REPORT_SIZE, formats=["png"], progress=progress
+        drawings=drawings, folder=folder, form=REPORT_SIZE, formats=["png"], progress=progress
     )
 
 
 def _write(
-    chosen: Mapping[str, Callable[[], Figure]],
+    drawings: Mapping[str, Callable[[], Figure]],
     folder: Path,
     form: FigureSize,
     formats: Sequence[str],
@@ -164,19 +177,33 @@ def _write(
     *,
     force: bool = True,
 ) -> list[Path]:
-    """Writes figures by name, after checking all formats and files before the first drawing."""
+    """Writes figures by name and returns the paths of the files.
+
+    All formats and files are checked before the first figure is drawn.
+
+    Args:
+        drawings: functions that draw the figures, by the names of the files.
+        folder: the folder, created if it does not exist.
+        form: size of the figures.
+        formats: formats of the files, of `FIGURE_FORMATS`.
+        progress: called with the number of drawn figures and the number of all figures.
+        force: True to overwrite existing files.
+
+    Raises:
+        UsageError: a format does not exist, or a file exists.
+    """
     kinds = list(dict.fromkeys(formats))
     for kind in kinds:
         if kind not in FIGURE_FORMATS:
             known = ", ".join(FIGURE_FORMATS)
             raise UsageError(f"a figure is written as {known}, not as {kind!r}")
-    for name in chosen:
+    for name in drawings:
         for kind in kinds:
             refuse_existing(folder / f"{name}.{kind}", force=force)
     paths = []
-    for drawn_count, (name, draw) in enumerate(chosen.items()):
+    for drawn_count, (name, draw) in enumerate(drawings.items()):
         if progress is not None:
-            progress(drawn_count, len(chosen))
+            progress(drawn_count, len(drawings))
         drawn = draw()
         make_folder(folder)
         for kind in kinds:
@@ -187,6 +214,11 @@ def _write(
 
 
 def _find_figure(log: Log, name: str) -> FigureEntry:
+    """Returns the figure of a name.
+
+    Raises:
+        UsageError: there is no such figure, or the log has nothing to show in it.
+    """
     if name not in FIGURES:
         hint = suggest_nearest(name, list(FIGURES)) or f"; there are {', '.join(FIGURES)}"
         raise UsageError(f"no figure {name!r}{hint}")
