@@ -1,14 +1,18 @@
-"""A picture of an episode at an instant, as an array of pixels: a panel per site, and the goal
-of the task.
+"""Pictures of an episode of a task, as arrays of pixels for a film.
+
+A picture has a panel per site with its arm, and in one panel the goal of the task.
 
 Invariant:
-- The picture is a function of the poses, the goal and the time; its size never changes.
-- The axes have fixed limits, so that motion in a film is motion of the arms.
+    - A picture depends on the poses, the goal and the title alone.
+    - All pictures of an episode have the same size and the same limits of their axes, so that
+      motion in a film is motion of the arms.
 """
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -24,27 +28,39 @@ PANEL_PX = 240
 """Side of a panel, pixels."""
 _DPI = 100
 _MARGIN = 1.08
-"""Half the side of a panel, in reaches of the arm."""
+"""Half the side of a panel, as a multiple of the reach of its arm."""
+_GOAL: dict[str, Any] = {
+    "marker": "x",
+    "markersize": 9.0,
+    "markeredgewidth": 2.0,
+    "color": "#bb5566",
+}
+_BASE: dict[str, Any] = {
+    "linestyle": "none",
+    "marker": "s",
+    "markersize": 6.0,
+    "color": style.REFERENCE,
+}
 
 
 class EpisodePicture:
-    """The panels of the sites of a scenario, which are drawn anew for every picture.
+    """Draws pictures of an episode, one after another, into the same panels.
 
     Args:
         scenario: the experiment.
-        goal_site: the site in whose panel the goal of the task is drawn.
+        goal_site: the site whose panel shows the goal of the task.
     """
 
     def __init__(self, scenario: Scenario, goal_site: str) -> None:
         self._scenario = scenario
         self._goal_site = goal_site
         names = scenario.names
+        side_in = PANEL_PX / _DPI
         width_in = PANEL_PX * len(names) / _DPI
-        self._figure = Figure(figsize=(width_in, PANEL_PX / _DPI), dpi=_DPI)
+        self._figure = Figure(figsize=(width_in, side_in), dpi=_DPI)
         self._canvas = FigureCanvasAgg(self._figure)
-        self._panels = dict(
-            zip(names, self._figure.subplots(1, len(names), squeeze=False)[0], strict=True)
-        )
+        panels = self._figure.subplots(1, len(names), squeeze=False)[0]
+        self._panels: dict[str, Axes] = dict(zip(names, panels, strict=True))
         self._figure.subplots_adjust(left=0.0, right=1.0, bottom=0.0, top=1.0, wspace=0.02)
 
     def draw(
@@ -54,47 +70,71 @@ class EpisodePicture:
         goal_m: Array | None,
         title: str,
     ) -> NDArray[np.uint8]:
-        """Returns the picture, shape (height, width, 3).
+        """Returns a picture, shape (height, width, 3).
 
         Args:
-            q_rad: joint angles by site, rad, shape (n,).
-            bodies: poses of the bodies of plants, by site and name, shape (7,).
-            goal_m: the place that the task asks for, m; None where the goal is no place of this
-                arm.
-            title: what stands in the corner of the first panel.
+            q_rad: joint angles by site, rad, shape (n,) each.
+            bodies: poses of the bodies of plants by site and name, shape (7,) each.
+            goal_m: position that the task asks for, m; None if the goal is not a position of
+                this arm.
+            title: text in the lower left corner of the first panel.
         """
-        for number, (name, axes) in enumerate(self._panels.items()):
-            arm = self._scenario.arms[name]
-            points_m = joint_positions_m(arm, np.asarray(q_rad[name])[np.newaxis])[0]
-            reach_m = _MARGIN * float(np.linalg.norm(np.diff(points_m, axis=0), axis=1).sum())
-            drawn = project_arm_m(arm, points_m)
+        for number, (site, axes) in enumerate(self._panels.items()):
+            arm = self._scenario.arms[site]
             colour = SITE_COLOURS[number % len(SITE_COLOURS)]
+            all_q_rad = np.asarray(q_rad[site])[np.newaxis]
+            points_m = joint_positions_m(arm, all_q_rad)[0]
             axes.clear()
-            axes.set(xlim=(-reach_m, reach_m), ylim=(-reach_m, reach_m), aspect="equal")
-            axes.set_axis_off()
-            poses = list(bodies.get(name, {}).values())
-            if poses:
-                sizes_m = self._scenario.bodies_m(name).values()
-                for path in trace_bodies_m(arm, sizes_m, np.concatenate(poses)[np.newaxis]):
-                    axes.plot(*path[0].T, color=style.REFERENCE, linewidth=0.8)
-            axes.plot(*drawn.T, color=colour, linewidth=3.0, solid_capstyle="round")
-            axes.plot(*drawn[1:].T, linestyle="none", marker="o", markersize=4.0, color=colour)
-            axes.plot(
-                0.0, 0.0, linestyle="none", marker="s", markersize=6.0, color=style.REFERENCE
-            )
-            if goal_m is not None and name == self._goal_site:
-                place = project_arm_m(arm, np.asarray(goal_m))
-                axes.plot(
-                    *place, marker="x", markersize=9.0, markeredgewidth=2.0, color="#bb5566"
-                )
-            axes.text(0.03, 0.97, name, transform=axes.transAxes, va="top", fontsize=9.0)
+            _scale_panel(axes, points_m)
+            self._draw_bodies(axes, site, bodies.get(site, {}))
+            _draw_arm(axes, project_arm_m(arm, points_m), colour)
+            if goal_m is not None and site == self._goal_site:
+                goal = project_arm_m(arm, np.asarray(goal_m))
+                axes.plot(*goal, **_GOAL)
+            axes.text(0.03, 0.97, site, transform=axes.transAxes, va="top", fontsize=9.0)
         first = next(iter(self._panels.values()))
         first.text(0.03, 0.03, title, transform=first.transAxes, va="bottom", fontsize=8.0)
+        return self._read_pixels()
+
+    def _draw_bodies(self, axes: Axes, site: str, bodies: Mapping[str, Array]) -> None:
+        """Draws the edges of the bodies that the plant of a site moves."""
+        if not bodies:
+            return
+        poses = np.concatenate(list(bodies.values()))
+        sizes_m = self._scenario.bodies_m(site).values()
+        arm = self._scenario.arms[site]
+        for path in trace_bodies_m(arm, sizes_m, poses[np.newaxis]):
+            axes.plot(*path[0].T, color=style.REFERENCE, linewidth=0.8)
+
+    def _read_pixels(self) -> NDArray[np.uint8]:
+        """Returns the pixels of the figure without their opacity."""
         self._canvas.draw()  # type: ignore[no-untyped-call]
-        pixels: NDArray[np.uint8] = np.asarray(self._canvas.buffer_rgba())[:, :, :3].copy()  # type: ignore[no-untyped-call]
+        rgba = np.asarray(self._canvas.buffer_rgba())  # type: ignore[no-untyped-call]
+        pixels: NDArray[np.uint8] = rgba[:, :, :3].copy()
         return pixels
 
 
+def _scale_panel(axes: Axes, points_m: Array) -> None:
+    """Sets the limits of a panel to the reach of its arm, the sum of its links' lengths.
+
+    Args:
+        axes: the panel.
+        points_m: base, joints and end effector in any pose, shape (L, 2) or (L, 3), m.
+    """
+    lengths_m = np.linalg.norm(np.diff(points_m, axis=0), axis=1)
+    half_m = _MARGIN * float(lengths_m.sum())
+    axes.set(xlim=(-half_m, half_m), ylim=(-half_m, half_m), aspect="equal")
+    axes.set_axis_off()
+
+
+def _draw_arm(axes: Axes, points_m: Array, colour: str) -> None:
+    """Draws links, joints and base of an arm at points in the picture, shape (L, 2), m."""
+    axes.plot(*points_m.T, color=colour, linewidth=3.0, solid_capstyle="round")
+    joints_m = points_m[1:]
+    axes.plot(*joints_m.T, linestyle="none", marker="o", markersize=4.0, color=colour)
+    axes.plot(0.0, 0.0, **_BASE)
+
+
 def is_position(goal: Sequence[float] | Array, end_effector_m: Array) -> bool:
-    """Returns whether a goal has the numbers of a place of this end effector."""
+    """True if a goal has as many numbers as the position of the end effector."""
     return np.shape(goal) == np.shape(end_effector_m)

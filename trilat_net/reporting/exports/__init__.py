@@ -1,8 +1,12 @@
-"""Formats that logs are exported to, one a file: a file and its format's name are one."""
+"""The formats that logs are exported to, one module per format.
+
+The name of a module is the name of its format. A module has a constant `FORMAT`, an
+`ExportFormat`. A further module in this folder is a further format.
+"""
 
 import pkgutil
 
 
 def list_export_formats() -> list[str]:
     """Returns the names of all formats."""
-    return [found.name for found in pkgutil.iter_modules(__path__)]
+    return [module.name for module in pkgutil.iter_modules(__path__)]

@@ -1,4 +1,8 @@
-"""A folder of CSV files: a file per site and kind, numbers as Python shows them."""
+"""Exports a log as a folder of CSV files, a file per table.
+
+A file has a line of column names and then a line per row. Numbers are written as Python shows
+them, so that they are read back unchanged. A missing value is an empty field.
+"""
 
 import csv
 from pathlib import Path
@@ -7,24 +11,30 @@ from ...log.data_tables import Table
 from ...log.log_reader import Log
 from ..export import ExportFormat, Written, describe_folder, store_tables
 
-_ROWS = 4096
-"""Rows that are converted to text together."""
+_ROWS_AT_ONCE = 4096
+"""Number of rows that are converted to text together, which limits the memory."""
 
 
 def _write(log: Log, folder: Path, written: Written) -> None:
-    """Writes CSV files: a line of names, then a row per line, numbers as Python shows them."""
-
-    def store(table: Table, name: str) -> None:
-        with (folder / name).open("w", encoding="utf-8", newline="") as stream:
-            writer = csv.writer(stream, lineterminator="\n")
-            writer.writerow(column.name for column in table.columns)
-            for first in range(0, len(table), _ROWS):
-                columns = (column.rows(first, first + _ROWS) for column in table.columns)
-                writer.writerows(zip(*columns, strict=True))
-
-    describe_folder(
-        log, folder, store_tables(log, written, lambda table: f"{table.label}.csv", store)
+    """Writes the tables of a log, its scenario and their description into a folder."""
+    description = store_tables(
+        log,
+        written,
+        lambda table: f"{table.label}.csv",
+        lambda table, file_name: _write_table(table, folder / file_name),
     )
+    describe_folder(log, folder, description)
+
+
+def _write_table(table: Table, path: Path) -> None:
+    """Writes a table as a CSV file."""
+    with path.open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(column.name for column in table.columns)
+        for first in range(0, len(table), _ROWS_AT_ONCE):
+            last = first + _ROWS_AT_ONCE
+            columns = [column.rows(first, last) for column in table.columns]
+            writer.writerows(zip(*columns, strict=True))
 
 
 FORMAT = ExportFormat(_write, "-csv", folder=True)

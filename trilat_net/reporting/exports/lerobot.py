@@ -1,21 +1,24 @@
-"""A dataset of LeRobot, v3.0: what each user commands, who leads, and where a person
-intervened.
+"""Exports logs as a dataset of LeRobot, version 3.0, for learning from demonstrations.
+
+A dataset has frames at a fixed rate. A frame has the state of the slave, the command of every
+user, the shares of the users, and whether a person intervened in place of the program.
 
 Invariant:
-- A frame has of every site the newest record at or before its time, as float32; nothing is
-  interpolated.
-- Where that record is older than a period of the site and of the frames an episode ends, and
-  the next one begins behind the gap.
-- An orientation is six numbers, which never jump (see `trilat_net.log.orientations`).
-- With `actions`, the names and units of actions are those of `action_features` of the plugin
-  `lerobot_robot_trilat` (a test compares them).
+    - A frame has the newest record of every site at or before its time. Nothing is
+      interpolated.
+    - A frame is left out if such a record is older than the longer of two periods: that of the
+      site and that of the frames. Its episode ends, and the next episode begins after the gap.
+    - Numbers are float32.
+    - An orientation is six numbers, which never jump (see `trilat_net.log.orientations`).
+    - With the setting `actions`, actions have the names and units of `action_features` of the
+      plugin `lerobot_robot_trilat`. A test compares the two.
 """
 
 import json
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,12 +41,23 @@ _EXTRA = ("pyarrow.parquet", "lerobot", "datasets of LeRobot")
 _FILE = "chunk-000/file-000.parquet"
 _MEANINGS = {
     "observation.state": "angles, rad, and velocities, rad/s, of the slave's joints",
-    "action": "command of the leading user, action.USER of each: angles, rad; or a place, m, and its turn",
-    "r11.rot": "a turn is six entries of the rotation matrix: its first column and its second one",
+    "action": (
+        "command of the leading user; action.USER is the command of each user: angles, rad, or "
+        "a position, m, and an orientation"
+    ),
+    "r11.rot": (
+        "an orientation is six entries of the rotation matrix, its first and second column"
+    ),
     "dominance": "share of each user in the slave's reference, Eq. (6); the largest one leads",
-    "tau_x": "external torque of Eq. (8) at the slave, N m; tau_x.USER: what the hand of each user feels",
-    "intervention": "true where another user than the program leads",
-    "frame": "of each site the newest record at or before its time; nothing is interpolated",
+    "tau_x": (
+        "external torque of Eq. (8) at the slave, N m; tau_x.USER is the torque that the hand "
+        "of each user feels"
+    ),
+    "intervention": "true if a user other than the program leads",
+    "frame": (
+        "the newest record of each site at or before the time of the frame; nothing is "
+        "interpolated"
+    ),
 }
 _INDEX = {
     "name": "task",
@@ -54,14 +68,30 @@ _INDEX = {
 _PANDAS = {
     "pandas": json.dumps({"index_columns": ["task"], "column_indexes": [], "columns": [_INDEX]})
 }
-"""By this the reader of LeRobot, pandas, takes the texts of tasks for its index."""
+"""Metadata by which pandas, the reader of LeRobot, takes the texts of tasks as an index."""
+_QUANTILES = (0.01, 0.1, 0.5, 0.9, 0.99)
 ACTIONS = ("tip", "joints")
-"""What actions may be besides what sites share: the modes of the plugin's hand that go to a
-place.
+"""Kinds of actions besides what sites share: the modes in which the plugin's hand goes to a
+position.
 """
 Names = dict[str, list[str]]
+"""Names of the numbers of each feature."""
 Columns = dict[str, NDArray[Any]]
-"""Columns of frames by the names of their features, shape (K, n) or (K,)."""
+"""Columns of frames by the names of their features, shape (F, n) or (F,)."""
+
+
+class _Frames(NamedTuple):
+    """The F frames of a log.
+
+    Attributes:
+        rows: rows of the frames' records in the log of each site, shape (F,) each.
+        episode: number of each frame's episode, from 0, shape (F,).
+        left_out: number of frames in gaps, which are left out.
+    """
+
+    rows: dict[str, Ints]
+    episode: Ints
+    left_out: int
 
 
 def _write(
@@ -73,189 +103,284 @@ def _write(
     program: str = "",
     actions: str = "",
 ) -> str:
+    """Writes logs as one dataset, and returns a sentence on its size.
+
+    Args:
+        logs: the logs, at least one.
+        folder: the folder of the dataset.
+        written: called with the number of records of every log.
+        fps: number of frames a second.
+        program: the user that is the program; "" for the last user.
+        actions: kind of the actions, one of `ACTIONS`; "" for what sites share.
+
+    Raises:
+        LogError: a log has no frames, or the users or joints of the logs differ.
+        UsageError: a setting is not valid.
+    """
     if fps < 1:
         raise UsageError(f"fps is a whole number of frames a second, not {fps}")
     if actions not in ("", *ACTIONS):
         raise UsageError(f"actions are {' or '.join(ACTIONS)}, not {actions!r}")
-    tasks: dict[str, int] = {}
+
     names: Names = {}
+    tasks: dict[str, int] = {}
     parts = list[Columns]()
     sessions = []
-    lost = 0
+    left_out = 0
     for log in logs:
-        rows, episode, left_out = _find_rows(log, fps)
-        columns, found = _read_columns(log, rows, program, actions)
-        if (names := names or found) != found:
+        frames = _choose_frames(log, fps)
+        columns, log_names = _read_columns(log, frames.rows, program, actions)
+        names = names or log_names
+        if log_names != names:
             raise LogError(
                 f"{log.source}: its users and joints are not those of {logs[0].source}"
             )
-        columns["episode_index"] = episode + (
-            parts[-1]["episode_index"][-1] + 1 if parts else 0
-        )
+        first_episode = parts[-1]["episode_index"][-1] + 1 if parts else 0
+        columns["episode_index"] = frames.episode + first_episode
         task = tasks.setdefault(log.scenario.title or log.scenario.name, len(tasks))
-        parts.append({**columns, "task_index": np.full_like(episode, task)})
-        sessions.append(
-            {**log.session, "scenario": log.scenario_text, "frames_left_out": left_out}
-        )
-        lost += left_out
+        columns["task_index"] = np.full_like(frames.episode, task)
+        parts.append(columns)
+        sessions.append(_describe_session(log, frames))
+        left_out += frames.left_out
         written(sum(len(log[site]) for site in log.sites))
-    whole = {key: np.concatenate([one[key] for one in parts]) for key in parts[0]}
-    index = np.arange(len(whole["episode_index"]))
-    starts = np.flatnonzero(np.diff(whole["episode_index"], prepend=-1))
-    frame = index - starts[whole["episode_index"]]
-    whole |= {
-        "timestamp": (frame / fps).astype(np.float32),
-        "frame_index": frame,
-        "index": index,
-    }
-    texts = _store_tables(folder, whole, [*starts.tolist(), len(index)], list(tasks))
-    texts["meta/info.json"] = _describe_set(
-        fps=fps, names=names, whole=whole, episodes=len(starts), tasks=len(tasks)
+
+    dataset = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+    starts = _number_frames(dataset, fps)
+    files = _write_tables(folder, dataset, starts, list(tasks))
+    frame_count = len(dataset["index"])
+    episode_count = len(starts)
+    files["meta/info.json"] = _describe_dataset(
+        fps=fps, names=names, columns=dataset, episodes=episode_count, tasks=len(tasks)
     )
-    about: dict[str, Any] = {
+    files[EXPORT_MANIFEST] = {
         "exported_by": f"trilat-net {collect_provenance()['version_trilat-net']}",
         "meanings": _MEANINGS,
+        "actions": actions or "what sites share",
+        "program": program or "the last user",
+        "sessions": sessions,
     }
-    about |= {"actions": actions or "what sites share", "program": program or "the last user"}
-    texts[EXPORT_MANIFEST] = {**about, "sessions": sessions}
-    for place, content in texts.items():
-        (folder / place).write_text(
-            json.dumps(content, indent=4) + "\n", encoding="utf-8", newline="\n"
-        )
-    return (
-        f"{count_nouns(len(index), 'frame')} in {count_nouns(len(starts), 'episode')}; "
-        f"{count_nouns(lost, 'frame lies in a gap and is', 'frames lie in gaps and are')} left out"
+    for file_name, content in files.items():
+        text = json.dumps(content, indent=4) + "\n"
+        (folder / file_name).write_text(text, encoding="utf-8", newline="\n")
+
+    frames_text = count_nouns(frame_count, "frame")
+    episodes_text = count_nouns(episode_count, "episode")
+    gaps_text = count_nouns(
+        left_out, "frame lies in a gap and is", "frames lie in gaps and are"
     )
+    return f"{frames_text} in {episodes_text}; {gaps_text} left out"
 
 
-def _find_rows(log: Log, fps: int) -> tuple[dict[str, Ints], Ints, int]:
-    """Returns per site the rows of the frames' records, each frame's episode, and how many are
-    left out.
-    """
-    kept = {site: np.flatnonzero(log[site].mode != "diverged") for site in log.sites}
-    if empty := [site for site, rows in kept.items() if not len(rows)]:
-        raise LogError(f"{log.source}: no records of {', '.join(empty)}")
-    stamps = {
-        site: log[site].tick[rows] * NS_PER_S // log[site].rate_hz
-        for site, rows in kept.items()
+def _describe_session(log: Log, frames: _Frames) -> dict[str, Any]:
+    """Returns the description of the session of a log."""
+    return {
+        **log.session,
+        "scenario": log.scenario_text,
+        "frames_left_out": frames.left_out,
     }
-    begin_ns = max(t[0] for t in stamps.values())
-    end_ns = min(t[-1] for t in stamps.values())
-    at_ns = begin_ns + np.arange((end_ns - begin_ns) * fps // NS_PER_S + 1) * NS_PER_S // fps
-    fresh = np.ones(len(at_ns), dtype=np.bool_)
-    for site, t_ns in stamps.items():
-        row = np.searchsorted(t_ns, at_ns, side="right") - 1
-        fresh &= at_ns - t_ns[row] <= NS_PER_S // min(fps, log[site].rate_hz)
-        kept[site] = kept[site][row]
-    if not len(frames := np.flatnonzero(fresh)):
-        raise LogError(f"{log.source}: there is no time of which every site has a record")
-    episode = np.cumsum(np.diff(frames, prepend=frames[0]) > 1, dtype=np.int64)
-    return (
-        {site: rows[frames] for site, rows in kept.items()},
-        episode,
-        len(at_ns) - len(frames),
+
+
+def _number_frames(dataset: Columns, fps: int) -> list[int]:
+    """Adds the time and the numbers of all frames, and returns each episode's first frame."""
+    episode = dataset["episode_index"]
+    index = np.arange(len(episode))
+    starts = np.flatnonzero(np.diff(episode, prepend=-1))
+    frame_index = index - starts[episode]
+    dataset["timestamp"] = (frame_index / fps).astype(np.float32)
+    dataset["frame_index"] = frame_index
+    dataset["index"] = index
+    return [int(start) for start in starts]
+
+
+def _choose_frames(log: Log, fps: int) -> _Frames:
+    """Returns the frames of a log, at `fps` frames a second, and their records.
+
+    The first frame is at the first time for which every site has a record. Records of a site
+    that has diverged do not count.
+
+    Raises:
+        LogError: a site has no records, or there is no time for which every site has a record.
+    """
+    rows = {site: np.flatnonzero(log[site].mode != "diverged") for site in log.sites}
+    empty_sites = [site for site, site_rows in rows.items() if not len(site_rows)]
+    if empty_sites:
+        raise LogError(f"{log.source}: no records of {', '.join(empty_sites)}")
+    stamps_ns = {}
+    for site, site_rows in rows.items():
+        stamps_ns[site] = log[site].tick[site_rows] * NS_PER_S // log[site].rate_hz
+
+    begin_ns = max(t_ns[0] for t_ns in stamps_ns.values())
+    end_ns = min(t_ns[-1] for t_ns in stamps_ns.values())
+    count = (end_ns - begin_ns) * fps // NS_PER_S + 1
+    frame_ns = begin_ns + np.arange(count) * NS_PER_S // fps
+    is_fresh = np.ones(len(frame_ns), dtype=np.bool_)
+    for site, t_ns in stamps_ns.items():
+        newest = np.searchsorted(t_ns, frame_ns, side="right") - 1
+        age_ns = frame_ns - t_ns[newest]
+        is_fresh &= age_ns <= NS_PER_S // min(fps, log[site].rate_hz)
+        rows[site] = rows[site][newest]
+
+    fresh_frames = np.flatnonzero(is_fresh)
+    if not len(fresh_frames):
+        raise LogError(f"{log.source}: there is no time for which every site has a record")
+    is_after_gap = np.diff(fresh_frames, prepend=fresh_frames[0]) > 1
+    return _Frames(
+        rows={site: site_rows[fresh_frames] for site, site_rows in rows.items()},
+        episode=np.cumsum(is_after_gap, dtype=np.int64),
+        left_out=len(frame_ns) - len(fresh_frames),
     )
 
 
 def _read_columns(
     log: Log, rows: dict[str, Ints], program: str, actions: str
 ) -> tuple[Columns, Names]:
-    """Returns the columns of all frames, and the names of their numbers."""
+    """Returns the features of all frames of a log that follow from its records.
+
+    Args:
+        log: the log.
+        rows: rows of the frames' records of each site, shape (F,).
+        program: the user that is the program; "" for the last user.
+        actions: kind of the actions, one of `ACTIONS`, or "".
+
+    Returns:
+        The columns, and the names of the numbers of each feature with several numbers.
+
+    Raises:
+        LogError: the log has no slave or no user, or see `_read_commands`.
+        UsageError: the program is not a user.
+    """
     slave, users = find_users(log.scenario)
     if not slave or not users:
-        raise LogError(f"{log.source}: it has no slave that a master leads")
+        raise LogError(f"{log.source}: it has no slave that follows a master")
     alpha = trace_dominance(log, slave, log[slave].t_s[rows[slave]]).alpha
     shared = find_user_shares(log.scenario, alpha, program)
+    commands, command_names = _read_commands(log, users, rows, actions)
+    leading_commands = np.stack(commands)[shared.leader, np.arange(len(alpha))]
+
+    slave_records = log[slave]
+    slave_rows = rows[slave]
+    state = np.hstack([slave_records.q[slave_rows], slave_records.qd[slave_rows]])
     joints = {site: list(log.scenario.arms[site].joint_names) for site in (slave, *users)}
+    state_names = [f"{slave}.{joint}.pos" for joint in joints[slave]]
+    state_names += [f"{slave}.{joint}.vel" for joint in joints[slave]]
 
-    def read(site: str, field: str) -> Array:
-        return np.asarray(getattr(log[site], field)[rows[site]])
-
-    commands, commanded = _read_commands(log, users, rows, actions)
-    state = [f"{slave}.{one}.{what}" for what in ("pos", "vel") for one in joints[slave]]
-    found = [
-        ("observation.state", np.hstack([read(slave, "q"), read(slave, "qd")]), state),
-        ("action", np.stack(commands)[shared.leader, np.arange(len(alpha))], commanded),
-        *(
-            (f"action.{user}", one, commanded)
-            for user, one in zip(users, commands, strict=True)
-        ),
-        ("dominance", shared.shares, users),
-        ("tau_x", read(slave, "tau_x"), joints[slave]),
-        *((f"tau_x.{user}", read(user, "tau_x"), joints[user]) for user in users),
+    features = [
+        ("observation.state", state, state_names),
+        ("action", leading_commands, command_names),
     ]
-    columns: Columns = {key: values.astype(np.float32) for key, values, _ in found}
-    return {**columns, "intervention": shared.leader != shared.program}, {
-        key: names for key, _, names in found
-    }
+    features += [
+        (f"action.{user}", command, command_names)
+        for user, command in zip(users, commands, strict=True)
+    ]
+    features.append(("dominance", shared.shares, users))
+    features.append(("tau_x", slave_records.tau_x[slave_rows], joints[slave]))
+    features += [(f"tau_x.{user}", log[user].tau_x[rows[user]], joints[user]) for user in users]
+
+    columns: Columns = {key: values.astype(np.float32) for key, values, _ in features}
+    columns["intervention"] = shared.leader != shared.program
+    return columns, {key: names for key, _, names in features}
 
 
 def _read_commands(
     log: Log, users: Sequence[str], rows: dict[str, Ints], actions: str
 ) -> tuple[list[Array], list[str]]:
-    """Returns what each user commands, shape (K, n) each, and the names of its numbers.
+    """Returns the commands of every user, shape (F, n) each, and the names of their numbers.
 
     Raises:
-        LogError: the users' arms have other joints, so that no action is both's.
+        LogError: the users' arms have different joints, so that they have no common action.
     """
     if actions == "tip":
-        tips = []
+        positions = []
         for user in users:
-            q = log[user].q[rows[user]]
-            qd = log[user].qd[rows[user]]
-            tips.append(build_arm_rows(log.scenario, user).place_end_effector(q, qd).position)
-        return tips, [f"{axis}.pos" for axis in TASK_AXES[: tips[0].shape[1]]]
-    if not actions and log[users[0]].layout.task:
+            records = log[user]
+            arm_rows = build_arm_rows(log.scenario, user)
+            q = records.q[rows[user]]
+            qd = records.qd[rows[user]]
+            positions.append(arm_rows.place_end_effector(q, qd).position)
+        axes = TASK_AXES[: positions[0].shape[1]]
+        return positions, [f"{axis}.pos" for axis in axes]
+
+    first_user = users[0]
+    if not actions and log[first_user].layout.task:
         poses = [expand_poses(log[user].x[rows[user]]) for user in users]
-        places = [f"{axis}.pos" for axis in TASK_AXES[:POSITION]]
-        turned = [f"{entry}.rot" for entry in MATRIX_ENTRIES]
-        return poses, [*places, *turned][: poses[0].shape[1]]
-    joints = {
-        user: [f"{name}.pos" for name in log.scenario.arms[user].joint_names] for user in users
-    }
-    if other := next((user for user in users if joints[user] != joints[users[0]]), None):
-        text = f"the joints of {other} are not those of {users[0]}, so that an action cannot stand for both"
-        raise LogError(f"{log.source}: {text}: use --actions tip")
-    return [log[user].q[rows[user]] for user in users], joints[users[0]]
+        names = [f"{axis}.pos" for axis in TASK_AXES[:POSITION]]
+        names += [f"{entry}.rot" for entry in MATRIX_ENTRIES]
+        return poses, names[: poses[0].shape[1]]
+
+    joints = {user: log.scenario.arms[user].joint_names for user in users}
+    for user in users:
+        if joints[user] != joints[first_user]:
+            raise LogError(
+                f"{log.source}: the joints of {user} are not those of {first_user}, so that "
+                "the two have no common action: use --actions tip"
+            )
+    angles = [log[user].q[rows[user]] for user in users]
+    return angles, [f"{joint}.pos" for joint in joints[first_user]]
 
 
-def _store_tables(
-    folder: Path, whole: Columns, edges: list[int], tasks: list[str]
+def _write_tables(
+    folder: Path, dataset: Columns, starts: Sequence[int], tasks: list[str]
 ) -> dict[str, Any]:
-    """Stores the tables of a dataset, and returns its statistics by their place."""
+    """Writes the tables of a dataset, and returns the contents of its JSON file of statistics.
+
+    Args:
+        folder: the folder of the dataset.
+        dataset: the columns of all frames.
+        starts: the first frame of each episode.
+        tasks: texts of the tasks.
+    """
     pa = import_extra("pyarrow", *_EXTRA[1:])
     parquet = import_extra(*_EXTRA)
-    vectors = {
-        key: pa.FixedSizeListArray.from_arrays(one.ravel(), one[0].size)
-        if one[0].size > 1
-        else one.ravel()
-        for key, one in whole.items()
-    }
-    described = [_describe_episode(whole, *ends, tasks) for ends in pairwise(edges)]
-    texts = pa.table({"task_index": np.arange(len(tasks)), "task": tasks})
+    frames = {}
+    for key, column in dataset.items():
+        size = column[0].size
+        numbers = column.ravel()
+        if size > 1:
+            numbers = pa.FixedSizeListArray.from_arrays(numbers, size)
+        frames[key] = numbers
+    episode_edges = pairwise([*starts, len(dataset["index"])])
+    episodes = [_describe_episode(dataset, first, end, tasks) for first, end in episode_edges]
+    task_table = pa.table({"task_index": np.arange(len(tasks)), "task": tasks})
     tables = {
-        f"data/{_FILE}": pa.table(vectors),
-        f"meta/episodes/{_FILE}": pa.Table.from_pylist(described),
-        "meta/tasks.parquet": texts.replace_schema_metadata(_PANDAS),
+        f"data/{_FILE}": pa.table(frames),
+        f"meta/episodes/{_FILE}": pa.Table.from_pylist(episodes),
+        "meta/tasks.parquet": task_table.replace_schema_metadata(_PANDAS),
     }
-    for place, table in tables.items():
-        (folder / place).parent.mkdir(parents=True, exist_ok=True)
-        with (folder / place).open(
-            "wb"
-        ) as stream:  # a full disk is reported here, not by pyarrow
+    for file_name, table in tables.items():
+        path = folder / file_name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # opened by Python and not by pyarrow, so that a full disk is an OSError
+        with path.open("wb") as stream:
             parquet.write_table(table, stream)
-    return {"meta/stats.json": {key: _describe(one) for key, one in whole.items()}}
+    statistics = {key: _compute_statistics(column) for key, column in dataset.items()}
+    return {"meta/stats.json": statistics}
 
 
-def _describe_set(
-    fps: int, names: Names, whole: Columns, episodes: int, tasks: int
+def _describe_dataset(
+    fps: int, names: Names, columns: Columns, episodes: int, tasks: int
 ) -> dict[str, Any]:
+    """Returns the contents of the dataset's meta/info.json.
+
+    Args:
+        fps: number of frames a second.
+        names: names of the numbers of each feature.
+        columns: the columns of all frames.
+        episodes: number of episodes.
+        tasks: number of tasks.
+    """
+    features = {}
+    for key, column in columns.items():
+        features[key] = {
+            "dtype": str(column.dtype),
+            "shape": [column[0].size],
+            "names": names.get(key),
+        }
     return {
         "codebase_version": "v3.0",
         "robot_type": "trilat",
         "fps": fps,
         "total_episodes": episodes,
-        "total_frames": len(whole["index"]),
+        "total_frames": len(columns["index"]),
         "total_tasks": tasks,
         "chunks_size": 1000,
         "data_files_size_in_mb": 100,
@@ -263,43 +388,48 @@ def _describe_set(
         "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
         "video_path": None,
         "splits": {"train": f"0:{episodes}"},
-        "features": {
-            key: {"dtype": str(one.dtype), "shape": [one[0].size], "names": names.get(key)}
-            for key, one in whole.items()
-        },
+        "features": features,
     }
 
 
-def _describe_episode(whole: Columns, first: int, end: int, tasks: list[str]) -> dict[str, Any]:
-    stats = {key: _describe(values[first:end]) for key, values in whole.items()}
-    return {
-        "episode_index": int(whole["episode_index"][first]),
-        "tasks": [tasks[whole["task_index"][first]]],
+def _describe_episode(
+    dataset: Columns, first: int, end: int, tasks: list[str]
+) -> dict[str, Any]:
+    """Returns the row of an episode, with the frames `first` to `end` - 1."""
+    row: dict[str, Any] = {
+        "episode_index": int(dataset["episode_index"][first]),
+        "tasks": [tasks[dataset["task_index"][first]]],
         "length": end - first,
         "dataset_from_index": first,
         "dataset_to_index": end,
-        **{
-            f"{of}/{which}_index": 0
-            for of in ("data", "meta/episodes")
-            for which in ("chunk", "file")
-        },
-        **{
-            f"stats/{key}/{name}": one
-            for key, found in stats.items()
-            for name, one in found.items()
-        },
+        "data/chunk_index": 0,
+        "data/file_index": 0,
+        "meta/episodes/chunk_index": 0,
+        "meta/episodes/file_index": 0,
     }
+    for key, column in dataset.items():
+        for name, numbers in _compute_statistics(column[first:end]).items():
+            row[f"stats/{key}/{name}"] = numbers
+    return row
 
 
-def _describe(values: NDArray[Any]) -> dict[str, list[float]]:
-    """Returns what LeRobot scales a feature by, of each of its numbers."""
-    rows = values.reshape(len(values), -1).astype(np.float64)
-    found = {
-        name: getattr(np, name)(rows, axis=0).tolist() for name in ("min", "max", "mean", "std")
+def _compute_statistics(column: NDArray[Any]) -> dict[str, list[float]]:
+    """Returns the statistics of a feature by which LeRobot scales it, with n numbers each.
+
+    Args:
+        column: the feature in F frames, shape (F, n) or (F,).
+    """
+    rows = column.reshape(len(column), -1).astype(np.float64)
+    statistics = {
+        "min": np.min(rows, axis=0).tolist(),
+        "max": np.max(rows, axis=0).tolist(),
+        "mean": np.mean(rows, axis=0).tolist(),
+        "std": np.std(rows, axis=0).tolist(),
     }
-    for share in (0.01, 0.1, 0.5, 0.9, 0.99):
-        found[f"q{100 * share:02.0f}"] = np.quantile(rows, share, axis=0).tolist()
-    return {**found, "count": [len(rows)]}
+    for share in _QUANTILES:
+        statistics[f"q{100 * share:02.0f}"] = np.quantile(rows, share, axis=0).tolist()
+    statistics["count"] = [len(rows)]
+    return statistics
 
 
 FORMAT = ExportFormat(_write, "-lerobot", folder=True, extra=_EXTRA, many=True)

@@ -1,4 +1,4 @@
-"""A MATLAB file with a struct per site, and in it an array per column."""
+"""Exports a log as a MATLAB file (.mat) with a struct per site and an array per column."""
 
 from pathlib import Path
 from typing import Any
@@ -12,53 +12,76 @@ from ...log.log_reader import Log
 from ..export import ExportFormat, Written, name_inside, read_texts, store_tables
 
 _EXTRA = ("scipy.io", "mat", "MAT files")
-_EXACT = 2**53
-"""Largest integer up to which all are exact as floats, the numbers of MATLAB."""
+_MAX_EXACT_INTEGER = 2**53
+"""Integers of at most this size are exact as doubles, the usual numbers of MATLAB."""
 _KEYWORDS = {
-    "break", "case", "catch", "classdef", "continue", "else", "elseif", "end", "for", "function", "global",
-    "if", "otherwise", "parfor", "persistent", "return", "spmd", "switch", "try", "while",
+    "break", "case", "catch", "classdef", "continue", "else", "elseif", "end", "for",
+    "function", "global", "if", "otherwise", "parfor", "persistent", "return", "spmd", "switch",
+    "try", "while",
 }  # fmt: skip
 """Reserved words of MATLAB."""
 
 
 def _write(log: Log, path: Path, written: Written) -> None:
-    """Writes a struct per site (`m1.q1_rad`, `m1.link.age_s_us`), `events`, and two texts."""
+    """Writes a struct per site, the struct `events`, and two texts.
+
+    Columns have names such as `m1.q1_rad` and `m1.link.age_s_us`. The texts are the
+    description, `about_json`, and the scenario, `scenario_toml`.
+
+    Raises:
+        UsageError: the log is too large for a MATLAB file.
+    """
     variables: dict[str, Any] = {}
 
-    def store(table: Table, place: str) -> None:
-        struct: dict[str, Any] = {
-            column.name: _matlab(column, table) for column in table.columns
-        }
-        struct["units"] = {column.name: column.unit for column in table.columns}
-        name, _, kind = place.partition(".")
-        (variables[name] if kind else variables)[kind or name] = struct
+    def store(table: Table, table_name: str) -> None:
+        struct = _build_struct(table)
+        site, _, kind = table_name.partition(".")
+        if kind:
+            # store_tables stores the records of a site before its other tables
+            variables[site][kind] = struct
+        else:
+            variables[site] = struct
 
-    def place_of(table: Table) -> str:
-        return name_inside(
-            table, f"{table.name}_site" if table.name in _KEYWORDS else table.name, "."
-        )
-
-    about = store_tables(log, written, place_of, store)
-    variables |= {"about_json": about, "scenario_toml": log.scenario_text}
+    variables["about_json"] = store_tables(log, written, _name_table, store)
+    variables["scenario_toml"] = log.scenario_text
     savemat = import_extra(*_EXTRA).savemat
     try:
         with path.open("wb") as stream:
             savemat(stream, variables, long_field_names=True, oned_as="column")
     except (ValueError, OverflowError) as error:
-        text = f"too large for a MAT file ({error}); export it --to npz, or --to parquet"
-        raise UsageError(f"{log.source}: {text}") from None
+        raise UsageError(
+            f"{log.source}: too large for a MAT file ({error}); "
+            "export it --to npz, or --to parquet"
+        ) from None
 
 
-def _matlab(column: Column, table: Table) -> Any:
-    """Returns a column for MATLAB: doubles if they are exact, rows of characters or cells."""
+def _name_table(table: Table) -> str:
+    """Returns the name of a table in the file; a site named like a keyword gets an ending."""
+    name = f"{table.name}_site" if table.name in _KEYWORDS else table.name
+    return name_inside(table, name, ".")
+
+
+def _build_struct(table: Table) -> dict[str, Any]:
+    """Returns a struct of the columns of a table, with their units in the field `units`."""
+    struct = {column.name: _convert_column(column, table) for column in table.columns}
+    struct["units"] = {column.name: column.unit for column in table.columns}
+    return struct
+
+
+def _convert_column(column: Column, table: Table) -> Any:
+    """Returns a column for MATLAB.
+
+    Texts are rows of characters in the tables of sites, and cells in the table of events.
+    Integers become doubles if all of them are exact as doubles. Stamps in ns stay integers.
+    """
     if column.is_text:
         return read_texts(column) if table.kind else column.values.reshape(-1, 1)
     values = column.numbers()
     is_stamp = column.unit == "ns" and not column.name.startswith("drift")
-    exact = values.dtype == np.int64 and bool((np.abs(values) <= _EXACT).all())
-    if is_stamp or values.dtype.kind not in "iu" or not exact:
+    if is_stamp or values.dtype != np.int64:
         return values
-    return values.astype(np.float64)
+    is_exact = bool((np.abs(values) <= _MAX_EXACT_INTEGER).all())
+    return values.astype(np.float64) if is_exact else values
 
 
 FORMAT = ExportFormat(_write, ".mat", extra=_EXTRA)

@@ -1,11 +1,11 @@
-"""A ROS 2 bag: standard messages at full rate, in an MCAP file of profile `ros2`.
+"""Exports a log as a ROS 2 bag: standard messages in an MCAP file of profile `ros2`.
 
 Invariant:
-- A bag has every record once, with its numbers and times; nothing is decimated.
-- Topics and types are those of the live bridge (`trilat_net.log.ros2.published`), and so are
-  their names.
-- A header's stamp is the nominal time of its tick, the publish time the time of sending, the
-  log time the time of arrival.
+    - A bag has every record once, with its numbers and times. Nothing is decimated.
+    - The topics and their names and types are those of the live bridge
+      (`trilat_net.log.ros2.published`).
+    - The stamp of a header is the nominal time of its tick. The publish time of a message is
+      the time of sending, and its log time is the time of arrival.
 """
 
 import heapq
@@ -33,50 +33,48 @@ from ...log.ros2.topic_names import (
 from ..export import ExportFormat, Written
 
 SOURCE_METADATA = "trilat.source"
-"""Metadata of the file: its session."""
+"""Name of the metadata record that describes the exported session."""
 _QOS = (cdr.DEFINITIONS / "qos.yaml").read_text(encoding="utf-8")
+"""Template of a quality of service, as rosbag2 writes it: reliable."""
 _VOLATILE = {"DEPTH": "10", "DURABILITY": "2"}
+"""Values for `_QOS`: the last ten messages, for present subscribers."""
 _LATCHED = {"DEPTH": "1", "DURABILITY": "1"}
-"""Quality of service of the live topics: reliable; the last ten messages, or the last one also
-for who comes later (transient local).
-"""
-_EVERY = 1000
-"""Records between two reports of progress."""
+"""Values for `_QOS`: the last message, for late subscribers as well (transient local)."""
+_RECORDS_PER_REPORT = 1000
+"""Number of records between two reports of progress."""
 
 TimedMessages = tuple[int, int, list[tuple[str, bytes]]]
-"""Messages of one publish time, by topic: the log time and the publish time, ns, before them.
+"""Log time, ns, publish time, ns, and the messages with these times as pairs of topic and data.
 """
 
 
 def export_ros2(
     log: Log, path: Path, written: Written = lambda _: None, *, names: str = NAMINGS[0]
 ) -> None:
-    """Writes a log as a bag that `ros2 bag` and its like play and read.
+    """Writes a log as a bag for `ros2 bag` and other players of bags.
 
-    The topics are those of the live bridge: `/<session>/<site>/joint_states` and so on, `/tf`,
-    `/diagnostics`, and of the session `/<session>/events` and `/<session>/log`. Units, names
-    and representations of orientations stand in the channels' metadata.
-
-    An earlier file is replaced; `written` is called with the number of records since its last
-    call.
+    The topics are those of the live bridge: `/<session>/<site>/joint_states` and others per
+    site, `/<session>/events` and `/<session>/log` of the session, `/tf` and `/diagnostics`. The
+    metadata of the channels have units, names and representations of orientations. An existing
+    file is replaced.
 
     Args:
         log: the log.
         path: the bag.
-        written: called with the number of records.
-        names: "crisp", "crtk" or a file of names, as `trilat ros2 --names` takes it.
+        written: called with the number of records since its last call.
+        names: names of the topics: "crisp", "crtk", or a file of names as for
+            `trilat ros2 --names`.
 
     Raises:
         LogError: a message of the log cannot be read.
         UsageError: the names cannot be read.
-        OSError: the disk refuses.
+        OSError: the disk refused the data.
     """
     table = read_topic_table(names)
     session = make_session_name(log.session.get("session", "") or log.scenario.name)
     with path.open("wb") as stream:
-        file = McapWriter(
-            stream, f"trilat-net {collect_provenance()['version_trilat-net']}", profile="ros2"
-        )
+        version = collect_provenance()["version_trilat-net"]
+        file = McapWriter(stream, f"trilat-net {version}", profile="ros2")
         file.add_metadata(SOURCE_METADATA, {"source": log.source, **log.session})
         file.add_attachment(
             create_time=0,
@@ -85,114 +83,131 @@ def export_ros2(
             media_type="application/toml",
             data=log.scenario_text.encode(),
         )
-        sites = [
-            _SiteRecords(log=log, name=name, session=session, table=table, progress=written)
-            for name in log.sites
-        ]
-        known = {
-            f"/{topic}": channel
-            for topic, channel in list_topics(log.scenario, session, table).items()
-        }
-        bag = ros2_messages.StandardChannels(
-            file, {topic: _offer_quality(channel) for topic, channel in known.items()}
-        )
-        parts = [part for site in sites for part in (site.records(), site.statistics())]
-        parts += [_events(log, session), _diagnostics(log, session)]
-        for log_ns, publish_ns, messages in heapq.merge(*parts, key=itemgetter(0)):
+        channels = {}
+        for topic, channel in list_topics(log.scenario, session, table).items():
+            channels[f"/{topic}"] = _add_quality(channel)
+        channel_numbers = ros2_messages.StandardChannels(file, channels)
+
+        streams: list[Iterator[TimedMessages]] = []
+        for site in log.sites:
+            site_bag = _SiteBag(
+                log=log, site=site, session=session, table=table, progress=written
+            )
+            streams += [site_bag.iterate_records(), site_bag.iterate_statistics()]
+        streams += [_iterate_events(log, session), _iterate_diagnostics(log, session)]
+        for log_ns, publish_ns, messages in heapq.merge(*streams, key=itemgetter(0)):
             for topic, data in messages:
-                file.add_message(bag[f"/{topic}"], log_ns, data, publish_ns)
+                file.add_message(channel_numbers[f"/{topic}"], log_ns, data, publish_ns)
         file.finish()
 
 
-def _offer_quality(channel: ros2_messages.Ros2Channel) -> ros2_messages.Ros2Channel:
-    """Returns a channel whose metadata has its quality of service as rosbag2 writes it."""
+def _add_quality(channel: ros2_messages.Ros2Channel) -> ros2_messages.Ros2Channel:
+    """Returns a channel with its quality of service in its metadata, as rosbag2 writes it."""
     text = _QOS
-    for word, number in (_LATCHED if channel.latched else _VOLATILE).items():
-        text = text.replace(word, number)
+    values = _LATCHED if channel.latched else _VOLATILE
+    for placeholder, value in values.items():
+        text = text.replace(placeholder, value)
     return channel._replace(about={"offered_qos_profiles": text, **channel.about})
 
 
-class _SiteRecords:
-    """The messages of one site, with their times."""
+class _SiteBag:
+    """The messages of one site in a bag.
+
+    Args:
+        log: the log.
+        site: name of the site.
+        session: name of the session in topics.
+        table: names of the topics.
+        progress: called with the number of records since its last call.
+    """
 
     def __init__(
         self,
         log: Log,
-        name: str,
+        site: str,
         session: str,
         table: TopicTable,
         progress: Callable[[int], None],
     ) -> None:
         self._log = log
-        self._name = name
-        self._progress = progress
-        self._messages = SiteMessages(log.scenario, name, _find_epoch_ns(log))
+        self._site = site
         self._session = session
         self._table = table
+        self._progress = progress
+        self._messages = SiteMessages(log.scenario, site, _find_epoch_ns(log))
 
     def _find_topic(self, topic: str) -> str:
-        return self._table.find(self._session, self._name, topic)
+        """Returns the full name of a topic of the site."""
+        return self._table.find(self._session, self._site, topic)
 
-    def _named(self, messages: Iterable[tuple[str, bytes]]) -> list[tuple[str, bytes]]:
+    def _name_messages(self, messages: Iterable[tuple[str, bytes]]) -> list[tuple[str, bytes]]:
+        """Returns messages with the full names of their topics."""
         return [(self._find_topic(topic), data) for topic, data in messages]
 
-    def records(self) -> Iterator[TimedMessages]:
-        """Yields its records in the order of arrival."""
-        part = self._log[self._name]
-        shares = trace_dominance(self._log, self._name, part.t_s).alpha.tolist()
-        log_ns = part.log_time_ns.tolist()
-        publish_ns = part.publish_time_ns.tolist()
-        for count, at in enumerate(np.argsort(part.log_time_ns, kind="stable").tolist(), 1):
-            record = part.states[at]
-            messages = self._named(self._messages.pack_record(record, shares[at]))
+    def iterate_records(self) -> Iterator[TimedMessages]:
+        """Yields the messages of the records, in the order in which the records arrived."""
+        records = self._log[self._site]
+        shares = trace_dominance(self._log, self._site, records.t_s).alpha.tolist()
+        log_ns = records.log_time_ns.tolist()
+        publish_ns = records.publish_time_ns.tolist()
+        order = np.argsort(records.log_time_ns, kind="stable").tolist()
+        for count, row in enumerate(order, 1):
+            record = records.states[row]
+            messages = self._name_messages(self._messages.pack_record(record, shares[row]))
             if count == 1:
-                messages.insert(
-                    0, (self._find_topic("robot_description"), self._messages.description)
-                )
+                description_topic = self._find_topic("robot_description")
+                messages.insert(0, (description_topic, self._messages.description))
             messages += [(FRAMES, data) for data in self._messages.pack_frames(record)]
-            yield log_ns[at], publish_ns[at], messages
-            if not count % _EVERY or count == len(part):
-                self._progress((count - 1) % _EVERY + 1)
+            yield log_ns[row], publish_ns[row], messages
+            if count % _RECORDS_PER_REPORT == 0 or count == len(records):
+                # the last report can be shorter than the others
+                self._progress((count - 1) % _RECORDS_PER_REPORT + 1)
 
-    def statistics(self) -> Iterator[TimedMessages]:
-        """Yields its statistics in the order of arrival."""
-        timed = self._log.timed_link_stats(self._name)
+    def iterate_statistics(self) -> Iterator[TimedMessages]:
+        """Yields the messages of the link statistics, in the order of arrival."""
+        timed = self._log.timed_link_stats(self._site)
         rows = zip(
             timed.log_ns.tolist(), timed.publish_ns.tolist(), timed.messages, strict=True
         )
         for log_ns, publish_ns, stats in sorted(rows, key=itemgetter(0)):
-            yield log_ns, publish_ns, self._named(self._messages.pack_statistics(stats))
+            messages = self._name_messages(self._messages.pack_statistics(stats))
+            yield log_ns, publish_ns, messages
 
 
 def _find_epoch_ns(log: Log) -> int:
+    """Returns the Unix time of the epoch of a session, in ns; 0 in virtual time."""
     return int(log.session.get("epoch_unix_ns", "0"))
 
 
-def _events(log: Log, session: str) -> Iterator[TimedMessages]:
+def _iterate_events(log: Log, session: str) -> Iterator[TimedMessages]:
+    """Yields the messages of the events of a session."""
     timed = log.timed_events()
     rows = zip(timed.log_ns.tolist(), timed.publish_ns.tolist(), timed.messages, strict=True)
     for log_ns, publish_ns, event in rows:
-        messages = ros2_messages.pack_event(event, publish_ns)
-        yield log_ns, publish_ns, [(f"{session}/{topic}", data) for topic, data in messages]
+        packed = ros2_messages.pack_event(event, publish_ns)
+        messages = [(f"{session}/{topic}", data) for topic, data in packed]
+        yield log_ns, publish_ns, messages
 
 
-def _diagnostics(log: Log, session: str) -> Iterator[TimedMessages]:
-    """Yields a message of every whole second, after the records that it is of."""
+def _iterate_diagnostics(log: Log, session: str) -> Iterator[TimedMessages]:
+    """Yields a message per second on the newest records of all sites.
+
+    A message has the times of the last of these records, and never times before those of its
+    predecessor.
+    """
     parts = [log[site] for site in log.sites if len(log[site])]
     end_ns = max((int(part.t_ns.max()) for part in parts), default=-1)
-    log_ns = publish_ns = 0
+    log_ns = 0
+    publish_ns = 0
     for second in range(end_ns // NS_PER_S + 1):
-        places = [
-            int(np.searchsorted(part.t_ns, second * NS_PER_S, side="right")) - 1
-            for part in parts
-        ]
-        newest = [(part, at) for part, at in zip(parts, places, strict=True) if at >= 0]
-        if newest:
-            log_ns = max([log_ns, *(int(part.log_time_ns[at]) for part, at in newest)])
-            publish_ns = max(
-                [publish_ns, *(int(part.publish_time_ns[at]) for part, at in newest)]
-            )
-            records = [part.record(at) for part, at in newest]
+        records = []
+        for part in parts:
+            row = int(np.searchsorted(part.t_ns, second * NS_PER_S, side="right")) - 1
+            if row >= 0:
+                records.append(part.record(row))
+                log_ns = max(log_ns, int(part.log_time_ns[row]))
+                publish_ns = max(publish_ns, int(part.publish_time_ns[row]))
+        if records:
             data = pack_session_diagnostics(session, _find_epoch_ns(log), records)
             yield log_ns, publish_ns, [(DIAGNOSTICS, data)]
 
