@@ -46,9 +46,11 @@ MAX_EQUILIBRIUM_RESIDUAL = 1e-10
 _NEWTON_RESIDUAL = 1e-11
 """A residual below this is rounding, rad/s^2."""
 _GAUSS_NEWTON_STEPS = 60
+"""Largest number of Gauss-Newton steps."""
 _MAX_STEP = 0.3
 """Largest change of a state in one Gauss-Newton step, rad or units of the estimate."""
 _MAX_HALVINGS = 20
+"""Largest number of times that a step is halved."""
 _SETTLING_TICKS = 20_000
 """Ticks that the memory of an imported law has to become constant."""
 _FLAT = 1e-8
@@ -69,48 +71,50 @@ def extend_scenario(scenario: Scenario, duration_s: float) -> Scenario:
     def extend_actors(actors: tuple[msgspec.Struct, ...]) -> tuple[msgspec.Struct, ...]:
         extended = []
         for actor in actors:
-            if getattr(actor, "start_s", 0.0) > end_s or isinstance(actor, Chirp | Multisine):
+            starts_later = getattr(actor, "start_s", 0.0) > end_s
+            if starts_later or isinstance(actor, Chirp | Multisine):
                 continue
             is_present = getattr(actor, "end_s", 0.0) > end_s
             if is_present and hasattr(actor, "stiffness_nm_rad"):
-                extended.append(msgspec.structs.replace(actor, end_s=1e9))
-            else:
-                extended.append(actor)
+                actor = msgspec.structs.replace(actor, end_s=1e9)
+            extended.append(actor)
         return tuple(extended)
 
-    sites = {
-        name: msgspec.structs.replace(
+    sites = {}
+    for name, spec in scenario.sites.items():
+        sites[name] = msgspec.structs.replace(
             spec,
             hands=extend_actors(spec.hands),
             environment=extend_actors(spec.environment),
         )
-        for name, spec in scenario.sites.items()
-    }
     timeline = tuple(change for change in scenario.timeline if change.at_s <= end_s)
     return msgspec.structs.replace(
-        scenario, sites=sites, timeline=timeline, duration_s=duration_s
+        scenario,
+        sites=sites,
+        timeline=timeline,
+        duration_s=duration_s,
     )
 
 
 def compute_equilibrium_residual(conditions: OperatingConditions, rest: Equilibrium) -> Array:
     """Returns the rates at a pose in the order of the loop's states, shape (states,).
 
-    They are zero for the angles, and the accelerations and the rates of the estimates.
+    The rates of the angles are zero. The others are the accelerations and the rates of the
+    estimates.
     """
     arguments = linear_loop.gather_site_arguments(conditions, rest)
-    states = [
-        np.concatenate([np.zeros_like(rates.qdd), rates.qdd, rates.estimate])
-        for rates in conditions.evaluate_rates(arguments)
-    ]
+    states = []
+    for rates in conditions.evaluate_rates(arguments):
+        velocities = np.zeros_like(rates.qdd)
+        states.append(np.concatenate([velocities, rates.qdd, rates.estimate]))
     return _select_loop_states(conditions, states)
 
 
 def _select_loop_states(conditions: OperatingConditions, states: Sequence[Array]) -> Array:
-    """Returns the states in the loop of all sites in one vector."""
+    """Returns the states of all sites that are in the loop, in one vector."""
     masks = linear_loop.mask_loop_states(conditions)
-    return np.concatenate(
-        [site_states[mask] for site_states, mask in zip(states, masks, strict=True)]
-    )
+    pairs = zip(states, masks, strict=True)
+    return np.concatenate([site_states[mask] for site_states, mask in pairs])
 
 
 @limit_blas_threads()
@@ -129,12 +133,13 @@ def find_nearest_equilibrium(conditions: OperatingConditions, rest: Equilibrium)
         if np.abs(residual).max() <= _NEWTON_RESIDUAL:
             break
         step = _compute_gauss_newton_step(conditions, rest, residual)
-        share = _MAX_STEP / max(float(np.abs(step).max()), _MAX_STEP)
+        share = _limit_step(step)
+        size = np.linalg.norm(residual)
         # a shorter step if the residual does not fall, as when a wall is touched
         for _ in range(_MAX_HALVINGS):
             candidate = _shift_equilibrium(conditions, rest, share * step)
             candidate_residual = compute_equilibrium_residual(conditions, candidate)
-            if np.linalg.norm(candidate_residual) < np.linalg.norm(residual):
+            if np.linalg.norm(candidate_residual) < size:
                 break
             share *= 0.5
         else:
@@ -142,6 +147,12 @@ def find_nearest_equilibrium(conditions: OperatingConditions, rest: Equilibrium)
         rest = candidate
         residual = candidate_residual
     return rest._replace(residual=float(np.abs(residual).max()))
+
+
+def _limit_step(step: Array) -> float:
+    """Returns the share of a step with which no state changes by more than `_MAX_STEP`."""
+    largest = float(np.abs(step).max())
+    return _MAX_STEP / max(largest, _MAX_STEP)
 
 
 def _compute_gauss_newton_step(
@@ -153,11 +164,15 @@ def _compute_gauss_newton_step(
     an end of its box.
     """
     loop = linear_loop.linearise_loop(conditions, rest, all_estimates=True)
-    effects = np.hstack([loop.A, *(term.A for term in loop.delayed)])
+    delayed_matrices = [term.A for term in loop.delayed]
+    effects = np.hstack([loop.A, *delayed_matrices])
+    is_moved = effects.any(axis=1)
     is_speed = [name.rpartition(".")[2].startswith("qd") for name in loop.names]
-    free = np.flatnonzero(effects.any(axis=1) & ~np.array(is_speed))
+    free = np.flatnonzero(is_moved & ~np.array(is_speed))
+    free_columns = loop.static_matrix[:, free]
+    solution = np.linalg.lstsq(free_columns, -residual, rcond=_FLAT)
     step = np.zeros(len(loop.names))
-    step[free] = np.linalg.lstsq(loop.static_matrix[:, free], -residual, rcond=_FLAT)[0]
+    step[free] = solution[0]
     return step
 
 
@@ -166,8 +181,9 @@ def _shift_equilibrium(
 ) -> Equilibrium:
     """Returns an equilibrium shifted by a step of the loop's states; velocities are ignored."""
     masks = linear_loop.mask_loop_states(conditions)
-    bounds = np.cumsum([np.count_nonzero(mask) for mask in masks])[:-1]
-    site_steps = np.split(step, bounds)
+    counts = [np.count_nonzero(mask) for mask in masks]
+    ends = np.cumsum(counts)
+    site_steps = np.split(step, ends[:-1])
     q = np.array(rest.q)
     theta_hat = np.array(rest.theta_hat)
     for n, site in enumerate(conditions.sites):
@@ -181,7 +197,8 @@ def _shift_equilibrium(
 
 def pad_rows(rows: Sequence[Sequence[float] | Array]) -> Array:
     """Returns vectors of different lengths as rows of one array, padded with zeros."""
-    padded = np.zeros((len(rows), max(map(len, rows))))
+    longest = max(map(len, rows))
+    padded = np.zeros((len(rows), longest))
     for padded_row, row in zip(padded, rows, strict=True):
         padded_row[: len(row)] = row
     return padded
@@ -191,8 +208,10 @@ def _refuse_singular_poses(conditions: OperatingConditions, rest: Equilibrium) -
     """Raises ScenarioError if a site in task space is in a singular pose."""
     arguments = linear_loop.gather_site_arguments(conditions, rest)
     for site, x in zip(conditions.sites, arguments, strict=True):
-        arm = place_arm(site, x[lay_out_arguments(site).q])
-        if not compute_following(site, arm, x).least > SINGULAR:
+        layout = lay_out_arguments(site)
+        arm = place_arm(site, x[layout.q])
+        following = compute_following(site, arm, x)
+        if not following.least > SINGULAR:
             raise ScenarioError(
                 "rests in a singular pose, where the inverse of its Jacobian, and so the loop, "
                 "has no derivative: end it elsewhere, or follow fewer axes",
@@ -203,9 +222,9 @@ def _refuse_singular_poses(conditions: OperatingConditions, rest: Equilibrium) -
 def predict_from_start(conditions: OperatingConditions, scenario: Scenario) -> Equilibrium:
     """Returns the equilibrium that the loop reaches from the start poses.
 
-    The prediction assumes that every mode decays except those at zero. A loop with roots at
-    zero keeps part of its history: with null vectors W' S = 0 and S V = 0 of
-    S = A + sum_k A_k, and D = I + sum_k T_k A_k, it is
+    The prediction assumes that all modes decay except those at zero. A loop with roots at zero
+    keeps part of its history. With the null vectors W' S = 0 and S V = 0 of S = A + sum_k A_k,
+    and D = I + sum_k T_k A_k, this part is
 
         V (W' D V)^-1 W' (x(0) + sum_k A_k int_{-T_k}^0 x)
 
@@ -214,12 +233,13 @@ def predict_from_start(conditions: OperatingConditions, scenario: Scenario) -> E
     """
     q = pad_rows([spec.q0_rad for spec in scenario.sites.values()])
     start = Equilibrium(q, _complete_estimates(conditions), "", 0.0)
-    # from afar, steps of a chain's ten estimates per link diverge; about the mean pose the
-    # estimates are true
+    # far from the equilibrium, steps of a chain's ten estimates per link diverge; at the mean
+    # pose the estimates are true
     layout = conditions.sites[0].layout
     first_guess = start
     if layout.chain and not layout.task:
-        first_guess = start._replace(q=np.tile(q.mean(axis=0), (len(q), 1)))
+        mean_pose = q.mean(axis=0)
+        first_guess = start._replace(q=np.tile(mean_pose, (len(q), 1)))
     rest = find_nearest_equilibrium(conditions, first_guess)
     if conditions.has_forms:
         return rest._replace(how="the start poses")
@@ -254,19 +274,24 @@ def _compute_deviation(
 def _project_on_zero_roots(loop: linear_loop.LinearLoop, deviation: Array) -> Array | None:
     """Returns the part of a constant deviation that remains for ever, shape (states,).
 
-    None: the roots at zero have too few vectors.
+    Returns None if the roots at zero have too few vectors.
     """
     left, values, right = np.linalg.svd(loop.static_matrix)
-    count = int(np.sum(values <= _FLAT * values[0]))
+    is_zero = values <= _FLAT * values[0]
+    count = int(np.sum(is_zero))
     if not count:
         return None
     W = left[:, -count:]
     V = right[-count:].T
-    D = sum((term.delay_s * term.A for term in loop.delayed), np.eye(len(values)))
-    inner = W.T @ D @ V
+    D = np.eye(len(values))
+    for term in loop.delayed:
+        D = D + term.delay_s * term.A
+    W_D = W.T @ D
+    inner = W_D @ V
     if np.linalg.cond(inner) > 1.0 / _FLAT:
         return None
-    return V @ np.linalg.solve(inner, W.T @ D @ deviation)
+    coordinates = np.linalg.solve(inner, W_D @ deviation)
+    return V @ coordinates
 
 
 def find_equilibrium(scenario: Scenario, pose: tuple[float, ...] | None = None) -> Equilibrium:
@@ -303,7 +328,7 @@ def predict_equilibrium(scenario: Scenario) -> Equilibrium:
 def follow_equilibrium(scenario: Scenario, rest: Equilibrium) -> Equilibrium:
     """Returns the equilibrium of a scenario nearest to the equilibrium of another scenario.
 
-    It is `rest` itself, with completed estimates, if that is an equilibrium here too.
+    `rest` itself, with completed estimates, is returned if it is an equilibrium here too.
 
     Raises:
         ScenarioError: the scenario has no linear loop, or no equilibrium there.
@@ -315,7 +340,8 @@ def follow_equilibrium(scenario: Scenario, rest: Equilibrium) -> Equilibrium:
     residual = compute_equilibrium_residual(conditions, start)
     if float(np.abs(residual).max()) <= MAX_EQUILIBRIUM_RESIDUAL:
         return start
-    return _require_equilibrium(scenario, find_nearest_equilibrium(conditions, start))
+    nearest = find_nearest_equilibrium(conditions, start)
+    return _require_equilibrium(scenario, nearest)
 
 
 def choose_equilibrium(scenario: Scenario) -> Equilibrium:
@@ -352,25 +378,27 @@ def _complete_estimates(
     for n, site in enumerate(conditions.sites):
         known = None if theta_hat is None else theta_hat[n]
         if isinstance(site.law_factory, NumericLaw):
-            rows.append(site.law_factory.complete_memory(known))
-        elif has_estimate(site):
-            rows.append(site.theta if known is None else known[: len(site.theta)])
+            row = site.law_factory.complete_memory(known)
+        elif not has_estimate(site):
+            row = np.broadcast_to(site.gains.known, site.theta.shape)
+        elif known is None:
+            row = site.theta
         else:
-            rows.append(np.broadcast_to(site.gains.known, site.theta.shape))
+            row = known[: len(site.theta)]
+        rows.append(row)
     return pad_rows(rows)
 
 
 def _iterate_memories(
     conditions: OperatingConditions, rest: Equilibrium, ticks: int
 ) -> Equilibrium:
-    """Returns a pose with the memories that imported laws have after some ticks there."""
+    """Returns a pose with the memories of imported laws after some ticks in this pose."""
     theta_hat = rest.theta_hat.copy()
     arguments = linear_loop.gather_site_arguments(conditions, rest)
     for n, (site, x) in enumerate(zip(conditions.sites, arguments, strict=True)):
         if isinstance(site.law_factory, NumericLaw):
-            theta_hat[n, : len(site.law_factory.memory)] = site.law_factory.iterate_memory(
-                x, ticks
-            )
+            memory = site.law_factory.iterate_memory(x, ticks)
+            theta_hat[n, : len(memory)] = memory
     return rest._replace(theta_hat=theta_hat)
 
 
@@ -381,14 +409,13 @@ def _build_at_pose(pose: tuple[float, ...], conditions: OperatingConditions) -> 
         ScenarioError: an end effector does not reach the pose, or the pose is singular.
         UsageError: the pose does not consist of as many finite numbers as expected.
     """
-    layout = lay_out_arguments(conditions.sites[0])
-    task = conditions.sites[0].layout.task
-    if len(pose) != layout.coordinates or not np.isfinite(pose).all():
-        example = f"--pose 0.1,0.3{',...' * (layout.coordinates > 2)}"
-        raise UsageError(
-            f"--pose is {_describe_pose(layout.coordinates, task=bool(task))}, "
-            f"as in {example}, not {pose}"
-        )
+    first_site = conditions.sites[0]
+    coordinates = lay_out_arguments(first_site).coordinates
+    task = first_site.layout.task
+    if len(pose) != coordinates or not np.isfinite(pose).all():
+        expected = _describe_pose(coordinates, task=bool(task))
+        more = ",..." if coordinates > 2 else ""
+        raise UsageError(f"--pose is {expected}, as in --pose 0.1,0.3{more}, not {pose}")
     target = np.array(pose, dtype=np.float64)
     q = [reach_pose(site, target) if task else target for site in conditions.sites]
     rest = Equilibrium(
@@ -418,7 +445,7 @@ def _describe_pose(coordinates: int, *, task: bool) -> str:
 def reach_pose(site: SiteSetup, pose: Array) -> Array:
     """Returns the joint angles at which a site's end effector has a pose, rad, shape (n,).
 
-    They are found by Gauss-Newton steps from the start pose, and nearest to it.
+    Gauss-Newton steps from the start pose find the nearest such angles.
 
     Args:
         site: setup of a site that follows in task space.
@@ -433,15 +460,16 @@ def reach_pose(site: SiteSetup, pose: Array) -> Array:
         x = np.zeros(layout.arguments)
         x[layout.q] = q
         x[layout.q_des] = pose
-        following = compute_following(site, place_arm(site, q), x)
-        if np.abs(following.e).max() <= _NEWTON_RESIDUAL:
+        arm = place_arm(site, q)
+        following = compute_following(site, arm, x)
+        largest_error = np.abs(following.e).max()
+        if largest_error <= _NEWTON_RESIDUAL:
             return q
         assert following.J is not None
         step = np.linalg.lstsq(following.J, -following.e, rcond=_FLAT)[0]
-        q = q + step * (_MAX_STEP / max(float(np.abs(step).max()), _MAX_STEP))
+        q = q + step * _limit_step(step)
     raise ScenarioError(
-        "its end effector does not reach the pose: "
-        f"{np.abs(following.e).max():.2g} m or rad remain",
+        f"its end effector does not reach the pose: {largest_error:.2g} m or rad remain",
         path=f"sites.{site.name}.q0_rad",
     )
 
@@ -451,8 +479,10 @@ def find_mean_pose(scenario: Scenario) -> tuple[float, ...]:
     conditions = derive_operating_conditions(scenario)
     count = len(conditions.sites)
     q = pad_rows([site.q0 for site in conditions.sites])
-    equal_shares = conditions._replace(alpha=np.full((count, count), 1.0 / count))
-    references = linear_loop.compute_references(equal_shares, Equilibrium(q, q, "", 0.0))
+    equal_alpha = np.full((count, count), 1.0 / count)
+    equal_shares = conditions._replace(alpha=equal_alpha)
+    start = Equilibrium(q, q, "", 0.0)
+    references = linear_loop.compute_references(equal_shares, start)
     return tuple(references[0].tolist())
 
 
@@ -463,13 +493,15 @@ def _find_at_run_end(scenario: Scenario, conditions: OperatingConditions) -> Equ
     diverges, the equilibrium is predicted from the start poses.
     """
     ticks = sum(map(scenario.ticks, scenario.names))
-    extension = max(1.0, min(MAX_PROLONGATION, _MAX_RUN_TICKS / ticks))
+    affordable = _MAX_RUN_TICKS / ticks
+    extension = max(1.0, min(MAX_PROLONGATION, affordable))
     most_s = scenario.duration_s * extension
     run = FusedRun(extend_scenario(scenario, most_s))
     until_s = scenario.duration_s
     while True:
         mean_states = run.run_and_sample(until_s)
-        speed_rad_s = max(float(values[-BUCKETS_PER_S:, 1].max()) for values in run.maxima)
+        last_speeds = [values[-BUCKETS_PER_S:, 1] for values in run.maxima]
+        speed_rad_s = max(float(speeds.max()) for speeds in last_speeds)
         is_at_rest = speed_rad_s < EQUILIBRIUM_SPEED_RAD_S
         if run.diverged_s is not None or is_at_rest or 2.0 * until_s > most_s:
             break
@@ -494,13 +526,15 @@ def _find_at_run_end(scenario: Scenario, conditions: OperatingConditions) -> Equ
     laws = scenario.controls
     if any(isinstance(law, ImportedLaw) for law in laws):
         # the memory of an imported law takes the position of its estimate
-        rows = zip(laws, theta_hat, run.memories, strict=True)
-        theta_hat = pad_rows(
-            [memory if isinstance(law, ImportedLaw) else row for law, row, memory in rows]
-        )
-    start = Equilibrium(q, _complete_estimates(conditions, theta_hat), how, 0.0)
+        rows = []
+        for law, estimate, memory in zip(laws, theta_hat, run.memories, strict=True):
+            rows.append(memory if isinstance(law, ImportedLaw) else estimate)
+        theta_hat = pad_rows(rows)
+    estimates = _complete_estimates(conditions, theta_hat)
+    start = Equilibrium(q, estimates, how, 0.0)
     start = _iterate_memories(conditions, start, 1)
-    return _require_equilibrium(scenario, find_nearest_equilibrium(conditions, start))
+    nearest = find_nearest_equilibrium(conditions, start)
+    return _require_equilibrium(scenario, nearest)
 
 
 def _require_equilibrium(scenario: Scenario, rest: Equilibrium) -> Equilibrium:
@@ -523,10 +557,14 @@ def _describe_limits(conditions: OperatingConditions, rest: Equilibrium) -> Iter
         )
     arguments = linear_loop.gather_site_arguments(conditions, rest)
     for site, x in zip(conditions.sites, arguments, strict=True):
-        arm = place_arm(site, x[lay_out_arguments(site).q])
-        least = compute_following(site, arm, x).least ** 0.5
-        task = None if site.chain is None else site.chain.task
-        if task is not None and least < task.singular_value:
+        if site.chain is None or site.chain.task is None:
+            continue
+        task = site.chain.task
+        layout = lay_out_arguments(site)
+        arm = place_arm(site, x[layout.q])
+        following = compute_following(site, arm, x)
+        least = following.least**0.5
+        if least < task.singular_value:
             yield (
                 f"{site.name} rests near a singular pose (bound of its least singular value "
                 f"{least:.3g}, damped below {task.singular_value:g}): the damping is part of "

@@ -1,13 +1,13 @@
 """Linear analysis of a scenario, or of a run's end: equilibrium, roots, margin, verdict.
 
-At the end of a recorded run, the roots are those at the log's own end pose and estimates, under
-the conditions at its end. Where delays are drawn or measured, the roots are computed over the
-very samples that the last quarter of the records has in use. Mean ages serve for laws that are
-linearised in continuous time only. Only twins are executed.
+At the end of a recorded run, the roots belong to the log's last pose and estimates, under the
+conditions at the log's end. If delays are drawn or measured, the roots are computed over the
+samples that the last quarter of the records uses. For laws that are linearised in continuous
+time only, mean ages replace these samples. Nothing is executed but twins.
 
 Invariant:
-    - The verdict is that of the sampled loop, at any tick rates and delays. It is that of the
-      continuous loop if a law is linearised in continuous time only.
+    - The verdict is the sampled loop's, at any tick rates and delays. If a law is linearised in
+      continuous time only, the verdict is the continuous loop's.
     - The verdict holds for small motions about the equilibrium only.
 """
 
@@ -50,7 +50,9 @@ from .port_analysis import PortAnalysis, analyse_ports, ports_to_json
 from .port_passivity import HandMatrices
 
 DEFAULT_ROOTS = 6
+"""Number of roots that are computed unless another number is requested."""
 MAX_ROOTS = 60
+"""Largest number of roots that can be requested."""
 SAMPLED_ROOT_DIFFERENCE = 0.01
 """Continuous and sampled roots that differ by more than this share of abs(s) are both shown."""
 
@@ -127,6 +129,15 @@ class LinearAnalysis(Result):
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the keys of `trilat linear --json`."""
+        sampled = None
+        if self.sampled is not None:
+            sampled = _spectrum_to_json(self.sampled)
+        ports = None
+        if self.ports is not None:
+            ports = ports_to_json(self.ports)
+        edges = {}
+        for scan in self.scans:
+            edges[scan.key] = [edge._asdict() for edge in scan.edges]
         return {
             "scenario": self.scenario.name,
             "scenario_sha256": self.scenario.sha256,
@@ -134,25 +145,11 @@ class LinearAnalysis(Result):
             "rest": self._rest_to_json(),
             "delay_in_use_ms": self._delays_to_json(),
             "continuous": _spectrum_to_json(self.continuous),
-            "as_computed": None if self.sampled is None else _spectrum_to_json(self.sampled),
-            "margin": {
-                "words": self.margin.description,
-                "stable": [
-                    {"from_s": interval.low_s, "to_s": interval.high_s}
-                    for interval in self.margin.intervals
-                ],
-                "crossings": [
-                    {
-                        "delay_s": crossing.delay_s,
-                        "omega_rad_s": crossing.omega_rad_s,
-                        "pairs_to_the_right": crossing.pairs,
-                    }
-                    for crossing in self.margin.crossings
-                ],
-            },
+            "as_computed": sampled,
+            "margin": _margin_to_json(self.margin),
             "notes": list(self.notes),
-            "ports": None if self.ports is None else ports_to_json(self.ports),
-            "edges": {scan.key: [edge._asdict() for edge in scan.edges] for scan in self.scans},
+            "ports": ports,
+            "edges": edges,
         }
 
     def _rest_to_json(self) -> dict[str, Any]:
@@ -181,34 +178,38 @@ class LinearAnalysis(Result):
         """Returns the age of the samples in use, ms, by link."""
         conditions = self.conditions
         names = self.scenario.names
-        return {
-            f"{names[j]}->{names[i]}": 1e3 * float(conditions.age_s[i, j])
-            for i, j in zip(*np.nonzero(conditions.alpha), strict=True)
-        }
+        receivers, senders = np.nonzero(conditions.alpha)
+        delays_ms = {}
+        for i, j in zip(receivers, senders, strict=True):
+            link = f"{names[j]}->{names[i]}"
+            delays_ms[link] = 1e3 * float(conditions.age_s[i, j])
+        return delays_ms
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a row per root: of the continuous loop, and as computed tick by tick."""
+        """Returns a row for each root: of the continuous loop, and as computed by ticks."""
         spectra = {"continuous": self.continuous, "as computed": self.sampled}
         rows: list[dict[str, Any]] = []
         for loop, spectrum in spectra.items():
             if spectrum is None:
                 continue
-            roots = _spectrum_to_json(spectrum)["roots"]
-            rows += [
-                {"loop": loop, **root, "states": ", ".join(root["states"])} for root in roots
-            ]
+            for root in _spectrum_to_json(spectrum)["roots"]:
+                row = {"loop": loop, **root}
+                row["states"] = ", ".join(root["states"])
+                rows.append(row)
         return rows
 
     def find_sampled_root(self, root: CharacteristicRoot) -> CharacteristicRoot | None:
         """Returns the sampled root nearest to a continuous root, if they differ by over 1 %.
 
-        None: they differ by less, or there is no sampled root.
+        Returns None if they differ by less, or if there is no sampled root.
         """
         if self.sampled is None or not self.sampled.roots:
             return None
         nearest = min(self.sampled.roots, key=lambda sampled: abs(sampled.s - root.s))
         difference = abs(nearest.s - root.s)
-        return nearest if difference > SAMPLED_ROOT_DIFFERENCE * abs(root.s) else None
+        if difference <= SAMPLED_ROOT_DIFFERENCE * abs(root.s):
+            return None
+        return nearest
 
 
 def analyse_linear_loop(
@@ -260,20 +261,38 @@ def analyse_linear_loop(
     return replace(analysis, scans=tuple(scans), ports=port_analysis)
 
 
+def _margin_to_json(margin: DelayMargin) -> dict[str, Any]:
+    """Returns a delay margin as plain values."""
+    intervals = []
+    for interval in margin.intervals:
+        ends = {"from_s": interval.low_s, "to_s": interval.high_s}
+        intervals.append(ends)
+    crossings = []
+    for crossing in margin.crossings:
+        values = {
+            "delay_s": crossing.delay_s,
+            "omega_rad_s": crossing.omega_rad_s,
+            "pairs_to_the_right": crossing.pairs,
+        }
+        crossings.append(values)
+    return {"words": margin.description, "stable": intervals, "crossings": crossings}
+
+
 def _spectrum_to_json(spectrum: Spectrum) -> dict[str, Any]:
     """Returns a spectrum as plain values."""
+    roots = []
+    for root in spectrum.roots:
+        values = {
+            "re_per_s": root.s.real,
+            "im_rad_s": root.s.imag,
+            "damping": root.damping,
+            "modes": root.multiplicity,
+            "states": list(root.states),
+        }
+        roots.append(values)
     return {
         "verdict": spectrum.verdict,
-        "roots": [
-            {
-                "re_per_s": root.s.real,
-                "im_rad_s": root.s.imag,
-                "damping": root.damping,
-                "modes": root.multiplicity,
-                "states": list(root.states),
-            }
-            for root in spectrum.roots
-        ],
+        "roots": roots,
         "zeros_by_structure": spectrum.zeros,
         "of_those_drifting": spectrum.drifting,
         "dropped_candidates": spectrum.dropped,
@@ -382,17 +401,19 @@ def _fix_delays(log: Log) -> _FixedDelays:
     A tick without a record uses the samples of the tick before.
     """
     scenario = msgspec.structs.replace(log.scenario, duration_s=recorded_end_s(log))
-    has_unknown_delay = {
-        name: link.random or link.measured or link.points is not None
-        for name, link in scenario.links.items()
-    }
+    has_unknown_delay = {}
+    for name, link in scenario.links.items():
+        has_trace = link.points is not None
+        has_unknown_delay[name] = link.random or link.measured or has_trace
     if not any(has_unknown_delay.values()):
         return _FixedDelays(scenario, None, {})
     sites = [log[name] for name in scenario.names]
     links = dict(scenario.links)
-    common_hz = math.gcd(*(site.rate_hz for site in sites))
+    rates_hz = [site.rate_hz for site in sites]
+    common_hz = math.gcd(*rates_hz)
     # start and end of the last quarter, in ticks of the common rate
-    end = max(1, min(int(site.tick[-1]) * common_hz // site.rate_hz for site in sites))
+    last_ticks = [int(site.tick[-1]) * common_hz // site.rate_hz for site in sites]
+    end = max(1, min(last_ticks))
     start = max(3 * end // 4, end - round(DRAWN_SPAN_S * common_hz))
     used = {}
     mean_age_s = {}
@@ -400,19 +421,23 @@ def _fix_delays(log: Log) -> _FixedDelays:
         first_tick = start * site.rate_hz // common_hz
         end_tick = end * site.rate_hz // common_hz
         ticks = np.arange(first_tick, end_tick)
-        rows = np.maximum(np.searchsorted(site.tick, ticks, side="right") - 1, 0)
+        rows_after = np.searchsorted(site.tick, ticks, side="right")
+        rows = np.maximum(rows_after - 1, 0)
         samples = site.used[peer.name][rows]
         if samples.min() < 0:
-            # the peer never sent a sample, or not yet
+            # the peer had not sent a sample yet, or never sent a sample
             return _FixedDelays(scenario, None, {})
-        used[i, j] = samples - start * peer.rate_hz // common_hz
+        first_sample = start * peer.rate_hz // common_hz
+        used[i, j] = samples - first_sample
         name = f"{peer.name}->{site.name}"
         if has_unknown_delay[name]:
             ages_s = ticks / site.rate_hz - samples / peer.rate_hz
             mean_age_s[i, j] = float(ages_s.mean())
             links[name] = ConstantDelay(delay_ms=1e3 * mean_age_s[i, j])
-    uses = SamplesInUse((end - start) / common_hz, used)
-    return _FixedDelays(msgspec.structs.replace(scenario, links=links), uses, mean_age_s)
+    span_s = (end - start) / common_hz
+    uses = SamplesInUse(span_s, used)
+    fixed_scenario = msgspec.structs.replace(scenario, links=links)
+    return _FixedDelays(fixed_scenario, uses, mean_age_s)
 
 
 def _explain_no_roots(reason: str) -> EndPoseRoots:
@@ -423,8 +448,9 @@ def _explain_no_roots(reason: str) -> EndPoseRoots:
 def _choose_end_state(scenario: Scenario, site_logs: Sequence[SiteLog]) -> tuple[Array, Array]:
     """Returns the angles and the estimates of all sites at the end of a run.
 
-    They are the last record of a site at rest, and otherwise the mean of the last quarter. If
-    arms chatter at a sampled wall, it is the state in the last quarter that is deepest in it.
+    Of a site at rest the last record is returned, of any other site the mean of the last
+    quarter. If arms chatter at a sampled wall, the state of the last quarter that is deepest in
+    the wall is returned.
 
     Returns:
         Angles, shape (N, n), rad, and estimates, shape (N, P).
@@ -432,9 +458,9 @@ def _choose_end_state(scenario: Scenario, site_logs: Sequence[SiteLog]) -> tuple
     count = min(map(len, site_logs))
     rows = slice(3 * count // 4, count)
     first_times = site_logs[0].t_s[rows]
-    have_same_times = all(
-        np.array_equal(site_log.t_s[rows], first_times) for site_log in site_logs
-    )
+    have_same_times = True
+    for site_log in site_logs:
+        have_same_times &= np.array_equal(site_log.t_s[rows], first_times)
     if have_same_times and not all(map(_is_at_rest, site_logs)):
         joints = max(site_log.q.shape[1] for site_log in site_logs)
         padded = []
@@ -454,13 +480,16 @@ def _choose_end_state(scenario: Scenario, site_logs: Sequence[SiteLog]) -> tuple
 def _is_at_rest(site_log: SiteLog) -> bool:
     """True if no joint moved faster than `SETTLED_SPEED_RAD_S` in the last second."""
     t_s = site_log.t_s
-    last_second = site_log.qd[t_s > t_s[-1] - 1.0]
-    return float(np.abs(last_second).max()) <= SETTLED_SPEED_RAD_S
+    in_last_second = t_s > t_s[-1] - 1.0
+    last_speeds = np.abs(site_log.qd[in_last_second])
+    return float(last_speeds.max()) <= SETTLED_SPEED_RAD_S
 
 
 def _find_end_value(site_log: SiteLog, values: Array) -> Array:
     """Returns a signal's last value if the arm is at rest, else its last quarter's mean."""
     if _is_at_rest(site_log):
         return np.asarray(values[-1])
-    last_quarter = values[site_log.t_s >= 0.75 * site_log.t_s[-1]]
-    return np.asarray(last_quarter.mean(axis=0))
+    t_s = site_log.t_s
+    in_last_quarter = t_s >= 0.75 * t_s[-1]
+    mean = values[in_last_quarter].mean(axis=0)
+    return np.asarray(mean)

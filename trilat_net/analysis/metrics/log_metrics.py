@@ -1,10 +1,10 @@
 """Computes all metrics of a log, converts them to JSON, and compares several logs.
 
 Invariant:
-    - Every quantity is present for every subject (run, site, link or wall) to which it applies:
-      as a number, or with the reason why there is none.
+    - Each quantity is present for each subject (run, site, link or wall) to which it applies:
+      as a number, or with the reason why the number is missing.
     - In JSON a missing number is null, and `unknown` has the reason.
-    - A comparison has a column per log and a row per metric of the whole run.
+    - A comparison has a column for each log and a row for each metric of the whole run.
 """
 
 import math
@@ -63,7 +63,7 @@ class LogMetrics(Result):
         responses: impedances and reflections over frequency.
         axes: names of the shared coordinates in task space, where the number of a joint stands
             for a coordinate; () otherwise.
-        joint_names: names of the joints in the arms' files, if these agree; () otherwise.
+        joint_names: names of the joints, if all arms' files have the same names; () otherwise.
     """
 
     log: str
@@ -91,7 +91,9 @@ class LogMetrics(Result):
         """
         if self.axes:
             return self.axes[number - 1]
-        return f"{number} {self.joint_names[number - 1]}" if self.joint_names else str(number)
+        if self.joint_names:
+            return f"{number} {self.joint_names[number - 1]}"
+        return str(number)
 
     def unit(self, joint_unit: str, number: int) -> str:
         """Returns the unit of a quantity of a joint or of an axis.
@@ -105,20 +107,16 @@ class LogMetrics(Result):
         return joint_unit
 
     def headline(self) -> str:
-        """Returns one line on what was measured."""
-        known = sum(value.value is not None for _, value in self._list_values())
+        """Returns one line with the log, the count of known numbers, and the sites."""
+        known = 0
+        for _, metric in self._list_values():
+            known += metric.value is not None
         numbers = count_nouns(known, "number")
-        return f"{self.log}: {numbers} of {self.scenario}, {', '.join(self.sites)}"
+        sites = ", ".join(self.sites)
+        return f"{self.log}: {numbers} of {self.scenario}, {sites}"
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the keys of `trilat metrics --json`."""
-        subjects = {"sites": self.sites, "links": self.links, "walls": self.walls}
-        window_count = self.static_windows.value
-        metrics_by_path = {"run.": self.run}
-        for kind, metrics_by_name in subjects.items():
-            for name, metrics in metrics_by_name.items():
-                metrics_by_path[f"{kind}.{name}."] = metrics
-        metrics_by_path[""] = {"windows_at_rest": self.static_windows}
         content: dict[str, Any] = {
             "version": METRICS_JSON_VERSION,
             "log": self.log,
@@ -127,43 +125,61 @@ class LogMetrics(Result):
             "complete": self.complete,
             "run": _values_to_json(self.run),
         }
-        for kind, metrics_by_name in subjects.items():
-            content[kind] = {
-                name: _values_to_json(metrics) for name, metrics in metrics_by_name.items()
-            }
-        content["parameters"] = {
-            site: estimates.to_json() for site, estimates in self.estimates.items()
-        }
+        for kind, metrics_by_name in self._subjects.items():
+            values_by_name = {}
+            for name, metrics in metrics_by_name.items():
+                values_by_name[name] = _values_to_json(metrics)
+            content[kind] = values_by_name
+        parameters = {}
+        for site, estimates in self.estimates.items():
+            parameters[site] = estimates.to_json()
+        window_count = self.static_windows.value
+        content["parameters"] = parameters
         content["windows_at_rest"] = None if window_count is None else int(window_count)
         content |= _details_to_json(self)
-        content["unknown"] = {
-            path + key: value.why
-            for path, metrics in metrics_by_path.items()
-            for key, value in metrics.items()
-            if value.value is None
-        }
+        content["unknown"] = self._list_reasons()
         return {key: _replace_not_finite(value) for key, value in content.items()}
 
+    @property
+    def _subjects(self) -> dict[str, dict[str, MetricValues]]:
+        """The metrics by name, for each kind of subject."""
+        return {"sites": self.sites, "links": self.links, "walls": self.walls}
+
+    def _list_reasons(self) -> dict[str, str]:
+        """Returns the reason for each missing number, by its path in the JSON."""
+        metrics_by_path = {"run.": self.run}
+        for kind, metrics_by_name in self._subjects.items():
+            for name, metrics in metrics_by_name.items():
+                metrics_by_path[f"{kind}.{name}."] = metrics
+        metrics_by_path[""] = {"windows_at_rest": self.static_windows}
+        reasons = {}
+        for path, metrics in metrics_by_path.items():
+            for key, metric in metrics.items():
+                if metric.value is None:
+                    reasons[path + key] = metric.why
+        return reasons
+
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a row per quantity and subject to which it applies."""
-        return [
-            {**row, "value": value.value, "why": value.why}
-            for row, value in self._list_values()
-            if value.applies
-        ]
+        """Returns a row for each quantity and each subject to which the quantity applies."""
+        rows = []
+        for description, metric in self._list_values():
+            if metric.applies:
+                row = {**description, "value": metric.value, "why": metric.why}
+                rows.append(row)
+        return rows
 
     def _list_values(self) -> Iterator[tuple[dict[str, str], Metric]]:
-        """Yields every metric, each after a description of its quantity and subject."""
+        """Yields a description of quantity and subject, and the metric, for all metrics."""
         for quantity in quantities():
-            for subject, value in self.values_of(quantity).items():
-                row = {
+            for subject, metric in self.values_of(quantity).items():
+                description = {
                     "group": quantity.group,
                     "key": quantity.key,
                     "name": quantity.name,
                     "of": subject or "run",
                     "unit": quantity.unit,
                 }
-                yield row, value
+                yield description, metric
 
     def values_of(self, quantity: Quantity) -> dict[str, Metric]:
         """Returns a quantity by subject; the run is named ""."""
@@ -180,23 +196,28 @@ class LogMetrics(Result):
 def reduce_to_run(quantity: Quantity, values_by_subject: Mapping[str, Metric]) -> Metric:
     """Returns a quantity of the run: the largest value of its subjects, or their sum.
 
-    Subjects to which the quantity does not apply are left out. If a subject lacks a number that
-    it could have, the run lacks it too.
+    Subjects to which the quantity does not apply are left out. If the number of any other
+    subject is missing, so is the number of the run.
     """
-    applicable = {name: value for name, value in values_by_subject.items() if value.applies}
-    reasons = [
-        f"{name}: {value.why}" if name else value.why
-        for name, value in applicable.items()
-        if value.why
-    ]
+    numbers = []
+    reasons = []
+    for subject, metric in values_by_subject.items():
+        if not metric.applies:
+            continue
+        if metric.why:
+            reasons.append(f"{subject}: {metric.why}" if subject else metric.why)
+        if metric.value is not None:
+            numbers.append(metric.value)
     if reasons:
         return Metric(None, "; ".join(reasons))
-    numbers = [value.value for value in applicable.values() if value.value is not None]
     if not numbers:
+        all_reasons = [metric.why for metric in values_by_subject.values()]
         # each reason once, in order
-        reasons = list(dict.fromkeys(value.why for value in values_by_subject.values()))
-        return Metric(None, "; ".join(reasons) or f"there is no {quantity.of}", applies=False)
-    return Metric(sum(numbers) if quantity.reduction == "sum" else max(numbers))
+        different_reasons = dict.fromkeys(all_reasons)
+        why = "; ".join(different_reasons) or f"there is no {quantity.of}"
+        return Metric(None, why, applies=False)
+    reduced = sum(numbers) if quantity.reduction == "sum" else max(numbers)
+    return Metric(reduced)
 
 
 # overflow and NaN do not warn: a metric that is not finite becomes a reason
@@ -213,10 +234,10 @@ def compute_log_metrics(log: Log) -> LogMetrics:
     axes: tuple[str, ...] = ()
     if follows_in_task_space(log):
         axes = TASK_AXES[: scenario.arms[log.sites[0]].counts.shared]
-    joint_names = {
-        arm.joint_names if scenario.sites[site].arm.urdf else ()
-        for site, arm in scenario.arms.items()
-    }
+    joint_names = set()
+    for site, arm in scenario.arms.items():
+        has_file = bool(scenario.sites[site].arm.urdf)
+        joint_names.add(arm.joint_names if has_file else ())
     return LogMetrics(
         log=Path(log.source).name,
         scenario=scenario.name,
@@ -241,10 +262,9 @@ def _measure_subjects(
     view: RunView, wanted: Iterable[Measure]
 ) -> dict[str, dict[str, MetricValues]]:
     """Returns metrics by kind of subject, subject and key."""
-    values: dict[str, dict[str, MetricValues]] = {
-        kind: {name: {} for name in view.list_subjects(kind)}
-        for kind in ("run", "site", "link", "wall")
-    }
+    values: dict[str, dict[str, MetricValues]] = {}
+    for kind in ("run", "site", "link", "wall"):
+        values[kind] = {name: {} for name in view.list_subjects(kind)}
     for measure in wanted:
         for name, metrics in values[measure.of].items():
             metrics.update(measure.measure(view, name))
@@ -273,17 +293,17 @@ def measure_run(log: Log, keys: Iterable[str]) -> dict[str, Metric]:
         LogError: a record cannot be read, or names a change that is not valid.
     """
     requested = {key: find_quantity(key) for key in keys}
-    wanted = [
-        measure
-        for measure in list_measures()
-        if any(quantity.key in requested for quantity in measure.quantities)
-    ]
+    wanted = []
+    for measure in list_measures():
+        measured_keys = {quantity.key for quantity in measure.quantities}
+        if not measured_keys.isdisjoint(requested):
+            wanted.append(measure)
     values = _measure_subjects(RunView(log), wanted)
     run_values = {}
     for key, quantity in requested.items():
-        values_by_subject = {
-            name: metrics[key] for name, metrics in values[quantity.of].items()
-        }
+        values_by_subject = {}
+        for subject, metrics in values[quantity.of].items():
+            values_by_subject[subject] = metrics[key]
         run_values[key] = reduce_to_run(quantity, values_by_subject)
     return run_values
 
@@ -297,28 +317,34 @@ def _details_to_json(metrics: LogMetrics) -> dict[str, Any]:
         "felt": [_impedance_to_json(metrics, estimate) for estimate in metrics.responses],
     }
     if metrics.axes:
-        return {
-            name: [_name_axis(metrics, entry) for entry in entries]
-            for name, entries in details.items()
-        }
+        by_axis = {}
+        for name, entries in details.items():
+            by_axis[name] = [_name_axis(metrics, entry) for entry in entries]
+        return by_axis
     if metrics.joint_names:
         for entries in details.values():
             for entry in entries:
-                entry["joint_name"] = metrics.joint_names[entry["joint"] - 1]
+                number = entry["joint"]
+                entry["joint_name"] = metrics.joint_names[number - 1]
     return details
 
 
 def _load_to_json(load: JointLoad) -> dict[str, Any]:
-    content = load._asdict() | {"weight": _values_to_json(load.weight)}
+    """Returns a joint's load as plain values."""
+    content = load._asdict()
+    content["weight"] = _values_to_json(load.weight)
     return content | _value_and_reason("imbalance", load.imbalance)
 
 
 def _sharing_to_json(ratio: SharingRatio) -> dict[str, Any]:
-    content = ratio._asdict() | {"off": ratio.off}
+    """Returns a force sharing as plain values."""
+    content = ratio._asdict()
+    content["off"] = ratio.off
     return content | _value_and_reason("expected_nm", ratio.expected_nm)
 
 
 def _impedance_to_json(metrics: LogMetrics, estimate: ImpedanceEstimate) -> dict[str, Any]:
+    """Returns an estimated impedance as plain values, with the units of its coordinate."""
     unit = metrics.unit(estimate.unit, estimate.joint)
     content = estimate._asdict()
     content["ratio"] = _response_to_json(estimate.ratio, unit)
@@ -327,28 +353,37 @@ def _impedance_to_json(metrics: LogMetrics, estimate: ImpedanceEstimate) -> dict
 
 
 def _name_axis(metrics: LogMetrics, entry: dict[str, Any]) -> dict[str, Any]:
-    """Returns an entry with the name of its axis for its joint, and the units of an axis."""
+    """Returns an entry with an axis in place of its joint, and the units of this axis."""
     number = entry.pop("joint")
-    endings: dict[str, str] = {}
-    if number <= POSITION:
-        endings = {"_nm_rad": "_n_m", "_nm": "_n", "_rad": "_m"}  # the longest first
-    renamed = {}
+    renamed = {"axis": metrics.label(number)}
     for key, value in entry.items():
-        ending = next((ending for ending in endings if key.endswith(ending)), "")
-        renamed[key.removesuffix(ending) + endings.get(ending, "")] = value
-    return {"axis": metrics.label(number), **renamed}
+        new_key = _name_along_axis(key) if number <= POSITION else key
+        renamed[new_key] = value
+    return renamed
+
+
+def _name_along_axis(key: str) -> str:
+    """Returns the key of a joint's quantity with the unit of a position's coordinate."""
+    # the longest ending first
+    endings = {"_nm_rad": "_n_m", "_nm": "_n", "_rad": "_m"}
+    for ending, replacement in endings.items():
+        if key.endswith(ending):
+            return key.removesuffix(ending) + replacement
+    return key
 
 
 def _response_to_json(response: FrequencyResponse, unit: str) -> dict[str, Any]:
+    """Returns a response as plain values."""
     return {**response._asdict(), "why": response.why or None, "unit": unit}
 
 
 def _value_and_reason(key: str, value: Metric) -> dict[str, Any]:
+    """Returns the number of a metric under a key, and the reason if it is missing."""
     return {key: value.value, "why": value.why or None}
 
 
 def _replace_not_finite(value: Any) -> Any:
-    """Returns a value with None for every number in it that is not finite."""
+    """Returns a value in which None replaces all numbers that are not finite."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, dict):
@@ -359,7 +394,8 @@ def _replace_not_finite(value: Any) -> Any:
 
 
 def _values_to_json(metrics: MetricValues) -> dict[str, float | None]:
-    return {key: value.value for key, value in metrics.items()}
+    """Returns the numbers of metrics by key; None for missing numbers."""
+    return {key: metric.value for key, metric in metrics.items()}
 
 
 class ComparisonRow(NamedTuple):
@@ -407,13 +443,13 @@ def compare_metrics(logs: Sequence[Log], names: Sequence[str] = ()) -> MetricCom
         LogError: a record cannot be read, or names a change that is not valid.
     """
     measured = [compute_log_metrics(log) for log in logs]
-    rows = [
-        ComparisonRow(quantity, tuple(metrics.run_value(quantity) for metrics in measured))
-        for quantity in quantities()
-    ]
-    applicable = tuple(row for row in rows if any(entry.applies for entry in row.entries))
+    rows = []
+    for quantity in quantities():
+        entries = tuple(metrics.run_value(quantity) for metrics in measured)
+        if any(entry.applies for entry in entries):
+            rows.append(ComparisonRow(quantity, entries))
     columns = tuple(names) or tuple(Path(log.source).stem for log in logs)
-    return MetricComparison(columns, applicable)
+    return MetricComparison(columns, tuple(rows))
 
 
 def comparison_to_json(comparison: MetricComparison) -> dict[str, Any]:

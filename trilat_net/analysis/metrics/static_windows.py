@@ -8,9 +8,9 @@ where pi is the left Perron vector of the dominance matrix, and K_i the stiffnes
 e_i. docs/metrics.md defines and derives each metric.
 
 Invariant:
-    - A stiffness is that which one operator met, and is given only if nothing but that operator
-      changed.
-    - A stiffness is a secant along the path taken: the other joints move as well.
+    - A stiffness is measured by one operator, and is known only if nothing but this operator
+      changed between two windows.
+    - A stiffness is a secant along the path of the arm: the other joints move as well.
     - If gravity is adapted, the estimates take up the load, and no torque is expected.
 """
 
@@ -46,9 +46,7 @@ MIN_TORQUE_CHANGE_NM = 0.1
 MIN_ANGLE_CHANGE_RAD = 1e-4
 """Least change of an angle from which a stiffness is computed, rad."""
 STILL_SCRIPT_NM = 1e-6
-"""An operator whose script changes by no more than this between two windows stood still, N
-m.
-"""
+"""An operator whose script changes by at most this between two windows did not move, N m."""
 MIN_LOAD_SHARE = 0.02
 """A site with less than this share of the largest torque is not loaded."""
 
@@ -91,7 +89,8 @@ def find_static_windows(view: RunView) -> list[StaticWindow]:
         rows_by_site[site] = row
         still &= recorded & _find_resting_rows(run)[row]
     window_ticks = int(np.ceil(WINDOW_S * first_records.rate_hz))
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]])))
+    changes = np.diff(np.concatenate([[False], still, [False]]))
+    edges = np.flatnonzero(changes)
     windows = []
     for begin, end in edges.reshape(-1, 2).tolist():
         if end - begin <= window_ticks:
@@ -101,20 +100,28 @@ def find_static_windows(view: RunView) -> list[StaticWindow]:
         torques = [runs[site].records.tau_x[row] for site, row in window_rows.items()]
         largest_nm = max(float(np.abs(torque).max()) for torque in torques)
         variation_nm = max(float(np.ptp(torque, axis=0).max()) for torque in torques)
-        if not variation_nm > MAX_TORQUE_VARIATION * max(largest_nm, MIN_LOAD_NM):
-            windows.append(_average_window(runs, window_rows, first_records.t_s[ticks]))
+        reference_nm = max(largest_nm, MIN_LOAD_NM)
+        if not variation_nm > MAX_TORQUE_VARIATION * reference_nm:
+            window = _average_window(runs, window_rows, first_records.t_s[ticks])
+            windows.append(window)
     return windows
 
 
 def _find_resting_rows(run: SiteRun) -> Bools:
     """Returns the rows in which a site rests under constant shares and a constant script."""
     records = run.records
-    slow = np.abs(records.qd).max(axis=1) < STATIC_SPEED_RAD_S
-    resting: Bools = records.follows & slow & ~run.dominance.rate.any(axis=1)
+    largest_speed = np.abs(records.qd).max(axis=1)
+    is_slow = largest_speed < STATIC_SPEED_RAD_S
+    shares_change = run.dominance.rate.any(axis=1)
+    resting: Bools = records.follows & is_slow & ~shares_change
     script = run.torque.script
-    if script is not None:  # without a script the variation of the torque decides
-        moves = np.abs(np.diff(script, axis=0)).max(axis=1) > MOVING_SCRIPT_NM
-        resting &= ~(np.append(moves, False) | np.append(False, moves))
+    # without a script, only the variation of the torque decides
+    if script is not None:
+        largest_change = np.abs(np.diff(script, axis=0)).max(axis=1)
+        moves = largest_change > MOVING_SCRIPT_NM
+        moves_after = np.append(moves, False)
+        moves_before = np.append(False, moves)
+        resting &= ~(moves_after | moves_before)
     return resting
 
 
@@ -185,7 +192,8 @@ def estimate_stiffness(view: RunView) -> list[StiffnessEstimate]:
         torque_changes = (torque_after - torque_before).tolist()
         angle_changes = (after.q[site] - before.q[site]).tolist()
         for joint, torque_nm in enumerate(torque_changes):
-            if not abs(torque_nm) >= MIN_TORQUE_CHANGE_NM:  # also if it is NaN
+            # also if it is NaN
+            if not abs(torque_nm) >= MIN_TORQUE_CHANGE_NM:
                 continue
             angle_rad = angle_changes[joint]
             stiffness = None
@@ -227,11 +235,11 @@ class SharingRatio(NamedTuple):
         to_s: time of the window's last tick, in s.
         joint: number of the joint, from 1.
         pushed: site at which the torque acts.
-        pushed_nm: that torque ON its arm.
-        by_wall: True if the environment contributes most of that torque.
+        pushed_nm: the torque ON the arm of this site.
+        by_wall: True if the environment contributes most of this torque.
         holds: site of the operator that feels the torque.
-        felt_nm: torque that this operator feels: the negative of its own torque ON its arm.
-        expected_nm: torque that the dominance factors let expect.
+        felt_nm: torque that this operator feels: the negative of its torque ON its arm.
+        expected_nm: torque to be felt according to the dominance factors.
     """
 
     from_s: float
@@ -246,11 +254,12 @@ class SharingRatio(NamedTuple):
 
     @property
     def off(self) -> float | None:
-        """Relative deviation of the felt torque from the expected one; None if unknown."""
+        """Relative deviation of the felt torque from the expected torque; None if unknown."""
         expected = self.expected_nm.value
         if expected is None or expected == 0.0:
             return None
-        return abs(self.felt_nm / expected - 1.0)
+        ratio = self.felt_nm / expected
+        return abs(ratio - 1.0)
 
 
 class JointLoad(NamedTuple):
@@ -278,12 +287,15 @@ def find_joint_loads(view: RunView) -> list[JointLoad]:
     loads = []
     for window in view.compute_once(find_static_windows):
         weights = _compute_torque_weights(view.scenario, window.alpha)
-        for joint in range(min(map(len, window.torque.values()))):
+        common_joints = min(map(len, window.torque.values()))
+        for joint in range(common_joints):
             torque = {site: float(values[joint]) for site, values in window.torque.items()}
-            least_nm = max(MIN_LOAD_NM, MIN_LOAD_SHARE * max(map(abs, torque.values())))
+            largest_nm = max(map(abs, torque.values()))
+            least_nm = max(MIN_LOAD_NM, MIN_LOAD_SHARE * largest_nm)
             loaded = {site: value for site, value in torque.items() if abs(value) >= least_nm}
             if loaded:
-                loads.append(_weigh_load(window, joint, loaded, weights))
+                load = _weigh_load(window, joint, loaded, weights)
+                loads.append(load)
     return loads
 
 
@@ -291,10 +303,9 @@ def count_static_windows(view: RunView) -> Metric:
     """Returns the number of static windows."""
     if view.absent:
         return Metric(None, f"no records of {', '.join(view.absent)}")
-    return metric(
-        len(view.compute_once(find_static_windows)) or None,
-        "no second in which all sites rest under constant torques",
-    )
+    windows = view.compute_once(find_static_windows)
+    reason = "no second in which all sites rest under constant torques"
+    return metric(len(windows) or None, reason)
 
 
 @measures(
@@ -308,12 +319,13 @@ def measure_force_sharing(view: RunView, _run: str) -> MetricValues:
     deviations = [ratio.off for ratio in ratios if ratio.off is not None]
     if deviations:
         return {"sharing_off": metric(max(deviations))}
-    reasons = "; ".join(dict.fromkeys(ratio.expected_nm.why for ratio in ratios))
-    why = (
-        count_static_windows(view).why
-        or reasons
-        or "no two sites are loaded in a window at rest"
-    )
+    reasons = [ratio.expected_nm.why for ratio in ratios]
+    why = count_static_windows(view).why
+    if not why:
+        # each reason once, in order
+        why = "; ".join(dict.fromkeys(reasons))
+    if not why:
+        why = "no two sites are loaded in a window at rest"
     return {"sharing_off": Metric(None, why, applies=bool(view.absent))}
 
 
@@ -334,11 +346,14 @@ def _weigh_load(
         weight_metrics = dict.fromkeys(torque, unknown)
         imbalance = unknown
     else:
-        column = weights[:, joint] / np.nanmax(weights[:, joint])
-        weight = dict(zip(window.torque, column.tolist(), strict=True))
-        moments = [weight[site] * value for site, value in torque.items()]
-        largest = max(map(abs, moments))
-        share = abs(sum(moments)) / largest if largest > 0.0 else None
+        joint_weights = weights[:, joint]
+        relative_weights = joint_weights / np.nanmax(joint_weights)
+        weight = dict(zip(window.torque, relative_weights.tolist(), strict=True))
+        weighted = [weight[site] * value for site, value in torque.items()]
+        largest = max(map(abs, weighted))
+        share = None
+        if largest > 0.0:
+            share = abs(sum(weighted)) / largest
         imbalance = metric(share, "no site that others follow is loaded")
         weight_metrics = {site: metric(weight[site]) for site in torque}
     return JointLoad(
@@ -354,20 +369,22 @@ def _weigh_load(
 def find_sharing_ratios(view: RunView) -> list[SharingRatio]:
     """Returns the force sharing at every joint at which two sites are loaded.
 
-    The operator that feels the torque is a spring. If both operators are springs, or none is,
-    the torque is that of the slave.
+    The operator that feels the torque is a spring. If both operators or neither of them is a
+    spring, the torque acts on the slave.
     """
-    windows = {window.from_s: window for window in view.compute_once(find_static_windows)}
+    static_windows = view.compute_once(find_static_windows)
+    windows = {window.from_s: window for window in static_windows}
     ratios = []
     for load in view.compute_once(find_joint_loads):
         if len(load.torque_nm) != 2:
             continue
-        ranks = {
-            site: _rank_as_holder(view.scenario, site, load.to_s) for site in load.torque_nm
-        }
+        ranks = {}
+        for site in load.torque_nm:
+            ranks[site] = _rank_as_holder(view.scenario, site, load.to_s)
         pushed, holds = sorted(load.torque_nm, key=ranks.__getitem__)
         torque = load.torque_nm[pushed]
-        wall_torque = float(windows[load.from_s].environment[pushed][load.joint - 1])
+        environment = windows[load.from_s].environment[pushed]
+        wall_torque = float(environment[load.joint - 1])
         pushed_weight = load.weight[pushed]
         holds_weight = load.weight[holds]
         if pushed_weight.value is None or holds_weight.value is None:
@@ -394,7 +411,7 @@ def find_sharing_ratios(view: RunView) -> list[SharingRatio]:
 def _rank_as_holder(scenario: Scenario, site: str, t_s: float) -> tuple[bool, bool]:
     """Returns a sort key: the site whose operator feels the torque comes last.
 
-    That is a site at which a spring is active and no environment exists, or else a master.
+    Such a site has an active spring and no environment. Among equal sites, masters come last.
     """
     spec = scenario.sites[site]
     spring_kinds = (TorqueKind.HAND, TorqueKind.TASK_HAND)
@@ -413,7 +430,8 @@ def _compute_torque_weights(scenario: Scenario, alpha: Array) -> Array | str:
         if why:
             return f"{site}: {why}"
         stiffness.append(K)
-    return left_perron_vector(alpha)[:, np.newaxis] / np.array(stiffness)
+    pi = left_perron_vector(alpha)
+    return pi[:, np.newaxis] / np.array(stiffness)
 
 
 def _find_holding_stiffness(scenario: Scenario, site: str) -> tuple[Array, str]:
@@ -440,13 +458,18 @@ def _find_holding_stiffness(scenario: Scenario, site: str) -> tuple[Array, str]:
         why = "in task space the stiffness of this law changes with the pose: J+'Kp J+ Lambda"
         return unknown, why
     estimate = np.array(gains.theta_hat0 if is_adaptive else gains.known)
-    if is_adaptive and np.any((np.array(gains.Gamma) > 0.0) & gravity):
-        return unknown, "gravity is learnt: the estimates take up the load"
-    if np.any((estimate != arm.theta) & gravity) and spec.arm.g_m_s2 > 0.0:
+    if is_adaptive:
+        adapts = np.array(gains.Gamma) > 0.0
+        if np.any(adapts & gravity):
+            return unknown, "gravity is learnt: the estimates take up the load"
+    is_wrong = estimate != arm.theta
+    if np.any(is_wrong & gravity) and spec.arm.g_m_s2 > 0.0:
         return unknown, "gravity is not known exactly"
     K = np.array(gains.K)
     if is_adaptive:
         K = np.array(gains.Kp) * np.array(gains.Lambda)
-    free_axes = np.array(scenario.arms[site].axes or 1.0) == 0.0
-    why = "" if ((K > 0.0) | free_axes).all() else "nothing holds its e"
-    return np.where(free_axes, np.nan, K), why
+    axes = np.array(scenario.arms[site].axes or 1.0)
+    is_free = axes == 0.0
+    is_held = (K > 0.0) | is_free
+    why = "" if is_held.all() else "nothing holds its e"
+    return np.where(is_free, np.nan, K), why

@@ -41,12 +41,14 @@ LARGEST_HALF_WIDTH = 0.25
 STUDENT_T = 2.3646
 """The 0.975 quantile of Student's t with `JACKKNIFE_BLOCKS` - 1 = 7 degrees of freedom."""
 LEAST_INDEPENDENCE = 1e-9
-"""Smallest singular value of the users' relative velocities, as a share of the slave's
-motion.
+"""Smallest singular value of the users' relative velocities, as a share of the slave's motion.
+
+With a smaller value the users' motions count as dependent.
 """
 
 
 def _not_applicable(reason: str) -> Metric:
+    """Returns the metric of a quantity that does not apply, with the reason."""
     return Metric(None, reason, applies=False)
 
 
@@ -58,7 +60,8 @@ def read_user_shares(view: RunView) -> UserShares | Metric:
     missing = [site for site in (*users, slave) if site not in view.sites]
     if missing:
         return Metric(None, f"no records of {', '.join(missing)}")
-    return find_user_shares(view.scenario, view.sites[slave].dominance.alpha)
+    alpha = view.sites[slave].dominance.alpha
+    return find_user_shares(view.scenario, alpha)
 
 
 @measures(
@@ -83,24 +86,30 @@ def measure_authority(view: RunView, site: str) -> MetricValues:
     torque = view.sites[site].torque
     user = users.index(site)
     slave_row, slave_recorded = find_latest_rows(view.sites[slave].records, records.t_s)
-    weighted = shared.shares[slave_row, user] * np.square(torque.operator).sum(axis=1)
-    effort = weighted[records.known & slave_recorded].sum() * records.h_s
+    share = shared.shares[slave_row, user]
+    squared_torque = np.square(torque.operator).sum(axis=1)
+    weighted = share * squared_torque
+    counted = weighted[records.known & slave_recorded]
+    effort = counted.sum() * records.h_s
     motion_shares = view.compute_once(_identify_shares)
     if isinstance(motion_shares, Metric):
         motion_share = motion_shares
     else:
         motion_share = metric(motion_shares[user])
-    return {"authority_effort_nm2_s": metric(float(effort)), "motion_share": motion_share}
+    return {
+        "authority_effort_nm2_s": metric(float(effort)),
+        "motion_share": motion_share,
+    }
 
 
 def _identify_shares(view: RunView) -> list[float] | Metric:
     """Returns the least-squares shares of the users in the slave's motion.
 
     The shares a_i minimise sum_k |qd_k - sum_i a_i qd_i(s_k)|^2 subject to sum_i a_i = 1. Here
-    qd_k is the slave's velocity at tick k (in task space that of its end effector), and
-    qd_i(s_k) is user i's velocity at the stamp of the sample that the slave uses. With the
-    constraint, the last user's velocity is subtracted from all others, and its share is one
-    minus their sum.
+    qd_k is the slave's velocity at tick k (in task space the velocity of its end effector), and
+    qd_i(s_k) is user i's velocity at the stamp of the sample that the slave uses. The
+    constraint is met by subtracting the last user's velocity from all others: the last user's
+    share is one minus the sum of the other shares.
 
     The jackknife over blocks of rows estimates the shares' standard error, since velocities at
     successive ticks are not independent.
@@ -119,14 +128,16 @@ def _identify_shares(view: RunView) -> list[float] | Metric:
         valid &= (used_row == row) & records.known[row]
         user_rates.append(records.shared_rate[row])
     slave_rate = slave_records.shared_rate[valid].ravel()
-    *other_rates, last_rate = (rate[valid].ravel() for rate in user_rates)
+    valid_rates = [rate[valid].ravel() for rate in user_rates]
+    *other_rates, last_rate = valid_rates
     relative_rates = np.column_stack([rate - last_rate for rate in other_rates])
     relative_slave_rate = slave_rate - last_rate
     unknown = Metric(None, "the users' motions are not independent, or no arm moves")
     if not len(slave_rate):
         return unknown
-    least_singular_value = np.linalg.svd(relative_rates, compute_uv=False)[-1]
-    if least_singular_value <= LEAST_INDEPENDENCE * np.linalg.norm(slave_rate):
+    singular_values = np.linalg.svd(relative_rates, compute_uv=False)
+    slave_motion = np.linalg.norm(slave_rate)
+    if singular_values[-1] <= LEAST_INDEPENDENCE * slave_motion:
         return unknown
 
     shares = np.linalg.lstsq(relative_rates, relative_slave_rate)[0]
@@ -134,17 +145,17 @@ def _identify_shares(view: RunView) -> list[float] | Metric:
     jackknife_shares = []
     for block in np.array_split(all_rows, JACKKNIFE_BLOCKS):
         rows = np.delete(all_rows, block)
-        jackknife_shares.append(
-            np.linalg.lstsq(relative_rates[rows], relative_slave_rate[rows])[0]
-        )
+        solution = np.linalg.lstsq(relative_rates[rows], relative_slave_rate[rows])
+        jackknife_shares.append(solution[0])
     # jackknife (Quenouille 1956): (n - 1) / n times the sum of squared deviations, n blocks
     variance = (JACKKNIFE_BLOCKS - 1) * np.var(jackknife_shares, axis=0).max()
     half_width = STUDENT_T * math.sqrt(variance)
-    if not half_width <= LARGEST_HALF_WIDTH:  # also if it is NaN
-        return Metric(
-            None, f"the motion does not determine the shares: only within +- {half_width:.2g}"
-        )
-    return [*shares.tolist(), 1.0 - float(shares.sum())]
+    # also if it is NaN
+    if not half_width <= LARGEST_HALF_WIDTH:
+        why = f"the motion does not determine the shares: only within +- {half_width:.2g}"
+        return Metric(None, why)
+    last_share = 1.0 - float(shares.sum())
+    return [*shares.tolist(), last_share]
 
 
 @measures(
@@ -166,17 +177,20 @@ def measure_sharing(view: RunView, _run: str) -> MetricValues:
         return unavailable(USERS, shared.why, of="run", applies=shared.applies)
     records = view.sites[slave].records
     intervenes = shared.leader[records.known] != shared.program
-    ramps = list_ramps(view.log, slave)[1]
+    _, ramps = list_ramps(view.log, slave)
     ramp_spans_s = sorted((ramp.start_ns * 1e-9, ramp.end_ns * 1e-9) for ramp in ramps)
-    takeover_times_s = records.t_s[1:][np.diff(shared.leader) != 0]
+    leader_changes = np.diff(shared.leader) != 0
+    takeover_times_s = records.t_s[1:][leader_changes]
     durations_s = [
-        _measure_takeover_s(t_s, records.h_s, ramp_spans_s) for t_s in takeover_times_s.tolist()
+        _measure_takeover_s(change_s, records.h_s, ramp_spans_s)
+        for change_s in takeover_times_s.tolist()
     ]
     longest_s = _not_applicable("the leader never changes")
     if durations_s:
         longest_s = metric(max(durations_s))
+    user_runs = [view.shared[user] for user in users]
     return {
-        **_measure_disagreement([view.shared[user] for user in users]),
+        **_measure_disagreement(user_runs),
         "intervention_share": metric(float(intervenes.mean())),
         "takeovers": metric(float(len(takeover_times_s))),
         "takeover_s": longest_s,
@@ -187,22 +201,26 @@ def measure_sharing(view: RunView, _run: str) -> MetricValues:
 def _measure_disagreement(runs: list[SiteRun]) -> MetricValues:
     """Returns the part of the users' torques that cancels, as an RMS and as a share.
 
-    Of torques tau_i in a joint or along an axis, (sum_i |tau_i| - |sum_i tau_i|) / 2 cancels.
+    Torques tau_i in a joint or along an axis cancel by (sum_i |tau_i| - |sum_i tau_i|) / 2.
     """
     rows, known = find_common_rows([run.records for run in runs])
-    torques = np.stack([run.torque.operator[row] for run, row in zip(runs, rows, strict=True)])
-    torques = torques[:, known]
-    total_sizes = np.abs(torques).sum(axis=0)
-    cancelled = 0.5 * (total_sizes - np.abs(torques.sum(axis=0)))
-    total = total_sizes.sum()
+    torques = []
+    for run, row in zip(runs, rows, strict=True):
+        common_torque = run.torque.operator[row]
+        torques.append(common_torque[known])
+    sum_of_sizes = np.abs(torques).sum(axis=0)
+    size_of_sum = np.abs(np.sum(torques, axis=0))
+    cancelled = 0.5 * (sum_of_sizes - size_of_sum)
+    total = sum_of_sizes.sum()
     internal_share = _not_applicable("nobody pushes")
     if total:
         internal_share = metric(2.0 * cancelled.sum() / total)
     values = {"internal_share": internal_share}
     # in task space, forces along the axes of the position come first
     force_columns = POSITION if runs[0].records.x.size else 0
-    parts = {"n": cancelled[:, :force_columns], "nm": cancelled[:, force_columns:]}
-    for unit, part in parts.items():
+    forces = cancelled[:, :force_columns]
+    joint_torques = cancelled[:, force_columns:]
+    for unit, part in {"n": forces, "nm": joint_torques}.items():
         if part.shape[1]:
             values[f"internal_rms_{unit}"] = metric(rms(part))
         else:
@@ -223,12 +241,15 @@ def _measure_takeover_s(
     Returns:
         The time in s; 0 if no ramp caused the change.
     """
-    starts_s = [
-        start_s
-        for start_s, end_s in ramp_spans_s
-        if start_s <= change_s + RAMP_TIME_TOLERANCE_S and change_s <= end_s + h_s
-    ]
-    return change_s - starts_s[-1] if starts_s else 0.0
+    latest_start_s = None
+    for start_s, end_s in ramp_spans_s:
+        has_started = start_s <= change_s + RAMP_TIME_TOLERANCE_S
+        has_just_ended = change_s <= end_s + h_s
+        if has_started and has_just_ended:
+            latest_start_s = start_s
+    if latest_start_s is None:
+        return 0.0
+    return change_s - latest_start_s
 
 
 def _compare_steps(records: AlignedRecords, ramp_spans_s: list[tuple[float, float]]) -> Metric:
@@ -240,16 +261,21 @@ def _compare_steps(records: AlignedRecords, ramp_spans_s: list[tuple[float, floa
     """
     q_des = records.q_des[:, :POSITION] if records.x.size else records.q_des
     follows = records.known & records.follows
-    steps = np.abs(np.diff(q_des, axis=0)).max(axis=1)
+    differences = np.abs(np.diff(q_des, axis=0))
+    steps = differences.max(axis=1)
     period_start_s = records.t_s[:-1] - RAMP_TIME_TOLERANCE_S
     period_end_s = records.t_s[1:] + RAMP_TIME_TOLERANCE_S
     changing = np.zeros(len(steps), dtype=np.bool_)
     for start_s, end_s in ramp_spans_s:
         changing |= (period_end_s >= start_s) & (period_start_s <= end_s)
     judged = follows[:-1] & follows[1:]
-    if not (judged & changing).any():
+    judged_changing = judged & changing
+    judged_otherwise = judged & ~changing
+    if not judged_changing.any():
         return _not_applicable("no share changes")
-    largest_while_changing = peak(steps[judged & changing])
-    largest_otherwise = peak(steps[judged & ~changing])
-    ratio = largest_while_changing / largest_otherwise if largest_otherwise else None
+    largest_while_changing = peak(steps[judged_changing])
+    largest_otherwise = peak(steps[judged_otherwise])
+    ratio = None
+    if largest_otherwise:
+        ratio = largest_while_changing / largest_otherwise
     return metric(ratio, "the reference rests while no share changes")
