@@ -107,19 +107,24 @@ class ChangeServer:
         """
         if self._stop_tick is not None:
             self.stopped = k + 1 >= self._stop_tick
+
         changes: list[CoreChange] = []
         has_order = False
         while (query := self._poll()) is not None:
             try:
                 request = decode(query.payload, ChangeRequest)
-                if has_order and request.order in _NEEDED_MODES:
+                # "enable" and "reset" wait for a tick without earlier orders.
+                must_wait = has_order and request.order in _NEEDED_MODES
+                if must_wait:
                     self._deferred = query
                     break
+
                 text, tick, change = self._accept(request, k)
                 if change is not None:
                     changes.append(change)
                     has_order = has_order or bool(request.order)
-                if isinstance(request.source, str) and changes:
+                names_source = isinstance(request.source, str)
+                if names_source and changes:
                     self.sources[changes[-1].text] = request.source
                 reply = ChangeReply(member=self._site, accepted=True, text=text, tick=tick)
             except (WireError, ScenarioError) as error:
@@ -150,6 +155,8 @@ class ChangeServer:
         if request.order:
             change = self._make_order_change(k, request.order)
             return f"{self._site}: {request.order} at tick {k}", k, change
+
+        # A change of a link or of weights, which takes effect later.
         start_ns = tick_ns(k, self._rate_hz) + AHEAD_MS * 1_000_000
         first = first_tick_at(start_ns, self._rate_hz)
         change = self._make_change(request, first)

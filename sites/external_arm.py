@@ -193,15 +193,17 @@ class ExternalArm:
             "arm_silent" or "arm_lost" if the arm has been silent, "arm_back" if it has
             returned. Empty if nothing has changed.
         """
-        reported = self._reported_order
+        reported_before = self._reported_order
         self._reported_order = ""
         if self._silent_ns > SILENCE_LIMIT_NS:
             self._reported_order = "arm_lost"
-            return "" if reported == "arm_lost" and mode is Mode.FAULT else "arm_lost"
+            is_done = reported_before == "arm_lost" and mode is Mode.FAULT
+            return "" if is_done else "arm_lost"
         if self._silent_ns > HELD_SILENCE_NS:
             self._reported_order = "arm_silent"
-            return "" if reported else "arm_silent"
-        return "arm_back" if reported == "arm_silent" else ""
+            return "" if reported_before else "arm_silent"
+        # After "arm_lost" the site stays in the mode "fault" until a user resets it.
+        return "arm_back" if reported_before == "arm_silent" else ""
 
     def _accept(self, payload: bytes) -> None:
         """Checks one measurement, and stores it or counts the reason why it is dropped.
@@ -220,6 +222,7 @@ class ExternalArm:
         if message.site != self._site or is_other_boot:
             self._dropped["stranger"] += 1
             return
+
         if message.boot != self._boot:
             self._boot = message.boot
             self._n = message.n - 1
@@ -231,6 +234,7 @@ class ExternalArm:
         if self._is_bound and not self._is_plausible(message.q, elapsed_s):
             self._dropped["implausible measurement"] += 1
             return
+
         self._accepted_ns = now_ns
         if self._is_counting and message.n > self._n + 1:
             self._dropped["missing measurement"] += message.n - self._n - 1
@@ -336,8 +340,10 @@ class DeadManSwitch:
         was_released = self._was_released
         self._was_released = False
         if was_released or not self.held:
-            return "" if mode in (Mode.STOPPED, Mode.FAULT) else "released"
-        return "held" if (mode, reason) == (Mode.STOPPED, LifeReason.RELEASED) else ""
+            is_at_rest = mode in (Mode.STOPPED, Mode.FAULT)
+            return "" if is_at_rest else "released"
+        is_stopped_by_switch = mode == Mode.STOPPED and reason == LifeReason.RELEASED
+        return "held" if is_stopped_by_switch else ""
 
     def _release(self, released: Sequence[_Holder]) -> None:
         """Releases the switch for some programs.
@@ -370,6 +376,7 @@ class DeadManSwitch:
         if message.site != self._site:
             self._dropped["stranger"] += 1
             return
+
         if message.boot not in self._programs and len(self._programs) >= STARTS_KEPT:
             self._forget_program()
         program = self._programs.setdefault(message.boot, _Holder())
@@ -377,9 +384,11 @@ class DeadManSwitch:
             self._dropped["old switch message"] += 1
             return
         program.n = message.n
+
         if message.held:
             program.pressed_ns = received_ns
             return
+        # The switch of this program was released. From now on it can be pressed again.
         if program.counts and program.pressed_ns is not None:
             self._release([program])
         program.pressed_ns = None

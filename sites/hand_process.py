@@ -57,7 +57,7 @@ class HandProcess(SiteClient):
         session: Name of the session.
 
     Attributes:
-        asked: Number of views to which the class has replied.
+        answered: Number of views to which the class has replied.
         skipped: Number of views that were too old.
     """
 
@@ -65,7 +65,7 @@ class HandProcess(SiteClient):
         self, hand_site: HandSite, program: HandProgram, bus: Bus, clock: Clock, session: str
     ) -> None:
         super().__init__(bus, clock, session, hand_site.name)
-        self.asked = 0
+        self.answered = 0
         self.skipped = 0
         self._program = program
         self._code = hand_site.source
@@ -93,7 +93,7 @@ class HandProcess(SiteClient):
         due_ns = self._announced_ns + ANNOUNCE_PERIOD_NS
         if views:
             self._decide(views.popleft())
-        elif not self.asked and self._clock.monotonic_ns() > due_ns:
+        elif not self.answered and self._clock.monotonic_ns() > due_ns:
             self._announced_ns = self._clock.monotonic_ns()
             self._send(0, None)
 
@@ -103,7 +103,7 @@ class HandProcess(SiteClient):
         Raises:
             RunFailed: The class failed. The arm has been released.
         """
-        self.asked += 1
+        self.answered += 1
         try:
             goal = self._program.act(read_view(message))
             numbers = None if goal is None else [float(number) for number in goal]
@@ -190,12 +190,12 @@ def run_hand(
         say(f"{name}: its hand {hand_site.program} is there")
         while not (stopped() or hand.over):
             hand.serve()
-            if not hand.asked and clock.monotonic_ns() > give_up_ns:
+            if not hand.answered and clock.monotonic_ns() > give_up_ns:
                 raise SessionError(
                     f"{name} did not ask its hand {hand_site.program} within {timeout_s:g} s"
                 )
             clock.sleep_until(clock.monotonic_ns() + POLL_NS)
         say(
-            f"{name}: its hand was asked {count_nouns(hand.asked, 'time')}, "
+            f"{name}: its hand was asked {count_nouns(hand.answered, 'time')}, "
             f"{count_nouns(hand.skipped, 'view')} skipped"
         )

@@ -153,13 +153,15 @@ class HandServer:
             noun = "target"
             goal = message.target
             other_goal = message.force
-        if message.grip and (other_goal or len(goal) != self._rules.size):
+        is_wrong_goal = bool(other_goal) or len(goal) != self._rules.size
+        if message.grip and is_wrong_goal:
             size = count_nouns(self._rules.size, "number")
             self._dropped[f"hand: no {noun} of {size}"] += 1
             return None
         if message.grip and math.hypot(*goal) > self._rules.max_goal_norm:
             self._dropped["hand: out of range"] += 1
             return None
+
         if len(self._names) > MESSAGES_KEPT and message.boot not in self._names:
             # Only the holder's name is kept, so that many senders cannot fill the memory.
             holder = self._memory.source

@@ -74,15 +74,20 @@ class ChannelBuffer:
         """Adds the next message. The oldest messages are removed to make room for it."""
         length = len(payload)
         offset = self._head % self._size
-        if offset + length > self._size:  # a message must be contiguous
+        if offset + length > self._size:
+            # The message must be contiguous, but does not fit into the rest of the ring.
+            # Therefore it is stored at the beginning.
             self._head += self._size - offset
             offset = 0
         self._bytes[offset : offset + length] = payload
+
         slot = self.next_number % self._capacity
         self._starts[slot] = self._head
         self._lengths[slot] = length
         self._head += length
         self.next_number += 1
+
+        # Forget the messages whose slot or whose bytes have been overwritten.
         self.oldest = max(self.oldest, self.next_number - self._capacity)
         while self._starts[self.oldest % self._capacity] < self._head - self._size:
             self.oldest += 1

@@ -280,8 +280,8 @@ class SwitchClient(OutsideClient):
     The program reports regularly whether somebody holds the switch. The arm stops if the switch
     is released, or if no message has arrived for 100 ms.
 
-    >>> place = ["tcp/127.0.0.1:10241"]
-    >>> with tn.SwitchClient.connected("two_sites", "s", place) as switch:  # doctest: +SKIP
+    >>> endpoints = ["tcp/127.0.0.1:10241"]
+    >>> with tn.SwitchClient.connected("two_sites", "s", endpoints) as switch:  # doctest: +SKIP
     ...     while not switch.over:
     ...         switch.send(held=button.is_pressed())  # at least every 100 ms
     ...         time.sleep(0.02)
@@ -303,8 +303,8 @@ class ArmClient(OutsideClient):
     attribute `record` is the newest record of the site. The object is a context manager that
     closes the network connection.
 
-    >>> place = ["tcp/127.0.0.1:10241"]
-    >>> with tn.ArmClient.connected("two_sites", "s", place) as client:  # doctest: +SKIP
+    >>> endpoints = ["tcp/127.0.0.1:10241"]
+    >>> with tn.ArmClient.connected("two_sites", "s", endpoints) as client:  # doctest: +SKIP
     ...     client.send(robot.q, robot.qd)
     ...     tau = client.torque()
     """
