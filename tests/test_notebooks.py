@@ -58,7 +58,7 @@ def test_a_notebook_runs_and_says_what_is_true(name: str, tmp_path: Path) -> Non
 
 SHOWN = {
     "tn.figure(log)": "image/png",
-    'tn.figure(log, "velocities")': "image/png",
+    'tn.figure(log, "positions")': "image/png",
     'log["m1"]': "text/html",
     "log": "text/html",
     "tn.metrics(log)": "text/html",

@@ -61,7 +61,7 @@ def test_sampled_roots_stand_beside_where_they_differ(
 ) -> None:
     assert "re as computed" not in tabulate_roots(calm).headers
     cells = tabulate_roots(digital)
-    assert cells.headers[5:7] == ("re as computed", "im as computed")
+    assert tuple(cells.headers[5:7]) == ("re as computed", "im as computed")
     assert any(row[5] == "same" for row in cells.rows)
     assert float(cells.rows[0][5]) > 0.0 > float(cells.rows[0][0])
 
@@ -70,7 +70,7 @@ def test_every_word_has_its_number(calm: LinearAnalysis) -> None:
     told = calm.to_dict()
     assert told["verdict"] == "stable"
     first, *_ = told["continuous"]["roots"]
-    assert tabulate_roots(calm).rows[0][:2] == (
+    assert tuple(tabulate_roots(calm).rows[0][:2]) == (
         f"{first['re_per_s']:.4g}",
         f"{first['im_rad_s']:.4g}",
     )
