@@ -1,5 +1,7 @@
 """Figures of a log: what they show, per figure and per marker. Their size and type: test_registry."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from matplotlib.colors import to_hex
@@ -51,6 +53,12 @@ def test_a_site_has_one_colour_in_every_figure():
         assert drawn[: len(log.sites)] == [style.site_colour(log, site) for site in log.sites]
     for site, axes in zip(log.sites, joint_motion.draw_positions(log).axes[::2], strict=True):
         assert to_hex(lines(axes)[0].get_color()) == style.site_colour(log, site)
+
+
+def test_a_single_site_has_the_widest_line():
+    log = logs.simulated("paper")
+    first = SimpleNamespace(sites=log.sites[:1], scenario=log.scenario)
+    assert style.site_line(first, log.sites[0]) == style.site_line(log, log.sites[0])
 
 
 def test_histograms_count_every_tick():

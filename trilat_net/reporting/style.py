@@ -41,14 +41,30 @@ from ..scenario.arms import TASK_AXES
 from .appearance import REPORT_SIZE, SITE_COLOURS, FigureSize, list_site_colours
 
 AxesGrid = NDArray[np.object_]
-LegendEntries = Sequence[tuple[str, dict[str, Any]]]
-"""Entries of a legend: a text and the options of its line."""
+"""Panels of a figure, shape (rows, columns), of `Axes`."""
+LineOptions = dict[str, Any]
+"""Options of a line: keyword arguments of `Axes.plot`."""
+LegendEntry = tuple[str, LineOptions]
+"""Text of a line in a legend, and the options of the line."""
+LegendEntries = Sequence[LegendEntry]
 
-DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1.5, 1, 1.5)))
+DASHES: tuple[Any, ...] = (
+    "-",
+    (0, (5, 1.5)),
+    (0, (1, 1)),
+    (0, (5, 1.5, 1, 1.5)),
+)
+"""Line styles: solid, and three patterns of dashes."""
 REFERENCE = "#333333"
+"""Colour of references, limits and marks."""
 FAINT = "#8c8c8c"
+"""Colour of texts in empty panels and of bands."""
 
-LIMIT_LINE: dict[str, Any] = {"color": REFERENCE, "linestyle": (0, (4, 2)), "linewidth": 0.8}
+LIMIT_LINE: LineOptions = {
+    "color": REFERENCE,
+    "linestyle": (0, (4, 2)),
+    "linewidth": 0.8,
+}
 """Options of the line of a desired, true, stated or allowed value."""
 
 REPORT_DPI = REPORT_SIZE.dpi
@@ -92,10 +108,7 @@ class NotebookFigure(Figure):
     """A figure that a notebook shows as a picture instead of the text of its size."""
 
     def _repr_png_(self) -> bytes:
-        drawing = io.BytesIO()
-        with mpl.rc_context(_FILE_RC):
-            self.savefig(drawing, format="png", dpi=_NOTEBOOK_DPI, metadata=_UNDATED["png"])
-        return drawing.getvalue()
+        return _render_figure(self, "png", _NOTEBOOK_DPI)
 
     def _repr_html_(self) -> str:
         # sharp on a screen of high density: two pixels of the picture per pixel of the page
@@ -105,17 +118,24 @@ class NotebookFigure(Figure):
 
 
 def add_panels(figure: Figure, rows: int, columns: int, **options: Any) -> AxesGrid:
-    """Returns the panels of a figure as an array, shape (rows, columns), of `Axes`."""
+    """Adds panels to a figure, and returns them as an array, shape (rows, columns)."""
     grid: AxesGrid = figure.subplots(rows, columns, squeeze=False, **options)
     return grid
 
 
 def site_colour(log: Log, site: str) -> str:
     """Returns the colour of a site, the same in every figure."""
-    return list_site_colours(log.scenario)[log.sites.index(site) % len(SITE_COLOURS)]
+    colours = list_site_colours(log.scenario)
+    return colours[log.sites.index(site) % len(SITE_COLOURS)]
 
 
-def site_line(log: Log, site: str, width: float | None = None) -> dict[str, Any]:
+_WIDEST_PT = 2.0
+"""Width of the line of the first site in a panel of all sites."""
+_THINNER_PT = 1.2
+"""Difference of the widths of the first and the last site's lines in such a panel."""
+
+
+def site_line(log: Log, site: str, width: float | None = None) -> LineOptions:
     """Returns the options of the line of a site.
 
     Lines are solid until every colour is used; then the same colours return with dashes.
@@ -127,10 +147,18 @@ def site_line(log: Log, site: str, width: float | None = None) -> dict[str, Any]
             thinner lines, so that equal lines all stay visible.
     """
     index = log.sites.index(site)
+    last = len(log.sites) - 1
     if width is None:
-        width = 2.0 - 1.2 * index / (len(log.sites) - 1)
-    dashes = DASHES[index // len(SITE_COLOURS) % len(DASHES)]
-    return {"color": site_colour(log, site), "linestyle": dashes, "linewidth": width}
+        width = _WIDEST_PT
+        # a single site has no thinner lines beside it
+        if last > 0:
+            width = _WIDEST_PT - _THINNER_PT * index / last
+    repetitions = index // len(SITE_COLOURS)
+    return {
+        "color": site_colour(log, site),
+        "linestyle": DASHES[repetitions % len(DASHES)],
+        "linewidth": width,
+    }
 
 
 def site_title(log: Log, site: str) -> str:
@@ -159,7 +187,7 @@ def positive(values: Array) -> Array:
 
 SPREAD_BUCKETS = 120
 """Number of intervals of time for which `plot_spread` draws a median and a band."""
-SPREAD: dict[str, Any] = {"color": FAINT, "alpha": 0.35, "linewidth": 6.0}
+SPREAD: LineOptions = {"color": FAINT, "alpha": 0.35, "linewidth": 6.0}
 """Options of the line that represents the band of a spread in a legend."""
 
 
@@ -175,21 +203,27 @@ def plot_spread(axes: Axes, t_s: Array, values: Array, **options: Any) -> None:
     buckets = np.array_split(np.arange(len(values)), SPREAD_BUCKETS)
     rows = []
     for bucket in buckets:
-        if not len(bucket):
-            continue
-        part = values[bucket]
-        spread: tuple[float, float, float]
-        # numpy warns of buckets without a number
-        if np.isfinite(part).any():
-            spread = (np.nanmin(part), np.nanmedian(part), np.nanmax(part))
-        else:
-            spread = (np.nan, np.nan, np.nan)
-        rows.append((t_s[bucket].mean(), *spread))
-    middle_s, low, median, high = np.array(rows).reshape(-1, 4).T
+        if len(bucket):
+            middle_s = t_s[bucket].mean()
+            rows.append((middle_s, *_compute_spread(values[bucket])))
+    middles_s, low, median, high = np.array(rows).reshape(-1, 4).T
     axes.fill_between(
-        middle_s, low, high, color=options["color"], alpha=SPREAD["alpha"], linewidth=0.0
+        middles_s,
+        low,
+        high,
+        color=options["color"],
+        alpha=SPREAD["alpha"],
+        linewidth=0.0,
     )
-    axes.plot(middle_s, median, **options)
+    axes.plot(middles_s, median, **options)
+
+
+def _compute_spread(values: Array) -> tuple[float, float, float]:
+    """Returns the least, median and largest of the finite values; NaN if there is none."""
+    # numpy warns of values that are all NaN
+    if not np.isfinite(values).any():
+        return np.nan, np.nan, np.nan
+    return np.nanmin(values), np.nanmedian(values), np.nanmax(values)
 
 
 def set_plain_log_axis(axis: Axis, steps: Sequence[float] = (1.0, 2.0, 5.0)) -> None:
@@ -204,11 +238,14 @@ def name_joints(log: Log) -> list[str]:
     """Returns the titles of the joints: numbers, with names if all chains have equal names."""
     arms = [log.scenario.arms[site] for site in log.sites]
     longest = max(arms, key=lambda arm: arm.counts.joints)
-    if longest.chain is None or len({arm.joint_names for arm in arms}) > 1:
-        return [f"joint {number}" for number in range(1, longest.counts.joints + 1)]
+    numbers = range(1, longest.counts.joints + 1)
+    names_differ = len({arm.joint_names for arm in arms}) > 1
+    if longest.chain is None or names_differ:
+        return [f"joint {number}" for number in numbers]
+    units = longest.joint_units("rad")
     titles = []
-    names = zip(longest.joint_names, longest.joint_units("rad"), strict=True)
-    for number, (name, unit) in enumerate(names, 1):
+    for number, name, unit in zip(numbers, longest.joint_names, units, strict=True):
+        # prismatic joints have other units than the axes of the figure
         quantity = " (m, N)" if unit == "m" else ""
         titles.append(f"{number}: {name}{quantity}")
     return titles
@@ -217,18 +254,21 @@ def name_joints(log: Log) -> list[str]:
 def name_shared(log: Log) -> list[str]:
     """Returns the titles of the shared coordinates: joints, or axes of the task."""
     arm = log.scenario.arms[log.sites[0]]
-    return list(TASK_AXES[: arm.counts.shared]) if arm.shares_pose else name_joints(log)
+    if arm.shares_pose:
+        return list(TASK_AXES[: arm.counts.shared])
+    return name_joints(log)
 
 
 def title_joints(log: Log, row: Sequence[Axes], titles: Sequence[str] = ()) -> None:
-    """Titles a row of panels with `titles`, or with the names of the joints."""
+    """Titles a row of panels with `titles`; by default with the names of the joints."""
     for title, axes in zip(titles or name_joints(log), row, strict=True):
         axes.set_title(title)
 
 
 def label_row(axes: Axes, text: str, form: FigureSize) -> None:
     """Labels a low row of panels beside its first panel, `axes`."""
-    axes.set_ylabel("\n".join(textwrap.wrap(text, 12)), fontsize=form.tick_pt)
+    lines = textwrap.wrap(text, 12)
+    axes.set_ylabel("\n".join(lines), fontsize=form.tick_pt)
 
 
 def flatten_rounding(axes: Axes) -> None:
@@ -255,22 +295,39 @@ class JointPanels(NamedTuple):
 
 
 def arrange_joints(joints: int, narrow: bool) -> list[list[str]]:
-    """Returns the rows of a grid of panels: numbers of joints, and "." for an empty cell."""
+    """Returns the rows of a grid of panels: indices of joints, and "." for an empty cell.
+
+    Args:
+        joints: number of joints.
+        narrow: True if two panels fit beside each other; else three or four do.
+    """
+
+    def count_cells(columns: int) -> tuple[int, int]:
+        """Returns the number of rows, and the number of empty cells in the last row."""
+        rows = -(-joints // columns)  # rounded up
+        return rows, rows * columns - joints
+
     choices = (2,) if narrow or joints == 2 else (3, 4)
-    # fewest rows, then fewest empty cells
-    columns = min(choices, key=lambda count: (-(-joints // count), -joints % count))
-    empty = -joints % columns
-    cells = [*map(str, range(joints)), *["."] * empty]
+    columns = min(choices, key=count_cells)
+    _, empty = count_cells(columns)
+    cells = [str(joint) for joint in range(joints)]
+    cells += ["."] * empty
     return [cells[first : first + columns] for first in range(0, len(cells), columns)]
 
 
 def add_joint_panels(
     figure: Figure, joints: int, form: FigureSize, below: str = ""
 ) -> JointPanels:
-    """Returns a panel per joint, and if `below` names one, a wide panel below them.
+    """Adds a panel per joint to a figure, and optionally a wide panel below them.
 
     Two joints share their axis of values. More joints have an axis each, because the torques
     of wrists are smaller than those of shoulders.
+
+    Args:
+        figure: the figure.
+        joints: number of joints.
+        form: size of the figure.
+        below: name of the wide panel; "" for no wide panel.
     """
     grid = arrange_joints(joints, form.narrow)
     columns = len(grid[0])
@@ -285,16 +342,21 @@ def add_joint_panels(
     if joints == 2:
         joint_panels[1].sharey(joint_panels[0])
         joint_panels[1].tick_params(labelleft=False)
-    return JointPanels(joint_panels, columns, joint_panels[-columns:], panels.get(below))
+    return JointPanels(
+        joints=joint_panels,
+        columns=columns,
+        lowest=joint_panels[-columns:],
+        below=panels.get(below),
+    )
 
 
 def typeset(text: str) -> str:
-    """Returns a text of the terminal with typographic signs: ± and →."""
+    """Returns a text of the terminal with ± in place of "+-" and → in place of "->"."""
     return text.replace("+-", "±").replace("->", " → ")
 
 
 def typeset_unit(unit: str) -> str:
-    """Returns a unit with typographic signs: ²."""
+    """Returns a unit with ² in place of "^2"."""
     return unit.replace("^2", "²")
 
 
@@ -309,16 +371,28 @@ def typeset_symbol(parameter: str) -> str:
     return f"${stem.strip()}_{{{index}}}$" if index else f"${stem}$"
 
 
+_MAX_LEGEND_COLUMNS = 6
+
+
 def add_legend(figure: Figure, entries: LegendEntries, **options: Any) -> None:
     """Adds a legend of lines above the panels, see `place_legend`."""
-    handles = [Line2D([], [], label=text, **line) for text, line in entries]
+    handles = []
+    for text, line in entries:
+        handles.append(Line2D([], [], label=text, **line))
     place_legend(figure, handles, **options)
 
 
 def place_legend(figure: Figure, handles: Sequence[Any], **options: Any) -> None:
-    """Adds a legend above the panels, in as many columns, at most 6, as fit the figure."""
+    """Adds a legend above the panels, with as many columns as fit the figure.
+
+    Args:
+        figure: the figure.
+        handles: the Matplotlib objects of the entries.
+        **options: options of the legend.
+    """
     renderer = FigureCanvasAgg(figure).get_renderer()  # type: ignore[no-untyped-call]
-    for columns in range(min(len(handles), 6), 0, -1):
+    most_columns = min(len(handles), _MAX_LEGEND_COLUMNS)
+    for columns in range(most_columns, 0, -1):
         legend = figure.legend(
             handles=handles, loc="outside upper center", ncols=columns, **options
         )
@@ -328,25 +402,31 @@ def place_legend(figure: Figure, handles: Sequence[Any], **options: Any) -> None
         legend.remove()
 
 
-def site_legend_entries(log: Log, sites: Sequence[str]) -> list[tuple[str, dict[str, Any]]]:
+def site_legend_entries(log: Log, sites: Sequence[str]) -> list[LegendEntry]:
     """Returns the entries of a legend of sites."""
     return [(site_title(log, site), site_line(log, site)) for site in sites]
 
 
+_CENTRED: dict[str, Any] = {"ha": "center", "va": "center"}
+_EMPTY_FIGURE_CHARACTERS_PER_IN = 17
+
+
 def empty_figure(text: str, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns a figure that only shows a text, the reason why there is nothing to draw."""
+    """Returns a figure of a text alone: the reason why there is nothing to draw."""
+    characters = round(_EMPTY_FIGURE_CHARACTERS_PER_IN * form.width_in)
+    lines = textwrap.wrap(text, characters)
     with styled_figure(form, 1.0) as figure:
-        lines = "\n".join(textwrap.wrap(text, round(17 * form.width_in)))
-        figure.text(0.5, 0.5, lines, ha="center", va="center", color=REFERENCE)
+        figure.text(0.5, 0.5, "\n".join(lines), color=REFERENCE, **_CENTRED)
     return figure
 
 
 def annotate_empty_panel(axes: Axes, text: str) -> None:
     """Writes the reason why a panel is empty into the panel."""
-    axes.text(0.5, 0.5, text, ha="center", va="center", color=FAINT, transform=axes.transAxes)
+    axes.text(0.5, 0.5, text, color=FAINT, transform=axes.transAxes, **_CENTRED)
 
 
 FIGURE_FORMATS = ("pdf", "png", "svg")
+"""Suffixes of the files to which figures can be written."""
 
 _FILE_RC: Any = {
     "pdf.fonttype": 42,
@@ -361,11 +441,11 @@ _UNDATED: dict[str, dict[str, Any]] = {
 }
 
 
-def write_figure(drawn: Figure, path: Path, dpi: int) -> None:
+def write_figure(figure: Figure, path: Path, dpi: int) -> None:
     """Writes a figure to a file.
 
     Args:
-        drawn: the figure.
+        figure: the figure.
         path: the file; its suffix is the format, one of `FIGURE_FORMATS`.
         dpi: resolution of a .png file.
 
@@ -373,11 +453,22 @@ def write_figure(drawn: Figure, path: Path, dpi: int) -> None:
         UsageError: the file cannot be created.
         LogRefused: the disk refused the data.
     """
-    drawing = io.BytesIO()
     kind = path.suffix.removeprefix(".").lower()
+    write_whole(path, _render_figure(figure, kind, dpi))
+
+
+def _render_figure(figure: Figure, kind: str, dpi: int) -> bytes:
+    """Returns a figure as the bytes of a file without a date.
+
+    Args:
+        figure: the figure.
+        kind: format of the file, one of `FIGURE_FORMATS`.
+        dpi: resolution of a PNG file.
+    """
+    drawing = io.BytesIO()
     with mpl.rc_context(_FILE_RC):
-        drawn.savefig(drawing, format=kind, dpi=dpi, metadata=_UNDATED[kind])
-    write_whole(path, drawing.getvalue())
+        figure.savefig(drawing, format=kind, dpi=dpi, metadata=_UNDATED[kind])
+    return drawing.getvalue()
 
 
 MOST_EXPLAINED_CHANGES = 12
@@ -392,8 +483,13 @@ _RETURN_ALPHA = 0.09
 """Opacity of the shading while a site returns."""
 _LETTERS_PER_IN = 120.0
 """Average number of letters per inch of a font of 1 pt."""
-_CHANGE: dict[str, Any] = {"color": REFERENCE, "linestyle": (0, (1, 1.5)), "linewidth": 0.7}
-_NUMBER: dict[str, Any] = {
+_CHANGE_LINE: LineOptions = {
+    "color": REFERENCE,
+    "linestyle": (0, (1, 1.5)),
+    "linewidth": 0.7,
+}
+"""Options of the vertical line at a change."""
+_CHANGE_NUMBER: dict[str, Any] = {
     "xytext": (1.5, -0.5),
     "textcoords": "offset points",
     "va": "top",
@@ -408,8 +504,13 @@ _NUMBER: dict[str, Any] = {
 
 
 def site_records(log: Log, values: Callable[[SiteLog], Array]) -> SiteSignal:
-    """Returns the signal of the sites with `values` computed from the records of a site."""
-    return lambda site: (log[site].tick, log[site].t_s, values(log[site]))
+    """Returns the signal of the values that a function computes from a site's records."""
+
+    def read_signal(site: str) -> tuple[Ints, Array, Array]:
+        records = log[site]
+        return records.tick, records.t_s, values(records)
+
+    return read_signal
 
 
 @contextmanager
@@ -477,25 +578,38 @@ class TimeFigure:
             numbered: True to write the number of each change.
         """
         for site in sites:
-            colour = site_colour(self.log, site)
-            for mode, from_s, to_s in self._modes[site]:
-                alpha = _RETURN_ALPHA if mode == "return" else _HOLD_ALPHA
-                axes.axvspan(from_s, to_s, color=colour, alpha=alpha, linewidth=0.0, zorder=0.5)
-        # x in s, y as a share of the height of the panel
-        transform = axes.get_xaxis_transform()
-        for number, changed in self._changes:
-            if changed.site not in sites or (link and changed.change.link != link):
-                continue
-            at_s = changed.change.at_s
-            axes.axvline(at_s, zorder=0.6, **_CHANGE)
-            if numbered:
-                axes.annotate(
-                    text=str(number),
-                    xy=(at_s, 1.0),
-                    xycoords=transform,
-                    fontsize=self._small_pt,
-                    **_NUMBER,
-                )
+            self._shade_modes(axes, site)
+        for number, applied in self._changes:
+            is_other_link = bool(link) and applied.change.link != link
+            if applied.site in sites and not is_other_link:
+                at_s = applied.change.at_s
+                self._mark_change(axes, at_s, str(number) if numbered else "")
+
+    def _shade_modes(self, axes: Axes, site: str) -> None:
+        """Shades a panel in the colour of a site while the site does not follow its peers."""
+        colour = site_colour(self.log, site)
+        for mode, from_s, to_s in self._modes[site]:
+            axes.axvspan(
+                from_s,
+                to_s,
+                color=colour,
+                alpha=_RETURN_ALPHA if mode == "return" else _HOLD_ALPHA,
+                linewidth=0.0,
+                zorder=0.5,
+            )
+
+    def _mark_change(self, axes: Axes, at_s: float, number: str) -> None:
+        """Draws a vertical line at the time of a change, with its number if it is not ""."""
+        axes.axvline(at_s, zorder=0.6, **_CHANGE_LINE)
+        if number:
+            axes.annotate(
+                text=number,
+                xy=(at_s, 1.0),
+                # x in s, y as a share of the height of the panel
+                xycoords=axes.get_xaxis_transform(),
+                fontsize=self._small_pt,
+                **_CHANGE_NUMBER,
+            )
 
     def finish(
         self,
@@ -520,34 +634,45 @@ class TimeFigure:
             add_legend(self.figure, entries, title=title, title_fontsize=8.0)
         else:
             add_legend(self.figure, entries)
+        self._add_footnote(self._explain_changes(links=links), self._explain_shading())
+
+    def _add_footnote(self, *sentences: str) -> None:
+        """Writes sentences below the panels, each on lines of its own; "" is left out."""
         letters = int(_LETTERS_PER_IN * self.figure.get_figwidth() / self._small_pt)
-        sentences = [self._explain_changes(links=links), self._explain_shading()]
-        lines = [line for sentence in sentences for line in textwrap.wrap(sentence, letters)]
+        lines: list[str] = []
+        for sentence in sentences:
+            lines += textwrap.wrap(sentence, letters)
         if lines:
-            text = typeset("\n".join(lines))
             self.figure.supxlabel(
-                text, x=0.01, ha="left", fontsize=self._small_pt, color=REFERENCE
+                typeset("\n".join(lines)),
+                x=0.01,
+                ha="left",
+                fontsize=self._small_pt,
+                color=REFERENCE,
             )
 
     def _explain_changes(self, *, links: bool) -> str:
-        """Returns a sentence on the numbered changes, of links alone with `links`, or ""."""
-        marked = [
-            f"{number}: {changed.subject} {changed.text}"
-            for number, changed in self._changes
-            if changed.change.link or not links
-        ]
+        """Returns a sentence on the numbered changes; with `links` on changes of links only.
+
+        Returns "" if there are no changes.
+        """
+        marked = []
+        for number, applied in self._changes:
+            if applied.change.link or not links:
+                marked.append(f"{number}: {applied.subject} {applied.text}")
         if not marked:
             return ""
         parts = marked[:MOST_EXPLAINED_CHANGES]
-        if len(marked) > MOST_EXPLAINED_CHANGES:
-            parts.append(f"and {len(marked) - MOST_EXPLAINED_CHANGES} more")
+        more = len(marked) - len(parts)
+        if more:
+            parts.append(f"and {more} more")
         return f"Changes: {'; '.join(parts)}"
 
     def _explain_shading(self) -> str:
-        """Returns a sentence on the modes of the sites that are shaded, or ""."""
-        meanings = {
-            interval.meaning for intervals in self._modes.values() for interval in intervals
-        }
+        """Returns a sentence on the modes that are shaded; "" if no mode is shaded."""
+        meanings = set()
+        for intervals in self._modes.values():
+            meanings |= {interval.meaning for interval in intervals}
         if not meanings:
             return ""
         parts = []
