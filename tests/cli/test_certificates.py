@@ -43,7 +43,7 @@ def test_a_stable_run_ends_with_0(tmp_path: Path) -> None:
     assert "ok   this rest: stable, -0.1" in printed
     assert "constant on every link: 200 ms" in printed
     assert "ok   energy balance: closes to " in printed
-    assert "taken: disagreement" in printed
+    assert "dissipated: disagreement" in printed
 
 
 def test_a_run_that_diverged_ends_with_1(tmp_path: Path) -> None:

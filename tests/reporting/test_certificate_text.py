@@ -87,7 +87,7 @@ def test_many_links_are_one_entry() -> None:
     assert balance is not None
     some = {f"a->{n}": np.ones_like(balance.V) for n in range(7)}
     names = [name for name, _ in list_energies(replace(balance, work={**balance.work, **some}))]
-    assert [name for name in names if "->" in name or "links" in name] == ["given: 19 links"]
+    assert [name for name in names if "->" in name or "links" in name] == ["supplied: 19 links"]
 
 
 def test_the_papers_weights_are_told_where_they_are_wrong() -> None:

@@ -1,5 +1,8 @@
 """Text of a stability certificate, for the terminal and the report page.
 
+`describe_certificate` returns the sentences of both. The terminal adds tables of the premises
+and of the energies that changed V.
+
 Invariant:
     - The terminal and the page show the same sentences.
     - The verdict comes first.
@@ -7,17 +10,19 @@ Invariant:
       the entries too small to be listed.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from ..analysis.certificate.energy_balance import ZERO_ENERGY_J, EnergyBalance
 from ..analysis.certificate.observed_energy import ObservedFinding
+from ..analysis.certificate.premises import Premise
 from ..analysis.certificate.stability_certificate import Certificate, StabilityFinding
 from ..analysis.envelope_trend import EnvelopeTrend
 from ..analysis.run_end import Stability
 from ..analysis.twin_growth import PushedTwins, TwinGrowth
+from ..core.vectors import Array
 from ..errors import count_nouns
 from .result_text import MARKS, Block, MarkedText, TextTable
 
@@ -39,25 +44,34 @@ def compose_certificate(certificate: Certificate) -> Iterator[Block]:
     """Yields the judgement and its grounds, then tables of the premises and the energies."""
     for line in describe_certificate(certificate):
         yield MarkedText(MARKS[line.mark], line.text)
+
     observed = certificate.observed
     premises = list(certificate.premises)
     if observed is not None:
         premises += observed.premises
-    rows = [(premise.name, _HOLDS[premise.holds], premise.text) for premise in premises]
     yield ""
-    styles = {"holds": "green", "fails": "yellow"}
-    yield TextTable(("premise", "", "found"), rows, styles=styles)
+    yield _tabulate_premises(premises)
+
     if observed is not None and observed.least:
-        least = [
-            (name, f"{amount_j:.4g}", f"{at_s:.4g}") for name, amount_j, at_s in observed.least
-        ]
+        rows = []
+        for name, amount_j, at_s in observed.least:
+            rows.append((name, f"{amount_j:.4g}", f"{at_s:.4g}"))
+        headers = ("energy of the laws", "least J", "at s")
         yield ""
-        yield TextTable(("energy of the laws", "least J", "at s"), least, align="lrr")
-    if certificate.balance is None:
-        return
-    energies = [(name, f"{amount:.4g}") for name, amount in list_energies(certificate.balance)]
-    yield ""
-    yield TextTable(("energy", "J"), energies, align="lr")
+        yield TextTable(headers, rows, align="lrr")
+
+    if certificate.balance is not None:
+        energies = list_energies(certificate.balance)
+        cells = [(name, f"{energy_j:.4g}") for name, energy_j in energies]
+        yield ""
+        yield TextTable(("energy", "J"), cells, align="lr")
+
+
+def _tabulate_premises(premises: Sequence[Premise]) -> TextTable:
+    """Returns a table with a row per premise: whether it holds, and why."""
+    rows = [(premise.name, _HOLDS[premise.holds], premise.text) for premise in premises]
+    styles = {"holds": "green", "fails": "yellow"}
+    return TextTable(("premise", "", "finding"), rows, styles=styles)
 
 
 def compose_twins(twins: PushedTwins) -> Iterator[Block]:
@@ -71,7 +85,7 @@ def compose_twins(twins: PushedTwins) -> Iterator[Block]:
 
 
 class CertificateLine(NamedTuple):
-    """One sentence of a certificate.
+    """A sentence of a certificate.
 
     Attributes:
         mark: "ok" for a sentence that supports the stability of the run, "FAIL" for one against
@@ -89,38 +103,63 @@ def describe_certificate(certificate: Certificate) -> list[CertificateLine]:
     The grounds are V, the end of the run, the energy balance, the energy of the laws, the
     roots, the twins that were pushed, and the log.
     """
-    finding = certificate.verdict.finding
-    if finding is StabilityFinding.BROKEN:
+    lines = _describe_verdict(certificate)
+    if certificate.balance is not None:
+        mark = _BALANCE_MARKS.get(certificate.verdict.finding, "ok")
+        balance = describe_balance(certificate.balance)
+        lines.append(CertificateLine(mark, f"energy balance: {balance}"))
+    observed = certificate.observed
+    if observed is not None:
+        lines.append(CertificateLine(_OBSERVED_MARKS[observed.finding], observed.text))
+    roots = certificate.roots
+    if roots is not None:
+        # roots that are not exact cannot show stability
+        is_doubtful = roots.verdict == "stable" and not roots.exact
+        mark = "note" if is_doubtful else _ROOT_MARKS.get(roots.verdict, "note")
+        lines.append(CertificateLine(mark, roots.text))
+    twins = certificate.twins
+    if twins is not None:
+        lines.append(CertificateLine(_mark_twins(twins), twins.text))
+    lines.append(_describe_evidence(certificate))
+    paper_note = _describe_paper_weights(certificate)
+    if paper_note:
+        lines.append(CertificateLine("note", paper_note))
+    return lines
+
+
+def _describe_verdict(certificate: Certificate) -> list[CertificateLine]:
+    """Returns the judgement, the verdict on V, and the end of the run."""
+    stability_mark = _JUDGEMENT_MARKS[certificate.stability]
+    verdict_mark = "ok" if certificate.bounded_by_v else "open"
+    if certificate.verdict.finding is StabilityFinding.BROKEN:
         stability_mark = "FAIL"
         verdict_mark = "FAIL"
-    else:
-        stability_mark = _JUDGEMENT[certificate.stability]
-        verdict_mark = "ok" if certificate.bounded_by_v else "open"
-    lines = [(stability_mark, describe_judgement(certificate))]
-    lines.append((verdict_mark, certificate.verdict.text))
-    lines.append((_JUDGEMENT[certificate.end.stability], f"e and qd: {certificate.end.text}"))
-    if certificate.balance is not None:
-        mark = _BALANCE.get(finding, "ok")
-        lines.append((mark, f"energy balance: {describe_balance(certificate.balance)}"))
-    if certificate.observed is not None:
-        lines.append((_OBSERVED[certificate.observed.finding], certificate.observed.text))
-    if certificate.roots is not None:
-        verdict = certificate.roots.verdict
-        # roots that are not exact cannot show stability
-        doubtful = not certificate.roots.exact and verdict == "stable"
-        mark = "note" if doubtful else _ROOTS.get(verdict, "note")
-        lines.append((mark, certificate.roots.text))
-    if certificate.twins is not None:
-        lines.append((_mark_twins(certificate.twins), certificate.twins.text))
-    intact = "open" if certificate.evidence.reasons else "ok"
-    mark = intact if certificate.evidence.integrity.passed else "FAIL"
-    lines.append((mark, f"log: {certificate.evidence.text}"))
-    if certificate.paper_balance is not None and certificate.paper_weights_rise is not None:
-        rise_j = certificate.paper_weights_rise.amount
-        largest_j = certificate.paper_balance.V.max()
-        rise = f"V would have risen by {rise_j:.3g} J of {largest_j:.4g} J"
-        lines.append(("note", f"with the paper's weights, ones, {rise} (docs/errata.md, 6)"))
-    return [CertificateLine(mark, text) for mark, text in lines]
+    end_mark = _JUDGEMENT_MARKS[certificate.end.stability]
+    return [
+        CertificateLine(stability_mark, describe_judgement(certificate)),
+        CertificateLine(verdict_mark, certificate.verdict.text),
+        CertificateLine(end_mark, f"e and qd: {certificate.end.text}"),
+    ]
+
+
+def _describe_evidence(certificate: Certificate) -> CertificateLine:
+    """Returns the line on the completeness and integrity of the log."""
+    evidence = certificate.evidence
+    mark = "open" if evidence.reasons else "ok"
+    if not evidence.integrity.passed:
+        mark = "FAIL"
+    return CertificateLine(mark, f"log: {evidence.text}")
+
+
+def _describe_paper_weights(certificate: Certificate) -> str:
+    """Returns the rise of V with the paper's weights; "" if these weights are right."""
+    balance = certificate.paper_balance
+    rise = certificate.paper_weights_rise
+    if balance is None or rise is None:
+        return ""
+    largest_j = balance.V.max()
+    sentence = f"V would have risen by {rise.amount:.3g} J of {largest_j:.4g} J"
+    return f"with the paper's weights, ones, {sentence} (docs/errata.md, 6)"
 
 
 def describe_judgement(certificate: Certificate) -> str:
@@ -128,36 +167,46 @@ def describe_judgement(certificate: Certificate) -> str:
     return "; ".join([certificate.headline(), *certificate.reasons])
 
 
-_JUDGEMENT = {Stability.STABLE: "ok", Stability.NOT_STABLE: "FAIL", Stability.OPEN: "open"}
-_BALANCE = {StabilityFinding.BROKEN: "FAIL", StabilityFinding.NOT_JUDGED: "open"}
-_OBSERVED = {
+_JUDGEMENT_MARKS = {
+    Stability.STABLE: "ok",
+    Stability.NOT_STABLE: "FAIL",
+    Stability.OPEN: "open",
+}
+_BALANCE_MARKS = {
+    StabilityFinding.BROKEN: "FAIL",
+    StabilityFinding.NOT_JUDGED: "open",
+}
+_OBSERVED_MARKS = {
     ObservedFinding.PASSIVE: "ok",
     ObservedFinding.NEGATIVE: "open",
     ObservedFinding.BROKEN: "FAIL",
     ObservedFinding.NOT_JUDGED: "open",
 }
-_ROOTS = {"stable": "ok", "unstable": "open"}
+_ROOT_MARKS = {"stable": "ok", "unstable": "open"}
 
 
 def _mark_twins(twins: TwinGrowth) -> str:
+    """Returns the mark of the sentence on twins that were pushed."""
     if not twins.pushes:
         return "note"
     if twins.grows or twins.departure is not None:
         return "FAIL"
-    return "ok" if twins.trend in (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY) else "open"
+    decays = twins.trend in (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY)
+    return "ok" if decays else "open"
 
 
 def describe_balance(balance: EnergyBalance) -> str:
     """Returns a sentence on how closely the energy balance closes."""
+    scale_j = balance.scale
+    if scale_j <= ZERO_ENERGY_J:
+        return "there is no energy in this run"
     residual_j = float(np.abs(balance.residual).max())
     unexplained_j = float(np.abs(balance.unexplained).max())
-    scale = balance.scale
-    if scale <= ZERO_ENERGY_J:
-        return "there is no energy in this run"
-    text = f"closes to {residual_j / scale:.1e} of the largest energy, {scale:.4g} J"
+    text = f"closes to {residual_j / scale_j:.1e} of the largest energy, {scale_j:.4g} J"
     if unexplained_j >= residual_j:
         return text
-    return f"{text}; to {unexplained_j / scale:.1e} once the controller's sampling is booked"
+    share = unexplained_j / scale_j
+    return f"{text}; to {share:.1e} once the controller's sampling is booked"
 
 
 def list_energies(balance: EnergyBalance) -> list[tuple[str, float]]:
@@ -165,19 +214,26 @@ def list_energies(balance: EnergyBalance) -> list[tuple[str, float]]:
 
     Energies below `MIN_ENERGY_SHARE` of the largest energy are left out.
     """
-    links = {name: work for name, work in balance.work.items() if "->" in name}
-    sources = {name: work for name, work in balance.work.items() if "->" not in name}
+    links: dict[str, Array] = {}
+    sources: dict[str, Array] = {}
+    for name, work in balance.work.items():
+        group = links if "->" in name else sources
+        group[name] = work
     if len(links) > MAX_LISTED_LINKS:
-        links = {count_nouns(len(links), "link"): np.sum(list(links.values()), axis=0)}
-    gained = sum(balance.work.values())
-    lost = sum(balance.dissipation.values())
-    rest = balance.V - balance.V[0] - (gained - lost + balance.sampling - balance.transfer)
-    entries = {f"taken: {name}": -energy for name, energy in balance.dissipation.items()}
+        total = np.sum(list(links.values()), axis=0)
+        links = {count_nouns(len(links), "link"): total}
+
+    entries = {}
+    for name, energy in balance.dissipation.items():
+        entries[f"dissipated: {name}"] = -energy
     for name, energy in (sources | links).items():
-        entries[f"given: {_SOURCE_NAMES.get(name, name)}"] = energy
-    entries["given: sampling of the controller"] = balance.sampling
-    entries["left by beta"] = -balance.transfer
-    entries["unexplained" if balance.judged.all() else "in gaps, or unexplained"] = rest
+        entries[f"supplied: {_SOURCE_NAMES.get(name, name)}"] = energy
+    entries["supplied: sampling of the controller"] = balance.sampling
+    entries["transferred, not cancelled by beta"] = -balance.transfer
+    has_no_gaps = balance.judged.all()
+    rest_name = "unexplained" if has_no_gaps else "in gaps, or unexplained"
+    entries[rest_name] = _compute_rest(balance)
+
     least_j = MIN_ENERGY_SHARE * balance.scale + ZERO_ENERGY_J
     listed = [_describe_v(balance, 0)]
     for name, energy in entries.items():
@@ -186,7 +242,16 @@ def list_energies(balance: EnergyBalance) -> list[tuple[str, float]]:
     return [*listed, _describe_v(balance, -1)]
 
 
+def _compute_rest(balance: EnergyBalance) -> Array:
+    """Returns the change of V less all energies that changed V, shape (T,), J."""
+    gained = sum(balance.work.values())
+    lost = sum(balance.dissipation.values())
+    explained = gained - lost + balance.sampling - balance.transfer
+    return balance.V - balance.V[0] - explained
+
+
 def _describe_v(balance: EnergyBalance, index: int) -> tuple[str, float]:
-    energy_j = balance.V[index]
-    shown_j = float(energy_j) if energy_j > ZERO_ENERGY_J else 0.0
+    """Returns the name and the value in J of V at a tick; 0 for V below rounding."""
+    energy_j = float(balance.V[index])
+    shown_j = energy_j if energy_j > ZERO_ENERGY_J else 0.0
     return f"V at {balance.t_s[index]:.4g} s", shown_j
