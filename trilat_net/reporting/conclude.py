@@ -1,4 +1,7 @@
-"""Conclusion of a finished run: its checks, figures, page, summary and table of sites.
+"""Conclude a finished run: check its log, and write its figures, page and summary.
+
+`conclude` is the work of `trilat report`. Its result, a `Conclusion`, is the text that commands
+print after a run.
 
 Invariant:
     - Every claim rests on a new execution of the log, made for this conclusion.
@@ -63,27 +66,28 @@ class Conclusion(CheckReport):
     @property
     def page(self) -> Path:
         """The page of the report; without a page, the first path."""
-        return next((path for path in self.paths if path.suffix == ".html"), self.paths[0])
+        pages = [path for path in self.paths if path.suffix == ".html"]
+        return pages[0] if pages else self.paths[0]
 
     def headline(self) -> str:
         """Returns the result of the checks, and the path of the page."""
         results = {0: "passed", CodeWithheld.exit_code: "not all was judged"}
-        return f"{results.get(self.exit_code, 'FAILED')}; {self.page}"
+        result = results.get(self.exit_code, "FAILED")
+        return f"{result}; {self.page}"
 
     def to_rows(self) -> list[dict[str, str]]:
         """Returns a row per site."""
-        return [dict(zip(self.table.headers, row, strict=False)) for row in self.table.rows]
+        headers = self.table.headers
+        return [dict(zip(headers, row, strict=False)) for row in self.table.rows]
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the keys of `trilat report --json`."""
-        checks = [finding.to_row() for finding in self.findings]
-        paths = [path.as_posix() for path in self.paths]
         return {
             "passed": self.passed,
             "verdict": self.verdict.text,
             "notes": self.notes,
-            "checks": checks,
-            "paths": paths,
+            "checks": [finding.to_row() for finding in self.findings],
+            "paths": [path.as_posix() for path in self.paths],
         }
 
 
@@ -115,34 +119,42 @@ def conclude(
     findings: list[Finding] = []
     # uses two cores: the log is executed while its figures are drawn
     with worker_pool(1) as pool:
-        checking = pool.submit(check_log_files, log.sources, min_coverage, dict(allowed_code))
+        allowed = dict(allowed_code)
+        check = pool.submit(check_log_files, log.sources, min_coverage, allowed)
         twin = _run_without_operators(log)
         certificate = certify_run(log, min_coverage=min_coverage)
-        notes = [*format_run_lines(log), f"certificate: {certificate.verdict.text}"]
+        # raises, if at all, before anything is written
+        run_lines = format_run_lines(log)
+        figures: list[Path] = []
+        if png:
+            figures = write_report_figures(
+                log=log,
+                folder=folder,
+                twin=twin,
+                progress=progress,
+                pushed=certificate.twins,
+            )
 
-        def verdicts() -> Iterator[Finding]:
+        def wait_for_findings() -> Iterator[Finding]:
             try:
-                findings.extend(checking.result())
+                findings.extend(check.result())
             except BrokenProcessPool:
                 raise RunFailed(
                     "the process that executes the log again was ended; try again"
                 ) from None
             yield from findings
 
-        figures: list[Path] = []
-        if png:
-            figures = write_report_figures(
-                log=log, folder=folder, twin=twin, progress=progress, pushed=certificate.twins
-            )
         report = write_report(
-            log, folder, twin=twin, certificate=certificate, verdicts=verdicts()
+            log,
+            folder,
+            twin=twin,
+            certificate=certificate,
+            verdicts=wait_for_findings(),
         )
-    heads = (*_HEADERS, f"max|e| end {shared_unit(log)}")
-    table = TextTable(heads, [_site_row(log, site) for site in log.sites], align="lr")
     return Conclusion(
         verdict=describe_certificate(certificate)[0],
-        table=table,
-        notes=notes,
+        table=_tabulate_sites(log),
+        notes=[*run_lines, f"certificate: {certificate.verdict.text}"],
         findings=findings,
         paths=[*map(Path, log.sources), *report, *figures],
     )
@@ -151,9 +163,9 @@ def conclude(
 def _run_without_operators(log: Log) -> Log | None:
     """Returns the same run without operators; None if it would not differ, or cannot run."""
     # the twin of a run that failed would fail too, or hang
-    broke_off = any(event.kind == "failed" for event in log.events)
-    pushed = any(site.hands for site in log.scenario.sites.values())
-    if broke_off or log.scenario.external or not pushed:
+    has_failed = any(event.kind == "failed" for event in log.events)
+    has_operators = any(site.hands for site in log.scenario.sites.values())
+    if has_failed or log.scenario.external or not has_operators:
         return None
     try:
         return simulate_without_operators(log)
@@ -162,17 +174,38 @@ def _run_without_operators(log: Log) -> Log | None:
         return None
 
 
-_HEADERS = ("site", "records", "missing", "late p50 us", "p99", "max", "busy p50 us", "p99")
+_HEADERS = (
+    "site",
+    "records",
+    "missing",
+    "late p50 us",
+    "p99",
+    "max",
+    "busy p50 us",
+    "p99",
+)
 
 
-def _site_row(log: Log, site: str) -> tuple[str, ...]:
+def _tabulate_sites(log: Log) -> TextTable:
+    """Returns a table with a row per site: records, timing of the loop, and last error."""
+    headers = (*_HEADERS, f"max|e| end {shared_unit(log)}")
+    rows = [_list_site_cells(log, site) for site in log.sites]
+    return TextTable(headers, rows, align="lr")
+
+
+def _list_site_cells(log: Log, site: str) -> list[str]:
+    """Returns the cells of a site; those after the number of records are "" without records."""
     records = log[site]
     if not len(records):
-        return (site, "0", *("",) * (len(_HEADERS) - 1))
+        empty = [""] * (len(_HEADERS) - 1)
+        return [site, "0", *empty]
     ticks = max(log.last_ticks[site], records.last_tick) + 1
     missing = ticks - len(records) - log.absent_ticks(site)
     late_us = np.percentile(records.late_us, (50, 99, 100))
-    busy_us = np.percentile(records.busy_us, (50, 99)) if len(records) > 1 else (0, 0)
+    busy_us = np.zeros(2)
+    # a record holds the computing time of the tick before, so that the first record has none
+    if len(records) > 1:
+        busy_us = np.percentile(records.busy_us, (50, 99))
     times = [f"{time_us:.0f}" for time_us in (*late_us, *busy_us)]
     last_error = np.abs(records.e[-1]).max()
-    return (site, str(len(records)), str(missing), *times, f"{last_error:.2e}")
+    return [site, str(len(records)), str(missing), *times, f"{last_error:.2e}"]

@@ -1,8 +1,8 @@
-"""Text of results as a list of blocks, which are shown on the terminal, as text or as HTML.
+"""Text of results as a list of blocks, shown on the terminal, as plain text or as HTML.
 
 A block is a line, a marked line (`MarkedText`) or a table (`TextTable`). Results of `studies`
-compose their blocks in a method `blocks`. For the results of the packages below, which do not
-know about text, `_COMPOSERS` names a function in this folder.
+compose their blocks in a method `blocks`. Results of other packages, which do not depend on
+this one, have no such method: for these, `_COMPOSERS` names a function in this folder.
 
 Invariant:
     - The terminal, the plain text and the HTML have the same blocks in the same order.
@@ -10,11 +10,11 @@ Invariant:
 """
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from html import escape
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from rich.text import Text
 
@@ -24,10 +24,15 @@ from .terminal_output import MAX_LETTERS, sanitize
 if TYPE_CHECKING:
     from rich.table import Table
 
-_COLOURS = {"ok": "green", "warn": "yellow", "open": "yellow", "fail": "red", "FAIL": "red"}
-MARKS = {word: f"[{colour}]{word:<4}[/{colour}]" for word, colour in _COLOURS.items()} | {
-    "note": "note"
+_COLOURS = {
+    "ok": "green",
+    "warn": "yellow",
+    "open": "yellow",
+    "fail": "red",
+    "FAIL": "red",
 }
+MARKS = {state: f"[{colour}]{state:<4}[/{colour}]" for state, colour in _COLOURS.items()}
+MARKS["note"] = "note"
 """Marks in Rich's markup, by the state of a finding."""
 
 HASH = re.compile(r"\b(?=[0-9a-f]*[a-f])(?=[0-9a-f]*[0-9])[0-9a-f]{12,64}\b")
@@ -66,15 +71,16 @@ class TextTable(NamedTuple):
     @property
     def titles(self) -> list[str]:
         """The headers with their units."""
-        units = [*self.units, *[""] * len(self.headers)]
-        return [
-            f"{head} {unit}".strip() for head, unit in zip(self.headers, units, strict=False)
-        ]
+        missing = len(self.headers) - len(self.units)
+        units = [*self.units, *[""] * missing]
+        columns = zip(self.headers, units, strict=False)
+        return [f"{header} {unit}".strip() for header, unit in columns]
 
     @property
     def to_the_right(self) -> list[bool]:
         """Per column, True if its cells are aligned to the right."""
-        return [letter == "r" for letter in self.align.ljust(len(self.headers), self.align[-1])]
+        letters = self.align.ljust(len(self.headers), self.align[-1])
+        return [letter == "r" for letter in letters]
 
     def rich(self) -> "Table":
         """Returns the table for a Rich console, without borders.
@@ -85,26 +91,40 @@ class TextTable(NamedTuple):
 
         table = Table(box=None, pad_edge=False, show_header=any(self.titles))
         columns = zip(self.titles, self.to_the_right, strict=True)
-        for index, (title, right) in enumerate(columns):
-            cells = [row[index] for row in self.rows if index < len(row)]
-            hash_widths = [len(digits) for cell in cells for digits in HASH.findall(cell)]
-            widest = max(hash_widths, default=None)
-            side: Any = "right" if right else "left"
-            # Rich narrows columns that may wrap before it respects the least widths of others
-            holds_hashes = widest is not None and all(len(cell) <= widest for cell in cells)
+        for index, (title, is_right) in enumerate(columns):
+            hash_width = self._find_hash_width(index)
             table.add_column(
                 Text(sanitize(title)),
-                justify=side,
+                justify="right" if is_right else "left",
                 overflow="fold",
-                min_width=widest,
-                no_wrap=holds_hashes,
+                min_width=hash_width,
+                # Rich narrows columns that may wrap before it respects least widths
+                no_wrap=hash_width is not None and self._fits(index, hash_width),
             )
         for row in self.rows:
             is_heading = len(row) == 1 < len(self.headers)
-            default = "bold" if is_heading else ""
-            texts = [Text(sanitize(cell), style=self.styles.get(cell, default)) for cell in row]
+            default_style = "bold" if is_heading else ""
+            texts = []
+            for cell in row:
+                style = self.styles.get(cell, default_style)
+                texts.append(Text(sanitize(cell), style=style))
             table.add_row(*texts)
         return table
+
+    def _list_cells(self, index: int) -> list[str]:
+        """Returns the cells of a column, without those that short rows leave out."""
+        return [row[index] for row in self.rows if index < len(row)]
+
+    def _find_hash_width(self, index: int) -> int | None:
+        """Returns the length of the longest hash in a column; None without a hash."""
+        widths = []
+        for cell in self._list_cells(index):
+            widths += [len(digits) for digits in HASH.findall(cell)]
+        return max(widths, default=None)
+
+    def _fits(self, index: int, width: int) -> bool:
+        """True if no cell of a column is longer than a width."""
+        return all(len(cell) <= width for cell in self._list_cells(index))
 
     def markdown(self) -> str:
         """Returns the table in Markdown."""
@@ -124,13 +144,14 @@ class TextTable(NamedTuple):
         sides = ["right" if right else "left" for right in self.to_the_right]
 
         def render_row(cells: Sequence[str], tag: str) -> str:
-            columns = [
-                f'<{tag} style="text-align:{side}">{escape_text(cell)}</{tag}>'
-                for cell, side in zip(cells, sides, strict=False)
-            ]
-            return f"<tr>{''.join(columns)}</tr>"
+            html = ""
+            for cell, side in zip(cells, sides, strict=False):
+                html += f'<{tag} style="text-align:{side}">{escape_text(cell)}</{tag}>'
+            return f"<tr>{html}</tr>"
 
-        head = f"<thead>{render_row(self.titles, 'th')}</thead>" if any(self.titles) else ""
+        head = ""
+        if any(self.titles):
+            head = f"<thead>{render_row(self.titles, 'th')}</thead>"
         body = "".join(render_row(row, "td") for row in self.rows)
         return f"<table>{head}<tbody>{body}</tbody></table>"
 
@@ -139,18 +160,20 @@ class TextTable(NamedTuple):
 
         The first line holds the headers, unless all headers are empty.
         """
-        table = [self.titles, *self.rows] if any(self.titles) else self.rows
-        widths = []
-        for index in range(len(self.headers)):
-            lengths = [len(row[index]) for row in table if index < len(row)]
-            widths.append(max(lengths, default=0))
+        table = list(self.rows)
+        if any(self.titles):
+            table.insert(0, self.titles)
+        widths = [0] * len(self.headers)
+        for row in table:
+            for index, cell in enumerate(row[: len(widths)]):
+                widths[index] = max(widths[index], len(cell))
+
         lines = []
         for row in table:
             columns = zip(row, widths, self.to_the_right, strict=False)
-            cells = [
-                cell.rjust(width) if right else cell.ljust(width)
-                for cell, width, right in columns
-            ]
+            cells = []
+            for cell, width, is_right in columns:
+                cells.append(cell.rjust(width) if is_right else cell.ljust(width))
             lines.append("  ".join(cells).rstrip())
         return lines
 
@@ -174,12 +197,16 @@ class MarkedText(NamedTuple):
     failed: bool = False
 
     def lines(self) -> list[str]:
-        """Returns a list of one line, without colours."""
-        return [f"{Text.from_markup(self.mark).plain} {self.text}" if self.mark else self.text]
+        """Returns a list of a single line, without colours."""
+        if not self.mark:
+            return [self.text]
+        mark = Text.from_markup(self.mark).plain
+        return [f"{mark} {self.text}"]
 
     def html(self) -> str:
         """Returns the line in HTML."""
-        text = escape_text(sanitize(self.lines()[0], MAX_LETTERS))
+        line = sanitize(self.lines()[0], MAX_LETTERS)
+        text = escape_text(line)
         return f'<div style="white-space:pre-wrap">{text or "&nbsp;"}</div>'
 
 
@@ -209,19 +236,27 @@ def compose(result: Result) -> list[MarkedText | TextTable]:
     """Returns the lines and tables of a result, in order."""
     compose_blocks = getattr(result, "blocks", None)
     if compose_blocks is None:
-        classes = [cls.__name__ for cls in type(result).__mro__]
-        known = next(name for name in classes if name in _COMPOSERS)
-        module, _, function = _COMPOSERS[known].partition(":")
-        composer = getattr(import_module(f"{__package__}.{module}"), function)
-        compose_blocks = partial(composer, result)
+        compose_blocks = partial(_import_composer(result), result)
     blocks: Iterable[Block] = compose_blocks()
     return [MarkedText("", block) if isinstance(block, str) else block for block in blocks]
 
 
+def _import_composer(result: Result) -> Callable[[Result], Iterable[Block]]:
+    """Returns the function in `_COMPOSERS` for the nearest class of a result."""
+    classes = [cls.__name__ for cls in type(result).__mro__]
+    known = next(name for name in classes if name in _COMPOSERS)
+    module_name, _, function_name = _COMPOSERS[known].partition(":")
+    module = import_module(f"{__package__}.{module_name}")
+    composer: Callable[[Result], Iterable[Block]] = getattr(module, function_name)
+    return composer
+
+
 def summarize(result: Result) -> str:
     """Returns a result as plain text."""
-    lines = (line for block in compose(result) for line in block.lines())
-    return "\n".join(sanitize(line, MAX_LETTERS) for line in lines).strip("\n")
+    lines = []
+    for block in compose(result):
+        lines += [sanitize(line, MAX_LETTERS) for line in block.lines()]
+    return "\n".join(lines).strip("\n")
 
 
 def render_html(result: Result) -> str:
