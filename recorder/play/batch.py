@@ -1,12 +1,13 @@
-"""Hold messages in play order: a table of numbers over a few large byte buffers.
+"""Hold messages in play order, as a table of numbers over a few large byte buffers.
 
+A `BatchBuilder` collects messages in the order of a file and sorts them into a `MessageBatch`.
 A minute of 9000 messages/s takes some 100 MiB in this form, a third of its size as Python
 objects.
 
 Invariant:
     - Messages play in order of time, and within a channel in order of their numbers.
-    - A message that is later in the file than its number says (a backfilled message) plays at
-      the latest together with the next message of its channel.
+    - A backfilled message, which is later in the file than its number says, plays no later than
+      the next message of its channel.
     - Messages of the same time keep the order of the file.
 """
 
@@ -22,14 +23,23 @@ from trilat_net.log.record_columns import Ints
 PlayedMessage = tuple[int, int, int, bytes]
 """A message: time in ns since the epoch, channel, number in the channel, and payload.
 
-The number is the tick of a record and the number from 0 of statistics or an event of a site.
-The events of two successive starts differ by `NUMBERS_OF_A_START`. For other messages it is the
-time.
+The number of a record is its tick. Statistics and events of a site are numbered from 0, and the
+events of successive starts of a site differ by `NUMBERS_OF_A_START`. The number of any other
+message is its time.
 """
 PIECE_BYTES = 65_536
-"""Payload of a piece, bytes: small enough that preparing or receiving it does not delay the
-player.
+"""Payload of a piece, bytes.
+
+Preparing or receiving a piece of this size does not delay the player.
 """
+
+# columns of `MessageBatch.rows`
+_TIME = 0
+_CHANNEL = 1
+_NUMBER = 2
+_START = 3
+_END = 4
+_COLUMNS = 5
 
 
 def order_for_play(times_ns: Ints, channels: Ints, numbers: Ints) -> tuple[Ints, Ints]:
@@ -48,26 +58,33 @@ def order_for_play(times_ns: Ints, channels: Ints, numbers: Ints) -> tuple[Ints,
     """
     indices = np.arange(len(times_ns), dtype=np.int64)
     due_ns = times_ns.copy()
-    file_order = indices.copy()
+    positions = indices.copy()
     for channel in np.unique(channels):
         members = np.flatnonzero(channels == channel)
-        members = members[np.argsort(numbers[members], kind="stable")]
+        by_number = np.argsort(numbers[members], kind="stable")
+        members = members[by_number]
         # no message plays after the next message of its channel: not at a later time, and among
         # messages of the same time not at a later position
-        due_ns[members] = np.minimum.accumulate(times_ns[members][::-1])[::-1]
-        file_order[members] = np.minimum.accumulate(indices[members][::-1])[::-1]
-    order = np.lexsort((numbers, file_order, due_ns)).astype(np.int64)
+        due_ns[members] = _limit_by_later(times_ns[members])
+        positions[members] = _limit_by_later(indices[members])
+    # np.lexsort sorts by the last key first
+    order = np.lexsort((numbers, positions, due_ns)).astype(np.int64)
     return order, due_ns[order]
+
+
+def _limit_by_later(values: Ints) -> Ints:
+    """Returns, for each value, the least of this value and of all later values, shape (K,)."""
+    return np.minimum.accumulate(values[::-1])[::-1]
 
 
 @dataclass(frozen=True, slots=True)
 class MessageBatch:
-    """Messages: a table of numbers, and the bytes of the payloads.
+    """K messages: a table of numbers, and the bytes of the payloads.
 
     Attributes:
-        rows: per message the time in ns since the epoch, the channel, the number in the
+        rows: for each message the time in ns since the epoch, the channel, the number in the
             channel, and start and end of the payload in `data`; shape (K, 5).
-        data: the payloads.
+        data: the payloads, possibly with gaps.
     """
 
     rows: Ints
@@ -79,30 +96,35 @@ class MessageBatch:
     @property
     def times_ns(self) -> Ints:
         """Deadline of each message, ns since the epoch of its log, shape (K,)."""
-        return self.rows[:, 0]
+        return self.rows[:, _TIME]
+
+    @property
+    def end_ns(self) -> int:
+        """Deadline of the last message, ns since the epoch of its log."""
+        return int(self.times_ns[-1])
 
     @property
     def channels(self) -> Ints:
         """Channel of each message, shape (K,)."""
-        return self.rows[:, 1]
+        return self.rows[:, _CHANNEL]
 
     @property
     def numbers(self) -> Ints:
         """Number of each message in its channel, shape (K,)."""
-        return self.rows[:, 2]
+        return self.rows[:, _NUMBER]
 
     @property
     def _sizes(self) -> Ints:
         """Size of each payload, bytes, shape (K,)."""
-        return self.rows[:, 4] - self.rows[:, 3]
+        return self.rows[:, _END] - self.rows[:, _START]
 
     def payload(self, index: int) -> bytes:
         """Returns the payload of the message at an index."""
-        start, end = self.rows[index, 3:].tolist()
+        start, end = self.rows[index, _START:].tolist()
         return bytes(self.data[start:end])
 
     def messages(self) -> Iterator[PlayedMessage]:
-        """Yields every message."""
+        """Yields the messages in order."""
         view = memoryview(self.data)
         for t_ns, channel, number, start, end in self.rows.tolist():
             yield t_ns, channel, number, bytes(view[start:end])
@@ -116,38 +138,44 @@ class MessageBatch:
 
         A piece has at least one message.
         """
-        piece_numbers = np.cumsum(self._sizes) // size
-        changes = np.flatnonzero(np.diff(piece_numbers)) + 1
-        for start, end in pairwise([0, *changes.tolist(), len(self)]):
+        payload_ends = np.cumsum(self._sizes)
+        piece_numbers = payload_ends // size
+        first_rows = np.flatnonzero(np.diff(piece_numbers)) + 1
+        edges = [0, *first_rows.tolist(), len(self)]
+        for start, end in pairwise(edges):
             if end > start:
                 yield self.part(slice(start, end))
 
     def compact(self) -> "MessageBatch":
-        """Returns the messages over a copy of only their bytes, without gaps."""
+        """Returns the messages over a copy of their own bytes, without gaps."""
         view = memoryview(self.data)
-        payloads = [view[start:end] for start, end in self.rows[:, 3:].tolist()]
+        spans = self.rows[:, _START:].tolist()
+        payloads = [view[start:end] for start, end in spans]
+        sizes = self._sizes
+        ends = np.cumsum(sizes)
         rows = self.rows.copy()
-        rows[:, 4] = np.cumsum(self._sizes)
-        rows[1:, 3] = rows[:-1, 4]
-        rows[:1, 3] = 0
+        rows[:, _END] = ends
+        rows[:, _START] = ends - sizes
         return MessageBatch(rows, b"".join(payloads))
 
 
 class BatchBuilder:
-    """Collects messages in the order of a file and puts them in play order.
+    """Collects messages in the order of a file, and sorts them into play order.
 
     Args:
-        kept: messages that were put in order before; they come first.
+        kept: messages that were sorted before but not played. They precede the messages that
+            are added.
     """
 
     def __init__(self, kept: MessageBatch | None = None) -> None:
         self._payloads = bytearray()
         self._rows = array("q")
         if kept is not None:
-            file_order = np.argsort(kept.rows[:, 3], kind="stable")
-            kept = kept.part(file_order).compact()
-            self._payloads += kept.data
-            self._rows.frombytes(kept.rows.tobytes())
+            # payloads lie in the order in which their messages were added
+            file_order = np.argsort(kept.rows[:, _START], kind="stable")
+            earlier = kept.part(file_order).compact()
+            self._payloads += earlier.data
+            self._rows.frombytes(earlier.rows.tobytes())
 
     @property
     def memory(self) -> int:
@@ -158,31 +186,47 @@ class BatchBuilder:
         """Adds a message, see `PlayedMessage`."""
         start = len(self._payloads)
         self._payloads += payload
-        self._rows.extend((t_ns, channel, number, start, len(self._payloads)))
+        end = len(self._payloads)
+        self._rows.extend((t_ns, channel, number, start, end))
 
     def ordered(self) -> MessageBatch:
         """Returns the messages in play order, without repeated messages."""
-        rows = np.array(self._rows, dtype=np.int64).reshape(-1, 5)
+        rows = np.array(self._rows, dtype=np.int64).reshape(-1, _COLUMNS)
         repeats = self._find_repeats(rows)
         if repeats:
             rows = np.delete(rows, repeats, axis=0)
-        order, due_ns = order_for_play(rows[:, 0], rows[:, 1], rows[:, 2])
+        order, due_ns = order_for_play(
+            times_ns=rows[:, _TIME],
+            channels=rows[:, _CHANNEL],
+            numbers=rows[:, _NUMBER],
+        )
         rows = rows[order]
-        rows[:, 0] = due_ns
+        rows[:, _TIME] = due_ns
         return MessageBatch(rows, self._payloads)
 
     def _find_repeats(self, rows: Ints) -> list[int]:
-        """Returns the indices of repeated messages, as in two parts of a session."""
-        order = np.lexsort((rows[:, 2], rows[:, 1]))
-        # only messages with equal channel and number are compared
-        is_equal = (np.diff(rows[order, 1:3], axis=0) == 0).all(axis=1)
-        candidates = np.union1d(order[1:][is_equal], order[:-1][is_equal])
+        """Returns the indices of repeated messages, as in two parts of a session.
+
+        Args:
+            rows: the messages in file order, see `MessageBatch.rows`.
+        """
         seen: set[tuple[int, int, bytes]] = set()
         repeats = []
-        for index in candidates.tolist():
+        for index in _find_equal_numbers(rows).tolist():
             _, channel, number, start, end = rows[index].tolist()
             message = (channel, number, bytes(self._payloads[start:end]))
             if message in seen:
                 repeats.append(index)
             seen.add(message)
         return repeats
+
+
+def _find_equal_numbers(rows: Ints) -> Ints:
+    """Returns the indices of messages that share channel and number with another message."""
+    numbers = rows[:, _NUMBER]
+    channels = rows[:, _CHANNEL]
+    order = np.lexsort((numbers, channels))
+    identities = rows[order, _CHANNEL : _NUMBER + 1]
+    differences = np.diff(identities, axis=0)
+    equals_next = (differences == 0).all(axis=1)
+    return np.union1d(order[1:][equals_next], order[:-1][equals_next])

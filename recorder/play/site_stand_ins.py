@@ -1,7 +1,11 @@
-"""Stand in for the sites of a played session: their tokens, identities, pings and backfill.
+"""Stand in for the sites of a session that is played back from its log.
+
+The stand-ins announce the tokens of the sites, reply to queries for their identities and to
+pings, and send messages again that recorders request (backfill). `PlayedHistory` keeps the
+messages for this.
 
 Invariant:
-    - Recorders, viewers and pings find everything that a running session shows to a member that
+    - Recorders, viewers and pings see everything that a running session shows to a member that
       joins late.
     - Apart from identities, no message is published in the name of a site that the log does not
       hold.
@@ -52,21 +56,25 @@ class _ChannelMessages(NamedTuple):
     batch: MessageBatch
 
     def list_from(self, number: int) -> list[tuple[int, int]]:
-        """Returns number and index of the messages from a number on, enough for one reply."""
+        """Returns number and index of the messages from a number on.
+
+        There are at most as many messages as a reply holds, and a further one.
+        """
         start = int(np.searchsorted(self.numbers, number))
         selected = slice(start, start + BACKFILL_MESSAGES + 1)
         numbers = self.numbers[selected].tolist()
-        return list(zip(numbers, self.indices[selected].tolist(), strict=True))
+        indices = self.indices[selected].tolist()
+        return list(zip(numbers, indices, strict=True))
 
 
 class PlayedHistory:
-    """The messages that were given to the player, by channel.
+    """The messages that the player received, by channel, for backfill.
 
     Args:
-        kept_ns: length of log that is kept, ns; None: all messages are kept.
+        kept_ns: length of the log that is kept, ns; None to keep all messages.
 
     Attributes:
-        next_numbers: per channel the number after that of the last played message.
+        next_numbers: by channel, the number that follows that of the last played message.
     """
 
     def __init__(self, kept_ns: int | None = None) -> None:
@@ -78,11 +86,12 @@ class PlayedHistory:
         """Adds messages that are about to be played, and drops the oldest messages."""
         for channel in np.unique(batch.channels).tolist():
             indices = np.flatnonzero(batch.channels == channel)
+            numbers = batch.numbers[indices]
             parts = self._messages.setdefault(channel, deque())
-            parts.append(_ChannelMessages(batch.numbers[indices], indices, batch))
+            parts.append(_ChannelMessages(numbers, indices, batch))
             if self._kept_ns is not None:
-                oldest_ns = int(batch.times_ns[-1]) - self._kept_ns
-                while int(parts[0].batch.times_ns[-1]) < oldest_ns:
+                oldest_ns = batch.end_ns - self._kept_ns
+                while parts[0].batch.end_ns < oldest_ns:
                     parts.popleft()
 
     def clear(self) -> None:
@@ -92,6 +101,9 @@ class PlayedHistory:
     def find_messages(self, channel: int, first: int, last: int) -> tuple[int, list[bytes]]:
         """Returns successive messages for one reply to a backfill request.
 
+        A reply has no gaps. It is limited to `BACKFILL_MESSAGES` messages and, unless a single
+        message is larger, to `BACKFILL_BYTES` bytes.
+
         Args:
             channel: the channel.
             first: number of the first requested message. If that message is not kept, the reply
@@ -99,39 +111,50 @@ class PlayedHistory:
             last: number of the last requested message.
 
         Returns:
-            The number of the first message of the reply, and the payloads. A reply is limited
-            to `BACKFILL_MESSAGES` messages and about `BACKFILL_BYTES` bytes.
+            The number of the first message of the reply, and the payloads.
         """
         played = self.next_numbers.get(channel, 0)
+        last_available = min(last, played - 1)
         payloads: list[bytes] = []
         size = 0
-        start = first
+        reply_first = first
         next_number = first
-        parts = list(self._messages.get(channel, ()))
-        first_part = bisect_left(parts, first, key=lambda part: int(part.numbers[-1]))
-        for part in parts[first_part:]:
+        for part in self._list_parts(channel, first):
             for number, index in part.list_from(next_number):
                 if not payloads:
-                    start = max(first, min(number, played))
-                    next_number = start
+                    reply_first = max(first, min(number, played))
+                    next_number = reply_first
                 if number < next_number:
                     continue  # a repeated number
                 payload = part.batch.payload(index)
                 size += len(payload)
+                is_beyond = number > last_available
                 has_gap = number > next_number
                 is_full = len(payloads) == BACKFILL_MESSAGES
                 is_large = bool(payloads) and size > BACKFILL_BYTES
-                if number > min(last, played - 1) or has_gap or is_full or is_large:
-                    return start, payloads
+                if is_beyond or has_gap or is_full or is_large:
+                    return reply_first, payloads
                 payloads.append(payload)
                 next_number = number + 1
-        if payloads or first >= played:
-            return start, payloads
-        return played, payloads
+        # no requested message is kept: all of them count as unavailable
+        if not payloads and first < played:
+            reply_first = played
+        return reply_first, payloads
+
+    def _list_parts(self, channel: int, first: int) -> list[_ChannelMessages]:
+        """Returns the kept messages of a channel, without parts that end before `first`."""
+        parts = list(self._messages.get(channel, ()))
+        index = bisect_left(parts, first, key=lambda part: int(part.numbers[-1]))
+        return parts[index:]
 
 
+_MAX_RECORDER_EVENTS = 256
+"""Capacity of the inbox for events of recorders."""
 REFRESH_NS = 500_000_000
-"""Longest age of an encoded identity, which holds a whole scenario and takes long to encode."""
+"""Longest age of an encoded identity, ns.
+
+An identity holds a whole scenario, whose encoding takes long.
+"""
 
 
 class SiteStandIns:
@@ -145,7 +168,7 @@ class SiteStandIns:
         history: the messages that were played.
 
     Attributes:
-        recorders: starts of the recorders that are present.
+        recorders: boots of the recorders that are present.
         refilled: number of messages that were sent to recorders by backfill.
     """
 
@@ -162,24 +185,23 @@ class SiteStandIns:
         self._clock = clock
         self._header = header
         self._history = history
-        self._stored: dict[str, set[str]] = {}  # by recorder the sites that it has stored
-        self._listening: set[str] = set()  # recorders that sent their identity
-        self._boots: dict[
-            str, tuple[int, int]
-        ] = {}  # by site start and boot, see `_find_start`
         self._presence = bus.presence(topics.presence_key(session, topics.RECORDER))
-        self._recorder_events = bus.inbox(
-            topics.key(session, topics.RECORDER, topics.EVENT), 256
-        )
+        recorder_events = topics.key(session, topics.RECORDER, topics.EVENT)
+        self._recorder_events = bus.inbox(recorder_events, _MAX_RECORDER_EVENTS)
         self._recorder_query = MemberQuery(bus, clock, session, topics.RECORDER)
-        self._infos = {
-            site: describe_member(
+        # by recorder, the sites that the recorder has stored
+        self._stored: dict[str, set[str]] = {}
+        # recorders that sent their identity
+        self._listening: set[str] = set()
+        # by site, the number of its start and its boot, see `_find_start`
+        self._boots: dict[str, tuple[int, int]] = {}
+        # by site, the time at which its identity was encoded, and the identity
+        self._encoded: dict[str, tuple[int, bytes]] = {}
+        self._infos = {}
+        for site, boot in header.boots.items():
+            self._infos[site] = describe_member(
                 site, boot, clock, header.scenario_text, fingerprint=header.fingerprint
             )
-            for site, boot in header.boots.items()
-        }
-        # by site the time at which its identity was encoded, and the identity
-        self._encoded: dict[str, tuple[int, bytes]] = {}
         self._identity_queries = {}
         self._backfill_queries = {}
         for site, info in self._infos.items():
@@ -192,19 +214,22 @@ class SiteStandIns:
 
     def start_session(self, epoch_mono_ns: int) -> None:
         """Announces the session as running, with tick 0 at a time of the clock, ns."""
-        running = {
-            "running": True,
-            "epoch_mono_ns": epoch_mono_ns,
-            "epoch_unix_ns": self._clock.unix_ns() + epoch_mono_ns - self._clock.monotonic_ns(),
-            "boots": dict(self._header.boots),
-        }
-        self._infos = {
-            site: msgspec.structs.replace(info, **running) for site, info in self._infos.items()
-        }
+        unix_ns = self._clock.unix_ns()
+        epoch_unix_ns = unix_ns + epoch_mono_ns - self._clock.monotonic_ns()
+        for site, info in self._infos.items():
+            self._infos[site] = msgspec.structs.replace(
+                info,
+                running=True,
+                epoch_mono_ns=epoch_mono_ns,
+                epoch_unix_ns=epoch_unix_ns,
+                boots=dict(self._header.boots),
+            )
         self._encoded.clear()
 
     def serve_queries(self) -> bool:
-        """Replies to identity queries and one backfill query, and receives news of recorders.
+        """Replies to all identity queries and to one backfill query.
+
+        Also receives the presence and the events of recorders.
 
         Returns:
             True if there was a backfill query.
@@ -212,20 +237,25 @@ class SiteStandIns:
         for site, queries in self._identity_queries.items():
             while (query := queries.poll()) is not None:
                 query.reply(self._encode_identity(site))
-        for parts, alive in topics.read_presence(self._presence):
-            if alive:
-                self.recorders.add(parts.boot)
-            else:
-                self.recorders.discard(parts.boot)
-        for event in read_messages(self._recorder_events, Event):
-            if event.kind == "stored":
-                self._stored.setdefault(str(event.boot), set()).add(event.about)
+        self._receive_recorders()
         for site, queries in self._backfill_queries.items():
             query = queries.poll()
             if query is not None:
                 self._reply_backfill(site, query)
                 return True
         return False
+
+    def _receive_recorders(self) -> None:
+        """Receives the presence of recorders, and their events on sites that they stored."""
+        for token, is_alive in topics.read_presence(self._presence):
+            if is_alive:
+                self.recorders.add(token.boot)
+            else:
+                self.recorders.discard(token.boot)
+        for event in read_messages(self._recorder_events, Event):
+            if event.kind == "stored":
+                stored_sites = self._stored.setdefault(str(event.boot), set())
+                stored_sites.add(event.about)
 
     def _encode_identity(self, site: str) -> bytes:
         """Returns the identity of a site, encoded at most `REFRESH_NS` ago."""
@@ -234,26 +264,35 @@ class SiteStandIns:
         if not identity or now_ns - encoded_ns >= REFRESH_NS:
             channel = self._find_channel(site, topics.STATE)
             ticks = self._history.next_numbers.get(channel, 0)
-            identity = encode(msgspec.structs.replace(self._infos[site], ticks=ticks))
+            info = msgspec.structs.replace(self._infos[site], ticks=ticks)
+            identity = encode(info)
             self._encoded[site] = (now_ns, identity)
         return identity
 
     def are_recorders_listening(self) -> bool:
-        """Requests the identities of recorders; True once all of them have replied."""
+        """Queries the identities of recorders; True once all recorders have replied."""
         self._listening |= {str(info.boot) for info in self._recorder_query.poll()}
         return not self.recorders - self._listening
 
     def have_stored(self, recorders: Collection[str]) -> bool:
-        """True if all these recorders have published `stored` about every site."""
-        return all(self._stored.get(boot, set()) >= self._infos.keys() for boot in recorders)
+        """True if each of the recorders has published the event `stored` about every site."""
+        for boot in recorders:
+            stored_sites = self._stored.get(boot, set())
+            if not stored_sites >= self._infos.keys():
+                return False
+        return True
 
     def _find_channel(self, site: str, channel: str) -> int:
-        """Returns the number of a site's channel among the played channels; -1 if none."""
+        """Returns the number of a site's channel among the played channels.
+
+        Returns -1 if the log has no such channel.
+        """
         topic = "/" + topics.key(self._header.session, site, channel)
-        return self._header.topics.index(topic) if topic in self._header.topics else -1
+        played_topics = self._header.topics
+        return played_topics.index(topic) if topic in played_topics else -1
 
     def _find_start(self, site: str) -> tuple[int, int]:
-        """Returns the start of a site that is played, counted from 0, and its boot.
+        """Returns the number from 0 of the start of a site that is played, and the site's boot.
 
         The newest played event of the site determines both.
         """
@@ -261,7 +300,7 @@ class SiteStandIns:
         newest = self._history.next_numbers.get(channel, 0) - 1
         start = max(newest, 0) // NUMBERS_OF_A_START
         first_start = (0, self._infos[site].boot)
-        if not start:
+        if start == 0:
             return first_start
         if self._boots.get(site, first_start)[0] != start:
             _, payloads = self._history.find_messages(channel, newest, newest)
@@ -271,16 +310,19 @@ class SiteStandIns:
         return self._boots.get(site, first_start)
 
     def _reply_backfill(self, site: str, query: Query) -> None:
+        """Replies to a backfill query in the name of a site."""
         start, boot = self._find_start(site)
 
-        def find(request: BackfillRequest) -> tuple[int, list[bytes], int]:
-            # the requested numbers of events are those of the present start
-            offset = start * NUMBERS_OF_A_START if request.channel == topics.EVENT else 0
+        def find_requested(request: BackfillRequest) -> tuple[int, list[bytes], int]:
             channel = self._find_channel(site, request.channel)
+            offset = 0
+            if request.channel == topics.EVENT:
+                # a recorder numbers the events of the present start from 0
+                offset = start * NUMBERS_OF_A_START
             played = self._history.next_numbers.get(channel, 0) - offset
             first, payloads = self._history.find_messages(
                 channel, request.first + offset, request.last + offset
             )
             return max(first - offset, 0), payloads, max(played, 0)
 
-        self.refilled += answer_backfill(query, site, boot, find)
+        self.refilled += answer_backfill(query, site, boot, find_requested)
