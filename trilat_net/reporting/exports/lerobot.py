@@ -117,11 +117,7 @@ def _write(
         LogError: a log has no frames, or the users or joints of the logs differ.
         UsageError: a setting is not valid.
     """
-    if fps < 1:
-        raise UsageError(f"fps is a whole number of frames a second, not {fps}")
-    if actions not in ("", *ACTIONS):
-        raise UsageError(f"actions are {' or '.join(ACTIONS)}, not {actions!r}")
-
+    _check_settings(fps, actions)
     names: Names = {}
     tasks: dict[str, int] = {}
     parts = list[Columns]()
@@ -159,9 +155,7 @@ def _write(
         "program": program or "the last user",
         "sessions": sessions,
     }
-    for file_name, content in files.items():
-        text = json.dumps(content, indent=4) + "\n"
-        (folder / file_name).write_text(text, encoding="utf-8", newline="\n")
+    _write_json(folder, files)
 
     frames_text = count_nouns(frame_count, "frame")
     episodes_text = count_nouns(episode_count, "episode")
@@ -169,6 +163,25 @@ def _write(
         left_out, "frame lies in a gap and is", "frames lie in gaps and are"
     )
     return f"{frames_text} in {episodes_text}; {gaps_text} left out"
+
+
+def _check_settings(fps: int, actions: str) -> None:
+    """Checks the settings of an export, see `_write`.
+
+    Raises:
+        UsageError: a setting is not valid.
+    """
+    if fps < 1:
+        raise UsageError(f"fps is a whole number of frames a second, not {fps}")
+    if actions not in ("", *ACTIONS):
+        raise UsageError(f"actions are {' or '.join(ACTIONS)}, not {actions!r}")
+
+
+def _write_json(folder: Path, files: dict[str, Any]) -> None:
+    """Writes JSON files into a folder, given their contents by name."""
+    for file_name, content in files.items():
+        text = json.dumps(content, indent=4) + "\n"
+        (folder / file_name).write_text(text, encoding="utf-8", newline="\n")
 
 
 def _describe_session(log: Log, frames: _Frames) -> dict[str, Any]:

@@ -268,7 +268,7 @@ def draw_arms(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
 
 def _draw_pose(axes: Axes, pose: ArmPose | None, colour: str) -> None:
-    """Draws a pose; None is a site without a record until then."""
+    """Draws a pose, or a note if the site has no record yet and `pose` is None."""
     axes.set_aspect("equal")
     if pose is None:
         style.annotate_empty_panel(axes, "no record")
