@@ -163,9 +163,13 @@ def test_people_choose_after_each_pair(tmp_path: Path) -> None:
         (
             "trials = 2",
             "trials = 3",
-            "a staircase is of pairs, their number must be even, is 3",
+            "a staircase consists of pairs of trials: their number must be even, is 3",
         ),
-        ('users = ["m1"]', 'users = ["m1", "m2"]', "staircase: is of one user, who answers"),
+        (
+            'users = ["m1"]',
+            'users = ["m1", "m2"]',
+            "staircase: needs exactly one user, who answers",
+        ),
         ("start = 80.0", "start = -1", "staircase.start"),
         ("standard = 100.0", "standard = -1e9", "condition near: .*control.K"),
     ],

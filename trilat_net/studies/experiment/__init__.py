@@ -1,3 +1,1 @@
-"""Experiments with people: movement measures, questionnaires, and the statistics of what they
-show.
-"""
+"""Experiments with people: protocols, tasks, trials, measures and statistics."""

@@ -1,4 +1,8 @@
-"""Figures of a measure under the conditions of an experiment with people.
+"""Figures that compare a measure under the conditions of an experiment with people.
+
+`draw_conditions` shows a measure by condition, `draw_learning` over the trials of a block.
+Completion times need other figures if some trials were not completed in time, because such a
+time is only known to exceed the limit: then medians take the place of means.
 
 Invariant:
     - Each participant is drawn: a point for each condition with data, joined by a thin line.
@@ -21,22 +25,25 @@ from ...reporting.appearance import COLUMN_IN, SITE_COLOURS, make_print_size
 from .completion_times import COMPLETION, find_median, find_unit_medians, summarise_times
 from .statistics import ConditionMean, Row, average_trials, summarise_conditions
 
+Look = dict[str, Any]
+"""Options of matplotlib for a line and its markers."""
+
 _FORM = make_print_size(COLUMN_IN)
 _HEIGHT_IN = 2.6
-_USER: dict[str, Any] = {
+_USER: Look = {
     "color": style.FAINT,
     "linewidth": 0.5,
     "marker": "o",
     "markersize": 2.5,
 }
-_COURSE: dict[str, Any] = {"linewidth": 1.2, "marker": "o", "markersize": 3.0}
-_MEAN: dict[str, Any] = {
+_COURSE: Look = {"linewidth": 1.2, "marker": "o", "markersize": 3.0}
+_MEAN: Look = {
     "color": SITE_COLOURS[0],
     "linewidth": 1.6,
     "marker": "D",
     "markersize": 5.0,
 }
-_LIMIT: dict[str, Any] = {"color": style.FAINT, "linewidth": 1.0, "linestyle": "--"}
+_LIMIT: Look = {"color": style.FAINT, "linewidth": 1.0, "linestyle": "--"}
 
 
 def draw_conditions(rows: Sequence[Row], measure: str, *, unit: str = "participant") -> Figure:
@@ -49,17 +56,15 @@ def draw_conditions(rows: Sequence[Row], measure: str, *, unit: str = "participa
         measure: name of the measure in the rows.
         unit: "participant" or "pair".
     """
-    means = {
-        condition: means_by_unit
-        for condition, means_by_unit in average_trials(rows, measure, unit).items()
-        if means_by_unit
-    }
+    all_means = average_trials(rows, measure, unit)
+    means = {condition: by_unit for condition, by_unit in all_means.items() if by_unit}
+    interval_look = {**_MEAN, "marker": "_", "zorder": 3}
     with style.styled_figure(_FORM, _HEIGHT_IN) as figure:
         axes = _add_panel(figure, measure)
         for columns, values in _list_unit_lines(means):
             axes.plot(columns, values, **_USER)
         for column, mean in enumerate(summarise_conditions(rows, measure, unit=unit)):
-            _plot_interval(axes, column, mean, {**_MEAN, "marker": "_", "zorder": 3})
+            _plot_interval(axes, column, mean, interval_look)
             axes.plot([column], [mean.mean], zorder=3, **_MEAN)
         _label_conditions(axes, means)
         style.add_legend(figure, [(f"a {unit}", _USER), ("mean, 95 % interval", _MEAN)])
@@ -67,36 +72,33 @@ def draw_conditions(rows: Sequence[Row], measure: str, *, unit: str = "participa
 
 
 def draw_times(rows: Sequence[Row], limit_s: float, *, unit: str = "participant") -> Figure:
-    """Returns the figure of completion times by condition, if some exceed the time limit.
+    """Returns the figure of completion times by condition, for times with a limit.
 
-    The points are the medians of each unit. An open marker on the line of the limit is a median
-    that was not reached.
+    The points are the medians of each unit. An open marker on the line of the limit stands for
+    a median beyond the limit.
 
     Args:
         rows: tidy rows, as for `completion_times`.
-        limit_s: time limit of a trial, s.
+        limit_s: time limit of a trial, in s.
         unit: "participant" or "pair".
     """
     medians = find_unit_medians(rows, unit)
+    interval_look = {**_MEAN, "marker": "_"}
     with style.styled_figure(_FORM, _HEIGHT_IN) as figure:
         axes = _add_panel(figure, COMPLETION)
         axes.axhline(limit_s, **_LIMIT)
         for columns, times_s in _list_unit_lines(medians):
-            axes.plot(columns, [min(time_s, limit_s) for time_s in times_s], **_USER)
-            _plot_censored(
-                axes=axes, positions=columns, times_s=times_s, limit_s=limit_s, look=_USER
-            )
-        for column, time in enumerate(summarise_times(rows, limit_s, unit=unit)):
-            low, high = time.interval or (None, None)
-            if low is not None:
-                ends = [low, limit_s if high is None else high]
-                axes.plot([column, column], ends, **{**_MEAN, "marker": "_"})
-            median_s = math.inf if time.median is None else time.median
-            drawn_s = limit_s if time.median is None else time.median
-            axes.plot([column], [drawn_s], zorder=3, **_MEAN)
-            _plot_censored(
-                axes=axes, positions=[column], times_s=[median_s], limit_s=limit_s, look=_MEAN
-            )
+            _plot_times(axes, columns, times_s, limit_s, _USER)
+        for column, summary in enumerate(summarise_times(rows, limit_s, unit=unit)):
+            low_s, high_s = summary.interval or (None, None)
+            if low_s is not None:
+                # An interval without an upper end is drawn up to the limit.
+                ends_s = [low_s, limit_s if high_s is None else high_s]
+                axes.plot([column, column], ends_s, **interval_look)
+            median_s = limit_s if summary.median is None else summary.median
+            axes.plot([column], [median_s], zorder=3, **_MEAN)
+            beyond_limit = [column] if summary.median is None else []
+            _mark_beyond_limit(axes, beyond_limit, limit_s, _MEAN)
         _label_conditions(axes, medians)
         legend = [
             (f"a {unit}'s median", _USER),
@@ -110,45 +112,66 @@ def draw_times(rows: Sequence[Row], limit_s: float, *, unit: str = "participant"
 def _list_unit_lines(
     values: Mapping[str, Mapping[str, float]],
 ) -> Iterator[tuple[list[int], list[float]]]:
-    """Yields for each unit the columns of its conditions and its values there.
+    """Yields the line of each unit: the columns of its conditions, and its values there.
 
     Args:
-        values: a value for each condition and unit.
+        values: a value by condition and unit. Each condition is a column of the figure.
     """
-    values_by_column = list(values.values())
-    units = dict.fromkeys(chain.from_iterable(values_by_column))
+    units = dict.fromkeys(chain.from_iterable(values.values()))
     for unit in units:
-        columns = [column for column, by_unit in enumerate(values_by_column) if unit in by_unit]
-        yield columns, [values_by_column[column][unit] for column in columns]
+        columns: list[int] = []
+        unit_values: list[float] = []
+        for column, values_by_unit in enumerate(values.values()):
+            if unit in values_by_unit:
+                columns.append(column)
+                unit_values.append(values_by_unit[unit])
+        yield columns, unit_values
 
 
 def _label_conditions(axes: Axes, values: Mapping[str, Mapping[str, float]]) -> None:
     """Labels the horizontal axis with the conditions and their numbers of units."""
-    labels = [f"{condition}\nn = {len(by_unit)}" for condition, by_unit in values.items()]
+    labels: list[str] = []
+    for condition, values_by_unit in values.items():
+        labels.append(f"{condition}\nn = {len(values_by_unit)}")
     axes.set_xticks(range(len(values)), labels)
     axes.set_xlim(-0.4, len(values) - 0.6)
 
 
-def _plot_censored(
+def _plot_times(
     axes: Axes,
     positions: Sequence[float],
     times_s: Sequence[float],
     limit_s: float,
-    look: dict[str, Any],
+    look: Look,
 ) -> None:
-    """Draws an open marker on the line of the limit for each time that is infinite."""
-    longer = [
-        position
-        for position, time_s in zip(positions, times_s, strict=True)
-        if math.isinf(time_s)
-    ]
-    marker = {
+    """Draws completion times as a line, with an open marker for each time beyond the limit.
+
+    Args:
+        axes: the panel.
+        positions: positions of the times along the horizontal axis.
+        times_s: the times, in s; infinite beyond the limit.
+        limit_s: time limit of a trial, in s.
+        look: look of the line and its markers.
+    """
+    limited_s = [min(time_s, limit_s) for time_s in times_s]
+    axes.plot(positions, limited_s, **look)
+    times = zip(positions, times_s, strict=True)
+    beyond_limit = [position for position, time_s in times if math.isinf(time_s)]
+    _mark_beyond_limit(axes, beyond_limit, limit_s, look)
+
+
+def _mark_beyond_limit(
+    axes: Axes, positions: Sequence[float], limit_s: float, look: Look
+) -> None:
+    """Draws open markers on the line of the time limit, one at each position."""
+    open_marker: Look = {
         "marker": look["marker"],
         "markersize": look["markersize"] + 1.0,
         "linestyle": "none",
+        "markerfacecolor": "white",
+        "markeredgecolor": look["color"],
     }
-    colours = {"markerfacecolor": "white", "markeredgecolor": look["color"]}
-    axes.plot(longer, [limit_s] * len(longer), zorder=4, **marker, **colours)
+    axes.plot(positions, [limit_s] * len(positions), zorder=4, **open_marker)
 
 
 def draw_learning(
@@ -164,29 +187,43 @@ def draw_learning(
         rows: tidy rows, as for `statistics`, with the number of each `trial` in its block.
         measure: name of the measure in the rows.
         unit: "participant" or "pair".
-        limit_s: time limit of a trial, s, if some completion times exceed it. The figure then
-            shows medians, and open markers on the line of the limit for medians that were not
-            reached.
+        limit_s: time limit of a trial, in s, if some trials were not completed in time. The
+            figure then shows medians, and open markers on the line of the limit for medians
+            beyond the limit.
     """
     if limit_s is not None:
         return _draw_learning_times(rows, limit_s, unit)
     with style.styled_figure(_FORM, _HEIGHT_IN) as figure:
         axes = _add_panel(figure, measure)
-        legend = []
-        for index, condition in enumerate(dict.fromkeys(row["condition"] for row in rows)):
-            look = {**_COURSE, "color": SITE_COLOURS[index % len(SITE_COLOURS)]}
-            means = {}
+        looks = _assign_looks(rows)
+        for condition, look in looks.items():
+            means: dict[Any, ConditionMean] = {}
             for trial, trial_rows in _group_by_trial(rows, condition).items():
+                # The rows of one condition have one mean, or none without data.
                 for mean in summarise_conditions(trial_rows, measure, unit=unit):
                     means[trial] = mean
             for trial, mean in means.items():
                 _plot_interval(axes, trial, mean, {**look, "marker": "", "alpha": 0.5})
             axes.plot(list(means), [mean.mean for mean in means.values()], **look)
-            legend.append((condition, look))
-        axes.set_xlabel("trial of the block")
-        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-        style.add_legend(figure, legend)
+        _label_trials(axes)
+        style.add_legend(figure, list(looks.items()))
     return figure
+
+
+def _assign_looks(rows: Sequence[Row]) -> dict[str, Look]:
+    """Returns the look of each condition's line, in the order of the rows."""
+    conditions = dict.fromkeys(row["condition"] for row in rows)
+    looks: dict[str, Look] = {}
+    for index, condition in enumerate(conditions):
+        colour = SITE_COLOURS[index % len(SITE_COLOURS)]
+        looks[condition] = {**_COURSE, "color": colour}
+    return looks
+
+
+def _label_trials(axes: Axes) -> None:
+    """Labels the horizontal axis with the numbers of the trials."""
+    axes.set_xlabel("trial of the block")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
 
 
 def _group_by_trial(rows: Sequence[Row], condition: str) -> dict[Any, list[Row]]:
@@ -199,39 +236,34 @@ def _group_by_trial(rows: Sequence[Row], condition: str) -> dict[Any, list[Row]]
 
 
 def _draw_learning_times(rows: Sequence[Row], limit_s: float, unit: str) -> Figure:
-    """Returns the figure of completion times over the trials, if some exceed the time limit."""
+    """Returns the figure of completion times over the trials, for times with a limit."""
     with style.styled_figure(_FORM, _HEIGHT_IN) as figure:
         axes = _add_panel(figure, COMPLETION)
-        legend = []
         axes.axhline(limit_s, **_LIMIT)
-        for index, condition in enumerate(dict.fromkeys(row["condition"] for row in rows)):
-            look = {**_COURSE, "color": SITE_COLOURS[index % len(SITE_COLOURS)]}
-            rows_by_trial = _group_by_trial(rows, condition)
-            trials = list(rows_by_trial)
-            times_s = []
-            for trial_rows in rows_by_trial.values():
-                medians = find_unit_medians(trial_rows, unit)[condition]
-                times_s.append(find_median(list(medians.values())))
-            axes.plot(trials, [min(time_s, limit_s) for time_s in times_s], **look)
-            _plot_censored(
-                axes=axes, positions=trials, times_s=times_s, limit_s=limit_s, look=look
-            )
-            legend.append((condition, look))
-        axes.set_xlabel("trial of the block")
-        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-        style.add_legend(figure, [*legend, ("time limit; open: not reached", _LIMIT)])
+        looks = _assign_looks(rows)
+        for condition, look in looks.items():
+            trials: list[Any] = []
+            medians_s: list[float] = []
+            for trial, trial_rows in _group_by_trial(rows, condition).items():
+                unit_medians_s = find_unit_medians(trial_rows, unit)[condition]
+                trials.append(trial)
+                medians_s.append(find_median(list(unit_medians_s.values())))
+            _plot_times(axes, trials, medians_s, limit_s, look)
+        _label_trials(axes)
+        legend = [*looks.items(), ("time limit; open: not reached", _LIMIT)]
+        style.add_legend(figure, legend)
     return figure
 
 
 def _add_panel(figure: Figure, measure: str) -> Axes:
     """Adds the only panel of a figure, labelled with a measure and its unit."""
     axes: Axes = style.add_panels(figure, 1, 1)[0, 0]
-    axes.set_ylabel(", ".join(filter(None, split_unit(measure))))
+    name, unit = split_unit(measure)
+    axes.set_ylabel(f"{name}, {unit}" if unit else name)
     return axes
 
 
-def _plot_interval(
-    axes: Axes, position: float, mean: ConditionMean, look: dict[str, Any]
-) -> None:
+def _plot_interval(axes: Axes, position: float, mean: ConditionMean, look: Look) -> None:
     """Draws the vertical line of an interval; without an interval, a point at the mean."""
-    axes.plot([position, position], mean.interval or (mean.mean, mean.mean), **look)
+    ends = mean.interval or (mean.mean, mean.mean)
+    axes.plot([position, position], ends, **look)

@@ -1,6 +1,15 @@
-"""Measures of a trial: smoothness, path, energy, throughput, forces of a pair, questionnaires.
+"""Measures of human movement and cooperation in a trial, each by a published definition.
 
-All numbers are in SI units. Samples are equally spaced in time, with a row for each sample.
+A measure takes arrays of samples that are equally spaced in time, with a row for each sample,
+and returns a number. All quantities are in SI units.
+
+| measure | function |
+|---|---|
+| smoothness of a movement | `sparc` |
+| length, duration, work | `path_length_m`, `movement_time_s`, `energy_j` |
+| speed and accuracy of aimed movements | `measure_throughput` |
+| forces and work of two users on one object | `measure_pair` |
+| workload and usability by questionnaire | `raw_tlx`, `weighted_tlx`, `sus_score` |
 
 Invariant:
     - A measure is a function of its samples alone.
@@ -23,7 +32,16 @@ ONSET_SHARE = 0.05
 
 
 def _read(name: str, values: ArrayLike, dimensions: int) -> Array:
-    """Returns samples as an array of finite numbers, shape (K,) or (K, D)."""
+    """Returns samples as an array of finite numbers, shape (K,) or (K, D).
+
+    Args:
+        name: name of the samples in error messages.
+        values: the samples.
+        dimensions: 1 for shape (K,), 2 for shape (K, D).
+
+    Raises:
+        UsageError: the shape is another, or a sample is not finite.
+    """
     samples = np.asarray(values, dtype=np.float64)
     if samples.ndim != dimensions or not samples.size:
         shape = "(K,), a number" if dimensions == 1 else "(K, D), a row"
@@ -36,9 +54,14 @@ def _read(name: str, values: ArrayLike, dimensions: int) -> Array:
 
 
 def _read_same_shape(**values: ArrayLike) -> list[Array]:
-    """Returns several arrays of samples, all of the same shape (K, D)."""
+    """Returns several arrays of samples, all of the same shape (K, D).
+
+    Raises:
+        UsageError: the shapes differ, or a sample is not finite.
+    """
     arrays = {name: _read(name, value, 2) for name, value in values.items()}
-    if len({array.shape for array in arrays.values()}) > 1:
+    different_shapes = {array.shape for array in arrays.values()}
+    if len(different_shapes) > 1:
         shapes = ", ".join(f"{name} {array.shape}" for name, array in arrays.items())
         raise UsageError(f"{shapes}: give as many samples and axes of each")
     return list(arrays.values())
@@ -47,6 +70,11 @@ def _read_same_shape(**values: ArrayLike) -> list[Array]:
 def _integrate(values: Array, rate_hz: float) -> float:
     """Returns the integral over time of samples, shape (K,), by the trapezoidal rule."""
     return float(np.trapezoid(values)) / rate_hz
+
+
+def _compute_rms(values: Array) -> float:
+    """Returns the root of the mean square of all numbers in an array."""
+    return float(np.sqrt(np.mean(values**2)))
 
 
 # --- one movement -----------------------------------------------------------------------------
@@ -77,49 +105,71 @@ def sparc(
     samples = _read("speed", speed, 1)
     if not samples.any():
         return None
-    length = 1 << (int(np.ceil(np.log2(samples.size))) + padding)
-    magnitude = np.abs(np.fft.rfft(samples, length))
-    frequency_hz = np.arange(magnitude.size) * (rate_hz / length)
-    magnitude = (magnitude / magnitude.max())[frequency_hz <= cutoff_hz]
-    above = np.flatnonzero(magnitude >= threshold)
+    next_power = int(np.ceil(np.log2(samples.size)))
+    padded_size = 1 << (next_power + padding)
+    magnitude = np.abs(np.fft.rfft(samples, padded_size))
+    frequency_hz = np.arange(magnitude.size) * (rate_hz / padded_size)
+    relative_magnitude = magnitude / magnitude.max()
+    spectrum = relative_magnitude[frequency_hz <= cutoff_hz]
+
+    # The spectrum is cut to the range in which it exceeds the threshold.
+    above = np.flatnonzero(spectrum >= threshold)
     if above.size == 0 or above[0] == above[-1]:
         return None
-    arc = magnitude[above[0] : above[-1] + 1]
-    lengths = np.hypot(np.diff(arc), 1.0 / (arc.size - 1))
-    return -float(lengths.sum())
+    first = above[0]
+    last = above[-1]
+    curve = spectrum[first : last + 1]
+
+    # Length of the curve, whose frequency axis is scaled to run from 0 to 1.
+    frequency_step = 1.0 / (curve.size - 1)
+    segment_lengths = np.hypot(np.diff(curve), frequency_step)
+    return -float(segment_lengths.sum())
 
 
 def path_length_m(places: ArrayLike) -> float:
-    """Returns the length of a path through positions `places`, m, shape (K, D)."""
+    """Returns the length of a path, in m.
+
+    Args:
+        places: positions along the path, in m, shape (K, D).
+    """
     steps = np.diff(_read("places", places, 2), axis=0)
-    return float(np.linalg.norm(steps, axis=1).sum())
+    step_lengths = np.linalg.norm(steps, axis=1)
+    return float(step_lengths.sum())
 
 
 def movement_time_s(
     speed: ArrayLike, rate_hz: float, *, share: float = ONSET_SHARE
 ) -> float | None:
-    """Returns the duration of a movement, s; None at rest.
+    """Returns the duration of a movement, in s; None at rest.
 
     The movement lasts from the first to the last sample whose speed is at least `share` of the
     peak speed.
+
+    Args:
+        speed: speed, in m/s or rad/s, shape (K,).
+        rate_hz: samples per second.
+        share: share of the peak speed at which the movement starts and ends.
     """
     samples = np.abs(_read("speed", speed, 1))
     if not samples.any():
         return None
-    moving = np.flatnonzero(samples >= share * samples.max())
-    return float(moving[-1] - moving[0]) / rate_hz
+    onset_speed = share * samples.max()
+    moving = np.flatnonzero(samples >= onset_speed)
+    sample_count = moving[-1] - moving[0]
+    return float(sample_count) / rate_hz
 
 
 def energy_j(force: ArrayLike, velocity: ArrayLike, rate_hz: float) -> float:
-    """Returns the work of a force on a moving body: the integral of f'v, J.
+    """Returns the work of a force f on a body with velocity v: the integral of f'v, in J.
 
     Args:
-        force: force on the body, N, shape (K, D).
-        velocity: velocity of the body, m/s, of the same shape.
+        force: force on the body, in N, shape (K, D).
+        velocity: velocity of the body, in m/s, of the same shape.
         rate_hz: samples per second.
     """
     forces, velocities = _read_same_shape(force=force, velocity=velocity)
-    return _integrate((forces * velocities).sum(axis=1), rate_hz)
+    power = (forces * velocities).sum(axis=1)
+    return _integrate(power, rate_hz)
 
 
 # --- throughput -------------------------------------------------------------------------------
@@ -136,10 +186,11 @@ class Throughput(NamedTuple):
 
     Args:
         width_m: effective width, 4.133 standard deviations of the end points along the axis of
-            the task.
-        distance_m: effective distance, the mean distance moved along the axis of the task.
-        difficulty_bits: log2(distance / width + 1).
-        time_s: mean movement time.
+            the task, in m.
+        distance_m: effective distance: the mean distance moved along the axis of the task, in
+            m.
+        difficulty_bits: index of difficulty, log2(distance / width + 1), in bit.
+        time_s: mean movement time, in s.
     """
 
     width_m: float
@@ -149,7 +200,7 @@ class Throughput(NamedTuple):
 
     @property
     def bits_s(self) -> float:
-        """The throughput, bit/s."""
+        """The throughput, in bit/s."""
         return self.difficulty_bits / self.time_s
 
 
@@ -166,10 +217,10 @@ def measure_throughput(
     The throughput is None if the end points do not spread.
 
     Args:
-        starts: centres of the targets from which the movements start, m, shape (K, D).
-        targets: centres of the targets to reach, m, of the same shape.
-        ends: end points of the movements, m, of the same shape.
-        times_s: duration of each movement, s, shape (K,).
+        starts: centres of the targets from which the movements start, in m, shape (K, D).
+        targets: centres of the targets to reach, in m, of the same shape.
+        ends: end points of the movements, in m, of the same shape.
+        times_s: duration of each movement, in s, shape (K,).
         serial: whether each movement starts at the end point of the previous movement, as
             around a ring. The overshoot of the previous movement then adds to the distance.
 
@@ -187,8 +238,12 @@ def measure_throughput(
     axes = target_points - start_points
     lengths = np.linalg.norm(axes, axis=1)
     if not lengths.all():
-        raise UsageError("starts: a target is left for itself; give the one before it")
-    overshoots = ((end_points - target_points) * axes).sum(axis=1) / lengths
+        raise UsageError(
+            "starts: a movement starts at its own target; give the centre of the target before"
+        )
+    # How far each end point is beyond its target, along the axis of the task.
+    end_errors = end_points - target_points
+    overshoots = (end_errors * axes).sum(axis=1) / lengths
     distances = lengths + overshoots
     if serial:
         distances[1:] += overshoots[:-1]
@@ -196,7 +251,9 @@ def measure_throughput(
     if overshoots.size > 1:
         width = EFFECTIVE_WIDTH * float(np.std(overshoots, ddof=1))
     distance = float(distances.mean())
-    if width <= 1e-12 * float(lengths.max()) or distance <= 0.0:
+    # End points that coincide have a spread of rounding errors.
+    smallest_width = 1e-12 * float(lengths.max())
+    if width <= smallest_width or distance <= 0.0:
         return None
     return Throughput(
         width_m=width,
@@ -210,19 +267,27 @@ def measure_throughput(
 
 
 def find_internal_force(first: ArrayLike, second: ArrayLike) -> Array:
-    """Returns the first user's part of the forces on an object that cancel, N, shape (K, D).
+    """Returns the first user's part of the forces on an object that cancel each other.
 
     If the two users' forces along an axis have opposite signs, the smaller force cancels an
     equal part of the larger force; otherwise no force cancels. The second user's part is the
     negative of the first user's. `internal_rms_n` in docs/metrics.md is the RMS of this force.
 
+    Args:
+        first: force of the first user on the object, in N, shape (K, D).
+        second: force of the second user on the object, in N, of the same shape.
+
+    Returns:
+        The part, in N, shape (K, D).
+
     Source: Groten, Feth, Goshy, Peer, Kenny and Buss, "Experimental analysis of dominance in
     haptic collaboration", IEEE RO-MAN (2009).
     """
     first_force, second_force = _read_same_shape(first=first, second=second)
-    are_opposed = np.sign(first_force) * np.sign(second_force) < 0.0
-    smaller = np.minimum(np.abs(first_force), np.abs(second_force))
-    internal: Array = np.where(are_opposed, np.sign(first_force) * smaller, 0.0)
+    first_sign = np.sign(first_force)
+    are_opposed = first_sign * np.sign(second_force) < 0.0
+    smaller_size = np.minimum(np.abs(first_force), np.abs(second_force))
+    internal: Array = np.where(are_opposed, first_sign * smaller_size, 0.0)
     return internal
 
 
@@ -230,15 +295,15 @@ class PairMeasures(NamedTuple):
     """Forces and work of two users on a shared object in a trial.
 
     Args:
-        internal_rms_n: RMS of the force that cancels, over all axes and samples.
-        useful_rms_n: RMS of the sum of both forces, which moves the object.
+        internal_rms_n: RMS of the force that cancels, over all axes and samples, in N.
+        useful_rms_n: RMS of the sum of both forces, which moves the object, in N.
         internal_share: part of the forces that cancels, 0 to 1; None if both forces are zero.
         first_effort_share: the first user's part of the integral of the squared forces; None
             if both forces are zero.
-        first_work_j: work of the first user on the object.
-        second_work_j: work of the second user on the object.
-        first_taken_j: energy that the first user absorbs: the integral of the negative part of
-            the user's power.
+        first_work_j: work of the first user on the object, in J.
+        second_work_j: work of the second user on the object, in J.
+        first_taken_j: energy that the first user absorbs, in J: the integral of the negative
+            part of the user's power.
         second_taken_j: energy that the second user absorbs, likewise.
     """
 
@@ -258,25 +323,33 @@ def measure_pair(
     """Returns the forces and the work of two users on a shared object.
 
     Args:
-        first: force of the first user on the object, N, shape (K, D).
-        second: force of the second user on the object, N, of the same shape.
-        velocity: velocity of the object, m/s, of the same shape.
+        first: force of the first user on the object, in N, shape (K, D).
+        second: force of the second user on the object, in N, of the same shape.
+        velocity: velocity of the object, in m/s, of the same shape.
         rate_hz: samples per second.
     """
     first_force, second_force, velocities = _read_same_shape(
         first=first, second=second, velocity=velocity
     )
     internal = find_internal_force(first_force, second_force)
-    sizes = np.abs(first_force).sum() + np.abs(second_force).sum()
+    useful = first_force + second_force
+    first_size = np.abs(first_force).sum()
+    second_size = np.abs(second_force).sum()
+    total_size = first_size + second_size
+    internal_share = None
+    if total_size:
+        # Both users' parts of the internal force have the same size.
+        internal_size = 2.0 * np.abs(internal).sum()
+        internal_share = float(internal_size / total_size)
     first_effort = float((first_force * first_force).sum())
     second_effort = float((second_force * second_force).sum())
     effort = first_effort + second_effort
     first_power = (first_force * velocities).sum(axis=1)
     second_power = (second_force * velocities).sum(axis=1)
     return PairMeasures(
-        internal_rms_n=float(np.sqrt(np.mean(internal**2))),
-        useful_rms_n=float(np.sqrt(np.mean((first_force + second_force) ** 2))),
-        internal_share=float(2.0 * np.abs(internal).sum() / sizes) if sizes else None,
+        internal_rms_n=_compute_rms(internal),
+        useful_rms_n=_compute_rms(useful),
+        internal_share=internal_share,
         first_effort_share=first_effort / effort if effort else None,
         first_work_j=_integrate(first_power, rate_hz),
         second_work_j=_integrate(second_power, rate_hz),
@@ -298,10 +371,8 @@ def _list_ratings(ratings: Mapping[str, float]) -> list[float]:
         UsageError: a scale is missing or unknown, or a rating is not between 0 and 100.
     """
     if ratings.keys() != set(TLX_SCALES):
-        raise UsageError(
-            f"ratings of {', '.join(ratings) or 'nothing'}: "
-            f"NASA-TLX has {', '.join(TLX_SCALES)}"
-        )
+        rated = ", ".join(ratings) or "nothing"
+        raise UsageError(f"ratings of {rated}: NASA-TLX has {', '.join(TLX_SCALES)}")
     for scale, rating in ratings.items():
         if not 0.0 <= rating <= 100.0:
             raise UsageError(f"{scale} = {rating}: a rating of NASA-TLX lies between 0 and 100")
@@ -309,7 +380,10 @@ def _list_ratings(ratings: Mapping[str, float]) -> list[float]:
 
 
 def raw_tlx(ratings: Mapping[str, float]) -> float:
-    """Returns the raw NASA-TLX: the mean of six ratings from 0 to 100, given by scale.
+    """Returns the raw NASA Task Load Index: the mean of six ratings.
+
+    Args:
+        ratings: a rating from 0 to 100 for each of `TLX_SCALES`.
 
     Source: Hart, "NASA-Task Load Index (NASA-TLX); 20 years later", Proc. Human Factors and
     Ergonomics Society 50 (2006).
@@ -318,10 +392,11 @@ def raw_tlx(ratings: Mapping[str, float]) -> float:
 
 
 def weighted_tlx(ratings: Mapping[str, float], weights: Mapping[str, int]) -> float:
-    """Returns the weighted mean of six ratings from 0 to 100, given by scale.
+    """Returns the weighted NASA Task Load Index: the weighted mean of six ratings.
 
-    The weight of a scale is the number of times that the scale was chosen in the 15 comparisons
-    of two scales.
+    Args:
+        ratings: a rating from 0 to 100 for each of `TLX_SCALES`.
+        weights: how often each scale was chosen in the 15 comparisons of two scales.
 
     Source: Hart and Staveland, "Development of NASA-TLX (Task Load Index): results of empirical
     and theoretical research", Advances in Psychology 52 (1988).
@@ -329,7 +404,7 @@ def weighted_tlx(ratings: Mapping[str, float], weights: Mapping[str, int]) -> fl
     ordered_ratings = _list_ratings(ratings)
     ordered_weights = [weights.get(scale, -1) for scale in TLX_SCALES]
     sums = np.cumsum(sorted(ordered_weights))
-    # any n scales are compared with each other n (n - 1) / 2 times, and each comparison adds 1
+    # Any n scales are compared with each other n (n - 1) / 2 times, and each comparison adds 1.
     least_sums = [n * (n - 1) // 2 for n in range(1, 7)]
     has_all = len(weights) == 6
     is_whole = has_all and all(weight == int(weight) for weight in ordered_weights)
@@ -343,9 +418,10 @@ def weighted_tlx(ratings: Mapping[str, float], weights: Mapping[str, int]) -> fl
 
 
 def sus_score(answers: Sequence[int]) -> float:
-    """Returns the score of the System Usability Scale, 0 to 100.
+    """Returns the score of the System Usability Scale (SUS), from 0 to 100.
 
-    The ten answers are from 1 (strongly disagree) to 5, in the order of the questions.
+    Args:
+        answers: ten answers from 1 (strongly disagree) to 5, in the order of the questions.
 
     Source: Brooke, "SUS: a quick and dirty usability scale", Usability Evaluation in Industry
     (1996).
@@ -355,7 +431,7 @@ def sus_score(answers: Sequence[int]) -> float:
     for number, answer in enumerate(answers, 1):
         if answer not in (1, 2, 3, 4, 5):
             raise UsageError(f"answer {number} = {answer}: an answer of SUS is 1, 2, 3, 4 or 5")
-    # odd questions are worded positively, even questions negatively
-    positive = sum(answer - 1 for answer in answers[::2])
-    negative = sum(5 - answer for answer in answers[1::2])
-    return 2.5 * (positive + negative)
+    # Odd questions are worded positively, even questions negatively.
+    positive_points = sum(answer - 1 for answer in answers[::2])
+    negative_points = sum(5 - answer for answer in answers[1::2])
+    return 2.5 * (positive_points + negative_points)

@@ -1,9 +1,12 @@
-"""Questionnaires that people answer on the page: published ones that ship, and the user's own.
+"""Questionnaires that people answer on the page of an experiment.
+
+NASA-TLX, SUS and a questionnaire on the sense of agency ship with trilat-net; a protocol may
+define others.
 
 Invariant:
-    - An answer is a number of the questionnaire's scale or None; anything else is refused. None
-      is an item without an answer, such as a slider that nobody touched; it is stored and
-      counted as missing.
+    - An answer is a number of the questionnaire's scale or None; anything else is refused.
+    - None stands for an item without an answer, such as a slider that nobody touched. It is
+      stored and counted as missing.
     - A questionnaire with a missing answer has no score.
 """
 
@@ -25,7 +28,6 @@ from .movement_measures import raw_tlx, sus_score
 Name = Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,39}$")]
 Text = Annotated[str, Meta(max_length=300)]
 
-
 CHOICE = "choice"
 """The form after a pair of trials of a staircase: a forced choice, which must be answered."""
 Answers = Mapping[str, float | None]
@@ -33,16 +35,20 @@ Answers = Mapping[str, float | None]
 
 
 class Questionnaire(Frozen, frozen=True):
-    """A questionnaire of a protocol; a shipped one needs only its name.
+    """A questionnaire of a protocol; a shipped questionnaire needs only its name.
 
     Attributes:
         name: the name of a shipped questionnaire (`tlx`, `sus`, `agency`), or another name.
-        after: when it is answered: after each block, or once after the last one.
-        title: its heading.
+        after: "block" if people answer after each block, "experiment" if they answer once after
+            the last block.
+        title: the heading.
         items: the texts of the rated items, by their names in the table.
-        low, high: the words at the ends of the scale.
-        ends: other words at the ends, by item.
-        least, most, step: the numbers of the scale.
+        low: the text at the lower end of the scale.
+        high: the text at the upper end of the scale.
+        ends: other texts at the two ends, by item.
+        least: the smallest number of the scale.
+        most: the largest number of the scale.
+        step: the distance between two numbers of the scale.
     """
 
     name: Name
@@ -71,12 +77,17 @@ class Questionnaire(Frozen, frozen=True):
             UsageError: there are more or fewer values than items, a value is not on the scale,
                 or a required answer is missing.
         """
-        scale = range(self.least, self.most + 1, self.step)
-        is_valid = [not self.is_forced if value is None else value in scale for value in values]
-        if len(values) != len(self.items) or not all(is_valid):
+        are_valid = all(self._is_valid(value) for value in values)
+        if len(values) != len(self.items) or not are_valid:
             count = count_nouns(len(self.items), "answer")
             raise UsageError(f"{self.name}: {count} of {self.least} to {self.most}")
         return dict(zip(self.items, values, strict=True))
+
+    def _is_valid(self, value: float | None) -> bool:
+        """Returns whether a value is on the scale, or a missing answer that is allowed."""
+        if value is None:
+            return not self.is_forced
+        return value in range(self.least, self.most + 1, self.step)
 
     def score(self, answers: Answers) -> float | None:
         """Returns the score: raw NASA-TLX, the score of SUS, or the mean of the answers.
@@ -95,6 +106,7 @@ class Questionnaire(Frozen, frozen=True):
 
 @cache
 def _read_shipped() -> dict[str, Any]:
+    """Returns the shipped questionnaires as tables, by name."""
     source = resources.files("trilat_net") / "scenarios" / "_questionnaires.txt"
     tables: dict[str, Any] = tomllib.loads(source.read_text(encoding="utf-8"))
     return tables
@@ -107,28 +119,22 @@ def find_form(questionnaire: Questionnaire) -> Questionnaire:
         UsageError: the questionnaire has no items and no shipped one has its name, or its scale
             does not have 2 to 101 numbers.
     """
+    name = questionnaire.name
     shipped = _read_shipped()
-    if questionnaire.items and questionnaire.name in shipped:
-        raise UsageError(
-            f"questionnaire {questionnaire.name} ships with its items: "
-            "give your own another name"
-        )
-    if not questionnaire.items and questionnaire.name not in shipped:
-        raise UsageError(
-            f"questionnaire {questionnaire.name} has no items; "
-            f"those that ship are {', '.join(shipped)}"
-        )
     if not questionnaire.items:
-        form = msgspec.convert(
-            {"name": questionnaire.name, **shipped[questionnaire.name]}, Questionnaire
-        )
+        if name not in shipped:
+            raise UsageError(
+                f"questionnaire {name} has no items; those that ship are {', '.join(shipped)}"
+            )
+        form = msgspec.convert({"name": name, **shipped[name]}, Questionnaire)
         return replace(form, after=questionnaire.after)
-    if (
-        questionnaire.most < questionnaire.least + questionnaire.step
-        or questionnaire.most - questionnaire.least > 100 * questionnaire.step
-    ):
+    if name in shipped:
         raise UsageError(
-            f"questionnaire {questionnaire.name}: "
-            "a scale has 2 to 101 numbers from least to most"
+            f"questionnaire {name} ships with its items: give your own another name"
+        )
+    length = questionnaire.most - questionnaire.least
+    if not questionnaire.step <= length <= 100 * questionnaire.step:
+        raise UsageError(
+            f"questionnaire {name}: a scale has 2 to 101 numbers from least to most"
         )
     return questionnaire

@@ -1,14 +1,15 @@
-"""Adaptive staircases: pairs of trials, after each of which the participant compares the two.
+"""Adaptive staircases, which find the smallest difference that a participant perceives.
 
-In one trial of a pair, a key of the scenario has its standard value, in the other a larger one;
-their order is drawn. After `down` right answers in a row the difference is divided by `factor`,
-and after a wrong answer multiplied by it (Levitt, 1971). The difference settles where both are
-equally likely, that is, where the probability of a right answer is 0.5^(1 / down): 0.707 for
-`down` = 2.
+A staircase consists of pairs of trials. In one trial of a pair, a key of the scenario has its
+standard value, in the other a larger value; the order of the two is drawn. After each pair, the
+participant says in which trial the value was larger. After `down` right answers in a row the
+difference is divided by `factor`, and after a wrong answer it is multiplied by `factor`
+(Levitt, 1971). The difference settles where steps down and up are equally likely, that is,
+where the probability of a right answer is 0.5^(1 / down): 0.707 for `down` = 2.
 
 Invariant:
-    - The differences of a block are a function of the protocol and of the answers to its pairs
-      so far.
+    - The differences in a block follow from the protocol and from the earlier answers of the
+      block.
 """
 
 from collections.abc import Sequence
@@ -22,7 +23,9 @@ from ...fields import Frozen, Positive
 from .questionnaires import CHOICE, Questionnaire, Text
 
 STANDARD = "standard"
+"""The phase of a trial with the standard value."""
 COMPARISON = "comparison"
+"""The phase of a trial with the larger value."""
 SKIPPED_REVERSALS = 2
 """Number of reversals before the difference is near its final value."""
 
@@ -52,55 +55,69 @@ class Staircase(Frozen, frozen=True):
     @property
     def measure(self) -> str:
         """The threshold's name with its unit: threshold_delay_ms for link.delay_ms."""
-        return "threshold_" + [part for part in self.key.split(".") if not part.isdigit()][-1]
+        parts = [part for part in self.key.split(".") if not part.isdigit()]
+        return f"threshold_{parts[-1]}"
 
     @property
     def form(self) -> Questionnaire:
         """The questionnaire after each pair; the answer is 1 or 2."""
-        items = {CHOICE: self.asks}
-        ends = ("the first", "the second")
         return Questionnaire(
-            CHOICE, title="Which one?", items=items, low=ends[0], high=ends[1], most=2
+            name=CHOICE,
+            title="Which one?",
+            items={CHOICE: self.asks},
+            low="the first",
+            high="the second",
+            most=2,
         )
 
     def _list_directions(self, right: Sequence[bool]) -> list[int]:
         """Returns the direction after each answer: -1 down, 1 up, or 0 for no change."""
-        ways = list[int]()
-        in_row = 0
+        directions: list[int] = []
+        right_in_row = 0
         for is_right in right:
-            in_row = in_row + 1 if is_right else 0
-            ways.append(-int(in_row % self.down == 0) if is_right else 1)
-        return ways
+            if not is_right:
+                right_in_row = 0
+                directions.append(1)
+                continue
+            right_in_row += 1
+            is_row_complete = right_in_row % self.down == 0
+            directions.append(-1 if is_row_complete else 0)
+        return directions
 
     def list_differences(self, right: Sequence[bool]) -> list[float]:
-        """Returns the difference of each pair, and of the next one.
+        """Returns the difference of each pair, and of the next pair.
 
         Args:
-            right: whether each answer so far was right.
+            right: whether each earlier answer was right.
         """
         differences = [self.start]
-        for way in self._list_directions(right):
-            differences.append(min(differences[-1] * self.factor**way, self.start))
+        for direction in self._list_directions(right):
+            difference = differences[-1] * self.factor**direction
+            differences.append(min(difference, self.start))
         return differences
 
     def find_threshold(self, right: Sequence[bool]) -> float | None:
         """Returns the threshold, in the key's unit: the geometric mean of the reversals.
 
-        The first two reversals do not count, and neither does the third of an odd number.
-        Returns None if fewer than two are left.
+        A reversal is a step in another direction than the step before. The first two reversals
+        do not count. If the number of reversals is odd, the third does not count either, so
+        that as many reversals lead up as down. Returns None if no reversals are left.
 
         Args:
             right: whether each answer was right.
         """
+        # There is one difference more than directions: that of the next pair.
         pairs = zip(self.list_differences(right), self._list_directions(right), strict=False)
-        changes = [(difference, direction) for difference, direction in pairs if direction]
-        reversals = [
-            difference
-            for (_, previous), (difference, direction) in pairwise(changes)
-            if direction != previous
-        ]
-        counted = reversals[SKIPPED_REVERSALS + len(reversals) % 2 :]
-        return float(np.exp(np.mean(np.log(counted)))) if counted else None
+        steps = [(difference, direction) for difference, direction in pairs if direction]
+        reversals: list[float] = []
+        for (_, previous_direction), (difference, direction) in pairwise(steps):
+            if direction != previous_direction:
+                reversals.append(difference)
+        skipped_count = SKIPPED_REVERSALS + len(reversals) % 2
+        counted = reversals[skipped_count:]
+        if not counted:
+            return None
+        return float(np.exp(np.mean(np.log(counted))))
 
     def draw_choice(self, difference: float, comparison: int, seed: int) -> int:
         """Returns the trial of a pair, 1 or 2, that a synthetic participant chooses.
@@ -114,8 +131,11 @@ class Staircase(Frozen, frozen=True):
             seed: the seed of the choice.
         """
         deviation = self.deviation or self.start / 4.0
-        error = 2.0**0.5 * deviation * np.random.default_rng([seed, 2]).standard_normal()
-        return comparison if difference + error > 0.0 else 3 - comparison
+        random = np.random.default_rng([seed, 2])
+        # The difference of two normal errors has sqrt(2) times their deviation.
+        error = 2.0**0.5 * deviation * random.standard_normal()
+        standard = 3 - comparison
+        return comparison if difference + error > 0.0 else standard
 
     def describe(self) -> str:
         """Returns the procedure as a sentence of a methods paragraph."""

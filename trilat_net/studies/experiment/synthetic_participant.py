@@ -1,6 +1,7 @@
-"""A synthetic participant: a model of a person at a master, for experiments without people.
+"""A model of a person at a master, for experiments without people.
 
-The participant moves towards a target by what it sees of the slave over the network:
+The synthetic participant sees the slave over the network, and moves its hand so that the slave
+reaches the target:
     - It makes movements of minimum jerk (Flash and Hogan, 1985), whose ends scatter with their
       length (Harris and Wolpert, 1998) and whose durations follow Fitts' law.
     - Before a correction it waits until the slave is at rest, as people do with a delay
@@ -10,7 +11,7 @@ The participant moves towards a target by what it sees of the slave over the net
     - With practice it becomes faster by an exponential law.
 
 Invariant:
-    - Its motion is a function of what its site knows, of its parameters and of its seed.
+    - The motion follows from the views, the parameters and the seed of the participant.
 """
 
 import math
@@ -29,17 +30,24 @@ from .tasks import TrialGoal, place_slave
 
 Share = Annotated[float, Meta(ge=0.0, le=1.0)]
 
+MOVED_SHARE = 0.02
+"""The slave counts as moving if it moves by more than this share of the target's width."""
+OFF_TARGET_SHARE = 0.35
+"""A correction is made if the slave is off by more than this share of the target's width."""
+DELAY_MARGIN = 0.7
+"""Largest product of the rate at which a target is followed and the delay of the loop."""
+
 
 class ParticipantModel(Frozen, frozen=True):
-    """The mean parameters of synthetic participants; each draws its own about these.
+    """The mean parameters of synthetic participants, who differ from each other.
 
     Attributes:
-        reaction_s: time from a view to the reaction, s.
-        fitts_a_s: duration of a movement of no difficulty, s.
-        fitts_b_s: additional duration for each bit of its index of difficulty, s.
-        noise: standard deviation of a movement's end, as a share of its length.
-        crossover_rad_s: rate at which a moving target is followed without a delay, rad/s.
-        learning: by which share a first trial is slower than practised ones.
+        reaction_s: time from a view to the reaction, in s.
+        fitts_a_s: duration of a movement of no difficulty, in s.
+        fitts_b_s: additional duration for each bit of the index of difficulty, in s.
+        noise: standard deviation of a movement's end, as a share of the movement's length.
+        crossover_rad_s: rate at which a moving target is followed without a delay, in rad/s.
+        learning: share by which a first trial is slower than a practised trial.
         practised: number of trials after which half of that share is gone.
         spread: standard deviation of the logarithm of a participant's parameters.
     """
@@ -54,28 +62,32 @@ class ParticipantModel(Frozen, frozen=True):
     spread: Share = 0.15
 
     def draw(self, seed: int) -> "ParticipantModel":
-        """Returns the parameters of one participant."""
+        """Returns the parameters of one participant, drawn about the mean parameters."""
         random = np.random.default_rng(seed)
-        drawn = ("reaction_s", "fitts_a_s", "fitts_b_s", "noise", "crossover_rad_s")
-        factors = np.exp(self.spread * random.standard_normal(len(drawn)))
-        parameters = {
-            name: getattr(self, name) * float(x) for name, x in zip(drawn, factors, strict=True)
-        }
-        return replace(self, **{**parameters, "noise": min(parameters["noise"], 1.0)})
+        factors = np.exp(self.spread * random.standard_normal(5)).tolist()
+        reaction, fitts_a, fitts_b, noise, crossover = factors
+        return replace(
+            self,
+            reaction_s=self.reaction_s * reaction,
+            fitts_a_s=self.fitts_a_s * fitts_a,
+            fitts_b_s=self.fitts_b_s * fitts_b,
+            noise=min(self.noise * noise, 1.0),
+            crossover_rad_s=self.crossover_rad_s * crossover,
+        )
 
 
 class SyntheticParticipant:
-    """A synthetic participant at one master in one trial: a hand of the user's own.
+    """A synthetic participant at one master in one trial; a hand program as users write them.
 
     Args:
-        facts: the description of its site.
-        model: its parameters.
-        goal: the goal of the trial, with the target that it sees.
-        slave: the site of the slave, its arm, and a function that returns the force on its end
-            effector, N, from joint angles and torques.
-        before: the number of trials that it has made before.
+        facts: the description of the participant's site.
+        model: the participant's parameters.
+        goal: the goal of the trial.
+        slave: the site of the slave, the slave's arm, and a function that returns the force on
+            the end effector, in N, from joint angles and torques.
+        before: the number of trials that the participant has done before.
         seed: the seed of the trial.
-        user: its index among the users, from 0.
+        user: the participant's index among the users, from 0.
     """
 
     def __init__(
@@ -91,105 +103,123 @@ class SyntheticParticipant:
         self._model = model
         self._goal = goal
         self._before = before
-        self._size = facts.size
-        name, self._arm, self._find_force_n = slave
+        self._axes = facts.size
+        slave_name, self._arm, self._find_force_n = slave
+        self._slave_index = facts.peers.index(slave_name)
         self._user = user
-        self._peer = facts.peers.index(name)
         self._random = np.random.default_rng([seed, facts.seed])
-        self._start_m = np.zeros(facts.size)
+        # The present movement of the hand, from `_start_m` to `_end_m`.
+        self._start_m = np.zeros(self._axes)
         self._end_m = self._start_m
         self._begins_s = -math.inf
         self._duration_s = 0.0
-        self._seen_m = np.zeros(facts.size)
-        self._has_seen = False
+        # The newest position of the slave that the participant has seen, and the time at which
+        # the participant last saw the slave move.
+        self._slave_m: Array | None = None
         self._moved_s = 0.0
 
     def act(self, now: HandView) -> Array:
-        """Returns the target position of the hand, m."""
-        slave = now.peers[self._peer]
-        seen = place_slave(self._arm, slave.q)[: self._size]
-        if not self._has_seen:
-            self._has_seen = True
-            self._start_m = now.pose
-            self._end_m = now.pose
-            self._seen_m = seen
-        moved = float(np.linalg.norm(seen - self._seen_m))
-        self._seen_m = seen
-        if moved > 0.02 * self._goal.width_m:
-            self._moved_s = now.t_s
+        """Returns the target position of the hand, in m."""
+        slave = now.peers[self._slave_index]
+        slave_m = self._see_slave(now, slave)
         if not self._goal.has_authority(now.t_s, self._user):
             # Without authority, the hand yields to the arm.
             self._start_m = now.pose
             self._end_m = now.pose
             return now.pose
-        target = self._goal.find_target_m(now.t_s - self._model.reaction_s, self._user)[
-            : self._size
-        ]
+        seen_s = now.t_s - self._model.reaction_s
+        target_m = self._goal.find_target_m(seen_s, self._user)[: self._axes]
+        error_m = target_m - slave_m
         if self._goal.is_moving:
-            return self._follow(now, target - seen, slave.age_s)
-        if (
-            self._goal.force_n
-            and now.t_s > self._goal.appears_s
-            and (step := self._find_press_step(slave, now.t_s)).any()
-        ):
-            return self._follow(now, step, slave.age_s)
-        ended_s = max(self._begins_s + self._duration_s, self._moved_s)
-        waits_s = self._model.reaction_s + (0.0 if math.isinf(self._begins_s) else slave.age_s)
-        is_off = float(np.linalg.norm(target - seen)) > 0.35 * self._goal.width_m
-        if now.t_s >= max(ended_s, 0.0) + waits_s and is_off:
-            self._start_movement(now.t_s, target - seen)
+            return self._follow(now, error_m, slave.age_s)
+        if self._goal.force_n and now.t_s > self._goal.appears_s:
+            press_step_m = self._find_press_step(slave, now.t_s)
+            if press_step_m.any():
+                return self._follow(now, press_step_m, slave.age_s)
+        is_off_target = float(np.linalg.norm(error_m)) > OFF_TARGET_SHARE * self._goal.width_m
+        if is_off_target and now.t_s >= self._find_next_start_s(slave):
+            self._start_movement(now.t_s, error_m)
         return self._interpolate_movement(now.t_s)
 
-    def _find_press_step(self, slave: PeerView, t_s: float) -> Array:
-        """Returns the step towards the required force, m; 0 away from the wall."""
-        felt_n = self._find_force_n(slave.q, slave.tau_x)
-        towards = (self._goal.find_target_m(t_s) - self._goal.start_m)[: self._size]
-        step: Array = towards * (self._goal.width_m / np.linalg.norm(towards))
-        return step * (1.0 - felt_n / self._goal.force_n) if felt_n else 0.0 * step
+    def _see_slave(self, now: HandView, slave: PeerView) -> Array:
+        """Returns the position of the slave's end effector in the view, in m."""
+        slave_m = place_slave(self._arm, slave.q)[: self._axes]
+        if self._slave_m is None:
+            self._start_m = now.pose
+            self._end_m = now.pose
+            self._slave_m = slave_m
+        distance_m = float(np.linalg.norm(slave_m - self._slave_m))
+        self._slave_m = slave_m
+        if distance_m > MOVED_SHARE * self._goal.width_m:
+            self._moved_s = now.t_s
+        return slave_m
 
-    def _start_movement(self, t_s: float, step: Array) -> None:
+    def _find_next_start_s(self, slave: PeerView) -> float:
+        """Returns the earliest time of the next movement, in s.
+
+        The hand and the slave must have come to rest. Then the participant reacts; before a
+        correction, the participant also waits for the delayed view of the slave.
+        """
+        rest_s = max(self._begins_s + self._duration_s, self._moved_s)
+        is_correction = not math.isinf(self._begins_s)
+        wait_s = self._model.reaction_s + (slave.age_s if is_correction else 0.0)
+        return max(rest_s, 0.0) + wait_s
+
+    def _find_press_step(self, slave: PeerView, t_s: float) -> Array:
+        """Returns the step towards the required force, in m; 0 away from the wall."""
+        force_n = self._find_force_n(slave.q, slave.tau_x)
+        towards_m = (self._goal.find_target_m(t_s) - self._goal.start_m)[: self._axes]
+        step_m: Array = towards_m * (self._goal.width_m / np.linalg.norm(towards_m))
+        if not force_n:
+            return 0.0 * step_m
+        return step_m * (1.0 - force_n / self._goal.force_n)
+
+    def _start_movement(self, t_s: float, step_m: Array) -> None:
         """Starts a movement by a step, with noise in proportion to the step's length."""
-        length = float(np.linalg.norm(step))
-        scatter = self._model.noise * length * self._random.standard_normal(self._size)
-        difficulty = math.log2(length / self._goal.width_m + 1.0)
-        slower = 1.0 + self._model.learning * 0.5 ** (self._before / self._model.practised)
-        start = self._interpolate_movement(t_s)
-        self._start_m = start
-        self._end_m = start + step + scatter
+        model = self._model
+        length_m = float(np.linalg.norm(step_m))
+        scatter_m = model.noise * length_m * self._random.standard_normal(self._axes)
+        # Index of difficulty by Shannon's formulation of Fitts' law, in bit.
+        difficulty_bits = math.log2(length_m / self._goal.width_m + 1.0)
+        practice = 0.5 ** (self._before / model.practised)
+        slowness = 1.0 + model.learning * practice
+        start_m = self._interpolate_movement(t_s)
+        self._start_m = start_m
+        self._end_m = start_m + step_m + scatter_m
         self._begins_s = t_s
-        self._duration_s = slower * (self._model.fitts_a_s + self._model.fitts_b_s * difficulty)
+        self._duration_s = slowness * (model.fitts_a_s + model.fitts_b_s * difficulty_bits)
 
     def _interpolate_movement(self, t_s: float) -> Array:
-        """Returns the position of the present movement of minimum jerk, m.
+        """Returns the position of the present movement of minimum jerk, in m.
 
         With s from 0 to 1 over the movement, the position is start + (end - start) (10 s^3 - 15
         s^4 + 6 s^5).
         """
-        s = (
-            min(max((t_s - self._begins_s) / self._duration_s, 0.0), 1.0)
-            if self._duration_s
-            else 1.0
-        )
-        found: Array = self._start_m + (self._end_m - self._start_m) * (
-            10.0 * s**3 - 15.0 * s**4 + 6.0 * s**5
-        )
-        return found
+        s = 1.0
+        if self._duration_s:
+            s = min(max((t_s - self._begins_s) / self._duration_s, 0.0), 1.0)
+        share = 10.0 * s**3 - 15.0 * s**4 + 6.0 * s**5
+        position_m: Array = self._start_m + (self._end_m - self._start_m) * share
+        return position_m
 
-    def _follow(self, now: HandView, distance: Array, age_s: float) -> Array:
-        """Moves towards a moving target, at a rate that falls with the delay.
+    def _follow(self, now: HandView, distance_m: Array, age_s: float) -> Array:
+        """Moves the hand towards a moving target, at a rate that falls with the delay.
 
         The rate is at most 0.7 / (reaction time + 2 age of the slave's sample), in 1/s.
+
+        Args:
+            now: the present view.
+            distance_m: the slave's distance from the target, in m.
+            age_s: age of the slave's sample, in s.
         """
-        limit = 0.7 / (self._model.reaction_s + 2.0 * age_s)
-        rate = min(self._model.crossover_rad_s, limit)
-        scatter = (
-            self._model.noise
-            * float(np.linalg.norm(distance))
-            * self._random.standard_normal(self._size)
-        )
+        # The age is the delay of one direction; a correction is seen after both directions.
+        loop_delay_s = self._model.reaction_s + 2.0 * age_s
+        rate = min(self._model.crossover_rad_s, DELAY_MARGIN / loop_delay_s)
+        length_m = float(np.linalg.norm(distance_m))
+        scatter_m = self._model.noise * length_m * self._random.standard_normal(self._axes)
         share = 0.0
         if not math.isinf(self._begins_s):
             share = rate * (now.t_s - max(self._begins_s, 0.0))
         self._begins_s = now.t_s
-        self._end_m = self._end_m + min(share, 1.0) * (distance + scatter)
+        self._end_m = self._end_m + min(share, 1.0) * (distance_m + scatter_m)
         return self._end_m

@@ -1,9 +1,13 @@
-"""The tasks of a trial: reach, hand over, press a wall, track a path.
+"""The tasks of an experiment: reach a target, hand over, press a wall, track a path.
+
+A protocol defines a `TrialTask` with its numbers. For each trial the task makes a `TrialGoal`,
+which places the target at every time and judges how the trial ends.
 
 Invariant:
-    - A task is a function of its numbers, the trial's seed, and the start of the slave's arm.
-    - A task is judged by the position of the slave's end effector and the force on it, not by
-      what anybody sees.
+    - The goal of a trial follows from the task's numbers, the trial's seed, and the start of
+      the slave's arm.
+    - A trial is judged by the position of the slave's end effector and by the force on it. The
+      delayed pictures of the users play no role.
     - A trial ends by dwelling at the goal, by its time, or by a violation of the task's rules.
 """
 
@@ -22,7 +26,7 @@ Seconds = Annotated[float, Meta(gt=0.0, le=600.0)]
 
 
 class TrialTask(Frozen, frozen=True, tag_field="kind"):
-    """A task, as a protocol defines it; `make_goal` draws the goal of one trial.
+    """A task, as a protocol defines it; `make_goal` returns the goal of a trial.
 
     Attributes:
         description: the task in a phrase, for texts and plans.
@@ -37,12 +41,12 @@ class TrialTask(Frozen, frozen=True, tag_field="kind"):
     needs_wall: ClassVar[bool] = False
 
     def render_instructions(self, slave: str) -> str:
-        """Returns the instructions for participants, for the name of the slave."""
+        """Returns the instructions for participants; `slave` is the name of the slave."""
         return self.instructions.format(slave=slave, task=self)
 
     @property
     def longest_s(self) -> float:
-        """The longest duration of a trial after its target appears, s."""
+        """The longest duration of a trial after its target appears, in s."""
         raise NotImplementedError
 
     @property
@@ -60,7 +64,7 @@ class TrialTask(Frozen, frozen=True, tag_field="kind"):
 
         Args:
             start_m: the position of the slave's end effector at the start, shape (2,) or (3,),
-                m.
+                in m.
             number: the number of the target, from 0.
             seed: the seed of the trial.
         """
@@ -71,15 +75,15 @@ class TrialGoal:
     """The goal of one trial.
 
     Attributes:
-        start_m: the position of the target before it appears: the start of the slave, m.
-        width_m: the diameter of the target, m.
-        appears_s: when the target appears, s: the end of the fore-period.
+        start_m: the position of the target before it appears, in m: the start of the slave.
+        width_m: the diameter of the target, in m.
+        appears_s: the time at which the target appears, in s: the end of the fore-period.
         is_moving: whether the target moves from then on.
-        force_n: the force to press with, N; 0 if the task has none.
+        force_n: the force to press with, in N; 0 if the task has no force.
         lead: the first user's part of the authority that two users share over the slave until a
-            handover; None for the scenario's.
-        handover: when the authority goes to the second user, s after the target's appearance,
-            and the duration of the change, s; None without a handover.
+            handover; None for the scenario's dominance factors.
+        handover: the time from the target's appearance until the second user receives the
+            authority, and the duration of the change, both in s; None without a handover.
     """
 
     is_moving = False
@@ -93,23 +97,24 @@ class TrialGoal:
         self.appears_s = 0.0
 
     def find_target_m(self, t_s: float, user: int | None = None) -> Array:
-        """Returns the target position of the end effector, shape (2,) or (3,), m.
+        """Returns the target position of the end effector, shape (2,) or (3,), in m.
 
         Args:
-            t_s: time since the epoch, s.
-            user: the user, from 0, who is shown the target; None for the middle of all users.
+            t_s: time since the epoch, in s.
+            user: the user, from 0, whose target is returned; None for the middle of all users'
+                targets.
         """
         if t_s < self.appears_s:
             return self.start_m
         return self._find_target_m(t_s - self.appears_s, user)
 
     def judge(self, t_s: float, position_m: Array, force_n: float = 0.0) -> "Outcome | None":
-        """Returns how the trial has ended; None while it goes on.
+        """Returns the outcome of the trial; None while the trial goes on.
 
         Args:
-            t_s: time since the epoch, s.
-            position_m: the position of the end effector, shape (2,) or (3,), m.
-            force_n: the magnitude of the force on the end effector, N.
+            t_s: time since the epoch, in s.
+            position_m: the position of the end effector, shape (2,) or (3,), in m.
+            force_n: the magnitude of the force on the end effector, in N.
         """
         if t_s < self.appears_s:
             return None
@@ -122,16 +127,19 @@ class TrialGoal:
         begins_s, ramp_s = self.handover or (math.inf, 0.0)
         # In the middle of the ramp, both users have the same authority.
         is_handed_over = t_s >= self.appears_s + begins_s + ramp_s / 2.0
-        return abs(self.lead - (user != is_handed_over)) > 0.05
+        leading_user = 1 if is_handed_over else 0
+        if user == leading_user:
+            return abs(self.lead) > 0.05
+        return abs(self.lead - 1) > 0.05
 
     def find_corridor(self, t_s: float) -> tuple[Array, float] | None:  # noqa: ARG002 - there is none
         """Returns the corridor to the target, which nobody may leave; None without a corridor.
 
         Args:
-            t_s: time since the epoch, s.
+            t_s: time since the epoch, in s.
 
         Returns:
-            The start of the corridor, m, and its width, m.
+            The start of the corridor and its width, both in m.
         """
         return None
 
@@ -139,25 +147,27 @@ class TrialGoal:
         """Returns the measures that only this task has.
 
         Args:
-            after_s: times since the target's appearance, shape (K,), s.
-            position_m: positions of the slave's end effector, shape (K, 2) or (K, 3), m.
-            force_n: magnitudes of the force on the end effector, shape (K,), N.
+            after_s: times since the target's appearance, shape (K,), in s.
+            position_m: positions of the slave's end effector, shape (K, 2) or (K, 3), in m.
+            force_n: magnitudes of the force on the end effector, shape (K,), in N.
         """
         return {}
 
     def _find_target_m(self, after_s: float, user: int | None) -> Array:
+        """Returns the target at a time after the target's appearance."""
         raise NotImplementedError
 
     def _judge(self, t_s: float, position_m: Array, force_n: float) -> "Outcome | None":
+        """Returns the outcome of the trial at a time after the target's appearance."""
         raise NotImplementedError
 
 
 class Outcome(NamedTuple):
-    """How a trial has ended.
+    """The outcome of a trial.
 
     Attributes:
         succeeded: whether the task was done.
-        ended_s: the time of the end, s since the epoch.
+        ended_s: the time of the end, in s since the epoch.
     """
 
     succeeded: bool
@@ -169,16 +179,16 @@ class ReachTrial(TrialTask, frozen=True, tag="reach"):
 
     Attributes:
         targets: the number of targets.
-        distance_m: radius of the ring, m.
-        width_m: diameter of a target, m.
-        dwell_s: how long the end effector has to stay in the target, s.
-        timeout_s: time after which the trial has failed, s.
-        corridor_m: width of the straight corridor to the target, m, which nobody may leave, as
-            with a load; None for any path.
-        handover_s: time after which the second user receives the first user's authority, s;
+        distance_m: radius of the ring, in m.
+        width_m: diameter of a target, in m.
+        dwell_s: how long the end effector has to stay in the target, in s.
+        timeout_s: time after which the trial has failed, in s.
+        corridor_m: width of the straight corridor to the target, in m, which nobody may leave;
+            None if the users may choose the path.
+        handover_s: time after which the second user receives the first user's authority, in s;
             None without a handover.
-        ramp_s: duration of the handover, s, during which the end effector stays; then the next
-            target appears.
+        ramp_s: duration of the handover, in s. The end effector must stay in the target
+            meanwhile; then the next target appears.
     """
 
     description: ClassVar[str] = "reaching to a ring of targets"
@@ -213,47 +223,58 @@ class ReachTrial(TrialTask, frozen=True, tag="reach"):
 
     @property
     def longest_s(self) -> float:
-        """The time-out, which begins anew with the second target of a handover, s."""
+        """The time-out, in s, which begins again with the second target of a handover."""
         if self.handover_s is None:
             return self.timeout_s
-        return self.timeout_s + (self.handover_s + self.ramp_s)
+        second_appears_s = self.handover_s + self.ramp_s
+        return self.timeout_s + second_appears_s
 
     def make_goal(self, start_m: Array, number: int, seed: int) -> TrialGoal:  # noqa: ARG002 - the order is fixed
-        """Returns the goal of a trial: a target of the ring, and the next target as well."""
-        targets_m = [self._ring_target_m(start_m, number + n) for n in (0, 1)]
-        return _ReachGoal(self, start_m, targets_m)
+        """Returns the goal of a trial: a target of the ring, and the target after it."""
+        target_m = self._place_target_m(start_m, number)
+        next_target_m = self._place_target_m(start_m, number + 1)
+        return _ReachGoal(self, start_m, [target_m, next_target_m])
 
-    def _ring_target_m(self, start_m: Array, number: int) -> Array:
-        """Returns the position of a target, m; consecutive targets are opposite each other."""
-        index = (number // 2 + (number % 2) * (self.targets // 2)) % self.targets
+    def _place_target_m(self, start_m: Array, number: int) -> Array:
+        """Returns the position of a target, in m; consecutive targets are nearly opposite."""
+        # Even numbers advance around the ring, odd numbers are half a ring further.
+        half_ring = self.targets // 2
+        index = (number // 2 + (number % 2) * half_ring) % self.targets
         angle = 2.0 * math.pi * index / self.targets
         direction = np.zeros(len(start_m))
-        direction[:2] = math.cos(angle), math.sin(angle)
+        direction[0] = math.cos(angle)
+        direction[1] = math.sin(angle)
         return start_m + self.distance_m * direction
 
 
 class _DwellGoal(TrialGoal):
-    """A goal that is met by staying for some time where `_is_inside` returns True."""
+    """A goal that is reached by meeting a condition for some time, see `_is_inside`."""
 
     def __init__(self, task: "ReachTrial | ContactTrial", start_m: Array) -> None:
         super().__init__(start_m, task.width_m)
         self._dwell_s = task.dwell_s
         self._longest_s = task.longest_s
+        # Time since which the condition is met; infinite while it is not met.
         self._inside_since_s = math.inf
 
     def _is_inside(self, after_s: float, position_m: Array, force_n: float) -> bool:
+        """Returns whether the condition of the goal is met."""
         raise NotImplementedError
 
     def _judge(self, t_s: float, position_m: Array, force_n: float) -> Outcome | None:
-        is_inside = self._is_inside(t_s - self.appears_s, position_m, force_n)
-        self._inside_since_s = min(self._inside_since_s, t_s) if is_inside else math.inf
+        if self._is_inside(t_s - self.appears_s, position_m, force_n):
+            self._inside_since_s = min(self._inside_since_s, t_s)
+        else:
+            self._inside_since_s = math.inf
         if t_s - self._inside_since_s >= self._dwell_s:
             return Outcome(True, t_s)
-        return Outcome(False, t_s) if t_s >= self.appears_s + self._longest_s else None
+        if t_s >= self.appears_s + self._longest_s:
+            return Outcome(False, t_s)
+        return None
 
 
 class _ReachGoal(_DwellGoal):
-    """A target of the ring, and after a handover the next one.
+    """A target of the ring, and after a handover the next target.
 
     Without a handover, `_handover_s` and `_second_appears_s` are -1.
     """
@@ -269,10 +290,14 @@ class _ReachGoal(_DwellGoal):
         self._second_appears_s = self._handover_s + ramp_s
 
     def measure(self, after_s: Array, position_m: Array, force_n: Array) -> dict[str, float]:  # noqa: ARG002
-        """Returns the largest distance from the target during the handover, mm."""
-        is_handover = (after_s >= self._handover_s) & (after_s < self._second_appears_s)
-        errors_m = np.linalg.norm(position_m - self._waypoints_m[1], axis=1)[is_handover]
-        return {"error_handover_mm": 1e3 * float(errors_m.max())} if len(errors_m) else {}
+        """Returns the largest distance from the target during the handover, in mm."""
+        has_begun = after_s >= self._handover_s
+        is_handover = has_begun & (after_s < self._second_appears_s)
+        target_m = self._waypoints_m[1]
+        errors_m = np.linalg.norm(position_m - target_m, axis=1)[is_handover]
+        if not len(errors_m):
+            return {}
+        return {"error_handover_mm": 1e3 * float(errors_m.max())}
 
     def find_corridor(self, t_s: float) -> tuple[Array, float] | None:
         """Returns the corridor from the target's appearance on, if the task has one."""
@@ -282,24 +307,27 @@ class _ReachGoal(_DwellGoal):
         return start_m, self._corridor_m
 
     def _find_segment(self, after_s: float) -> Sequence[Array]:
-        """Returns the start and the end of the present movement, m."""
-        first = int(0.0 <= self._second_appears_s <= after_s)
-        return self._waypoints_m[first : first + 2]
+        """Returns the start and the end of the present movement, in m."""
+        has_second_appeared = 0.0 <= self._second_appears_s <= after_s
+        return self._waypoints_m[1:] if has_second_appeared else self._waypoints_m[:2]
 
-    def _find_target_m(self, after_s: float, user: int | None) -> Array:  # noqa: ARG002 - all users are shown the same
+    def _find_target_m(self, after_s: float, user: int | None) -> Array:  # noqa: ARG002 - all users see the same
         return self._find_segment(after_s)[1]
 
     def _is_inside(self, after_s: float, position_m: Array, force_n: float) -> bool:  # noqa: ARG002 - no force
-        error_m = float(np.linalg.norm(position_m - self._find_target_m(after_s, None)))
+        target_m = self._find_target_m(after_s, None)
+        error_m = float(np.linalg.norm(position_m - target_m))
+        # Before the second target appears, the trial cannot succeed.
         return error_m <= self.width_m / 2.0 and after_s >= self._second_appears_s
 
     def _judge(self, t_s: float, position_m: Array, force_n: float) -> Outcome | None:
         if self._corridor_m is not None:
             start_m, end_m = self._find_segment(t_s - self.appears_s)
             path_m = end_m - start_m
-            # Distance from the straight segment between start and end.
-            along = np.clip((position_m - start_m) @ path_m / (path_m @ path_m), 0.0, 1.0)
-            distance_m = float(np.linalg.norm(position_m - start_m - along * path_m))
+            offset_m = position_m - start_m
+            # The nearest point of the straight segment is at this share of its length.
+            share = np.clip(offset_m @ path_m / (path_m @ path_m), 0.0, 1.0)
+            distance_m = float(np.linalg.norm(offset_m - share * path_m))
             if distance_m > self._corridor_m / 2.0:
                 return Outcome(False, t_s)
         return super()._judge(t_s, position_m, force_n)
@@ -310,12 +338,12 @@ class ContactTrial(TrialTask, frozen=True, tag="contact"):
 
     Attributes:
         axis: the axis of the arm's base frame along which the target is drawn, from 0.
-        distance_m: distance from the start to the target, m; negative in the other direction.
-        width_m: diameter of the target, m.
-        force_n: the force to press with, N.
-        tolerance_n: largest error of the force, N.
-        dwell_s: how long the force must be held, s.
-        timeout_s: time after which the trial has failed, s.
+        distance_m: distance from the start to the target, in m; negative for the other side.
+        width_m: diameter of the target, in m.
+        force_n: the force to press with, in N.
+        tolerance_n: largest error of the force, in N.
+        dwell_s: how long the force must be held, in s.
+        timeout_s: time after which the trial has failed, in s.
     """
 
     description: ClassVar[str] = "holding a force at a wall"
@@ -335,7 +363,7 @@ class ContactTrial(TrialTask, frozen=True, tag="contact"):
 
     @property
     def longest_s(self) -> float:
-        """The time-out, s."""
+        """The time-out, in s."""
         return self.timeout_s
 
     def make_goal(self, start_m: Array, number: int, seed: int) -> TrialGoal:  # noqa: ARG002 - there is one wall
@@ -344,24 +372,27 @@ class ContactTrial(TrialTask, frozen=True, tag="contact"):
 
 
 class _ContactGoal(_DwellGoal):
+    """A target at a wall, and a force to press with."""
+
     def __init__(self, task: ContactTrial, start_m: Array) -> None:
         super().__init__(task, start_m)
         self.force_n = task.force_n
         self._tolerance_n = task.tolerance_n
-        self._ring_target_m: Array = start_m + task.distance_m * (
-            np.arange(len(start_m)) == task.axis
-        )
+        direction = np.arange(len(start_m)) == task.axis
+        self._target_m: Array = start_m + task.distance_m * direction
 
     def _find_target_m(self, after_s: float, user: int | None) -> Array:  # noqa: ARG002 - it does not move
-        return self._ring_target_m
+        return self._target_m
 
     def measure(self, after_s: Array, position_m: Array, force_n: Array) -> dict[str, float]:  # noqa: ARG002
-        """Returns the mean force while it had to be held, N, and the RMS of its error, N."""
-        held_n = force_n[after_s >= after_s[-1] - self._dwell_s]
-        error_n = float(np.sqrt(np.mean((held_n - self.force_n) ** 2)))
-        return {"wall_force_n": float(held_n.mean()), "error_force_n": error_n}
+        """Returns the mean of the force that had to be held, and the RMS of its error, in N."""
+        is_dwell = after_s >= after_s[-1] - self._dwell_s
+        held_n = force_n[is_dwell]
+        errors_n = held_n - self.force_n
+        rms_error_n = float(np.sqrt(np.mean(errors_n**2)))
+        return {"wall_force_n": float(held_n.mean()), "error_force_n": rms_error_n}
 
-    def _is_inside(self, after_s: float, position_m: Array, force_n: float) -> bool:  # noqa: ARG002 - a force
+    def _is_inside(self, after_s: float, position_m: Array, force_n: float) -> bool:  # noqa: ARG002 - only the force counts
         return abs(force_n - self.force_n) <= self._tolerance_n
 
 
@@ -370,12 +401,12 @@ class TrackTrial(TrialTask, frozen=True, tag="track"):
 
     Attributes:
         axis: the axis of the arm's base frame, from 0.
-        amplitude_m: largest distance of the path from the start, m.
-        frequencies_hz: frequencies of the sines, Hz; their phases are drawn for every trial.
-        duration_s: duration of a trial, s.
-        width_m: diameter of the drawn target, m.
-        apart_m: distance along the axis between the targets that two users are shown, m: they
-            have to agree on one.
+        amplitude_m: largest distance of the path from the start, in m.
+        frequencies_hz: frequencies of the sines, in Hz; their phases are drawn for every trial.
+        duration_s: duration of a trial, in s.
+        width_m: diameter of the target, in m.
+        apart_m: distance along the axis between the targets of the two users, in m. The users
+            have to agree on a position.
     """
 
     description: ClassVar[str] = "tracking a path of sines"
@@ -398,12 +429,12 @@ class TrackTrial(TrialTask, frozen=True, tag="track"):
 
     @property
     def needs_pair(self) -> bool:
-        """Whether the users are shown different targets."""
+        """Whether the users see different targets."""
         return self.apart_m > 0.0
 
     @property
     def longest_s(self) -> float:
-        """The duration of a trial, s."""
+        """The duration of a trial, in s."""
         return self.duration_s
 
     def make_goal(self, start_m: Array, number: int, seed: int) -> TrialGoal:  # noqa: ARG002 - the seed draws the path
@@ -414,6 +445,8 @@ class TrackTrial(TrialTask, frozen=True, tag="track"):
 
 
 class _TrackGoal(TrialGoal):
+    """A target that moves along a path until the time of the trial is over."""
+
     is_moving = True
 
     def __init__(self, task: TrackTrial, start_m: Array, phases: Array) -> None:
@@ -423,35 +456,42 @@ class _TrackGoal(TrialGoal):
 
     def measure(self, after_s: Array, position_m: Array, force_n: Array) -> dict[str, float]:  # noqa: ARG002
         """Returns whose target the slave followed: 1 the first user's, 0 the second user's."""
-        if not self._task.needs_pair:
+        task = self._task
+        if not task.needs_pair:
             return {}
         middle_m = np.array([self._find_target_m(after, None) for after in after_s.tolist()])
-        aside_m = float((position_m - middle_m)[:, self._task.axis].mean())
-        return {"first_settled": 0.5 + aside_m / self._task.apart_m}
+        errors_m = position_m - middle_m
+        mean_error_m = float(errors_m[:, task.axis].mean())
+        return {"first_settled": 0.5 + mean_error_m / task.apart_m}
 
     def _find_target_m(self, after_s: float, user: int | None) -> Array:
-        angular_hz = 2.0 * math.pi * np.array(self._task.frequencies_hz)
-        sines = np.sin(angular_hz * after_s + self._phases) - np.sin(self._phases)
-        offset_m = 0.0 if user is None else self._task.apart_m * (0.5 - user)
+        task = self._task
+        rates_rad_s = 2.0 * math.pi * np.array(task.frequencies_hz)
+        # The path begins at the start: each sine is 0 when the target appears.
+        sines = np.sin(rates_rad_s * after_s + self._phases) - np.sin(self._phases)
+        largest_sum = 2.0 * len(sines)
+        path_m = task.amplitude_m * float(sines.sum()) / largest_sum
+        # The users' targets are on opposite sides of the path.
+        offset_m = 0.0 if user is None else task.apart_m * (0.5 - user)
         target_m = self.start_m.copy()
-        target_m[self._task.axis] += offset_m + self._task.amplitude_m * float(sines.sum()) / (
-            2.0 * len(sines)
-        )
+        target_m[task.axis] += offset_m + path_m
         return target_m
 
     def _judge(self, t_s: float, position_m: Array, force_n: float) -> Outcome | None:  # noqa: ARG002 - by its time
-        return Outcome(True, t_s) if t_s >= self.appears_s + self._task.duration_s else None
+        if t_s >= self.appears_s + self._task.duration_s:
+            return Outcome(True, t_s)
+        return None
 
 
 AnyTask = ReachTrial | ContactTrial | TrackTrial
 
 
 def place_slave(arm: Any, shared: Sequence[float]) -> Array:
-    """Returns the position of an end effector, m, from the coordinates that its site shares.
+    """Returns the position of an end effector, in m, from the coordinates that its site shares.
 
     Args:
         arm: the arm of the site.
-        shared: joint angles, rad, or the pose of the end effector.
+        shared: joint angles in rad, or the pose of the end effector.
     """
     position = shared[:3] if arm.shares_pose else arm.end_effector(shared)
     return np.array(position, dtype=np.float64)

@@ -1,16 +1,20 @@
-"""One trial: its scenario, its judgement record by record, and the results of its log.
+"""One trial of an experiment: its scenario, its judgement, and the measures of its log.
+
+`ExperimentTrial` is a trial with people, whose log a live session records. `SyntheticTrial` is
+a trial of synthetic participants, which runs in virtual time.
 
 Invariant:
-    - The result of a trial is a function of its log, for people and for synthetic participants
+    - The result of a trial follows from its log, for people and for synthetic participants
       alike. The log is executed again, and judged by every record of the slave in it.
-    - A trial of synthetic participants is run twice with the same numbers: compiled, to find
-      its end, and then into its log, which lasts just that long.
+    - A trial of synthetic participants is run twice with the same numbers: first compiled, to
+      find the trial's end, and then into its log, which ends shortly after the trial.
 """
 
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -35,17 +39,17 @@ from ...scenario.operators.program_hand import HandPlayer, HandSite
 from ...scenario.scenario_types import Change
 from .movement_measures import energy_j, measure_pair, movement_time_s, path_length_m, sparc
 from .protocol import PlannedTrial, Protocol, limit_forces
-from .synthetic_participant import SyntheticParticipant
+from .synthetic_participant import ParticipantModel, SyntheticParticipant
 from .tasks import Outcome, TrialGoal
 
 RECORD_STEP = 5
 """Every fifth record of the slave is measured."""
 HAND_HZ = 50
-"""Rate at which a synthetic participant acts, 1/s."""
+"""Rate at which a synthetic participant acts, in 1/s."""
 HAND_DELAY_S = 0.02
-"""Time from the decision of a synthetic participant to its effect on the arm, s."""
+"""Time from the decision of a synthetic participant to the effect on the arm, in s."""
 REST_S = 0.1
-"""Time after the end of a trial that its log still has, s."""
+"""Time for which the log of a trial continues after the trial's end, in s."""
 
 
 class TrialEntry(msgspec.Struct, frozen=True):
@@ -53,8 +57,8 @@ class TrialEntry(msgspec.Struct, frozen=True):
 
     Attributes:
         cell: the number of the trial.
-        seed: its seed.
-        sha256: the digest of its log.
+        seed: the seed of the trial.
+        sha256: the digest of the trial's log.
         succeeded: whether the task was done.
         measures: the measures by name, with units in the names.
         people: False for synthetic participants.
@@ -69,11 +73,11 @@ class TrialEntry(msgspec.Struct, frozen=True):
 
 
 class TrialJudge:
-    """Judges a trial by the records of its slave, one after the other.
+    """Judges a trial by the records of the slave, one after the other.
 
     Attributes:
         goal: the goal of the trial.
-        outcome: how the trial has ended; None while it goes on.
+        outcome: the outcome of the trial; None while the trial goes on.
     """
 
     def __init__(self, trial: "ExperimentTrial") -> None:
@@ -85,15 +89,34 @@ class TrialJudge:
         """Judges a record of the slave; returns the outcome once the trial has ended.
 
         Args:
-            t_s: time since the epoch, s.
-            q: joint coordinates, rad or m.
-            tau_x: exogenous torques, N m or N.
+            t_s: time since the epoch, in s.
+            q: joint positions, in rad or m.
+            tau_x: exogenous torques, in N m or N.
         """
         if self.outcome is None:
+            # The force is computed only for tasks that need it, because it takes long.
             force_n = self._trial.find_force_n(q, tau_x) if self.goal.force_n else 0.0
             position_m = np.array(self._trial.arm.end_effector(q))
             self.outcome = self.goal.judge(t_s, position_m, force_n)
         return self.outcome
+
+
+class _MotionSamples(NamedTuple):
+    """Samples of the motion of the slave's end effector.
+
+    Attributes:
+        indices: indices of the records, shape (K,).
+        t_s: times of the records, shape (K,), in s.
+        positions_m: positions, shape (K, 2) or (K, 3), in m.
+        velocities_m_s: velocities, of the same shape, in m/s.
+        rate_hz: rate of the samples, in 1/s.
+    """
+
+    indices: Ints
+    t_s: Array
+    positions_m: Array
+    velocities_m_s: Array
+    rate_hz: float
 
 
 class ExperimentTrial:
@@ -107,9 +130,13 @@ class ExperimentTrial:
 
     Attributes:
         people: False for synthetic participants.
-        slave, arm: the site whose arm is moved, and that arm.
+        protocol: the protocol of the experiment.
+        planned: the trial in the plan.
+        slave: the site of the slave.
+        arm: the arm of the slave.
         scenario: the scenario of this trial, which lasts as long as the trial may.
-        appears_s, longest_s: when the target appears, and the latest end of the trial, s.
+        appears_s: the time at which the target appears, in s.
+        longest_s: the latest end of the trial, in s.
     """
 
     people = True
@@ -121,11 +148,14 @@ class ExperimentTrial:
         self.planned = planned
         self.slave = scenario.slave
         self.arm = scenario.arms[scenario.slave]
-        spec = scenario.sites[self.slave]
-        self._start_m = np.array(self.arm.end_effector(spec.q0_rad), dtype=np.float64)
-        foreperiod_s = np.random.default_rng(planned.seed).uniform(*protocol.foreperiod_s)
+        start = self.arm.end_effector(scenario.sites[self.slave].q0_rad)
+        self._start_m = np.array(start, dtype=np.float64)
+        shortest_s, longest_s = protocol.foreperiod_s
+        random = np.random.default_rng(planned.seed)
+        foreperiod_s = random.uniform(shortest_s, longest_s)
         self.appears_s = round(float(foreperiod_s), 3)
         scenario = self._set_authority(scenario)
+        # One period of the hands is added, because the judge sees a trial's end that late.
         self.longest_s = self.appears_s + protocol.task.longest_s + 1.0 / HAND_HZ
         kind = "" if self.people else "synthetic "
         about = (
@@ -144,9 +174,9 @@ class ExperimentTrial:
         self._rows = build_arm_rows(self.scenario, self.slave)
 
     def _set_authority(self, scenario: Scenario) -> Scenario:
-        """Returns the scenario with the trial's authority of the users over the slave.
+        """Returns the scenario with the users' authority over the slave in this trial.
 
-        The two users share the sum of their dominance factors; a handover exchanges the parts.
+        The two users share the sum of their dominance factors. A handover exchanges the parts.
         """
         goal = self.make_goal()
         if goal.lead is None:
@@ -155,41 +185,48 @@ class ExperimentTrial:
         first, second = self.protocol.users
         sum_of_shares = row[first] + row[second]
 
-        def divide(lead: float) -> dict[str, float]:
+        def divide_shares(lead: float) -> dict[str, float]:
+            """Returns the slave's row of dominance factors for the first user's part."""
             first_share = sum_of_shares * lead
             return {**row, first: first_share, second: sum_of_shares - first_share}
 
-        dominance = {**scenario.dominance, self.slave: divide(goal.lead)}
+        dominance = {**scenario.dominance, self.slave: divide_shares(goal.lead)}
         timeline = scenario.timeline
         if goal.handover is not None:
             after_s, ramp_s = goal.handover
             handover = Change(
                 self.appears_s + after_s,
                 dominance=self.slave,
-                to=divide(1.0 - goal.lead),
+                to=divide_shares(1.0 - goal.lead),
                 ramp_s=ramp_s,
             )
             timeline = (*timeline, handover)
         return replace(scenario, dominance=dominance, timeline=timeline)
 
     def find_force_n(self, q: Sequence[float], tau_x: Sequence[float]) -> float:
-        """Returns the magnitude of the external force on the slave's end effector, N."""
-        return float(self._find_forces_n(np.array([q]), np.array([tau_x]))[0])
+        """Returns the magnitude of the external force on the slave's end effector, in N."""
+        forces_n = self._find_forces_n(np.array([q]), np.array([tau_x]))
+        return float(forces_n[0])
 
     def _find_forces_n(self, q: Array, tau_x: Array) -> Array:
-        """Returns the magnitude of that force for K records, shape (K,), N."""
-        force_n: Array = np.linalg.norm(self._locate_end_effector(q).find_force(tau_x), axis=1)
-        return force_n
+        """Returns the magnitude of the external force in K records, shape (K,), in N."""
+        forces = self._place_end_effector(q).find_force(tau_x)
+        magnitude_n: Array = np.linalg.norm(forces, axis=1)
+        return magnitude_n
 
-    def _locate_end_effector(self, q: Array) -> EndEffectorRows:
-        return self._rows.place_end_effector(q, 0.0 * q)
+    def _place_end_effector(self, q: Array) -> EndEffectorRows:
+        """Returns the positions of the slave's end effector, and the Jacobians, at rest."""
+        speed = 0.0 * q
+        return self._rows.place_end_effector(q, speed)
 
     def make_goal(self) -> TrialGoal:
         """Returns the goal of the trial."""
         planned = self.planned
         goal = self.protocol.task.make_goal(self._start_m, planned.target, planned.seed)
         goal.appears_s = self.appears_s
-        goal.lead = planned.lead if goal.lead is None else goal.lead
+        # The task of a handover fixes the authority; otherwise the plan does.
+        if goal.lead is None:
+            goal.lead = planned.lead
         return goal
 
     def settle(self, path: Path) -> TrialEntry:
@@ -216,23 +253,26 @@ class ExperimentTrial:
     def _judge_log(self, log: Log) -> Outcome | None:
         """Returns the outcome of the trial in a log; None if the log ends before the trial."""
         judge = TrialJudge(self)
-        part = log[self.slave]
-        columns = zip(part.t_s.tolist(), part.q.tolist(), part.tau_x.tolist(), strict=True)
-        for t_s, q, tau_x in columns:
+        records = log[self.slave]
+        times_s = records.t_s.tolist()
+        positions = records.q.tolist()
+        torques = records.tau_x.tolist()
+        for t_s, q, tau_x in zip(times_s, positions, torques, strict=True):
             outcome = judge.accept(t_s, q, tau_x)
             if outcome is not None:
                 return outcome
-        return None if log.diverged_s is None else Outcome(False, log.diverged_s)
+        if log.diverged_s is not None:
+            return Outcome(False, log.diverged_s)
+        return None
 
     def _measure(self, log: Log, outcome: Outcome) -> dict[str, float]:
         """Returns the measures of a trial, with units in the names."""
         measures = self._measure_motion(log, outcome.ended_s)
         aligned = align_records(log)
         users = self.protocol.users
-        forces = list[Array]()
+        forces: list[Array] = []
         for number, user in enumerate(users, 1):
             records = aligned[user]
-            suffix = f"_user{number}" if len(users) > 1 else ""
             split = split_torque(records, log.scenario)
             is_in_trial = records.t_s <= outcome.ended_s
             # The force of the hand ON its arm, shape (K, 2) or (K, 3).
@@ -240,6 +280,7 @@ class ExperimentTrial:
             forces.append(force)
             magnitude_n = np.linalg.norm(force, axis=1)
             velocity = split.end_effector.speed[is_in_trial]
+            suffix = f"_user{number}" if len(users) > 1 else ""
             measures[f"force_mean{suffix}_n"] = float(magnitude_n.mean())
             measures[f"force_peak{suffix}_n"] = float(magnitude_n.max())
             measures[f"work{suffix}_j"] = energy_j(force, velocity, records.rate_hz)
@@ -249,62 +290,69 @@ class ExperimentTrial:
         measures["delay_ms"] = float(age_ms.mean()) if len(age_ms) else 0.0
         return measures
 
-    def _measure_path(
-        self, part: SiteLog | AlignedRecords, from_s: float, until_s: float
-    ) -> tuple[Ints, Array, Array, float]:
-        """Returns the measured records of the slave between two times.
-
-        Returns:
-            The indices of the records; positions, m, and velocities, m/s, of the end effector,
-            shape (K, 2) or (K, 3); and the rate of these samples, 1/s.
-        """
-        rows = np.flatnonzero((part.t_s >= from_s) & (part.t_s <= until_s))[::RECORD_STEP]
-        positions = self._locate_end_effector(part.q[rows]).position
-        rate_hz = part.rate_hz / RECORD_STEP
-        return rows, positions, np.gradient(positions, 1.0 / rate_hz, axis=0), rate_hz
+    def _sample_motion(
+        self, records: SiteLog | AlignedRecords, start_s: float, end_s: float
+    ) -> _MotionSamples:
+        """Returns the motion of the slave's end effector between two times."""
+        is_between = (records.t_s >= start_s) & (records.t_s <= end_s)
+        indices = np.flatnonzero(is_between)[::RECORD_STEP]
+        positions_m = self._place_end_effector(records.q[indices]).position
+        rate_hz = records.rate_hz / RECORD_STEP
+        return _MotionSamples(
+            indices=indices,
+            t_s=records.t_s[indices],
+            positions_m=positions_m,
+            velocities_m_s=np.gradient(positions_m, 1.0 / rate_hz, axis=0),
+            rate_hz=rate_hz,
+        )
 
     def _measure_pair(
         self, aligned: Mapping[str, AlignedRecords], forces: Sequence[Array], ended_s: float
     ) -> dict[str, float]:
         """Returns the measures of two users, as if each pushed at the slave's end effector."""
-        slave = aligned[self.slave]
-        rows, _, velocities, rate_hz = self._measure_path(slave, 0.0, ended_s)
-        t_s = slave.t_s[rows]
-
-        def interpolate(user: str, force: Array) -> Array:
+        motion = self._sample_motion(aligned[self.slave], 0.0, ended_s)
+        interpolated: list[Array] = []
+        for user, force in zip(self.protocol.users, forces, strict=True):
+            # The times of the user's records differ from those of the slave's records.
             force_t_s = aligned[user].t_s[: len(force)]
-            return np.column_stack([np.interp(t_s, force_t_s, axis) for axis in force.T])
-
-        first, second = map(interpolate, self.protocol.users, forces)
-        measures = measure_pair(first, second, velocities, rate_hz)._asdict()
+            columns = [np.interp(motion.t_s, force_t_s, component) for component in force.T]
+            interpolated.append(np.column_stack(columns))
+        first, second = interpolated
+        pair = measure_pair(first, second, motion.velocities_m_s, motion.rate_hz)
+        measures = pair._asdict()
         return {name: value for name, value in measures.items() if value is not None}
 
     def _measure_motion(self, log: Log, ended_s: float) -> dict[str, float]:
         """Returns the measures of the slave's motion after the target has appeared."""
         goal = self.make_goal()
-        part = log[self.slave]
-        rows, positions, velocities, rate_hz = self._measure_path(part, goal.appears_s, ended_s)
-        t_s = part.t_s[rows]
-        speed = np.linalg.norm(velocities, axis=1)
-        targets = np.array([goal.find_target_m(t) for t in t_s])
-        errors_m = np.linalg.norm(positions - targets, axis=1)
-        force_n = 0.0 * t_s
+        records = log[self.slave]
+        motion = self._sample_motion(records, goal.appears_s, ended_s)
+        speed = np.linalg.norm(motion.velocities_m_s, axis=1)
+        is_moving = speed > 0.05 * speed.max()
+        targets_m = np.array([goal.find_target_m(t_s) for t_s in motion.t_s])
+        errors_m = np.linalg.norm(motion.positions_m - targets_m, axis=1)
+        force_n = 0.0 * motion.t_s
         if goal.force_n:
-            force_n = self._find_forces_n(part.q[rows], part.tau_x[rows])
+            q = records.q[motion.indices]
+            tau_x = records.tau_x[motion.indices]
+            force_n = self._find_forces_n(q, tau_x)
         measures = {
             "completion_s": ended_s - goal.appears_s,
-            "movement_s": movement_time_s(speed, rate_hz) or 0.0,
-            "reaction_s": float(np.argmax(speed > 0.05 * speed.max())) / rate_hz,
+            "movement_s": movement_time_s(speed, motion.rate_hz) or 0.0,
+            "reaction_s": float(np.argmax(is_moving)) / motion.rate_hz,
             "error_end_mm": 1e3 * float(errors_m[-1]),
             "error_rms_mm": 1e3 * float(np.sqrt(np.mean(errors_m**2))),
-            "path_m": path_length_m(positions),
+            "path_m": path_length_m(motion.positions_m),
         }
-        smoothness = sparc(speed, rate_hz)
+        smoothness = sparc(speed, motion.rate_hz)
         if smoothness is not None:
             measures["sparc"] = smoothness
-        measures |= goal.measure(t_s - goal.appears_s, positions, force_n)
-        points = {"start": goal.start_m, "target": targets[-1], "end": positions[-1]}
+        after_s = motion.t_s - goal.appears_s
+        measures |= goal.measure(after_s, motion.positions_m, force_n)
+        end_m = motion.positions_m[-1]
+        points = {"start": goal.start_m, "target": targets_m[-1], "end": end_m}
         for name, point in points.items():
+            # The end effector of a planar arm has no z.
             for axis, coordinate_m in zip("xyz", point, strict=False):
                 measures[f"{name}_{axis}_m"] = float(coordinate_m)
         return measures
@@ -316,30 +364,37 @@ class SyntheticTrial(ExperimentTrial):
     people = False
 
     def _make_players(self, scenario: Scenario) -> dict[str, HandPlayer]:
-        """Returns the synthetic participants of the trial, by the sites that they hold."""
-        players = dict[str, HandPlayer]()
-        for user, name in zip(self.protocol.users, self.planned.group, strict=True):
-            hand = scenario.sites[user].find_live_hand(is_open=True)
-            assert hand is not None  # `plan_experiment` has checked it
+        """Returns the synthetic participants of the trial, by their sites."""
+        players: dict[str, HandPlayer] = {}
+        pairs = zip(self.protocol.users, self.planned.group, strict=True)
+        for user_index, (site, name) in enumerate(pairs):
+            hand = scenario.sites[site].find_live_hand(is_open=True)
+            # `plan_experiment` has checked that the scenario has the hands of all users.
+            assert hand is not None
             hand_site = HandSite(
-                scenario=scenario, name=user, spec=hand, rate_hz=HAND_HZ, delay_s=HAND_DELAY_S
+                scenario=scenario, name=site, spec=hand, rate_hz=HAND_HZ, delay_s=HAND_DELAY_S
             )
-            digest = hashlib.sha256(f"{self.protocol.seed}/{name}".encode()).digest()
-            participant_seed = int.from_bytes(digest[:4], "big")
             participant = SyntheticParticipant(
                 facts=hand_site.describe(),
-                model=self.protocol.model.draw(participant_seed),
+                model=self._draw_model(name),
                 goal=self.make_goal(),
                 slave=(self.slave, self.arm, self.find_force_n),
                 before=self.planned.before,
                 seed=self.planned.seed,
-                user=len(players),
+                user=user_index,
             )
-            players[user] = HandPlayer(hand_site, participant)
+            players[site] = HandPlayer(hand_site, participant)
         return players
 
+    def _draw_model(self, participant: str) -> ParticipantModel:
+        """Returns the parameters of a participant, which are the same in every trial."""
+        text = f"{self.protocol.seed}/{participant}"
+        digest = hashlib.sha256(text.encode()).digest()
+        participant_seed = int.from_bytes(digest[:4], "big")
+        return self.protocol.model.draw(participant_seed)
+
     def find_end_s(self) -> float:
-        """Runs the trial, compiled, until it ends; returns its end, s since the epoch."""
+        """Runs the trial, compiled, until it ends; returns its end in s since the epoch."""
         scenario = self.scenario
         judge = TrialJudge(self)
         slave = self.slave
@@ -348,13 +403,15 @@ class SyntheticTrial(ExperimentTrial):
         run.plan([scenario.ticks(name) for name in scenario.names])
         slave_index = scenario.names.index(slave)
         columns = scenario.layout(slave).columns()
-        for piece in range(math.ceil(self.longest_s * HAND_HZ)):
-            run.step_to((piece + 1) * NS_PER_S // HAND_HZ)
+        # The run is judged after each period of the hands.
+        for period in range(math.ceil(self.longest_s * HAND_HZ)):
+            period_end_ns = (period + 1) * NS_PER_S // HAND_HZ
+            run.step_to(period_end_ns)
             t_ns, rows = run.pop_records()[slave_index]
             times_s = (t_ns / NS_PER_S).tolist()
-            angles = rows[:, columns["q"]].tolist()
+            positions = rows[:, columns["q"]].tolist()
             torques = rows[:, columns["tau_x"]].tolist()
-            for t_s, q, tau_x in zip(times_s, angles, torques, strict=True):
+            for t_s, q, tau_x in zip(times_s, positions, torques, strict=True):
                 judge.accept(t_s, q, tau_x)
             if judge.outcome is not None:
                 return judge.outcome.ended_s
@@ -364,8 +421,10 @@ class SyntheticTrial(ExperimentTrial):
 
     def write(self, path: Path) -> TrialEntry:
         """Runs the trial into its log, and returns its result."""
-        scenario = replace(self.scenario, duration_s=self.find_end_s() + REST_S)
-        hands = {name: player.track for name, player in self._make_players(scenario).items()}
+        duration_s = self.find_end_s() + REST_S
+        scenario = replace(self.scenario, duration_s=duration_s)
+        players = self._make_players(scenario)
+        hands = {site: player.track for site, player in players.items()}
         record_virtual(scenario, path, force=True, views_hz=0.0, hands=hands)
         return self.settle(path)
 
