@@ -1,14 +1,15 @@
-"""Mass, damping and stiffness of the hand at an arm that sines move, from a log.
+"""Identify mass, damping and stiffness of a person's hand from the log of a run.
 
-Somebody holds the arm of a site while an operator of kind `multisine`, at any site, moves it.
-The force of the hand and the position follow the sines; the person's own movements do not. At
-the frequencies of the sines
+A person holds the arm of a site while an operator of kind `multisine`, at any site, moves it
+with sines. The force F of the hand on the arm and the position X of the end effector contain
+responses to the sines. At the angular frequency w of a sine these responses satisfy
 
     F(j w) = -(M (j w)^2 + B j w + K) X(j w)
 
-so that means over segments of a run give the same M, B and K whatever else happens, as with an
-instrument in the sense of system identification. Confidence intervals come from the jackknife
-over segments.
+with the mass M, the damping B and the stiffness K of the hand. The person's own movements do
+not follow the sines, and their part vanishes in the mean over segments of the run: the sines
+serve as an instrument, in the sense of system identification. M, B and K are fitted by weighted
+least squares. Their confidence intervals come from the jackknife over segments.
 
 Sources:
     - Stiffness along both axes at once: E. J. Perreault, R. F. Kirsch, A. M. Acosta,
@@ -19,7 +20,8 @@ Sources:
     - B. Efron, "The jackknife, the bootstrap and other resampling plans" (1982).
 
 Invariant:
-    - Force is that of the hand ON the arm, N, without the sines if they act at the same site.
+    - The force is that of the hand ON the arm, in N. Sines that act at the same site are not
+      part of it.
 """
 
 import json
@@ -47,14 +49,16 @@ from ..scenario.operators.kernel_operators import Multisine
 from ..theory.characteristic_roots import Complex
 from ..theory.port_passivity import HandMatrices
 
-LEAST_SEGMENTS = 5
-"""Number of segments that an interval needs."""
-LEAST_KNOWN = 0.98
-"""Share of its records that a segment needs."""
-NEIGHBOURS = 1.0 / 6.0
+MIN_SEGMENTS = 5
+"""Smallest number of segments for confidence intervals."""
+MIN_KNOWN_SHARE = 0.98
+"""Smallest share of a segment's records that must be in the log."""
+NEIGHBOUR_CORRELATION = 1.0 / 6.0
 """Correlation of white noise in two segments with Hann's window that overlap by half."""
-FARTHEST_CONDITION = 1e3
-"""Largest condition number of the motions, so that the axes can be distinguished."""
+MAX_CONDITION = 1e3
+"""Largest condition number of the motions with which the axes can be distinguished."""
+_TINY = 1e-300
+"""Smallest divisor, so that 0 / 0 gives 0."""
 KEYS = {"mass_kg": "M", "damping_n_s_m": "B", "stiffness_n_m": "K"}
 """The matrix of each key in JSON."""
 UNITS = {"M": "kg", "B": "N s/m", "K": "N/m"}
@@ -64,11 +68,11 @@ class SineResponse(NamedTuple):
     """The response at one frequency.
 
     Attributes:
-        hz: the frequency, Hz.
-        motion_mm: amplitude of the motion over all axes, mm.
-        force_n: amplitude of the force over all axes, N.
-        coherence: coherence of motion and of force with the sines, the smaller of the two; 1 if
-            all segments are equal.
+        hz: the frequency, in Hz.
+        motion_mm: amplitude of the motion over all axes, in mm.
+        force_n: amplitude of the force over all axes, in N.
+        coherence: coherence with the sines, of the motion or the force, whichever is smaller; 1
+            if all segments are equal.
         unexplained: share of the force that M, B and K do not explain.
     """
 
@@ -85,11 +89,13 @@ class HandImpedance(Result):
 
     Attributes:
         site: site of the held arm.
-        M, B, K: mass, kg, damping, N s/m, and stiffness, N/m: force along the row's axis by
-            motion along the column's, shape (n, n).
+        M: mass in kg, shape (n, n): force along the row's axis for an acceleration along the
+            column's axis.
+        B: damping in N s/m, likewise for a velocity.
+        K: stiffness in N/m, likewise for a displacement.
         halves: half the width of the 95 % intervals of "M", "B" and "K", shape (n, n).
         segments: number of segments.
-        segment_s: duration of a segment, s.
+        segment_s: duration of a segment, in s.
         responses: the responses by rising frequency.
     """
 
@@ -104,14 +110,16 @@ class HandImpedance(Result):
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, which `trilat linear --operators` reads."""
-        matrices = {name: getattr(self, letter).tolist() for name, letter in KEYS.items()}
-        halves = {f"{name}_half": self.halves[letter].tolist() for name, letter in KEYS.items()}
         return {
             "site": self.site,
             "segments": self.segments,
             "segment_s": self.segment_s,
-            **matrices,
-            **halves,
+            "mass_kg": self.M.tolist(),
+            "damping_n_s_m": self.B.tolist(),
+            "stiffness_n_m": self.K.tolist(),
+            "mass_kg_half": self.halves["M"].tolist(),
+            "damping_n_s_m_half": self.halves["B"].tolist(),
+            "stiffness_n_m_half": self.halves["K"].tolist(),
             "hand": self.to_hand(),
             "sines": self.to_rows(),
         }
@@ -121,52 +129,58 @@ class HandImpedance(Result):
         return [response._asdict() for response in self.responses]
 
     def to_hand(self) -> dict[str, Any]:
-        """Returns the nearest operator of a scenario, `[[sites.m1.hands]]`, without mass."""
-
-        def round_diagonal(matrix: Array) -> list[float]:
-            return [max(0.0, float(f"{value:.4g}")) for value in np.diag(matrix)]
-
+        """Returns the most similar operator of a scenario, which has no mass."""
         return {
             "kind": "tip_spring",
-            "stiffness_n_m": round_diagonal(self.K),
-            "damping_n_s_m": round_diagonal(self.B),
+            "stiffness_n_m": _round_diagonal(self.K),
+            "damping_n_s_m": _round_diagonal(self.B),
         }
 
     def blocks(self) -> Iterator[Block]:
         """Yields the matrices with their intervals, the responses, and the nearest operator."""
-        yield (
-            f"hand at {self.site}: {count_nouns(self.segments, 'segment')} of "
-            f"{self.segment_s:g} s, intervals of 95 %"
-        )
+        segments = count_nouns(self.segments, "segment")
+        yield f"hand at {self.site}: {segments} of {self.segment_s:g} s, intervals of 95 %"
+        yield self._tabulate_matrices()
+        sine_rows = [_format_response(response) for response in self.responses]
+        heads = ("sine", "motion", "force", "coherence", "unexplained")
+        yield TextTable(heads, sine_rows, "r", ("Hz", "mm", "N"))
+        settings = [f"{key} = {json.dumps(value)}" for key, value in self.to_hand().items()]
+        hand = ", ".join(settings)
+        yield f"in a scenario, without its mass: hands = [{{ {hand} }}]"
+
+    def _tabulate_matrices(self) -> TextTable:
+        """Returns the table of M, B and K with their intervals, a column for each entry."""
         axes = "xyz"[: len(self.K)]
         entries = list(product(range(len(axes)), repeat=2))
-        rows = []
+        heads = [axes[row] + axes[column] for row, column in entries]
+        rows: list[tuple[str, ...]] = []
         for letter, unit in UNITS.items():
             matrix = getattr(self, letter)
             half = self.halves[letter]
             cells = [f"{matrix[entry]:.4g} +- {half[entry]:.2g}" for entry in entries]
             rows.append((f"{letter}, {unit}", *cells))
-        yield TextTable(("", *(axes[i] + axes[j] for i, j in entries)), rows, align="lr")
-        sines = [tuple(f"{x:.3g}" for x in response) for response in self.responses]
-        yield TextTable(
-            ("sine", "motion", "force", "coherence", "unexplained"),
-            sines,
-            "r",
-            ("Hz", "mm", "N"),
-        )
-        hand = ", ".join(
-            f"{key} = {json.dumps(value)}" for key, value in self.to_hand().items()
-        )
-        yield f"in a scenario, without its mass: hands = [{{ {hand} }}]"
+        return TextTable(("", *heads), rows, align="lr")
+
+
+def _format_response(response: SineResponse) -> tuple[str, ...]:
+    """Returns the numbers of a response with three digits."""
+    return tuple(f"{value:.3g}" for value in response)
+
+
+def _round_diagonal(matrix: Array) -> list[float]:
+    """Returns the diagonal of a matrix with four digits, and 0 for negative entries."""
+    return [max(0.0, float(f"{value:.4g}")) for value in np.diag(matrix)]
 
 
 def identify_hand(log: Log | str | Path, site: str = "m1") -> HandImpedance:
-    """Returns mass, damping and stiffness of the hand at an arm.
-
-    The command is `trilat identify hand`.
+    """Returns mass, damping and stiffness of the hand at an arm, as `trilat identify hand`.
 
     >>> hand = tn.identify_hand("run.mcap", "m1")  # doctest: +SKIP
     >>> hand.K.diagonal(), hand.halves["K"].diagonal()  # doctest: +SKIP
+
+    Args:
+        log: the log or its path.
+        site: site of the held arm.
 
     Raises:
         UsageError: there is no such site or no sine, the run is too short, or the motion has
@@ -179,29 +193,26 @@ def identify_hand(log: Log | str | Path, site: str = "m1") -> HandImpedance:
     records = align_records(log)[site]
     force, position = _compute_hand_force(records, scenario)
     spacing_hz = np.diff(np.concatenate([[0.0], sines.hz]))
-    # two periods of the smallest spacing, so that the window separates the sines
+    # Two periods of the smallest spacing, so that the window separates the sines.
     segment_s = float(np.round(2.0 / spacing_hz.min(), 9))
-    columns = np.hstack((force, position))[records.t_s < sines.end_s]
+    signals = np.hstack((force, position))[records.t_s < sines.end_s]
     phasors = _compute_phasors(
         records=records,
-        columns=columns,
+        signals=signals,
         hz=sines.hz,
         start_s=sines.start_s,
         segment_s=segment_s,
     )
-    if len(phasors) < LEAST_SEGMENTS:
-        needed_s = sines.start_s + (0.5 * LEAST_SEGMENTS + 1.0) * segment_s
+    if len(phasors) < MIN_SEGMENTS:
+        segments = count_nouns(len(phasors), "whole segment")
+        needed_s = sines.start_s + (0.5 * MIN_SEGMENTS + 1.0) * segment_s
         raise UsageError(
-            f"{site}: {count_nouns(len(phasors), 'whole segment')} of {segment_s:g} s while "
-            f"the sines act, and intervals need {LEAST_SEGMENTS}: "
-            f"a run of at least {needed_s:g} s"
+            f"{site}: {segments} of {segment_s:g} s while the sines act, and intervals need "
+            f"{MIN_SEGMENTS}: a run of at least {needed_s:g} s"
         )
-    F, X = np.split(np.array(phasors), [force.shape[1]], axis=2)
+    axis_count = force.shape[1]
+    F, X = np.split(np.array(phasors), [axis_count], axis=2)
     fit = _fit_with_intervals(site, F, X, 2.0 * np.pi * sines.hz)
-    coherence = np.minimum(_compute_coherence(F), _compute_coherence(X))
-    motion_mm = 1e3 * np.linalg.norm(X.mean(axis=0), axis=1)
-    force_n = np.linalg.norm(F.mean(axis=0), axis=1)
-    rows = zip(sines.hz, motion_mm, force_n, coherence, fit.unexplained, strict=True)
     M, B, K = fit.matrices
     return HandImpedance(
         site=site,
@@ -211,17 +222,44 @@ def identify_hand(log: Log | str | Path, site: str = "m1") -> HandImpedance:
         halves=dict(zip(UNITS, fit.halves, strict=True)),
         segments=len(phasors),
         segment_s=segment_s,
-        responses=tuple(SineResponse(*map(float, row)) for row in rows),
+        responses=_list_responses(F, X, sines.hz, fit.unexplained),
     )
+
+
+def _list_responses(
+    F: Complex, X: Complex, hz: Array, unexplained: Array
+) -> tuple[SineResponse, ...]:
+    """Returns the response at each frequency.
+
+    Args:
+        F: phasors of the force, shape (segments, F, n), in N.
+        X: phasors of the position, shape (segments, F, n), in m.
+        hz: the frequencies, shape (F,), in Hz.
+        unexplained: share of the force that the fit does not explain, shape (F,).
+    """
+    coherence = np.minimum(_compute_coherence(F), _compute_coherence(X))
+    motion_mm = 1e3 * np.linalg.norm(X.mean(axis=0), axis=1)
+    force_n = np.linalg.norm(F.mean(axis=0), axis=1)
+    responses: list[SineResponse] = []
+    for index, frequency_hz in enumerate(hz):
+        response = SineResponse(
+            hz=float(frequency_hz),
+            motion_mm=float(motion_mm[index]),
+            force_n=float(force_n[index]),
+            coherence=float(coherence[index]),
+            unexplained=float(unexplained[index]),
+        )
+        responses.append(response)
+    return tuple(responses)
 
 
 class _Sines(NamedTuple):
     """The sines of a scenario.
 
     Attributes:
-        hz: all frequencies, rising, Hz.
-        start_s: time from which all sines act, s.
-        end_s: time until which all sines act, s.
+        hz: all frequencies, rising, in Hz.
+        start_s: time from which all sines act, in s.
+        end_s: time until which all sines act, in s.
     """
 
     hz: Array
@@ -247,26 +285,28 @@ def _find_sines(scenario: Scenario) -> _Sines:
 
 
 def _compute_hand_force(records: AlignedRecords, scenario: Scenario) -> tuple[Array, Array]:
-    """Returns the force of the hand ON the end effector, N, and its position, m.
+    """Returns the force of the hand ON the end effector, and the end effector's position.
 
-    Both have the shape (K, n).
+    Both have the shape (K, n) and the units N and m.
     """
     split = split_torque(records, scenario)
     scripted_torque = np.zeros_like(records.q)
     for hand in scenario.sites[records.site].hands:
         source = hand.actor
         if source.kind in SCRIPTED_KINDS:
+            first_jacobian = split.end_effector.J[0]
             scripted_torque += compute_operator_script(
-                source, records.nominal_s, split.end_effector.J[0]
+                source, records.nominal_s, first_jacobian
             )
-    force = split.end_effector.find_force(split.operator - scripted_torque)
+    hand_torque = split.operator - scripted_torque
+    force = split.end_effector.find_force(hand_torque)
     return force, split.end_effector.position
 
 
 def _compute_phasors(
-    records: AlignedRecords, columns: Array, hz: Array, start_s: float, segment_s: float
+    records: AlignedRecords, signals: Array, hz: Array, start_s: float, segment_s: float
 ) -> list[Complex]:
-    """Returns the phasors of columns in each segment, shape (F, columns).
+    """Returns the phasors of signals in each segment, shape (F, signals).
 
     Segments have Hann's window and overlap by half. The spectrum of the window is zero at the
     other sines, which are two or more multiples of 1 / segment_s away. It falls with the third
@@ -275,31 +315,39 @@ def _compute_phasors(
 
     Args:
         records: the records.
-        columns: signals, shape (K, columns).
-        hz: the frequencies, shape (F,), Hz.
-        start_s: time from which all sines act, s.
-        segment_s: duration of a segment, s.
+        signals: the signals, shape (K, signals).
+        hz: the frequencies, shape (F,), in Hz.
+        start_s: time from which all sines act, in s.
+        segment_s: duration of a segment, in s.
     """
-    count = round(segment_s * records.rate_hz)
+    size = round(segment_s * records.rate_hz)
     half_s = 0.5 * segment_s
     first = round((start_s + half_s) * records.rate_hz) - records.first
-    window = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(count) / count)
-    phasors = []
-    for begin in range(max(first, 0), len(columns) - count + 1, count // 2):
-        rows = slice(begin, begin + count)
-        if records.known[rows].mean() < LEAST_KNOWN:
+    window = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(size) / size)
+    window_sum = window.sum()
+    phasors: list[Complex] = []
+    for start in range(max(first, 0), len(signals) - size + 1, size // 2):
+        rows = slice(start, start + size)
+        if records.known[rows].mean() < MIN_KNOWN_SHARE:
             continue
+        segment = signals[rows]
         carriers = np.exp(-2j * np.pi * np.outer(hz, records.t_s[rows]))
-        centred = columns[rows] - window @ columns[rows] / window.sum()
-        phasors.append(2.0 / window.sum() * (carriers * window) @ centred)
+        mean = window @ segment / window_sum
+        phasors.append(2.0 / window_sum * (carriers * window) @ (segment - mean))
     return phasors
 
 
 def _compute_coherence(phasors: Complex) -> Array:
-    """Returns |mean|^2 / mean of |.|^2 over segments and all axes, shape (F,)."""
+    """Returns the coherence of phasors over segments and all axes, shape (F,).
+
+    For the phasor z of a segment the coherence is |mean of z|^2 / mean of |z|^2.
+
+    Args:
+        phasors: the phasors, shape (segments, F, n).
+    """
     power = (np.abs(phasors) ** 2).mean(axis=0).sum(axis=1)
-    mean_power = (np.abs(phasors.mean(axis=0)) ** 2).sum(axis=1)
-    coherence: Array = mean_power / np.maximum(power, 1e-300)
+    power_of_mean = (np.abs(phasors.mean(axis=0)) ** 2).sum(axis=1)
+    coherence: Array = power_of_mean / np.maximum(power, _TINY)
     return coherence
 
 
@@ -322,9 +370,9 @@ def _fit_with_intervals(site: str, F: Complex, X: Complex, w: Array) -> _HandFit
 
     Args:
         site: name of the site, for the error message.
-        F: phasors of the force, shape (segments, F, n), N.
-        X: phasors of the position, shape (segments, F, n), m.
-        w: the frequencies, shape (F,), rad/s.
+        F: phasors of the force, shape (segments, F, n), in N.
+        X: phasors of the position, shape (segments, F, n), in m.
+        w: the angular frequencies, shape (F,), in rad/s.
 
     Raises:
         UsageError: the motions do not distinguish the axes, or mass, damping and stiffness.
@@ -332,11 +380,7 @@ def _fit_with_intervals(site: str, F: Complex, X: Complex, w: Array) -> _HandFit
     count, _, axes = X.shape
     s = 1j * w[:, np.newaxis]
     motions = -np.concatenate((s**2 * X, s * X, X), axis=2)
-    design = _stack_real(motions.mean(axis=0))
-    normalised = design / np.maximum(np.linalg.norm(design, axis=0), 1e-300)
-    singular_values = np.linalg.svd(normalised, compute_uv=False)
-    is_singular = singular_values[-1] * FARTHEST_CONDITION < singular_values[0]
-    if len(design) < design.shape[1] or is_singular:
+    if not _can_distinguish(motions):
         raise UsageError(
             f"{site}: its end effector moved along fewer than {count_nouns(axes, 'axis')}, "
             "or at too few frequencies to distinguish mass, damping and stiffness: "
@@ -345,23 +389,42 @@ def _fit_with_intervals(site: str, F: Complex, X: Complex, w: Array) -> _HandFit
     all_segments = np.arange(count)
     forces = F.transpose(2, 0, 1)
     estimate = np.array([_fit(force, motions, all_segments) for force in forces])
-    # the jackknife leaves out one segment at a time
+
+    # The jackknife leaves out one segment at a time.
     partial_estimates = []
-    for n in range(count):
-        others = all_segments[all_segments != n]
+    for segment in range(count):
+        others = all_segments[all_segments != segment]
         partial_estimates.append([_fit(force, motions, others) for force in forces])
     pseudo_values = count * estimate - (count - 1) * np.array(partial_estimates)
-    # neighbouring segments overlap and are correlated, which widens the interval
-    inflation = 1.0 + 2.0 * NEIGHBOURS * (count - 1) / count
+    # Neighbouring segments overlap and are correlated, which widens the interval.
+    inflation = 1.0 + 2.0 * NEIGHBOUR_CORRELATION * (count - 1) / count
     deviation = pseudo_values.std(axis=0, ddof=1)
-    halves = stdtrit(count - 1, 0.975) * deviation * np.sqrt(inflation / count)
-    force = F.mean(axis=0)
-    residual = np.linalg.norm(force - motions.mean(axis=0) @ estimate.T, axis=1)
+    student_quantile = stdtrit(count - 1, 0.975)
+    halves = student_quantile * deviation * np.sqrt(inflation / count)
+
+    mean_force = F.mean(axis=0)
+    fitted_force = motions.mean(axis=0) @ estimate.T
+    residual = np.linalg.norm(mean_force - fitted_force, axis=1)
+    force_size = np.linalg.norm(mean_force, axis=1)
     return _HandFit(
         matrices=estimate.reshape(axes, 3, axes).transpose(1, 0, 2),
         halves=halves.reshape(axes, 3, axes).transpose(1, 0, 2),
-        unexplained=residual / np.maximum(np.linalg.norm(force, axis=1), 1e-300),
+        unexplained=residual / np.maximum(force_size, _TINY),
     )
+
+
+def _can_distinguish(motions: Complex) -> bool:
+    """Returns whether the motions determine mass, damping and stiffness along all axes.
+
+    Args:
+        motions: phasors of -(acceleration, velocity, position), shape (segments, F, 3 n).
+    """
+    design = _stack_real(motions.mean(axis=0))
+    column_sizes = np.linalg.norm(design, axis=0)
+    normalised = design / np.maximum(column_sizes, _TINY)
+    singular_values = np.linalg.svd(normalised, compute_uv=False)
+    is_singular = singular_values[-1] * MAX_CONDITION < singular_values[0]
+    return len(design) >= design.shape[1] and not is_singular
 
 
 def _stack_real(phasors: Complex) -> Array:
@@ -372,9 +435,9 @@ def _stack_real(phasors: Complex) -> Array:
 def _fit(force: Complex, motions: Complex, chosen: NDArray[np.int64]) -> Array:
     """Returns the rows of M, B and K for the force along one axis, shape (3 n,).
 
-    It is a weighted least-squares fit. The mean error of each frequency is divided by its
-    spread over the segments under the same M, B and K: motion is noisy as well, and the hand's
-    own movements move the arm.
+    The fit is by weighted least squares. The mean error at each frequency is divided by the
+    spread of the errors over the segments, under the same M, B and K. The spread depends on M,
+    B and K because the motion is noisy as well: the person's own movements move the arm.
 
     Args:
         force: phasors of the force, shape (segments, F).
@@ -383,16 +446,20 @@ def _fit(force: Complex, motions: Complex, chosen: NDArray[np.int64]) -> Array:
     """
     mean_motion = motions[chosen].mean(axis=0)
     mean_force = force[chosen].mean(axis=0)
+    smallest_spread = 1e-6 * np.abs(mean_force).max()
 
-    def compute_residuals(numbers: Array) -> Array:
-        errors = force - motions @ numbers
-        spread = np.maximum(errors.std(axis=0), 1e-6 * np.abs(mean_force).max())
-        return _stack_real((mean_force - mean_motion @ numbers) / spread)
+    def compute_residuals(parameters: Array) -> Array:
+        """Returns the weighted errors for rows of M, B and K."""
+        errors = force - motions @ parameters
+        spread = np.maximum(errors.std(axis=0), smallest_spread)
+        mean_error = mean_force - mean_motion @ parameters
+        return _stack_real(mean_error / spread)
 
+    # Ordinary least squares give the first guess.
     design = _stack_real(mean_motion)
     start = np.linalg.lstsq(design, _stack_real(mean_force), rcond=None)[0]
-    numbers: Array = least_squares(compute_residuals, start, x_scale="jac").x
-    return numbers
+    parameters: Array = least_squares(compute_residuals, start, x_scale="jac").x
+    return parameters
 
 
 def read_hands(files: Sequence[str | Path]) -> list[HandMatrices]:
@@ -414,7 +481,8 @@ def _read_hand(file: Path) -> HandMatrices:
         if not np.isfinite([M, B, K]).all():
             raise ValueError("its numbers are not finite")
     except (OSError, ValueError, KeyError, TypeError) as error:
-        problem = f"{type(error).__name__} {error}" if isinstance(error, KeyError) else error
+        # The text of a KeyError is only the key.
+        problem = f"KeyError {error}" if isinstance(error, KeyError) else str(error)
         raise UsageError(
             f"{file}: contains no hand of `trilat identify hand --json`: {problem}"
         ) from None
