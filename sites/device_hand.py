@@ -1,22 +1,24 @@
-"""A device that leads the arm of a site by its motion, and renders the arm's reaction force.
+"""A device in a person's hand, such as a haptic device, that leads the arm of a site.
+
+A person presses a button of the device, the clutch, and moves the device: the target of the arm
+moves by the same steps. The device renders the reaction force of the arm to the person.
 
 Invariant:
-    - Only changes of the device's position move the target, and only while its clutch is
+    - Only changes of the device's position move the target, and only while the clutch is
       pressed. A state that is not finite, a jump, and a device that reconnects move nothing.
     - The target stays within the arm's reach, however often the clutch is pressed. A motion of
-      the device out of that reach is lost; a motion back into it acts at once.
-    - After a release, also one by the device's silence, the arm is held again only when the
-      clutch is pressed anew.
-    - The force is that of the newest record, rotated, scaled and limited as the scenario says.
-      It is zero while the clutch is open, or the record is old.
-    - The hand has no heartbeat but the device's states: if the loop hangs, the hand is silent
-      and the site releases the arm.
+      the device out of this reach is lost; a motion back into the reach acts at once.
+    - After a release, or after a silence of the device, the arm is held again only when the
+      clutch is pressed again.
+    - The rendered force is that of the newest record, rotated, scaled and limited as the
+      scenario says. It is zero while the clutch is open or the record is old.
+    - The states of the device are the only heartbeat of the hand. If the loop hangs, the hand
+      is silent and the site releases the arm.
 """
 
 import math
-import operator
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -29,13 +31,19 @@ from trilat_net.scenario.operators.kernel_operators import DeviceSettings
 from .devices import Device, DeviceState, Vector
 
 RETRY_NS = 1_000_000_000
+"""Time between two attempts to connect to the device, in ns."""
 MIN_STATE_GAP_S = 0.005
-MAX_STATE_GAP_S = 0.05
-"""Largest and, above, smallest time between two states by which a jump is judged.
+"""Smallest time between two states by which a jump is judged, in s.
 
-The operating system may deliver states late, and several at once.
+The operating system may deliver several states at once.
+"""
+MAX_STATE_GAP_S = 0.05
+"""Largest time between two states by which a jump is judged, in s.
+
+The operating system may deliver states late.
 """
 TRIPS_KEPT = 60_000
+"""Number of round-trip times that are kept."""
 
 
 class DeviceHand:
@@ -52,7 +60,7 @@ class DeviceHand:
         states: the number of states that were read.
         jumps: the number of states that moved nothing because they jumped.
         unreadable: the number of states that moved nothing because they were not finite.
-        trips_ns: the times from a position of the device to the force that it has caused.
+        trips_ns: the times from a position of the device to the force caused by it, in ns.
     """
 
     def __init__(
@@ -68,22 +76,27 @@ class DeviceHand:
         self._settings = settings
         self._clock = clock
         self._reach = reach
+        # The axes of the arm in the coordinates of the device, a row per axis of the arm.
         self._axes = settings.rows(len(hand.pose))
         self.states = 0
         self.jumps = 0
         self.unreadable = 0
         self.trips_ns = deque[int](maxlen=TRIPS_KEPT)
+        # Number and time of each sent target whose force has not been received.
         self._sent = deque[tuple[int, int]](maxlen=TRIPS_KEPT)
         self._period_ns = 1_000_000_000 // device.rate_hz
         self._due_ns = 0
         self.release()
 
     def release(self) -> None:
-        """Releases the arm until the clutch is pressed anew."""
+        """Releases the arm until the clutch is pressed again."""
         self._hand.release()
+        # The target is empty while the arm is not held.
         self._target: list[float] = []
         self._position_m: Vector | None = None
+        # A clutch that is still pressed does not count as pressed again.
         self._was_pressed = True
+        # Time at which the clutch was closed; 0 while it is open.
         self._closed_ns = 0
         self._received_ns = self._clock.monotonic_ns()
         self._sent.clear()
@@ -95,8 +108,9 @@ class DeviceHand:
         """
         state = self._device.read()
         now_ns = self._clock.monotonic_ns()
+        # The device was silent, or this process was suspended.
         if now_ns - self._received_ns > SILENCE_NS:
-            self.release()  # the device was silent, or this process was suspended
+            self.release()
         self.states += 1
         if all(map(math.isfinite, (*state.position_m, *state.velocity_m_s))):
             self._follow(state, now_ns)
@@ -105,8 +119,9 @@ class DeviceHand:
         if self._target:
             number = self._hand.move(*self._target)
             self._sent.append((number, now_ns))
+        # By the end of the period, the site may have replied.
         self._due_ns = max(self._due_ns + self._period_ns, now_ns)
-        self._clock.sleep_until(self._due_ns)  # by then the site may have replied
+        self._clock.sleep_until(self._due_ns)
         self._device.render(self._compute_force())
         self._measure_trips()
 
@@ -128,7 +143,8 @@ class DeviceHand:
         elif not is_pressed:
             self._closed_ns = 0
         elif self._closed_ns and previous_m is not None:
-            step_m = list(map(operator.sub, state.position_m, previous_m))
+            positions = zip(state.position_m, previous_m, strict=True)
+            step_m = [new - previous for new, previous in positions]
             self._move_target(step_m, elapsed_s)
 
     def _move_target(self, step_m: list[float], elapsed_s: float) -> None:
@@ -138,41 +154,43 @@ class DeviceHand:
         if math.hypot(*step_m) > settings.jump_m_s * gap_s:
             self.jumps += 1
             return
-        target_steps = [
-            settings.scale * sum(map(operator.mul, axis, step_m)) for axis in self._axes
-        ]
-        target = list(map(operator.add, self._target, target_steps))
+        target: list[float] = []
+        for coordinate, axis in zip(self._target, self._axes, strict=True):
+            target.append(coordinate + settings.scale * _compute_product(axis, step_m))
         self._target = list(self._reach.find_nearest(target))
 
     def _compute_force(self) -> Vector:
-        """Returns the reaction force of the arm, N; it fades in when the clutch closes."""
+        """Returns the reaction force of the arm in the coordinates of the device, in N.
+
+        The force fades in when the clutch closes.
+        """
         if not (self._closed_ns and self._hand.fresh and self._hand.holds):
             return 0.0, 0.0, 0.0
         settings = self._settings
-        closed_share = min(1.0, (self._clock.monotonic_ns() - self._closed_ns) / GRIP_NS)
-        force = [
-            -settings.force_scale * closed_share * component for component in self._hand.force
-        ]
-        share = min(1.0, settings.force_limit_n / max(math.hypot(*force), 1e-9))
-        x, y, z = (
-            share * sum(map(operator.mul, force, column))
-            for column in zip(*self._axes, strict=True)
-        )
+        closed_ns = self._clock.monotonic_ns() - self._closed_ns
+        fade = min(1.0, closed_ns / GRIP_NS)
+        force = [-settings.force_scale * fade * component for component in self._hand.force]
+        limited_share = min(1.0, settings.force_limit_n / max(math.hypot(*force), 1e-9))
+        device_axes = zip(*self._axes, strict=True)
+        x, y, z = (limited_share * _compute_product(force, axis) for axis in device_axes)
         return x, y, z
 
     def _measure_trips(self) -> None:
-        number = self._hand.number
+        """Measures the round-trip times of the targets that the newest record has used."""
+        used_number = self._hand.number
         now_ns = self._clock.monotonic_ns()
-        while self._sent and self._sent[0][0] <= number:
-            _, sent_ns = self._sent.popleft()
+        while self._sent:
+            number, sent_ns = self._sent[0]
+            if number > used_number:
+                return
+            self._sent.popleft()
             self.trips_ns.append(now_ns - sent_ns)
 
     def describe(self) -> str:
         """Returns a line with the numbers of states and the round-trip times."""
-        counts = (
-            f"{count_nouns(self.states, 'state')} of the device, dropped "
-            f"{count_nouns(self.jumps, 'jump')}, {self.unreadable} unreadable"
-        )
+        states = count_nouns(self.states, "state")
+        jumps = count_nouns(self.jumps, "jump")
+        counts = f"{states} of the device, dropped {jumps}, {self.unreadable} unreadable"
         if not self.trips_ns:
             return counts
         p50, p99 = np.percentile(self.trips_ns, [50, 99]) / 1e6
@@ -181,7 +199,12 @@ class DeviceHand:
     def run(self, stopped: Callable[[], bool], say: Callable[[str], None]) -> None:
         """Leads the arm until the session ends or `stopped` returns True.
 
-        It connects to the device again after each loss, and prints each loss and each return.
+        After each loss of the device, the hand connects to it again. Each loss and each return
+        is printed.
+
+        Args:
+            stopped: returns True to end the call.
+            say: prints a line for the user.
         """
         is_present: bool | None = None
         while not (stopped() or self._hand.over):
@@ -199,3 +222,8 @@ class DeviceHand:
                     say(f"{problem}; the arm is let go, and the device is tried again")
                 is_present = False
                 self._clock.sleep_until(self._clock.monotonic_ns() + RETRY_NS)
+
+
+def _compute_product(first: Sequence[float], second: Sequence[float]) -> float:
+    """Returns the scalar product of two vectors."""
+    return sum(a * b for a, b in zip(first, second, strict=True))

@@ -1,11 +1,13 @@
-"""Devices in a person's hand: their position, velocity and buttons, and their force.
+"""Devices in a person's hand, which are read for their motion and may render a force.
+
+Each device has a file in this folder with a class that implements `Device`. To add a device,
+add its file: no list of devices needs a change.
 
 Invariant:
-    - A device is one class, which is found by its file in this folder; nothing else lists the
-      devices.
+    - The class of a device has the name of the file, without underscores.
     - All devices use the coordinates of the person who holds them: x to the right, y ahead, z
-      up; units m, m/s, N.
-    - Buttons are named "a", "b", "c" from the first on.
+      up. The units are m, m/s and N.
+    - Buttons are named "a", "b", "c" in their order.
 """
 
 from collections.abc import Mapping
@@ -25,9 +27,9 @@ class DeviceState(NamedTuple):
     True
 
     Attributes:
-        position_m: its position, m, in a frame with any origin: only changes are used.
-        velocity_m_s: its velocity, m/s.
-        buttons: whether each button is pressed, by its name.
+        position_m: the position, in m, in a frame with any origin: only changes are used.
+        velocity_m_s: the velocity, in m/s.
+        buttons: whether each button is pressed, by name.
     """
 
     position_m: Vector
@@ -38,7 +40,7 @@ class DeviceState(NamedTuple):
 class Device(Protocol):
     """A device that is read `rate_hz` times a second.
 
-    It is a context manager that is entered again after each loss of the connection.
+    A device is a context manager, which is entered again after each loss of the connection.
 
     >>> tn.session("play").lead("m1", MyDevice())  # doctest: +SKIP
     """
@@ -55,7 +57,7 @@ class Device(Protocol):
         """Returns the newest state; raises OSError if the device is silent or gone."""
 
     def render(self, force_n: Vector) -> None:
-        """Renders a force to the person who holds the device, N."""
+        """Renders a force in N to the person who holds the device."""
 
 
 def open_device(text: str) -> Device:
@@ -76,8 +78,7 @@ def open_device(text: str) -> Device:
         )
     module = import_module(f"{__name__}.{name}")
     class_name = name.replace("_", "")
-    device_class = next(
-        member for word, member in vars(module).items() if word.lower() == class_name
-    )
+    members = vars(module).items()
+    device_class = next(member for key, member in members if key.lower() == class_name)
     device: Device = device_class(address) if address else device_class()
     return device

@@ -1,12 +1,12 @@
-"""Haply's Inverse3, by the JSON messages of its service.
+"""The haptic device Inverse3 of Haply, by the JSON messages of the maker's service.
 
 The service replies to each message with one state, so this program sets the rate.
 
 Invariant:
-    - Each state is answered by one message with a force, also a zero force at rest, which keeps
-      the connection alive.
-    - A message that cannot be parsed becomes a state whose position is not finite; such a state
-      moves nothing.
+    - This program answers each state with one message, which contains a force. At rest the
+      force is zero; the message keeps the connection alive.
+    - A message that cannot be parsed becomes a state whose position is not finite, which moves
+      nothing.
 """
 
 import math
@@ -23,9 +23,9 @@ from trilat_net.net.host_names import check_hosts
 from . import DeviceState, Vector
 
 SILENCE_S = 0.15
-"""Silence after which the service is given up, before the site releases a silent hand."""
+"""Silence after which the connection is ended, in s: before the site releases a silent hand."""
 _NO_POSITION = (math.nan, math.nan, math.nan)
-_UNREADABLE = (
+_PARSE_ERRORS = (
     LookupError,
     TypeError,
     ValueError,
@@ -63,18 +63,19 @@ class HaplyInverse3:
         self._was_connected = False
 
     def __enter__(self) -> Self:
+        # The address is checked before the first connection only: later the service may be
+        # away for a while.
         if not self._was_connected:
-            # Only before the first connection: a known service may be away for a while.
             check_hosts([self._address])
         try:
-            self._socket = self._open.enter_context(
-                connect(self._address, open_timeout=2.0, **_CONNECT_OPTIONS)
-            )
+            connection = connect(self._address, open_timeout=2.0, **_CONNECT_OPTIONS)
+            self._socket = self._open.enter_context(connection)
         except (OSError, ValueError, WebSocketException) as error:
             raise ConnectionError(
                 f"no service of an Inverse3 at {self._address}: {error}"
             ) from None
         self._was_connected = True
+        # The first message also names this program to the service.
         self._configuration = {"session": {"configure": {"profile": {"name": "trilat-net"}}}}
         self._id = ""
         return self
@@ -86,42 +87,49 @@ class HaplyInverse3:
 
     def read(self) -> DeviceState:
         """Returns the next state that the service sends."""
-        assert self._socket is not None  # the context has been entered
+        assert self._socket is not None, "the context has been entered"
         try:
             message = msgspec.json.decode(self._socket.recv(SILENCE_S))
-            if not message.get("inverse3"):
-                raise ConnectionError(f"the service at {self._address} has no Inverse3")
-            self._id = str(message["inverse3"][0]["device_id"])
-            state = message["inverse3"][0]["state"]
-            grips = [
-                grip["state"].get("buttons", {})
-                for grip in message.get("wireless_verse_grip", [])
-            ]
-            buttons = {name: bool(pressed) for grip in grips for name, pressed in grip.items()}
-            return DeviceState(
-                _parse_vector(state["cursor_position"]),
-                _parse_vector(state["cursor_velocity"]),
-                buttons,
-            )
+            return self._parse_state(message)
         except TimeoutError:
             raise TimeoutError(f"the service at {self._address} is silent") from None
         except WebSocketException:
             raise ConnectionError(
                 f"the service at {self._address} has closed the connection"
             ) from None
-        except _UNREADABLE:
+        except _PARSE_ERRORS:
             return DeviceState(_NO_POSITION, _NO_POSITION, {})
 
+    def _parse_state(self, message: Any) -> DeviceState:
+        """Returns the state of the first Inverse3 in a message, with the buttons of all grips.
+
+        Raises:
+            ConnectionError: the service has no Inverse3.
+        """
+        if not message.get("inverse3"):
+            raise ConnectionError(f"the service at {self._address} has no Inverse3")
+        device = message["inverse3"][0]
+        self._id = str(device["device_id"])
+        state = device["state"]
+        buttons: dict[str, bool] = {}
+        for grip in message.get("wireless_verse_grip", []):
+            for name, is_pressed in grip["state"].get("buttons", {}).items():
+                buttons[name] = bool(is_pressed)
+        return DeviceState(
+            position_m=_parse_vector(state["cursor_position"]),
+            velocity_m_s=_parse_vector(state["cursor_velocity"]),
+            buttons=buttons,
+        )
+
     def render(self, force_n: Vector) -> None:
-        """Sends a force, N; the message also requests the next state."""
+        """Sends a force in N; the message also requests the next state."""
         if self._socket is None or not self._id:
             return
         force = {self._force_key: dict(zip("xyz", force_n, strict=True))}
         command = {"device_id": self._id, "commands": {"set_cursor_force": force}}
+        message = self._configuration | {"inverse3": [command]}
         try:
-            self._socket.send(
-                msgspec.json.encode(self._configuration | {"inverse3": [command]}), text=True
-            )
+            self._socket.send(msgspec.json.encode(message), text=True)
         except WebSocketException:
             raise ConnectionError(
                 f"the service at {self._address} has closed the connection"
@@ -130,4 +138,5 @@ class HaplyInverse3:
 
 
 def _parse_vector(point: dict[str, float]) -> Vector:
+    """Returns the coordinates of a point in a message."""
     return float(point["x"]), float(point["y"]), float(point["z"])

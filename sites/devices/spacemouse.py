@@ -1,6 +1,7 @@
-"""3Dconnexion's SpaceMouse, by the reports of Linux' hidraw.
+"""The SpaceMouse of 3Dconnexion, by the reports of Linux' hidraw.
 
-The device does not move: the deflection of its cap is a velocity, which is integrated here.
+The device has a cap that a person pushes and turns, and that springs back. The deflection of
+the cap stands for a velocity, from which this module integrates a position.
 
 Invariant:
     - A cap that reports nothing for `STILL_NS` is at rest, because a deflected cap reports all
@@ -18,9 +19,13 @@ from trilat_net.net.clock import Clock, SystemClock
 from . import DeviceState, Vector
 
 STILL_NS = 100_000_000
+"""Time without a report after which the cap is at rest, in ns."""
 SPEED_M_S = 0.2 / 350.0
-"""Velocity for each count of an axis, m/s; a fully deflected cap reports 350 counts."""
-_MAKER_IDS = ":0000256F:", ":0000046D:0000C62"
+"""Velocity for each count of an axis, in m/s; a fully deflected cap reports 350 counts."""
+_MAKER_IDS = (":0000256F:", ":0000046D:0000C62")
+"""Parts of the identities of SpaceMice: of 3Dconnexion, and of Logitech, the earlier maker."""
+_MOTION_REPORT = 1
+_BUTTON_REPORT = 3
 
 
 def find_spacemouse(devices: Path = Path("/sys/class/hidraw")) -> str:
@@ -30,7 +35,8 @@ def find_spacemouse(devices: Path = Path("/sys/class/hidraw")) -> str:
         FileNotFoundError: no SpaceMouse is connected.
     """
     for uevent in sorted(devices.glob("*/device/uevent")):
-        if any(maker in uevent.read_text(encoding="utf-8") for maker in _MAKER_IDS):
+        identity = uevent.read_text(encoding="utf-8")
+        if any(maker in identity for maker in _MAKER_IDS):
             return f"/dev/{uevent.parts[-3]}"
     raise FileNotFoundError("no SpaceMouse is connected")
 
@@ -57,7 +63,10 @@ class SpaceMouse:
         self._position_m: Vector = (0.0, 0.0, 0.0)
         self._velocity_m_s = self._position_m
         self._button_bits = 0
-        self._reported_ns = self._read_ns = self._clock.monotonic_ns()
+        now_ns = self._clock.monotonic_ns()
+        # Time of the last report, and time until which the velocity is integrated.
+        self._reported_ns = now_ns
+        self._read_ns = now_ns
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -74,14 +83,19 @@ class SpaceMouse:
         self._read_ns = now_ns
         x, y, z = self._position_m
         vx, vy, vz = self._velocity_m_s
-        self._position_m = x + elapsed_s * vx, y + elapsed_s * vy, z + elapsed_s * vz
+        self._position_m = (
+            x + elapsed_s * vx,
+            y + elapsed_s * vy,
+            z + elapsed_s * vz,
+        )
         buttons = {"a": bool(self._button_bits & 1), "b": bool(self._button_bits & 2)}
         return DeviceState(self._position_m, self._velocity_m_s, buttons)
 
     def _read_report(self, now_ns: int) -> bool:
         """Reads a report and stores its contents; returns False if there is no report.
 
-        Report 1 holds the deflections, report 3 the buttons.
+        Raises:
+            ConnectionError: the device is not connected any more.
         """
         try:
             report = os.read(self._file, 64)
@@ -89,11 +103,13 @@ class SpaceMouse:
             return False
         if not report:
             raise ConnectionError("the SpaceMouse is gone")
-        if report[0] == 1 and len(report) >= 7:
+        kind = report[0]
+        if kind == _MOTION_REPORT and len(report) >= 7:
+            # The device counts towards the right, towards the person, and down.
             right, near, down = struct.unpack_from("<3h", report, 1)
             self._velocity_m_s = (SPEED_M_S * right, -SPEED_M_S * near, -SPEED_M_S * down)
             self._reported_ns = now_ns
-        elif report[0] == 3 and len(report) >= 2:
+        elif kind == _BUTTON_REPORT and len(report) >= 2:
             self._button_bits = report[1]
         return True
 
