@@ -234,7 +234,7 @@ def test_log_that_ends_too_early_does_not_count(experiment: Experiment) -> None:
 def test_people_and_models_of_them_share_no_folder(experiment: Experiment) -> None:
     people = People(experiment)
     people.run(lambda watch, _: setattr(people, "ends", watch.trial.planned.number == 1))
-    with pytest.raises(UsageError, match="its trials are of people: go on with"):
+    with pytest.raises(UsageError, match="its trials are of people: continue with"):
         open_experiment(experiment.folder).run(jobs=1)
 
 

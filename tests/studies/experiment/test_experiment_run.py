@@ -139,7 +139,7 @@ def test_folder_of_another_plan_is_refused(tmp_path: Path) -> None:
     file.write_text(
         file.read_text(encoding="utf-8").replace("trials = 2", "trials = 3"), encoding="utf-8"
     )
-    with pytest.raises(UsageError, match="its protocol was changed after it began"):
+    with pytest.raises(UsageError, match="its protocol was changed after the experiment began"):
         tn.open_experiment(begun.folder)
     with pytest.raises(UsageError, match="holds no experiment"):
         tn.open_experiment(tmp_path)

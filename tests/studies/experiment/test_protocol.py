@@ -124,7 +124,7 @@ def test_digest_knows_what_was_planned() -> None:
         ({"users": ["m1", "m2", "s"]}, "users are one or two sites, not m1, m2, s"),
         ({"users": ["m3"]}, "condition near: .*has no site m3; there are m1, m2, s"),
         ({"users": ["s"]}, "has no live hand, so nobody can hold it"),
-        ({"participants": ["A", "A"]}, "two participants have one pseudonym"),
+        ({"participants": ["A", "A"]}, "two participants have the same pseudonym"),
         ({"force_limit_n": {"P9": 5.0}}, "force_limit_n: there is no participant P9"),
         (
             {"force_limit_n": {"P1": 50.0}},
@@ -133,7 +133,7 @@ def test_digest_knows_what_was_planned() -> None:
         ({"catch": {"condition": "nowhere"}}, "catch.condition: there is no condition nowhere"),
         (
             {"questionnaires": [{"name": "tlx"}, {"name": "tlx"}]},
-            "two questionnaires have one name",
+            "two questionnaires have the same name",
         ),
         (
             {"questionnaires": [{"name": "mine"}]},
@@ -154,7 +154,7 @@ def test_digest_knows_what_was_planned() -> None:
         ),
         (
             {"task": {"kind": "track", "apart_m": 0.1}},
-            "who are shown different targets need two users",
+            "a task with two targets need two users",
         ),
         (
             {"training": {"lead": {"near": [1.0, 0.0]}}},
@@ -166,7 +166,7 @@ def test_digest_knows_what_was_planned() -> None:
                 "training": {"lead": {"near": [1.0, 0.0], "far": [1.0, 0.0]}},
                 "catch": {"condition": "far"},
             },
-            "one of catch trials, a training and a staircase",
+            "catch trials, a training and a staircase exclude each other",
         ),
         (
             {

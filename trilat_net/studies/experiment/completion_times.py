@@ -1,11 +1,12 @@
 """Completion times of trials with a time limit: medians, their intervals, and sign tests.
 
 A trial that was not completed has no completion time. If the trial reached the limit, its time
-is known only to be longer than the limit (right censoring); if the trial failed before the
-limit, the task was never completed. Both count as longer than every measured time. Order
-statistics need no more information: the median of Kaplan and Meier is exact as long as more
-than half of the trials were completed, and otherwise it was not reached. A mean would need the
-times themselves; replacing them by the limit would make different conditions look alike.
+is known only to be longer than the limit (right censoring). If the trial failed before the
+limit, the task was never completed. Both count as longer than every measured time.
+
+That is enough for order statistics. The median of Kaplan and Meier is exact if more than half
+of the trials were completed; otherwise the median was not reached. A mean would need the times
+themselves, and replacing them by the limit would make different conditions look alike.
 
 Invariant:
     - The limit never enters a sum or a difference.
@@ -27,7 +28,9 @@ import numpy as np
 from .statistics import CONFIDENCE, Row, correct_holm, import_scipy_stats, read_number
 
 COMPLETION = "completion_s"
+"""Column of the completion times."""
 SUCCESS = "succeeded"
+"""Column that tells whether a trial was completed."""
 
 
 class CompletionTime(NamedTuple):
@@ -40,10 +43,10 @@ class CompletionTime(NamedTuple):
             sooner.
         timed_out: number of trials that reached the time limit.
         number: number of units.
-        median: median over units of each unit's median time, s; None if it was not reached.
-        interval: interval of the median, 95 % or more, by order statistics, s. Its upper end is
-            None if it was not reached. The interval is None if there are too few units, or if
-            its lower end was not reached either.
+        median: median over units of each unit's median time, in s; None if it was not reached.
+        interval: interval of the median, of 95 % or more, by order statistics, in s. The upper
+            end is None if it was not reached. The interval is None if there are too few units,
+            or if the lower end was not reached either.
     """
 
     condition: str
@@ -65,7 +68,7 @@ class CompletionComparison(NamedTuple):
         longer: number of units whose median was longer under the second condition.
         shorter: number of units whose median was shorter under the second condition. The other
             units are ties, for example if both medians were not reached.
-        difference: median over units of second minus first, s; None if it depends on medians
+        difference: median over units of second minus first, in s; None if it depends on medians
             that were not reached.
         p: p value of the two-sided exact sign test, ties left out; None for fewer than two
             units that differ.
@@ -88,20 +91,21 @@ def is_completed(row: Row) -> bool:
 
 
 def find_median(times_s: Sequence[float]) -> float:
-    """Returns the median of times, s; censored times are infinite.
+    """Returns the median of times in s; censored times are infinite.
 
     The median is infinite (not reached) if half of the trials or more were not completed.
     """
     ordered = sorted(times_s)
-    lower = ordered[(len(ordered) - 1) // 2]
-    upper = ordered[len(ordered) // 2]
+    count = len(ordered)
+    lower = ordered[(count - 1) // 2]
+    upper = ordered[count // 2]
     return (lower + upper) / 2.0
 
 
 def find_unit_medians(
     rows: Sequence[Row], unit: str = "participant"
 ) -> dict[str, dict[str, float]]:
-    """Returns the median completion time of each condition and unit, s.
+    """Returns the median completion time of each condition and unit, in s.
 
     A median that was not reached is infinite.
 
@@ -120,10 +124,10 @@ def find_unit_medians(
         time_s = read_number(value, COMPLETION, row) if is_completed(row) else math.inf
         times_by_unit = times_s.setdefault(str(row["condition"]), {})
         times_by_unit.setdefault(str(row[unit]), []).append(time_s)
-    return {
-        condition: {name: find_median(times) for name, times in times_by_unit.items()}
-        for condition, times_by_unit in times_s.items()
-    }
+    medians: dict[str, dict[str, float]] = {}
+    for condition, times_by_unit in times_s.items():
+        medians[condition] = {name: find_median(times) for name, times in times_by_unit.items()}
+    return medians
 
 
 def summarise_times(
@@ -133,31 +137,30 @@ def summarise_times(
 
     Args:
         rows: trials, as for `find_unit_medians`.
-        limit_s: time limit of a trial, s.
+        limit_s: time limit of a trial, in s.
         unit: "participant" or "pair".
     """
-    summaries = []
+    summaries: list[CompletionTime] = []
     for condition, medians_by_unit in find_unit_medians(rows, unit).items():
         medians = list(medians_by_unit.values())
         trials = [row for row in rows if str(row["condition"]) == condition]
         failed = [row for row in trials if not is_completed(row)]
         ended_s = [read_number(row[COMPLETION], COMPLETION, row) for row in failed]
-        summaries.append(
-            CompletionTime(
-                condition=condition,
-                trials=len(trials),
-                censored=len(failed),
-                timed_out=sum(time_s >= limit_s - 1e-6 for time_s in ended_s),
-                number=len(medians),
-                median=_finite(find_median(medians)),
-                interval=find_median_interval(medians),
-            )
+        summary = CompletionTime(
+            condition=condition,
+            trials=len(trials),
+            censored=len(failed),
+            timed_out=sum(time_s >= limit_s - 1e-6 for time_s in ended_s),
+            number=len(medians),
+            median=_replace_infinity(find_median(medians)),
+            interval=find_median_interval(medians),
         )
+        summaries.append(summary)
     return summaries
 
 
 def find_median_interval(times_s: Sequence[float]) -> tuple[float, float | None] | None:
-    """Returns an interval of at least 95 % for a median, by order statistics, s.
+    """Returns an interval of at least 95 % for a median, by order statistics, in s.
 
     The r-th smallest and the r-th largest time enclose the median with probability
     1 - 2 P(B < r), where B is binomial with p = 1/2; r is the largest rank for which this
@@ -171,9 +174,12 @@ def find_median_interval(times_s: Sequence[float]) -> tuple[float, float | None]
     ranks = [rank for rank in candidates if float(binomial.cdf(rank - 1)) <= tail]
     if not ranks:
         return None
-    low = ordered[ranks[-1] - 1]
-    high = ordered[-ranks[-1]]
-    return None if math.isinf(low) else (low, _finite(high))
+    rank = ranks[-1]
+    low = ordered[rank - 1]
+    high = ordered[-rank]
+    if math.isinf(low):
+        return None
+    return low, _replace_infinity(high)
 
 
 def compare_times(
@@ -205,7 +211,13 @@ def compare_times(
 def _compare(
     first: str, second: str, pairs: Sequence[tuple[float, float]]
 ) -> CompletionComparison:
-    """Returns the comparison of two conditions from pairs of medians, one pair per unit, s."""
+    """Returns the comparison of two conditions.
+
+    Args:
+        first: name of the first condition.
+        second: name of the second condition.
+        pairs: the medians of each unit under both conditions, in s.
+    """
     longer = sum(second_s > first_s for first_s, second_s in pairs)
     shorter = sum(second_s < first_s for first_s, second_s in pairs)
     untied = longer + shorter
@@ -224,26 +236,27 @@ def _compare(
 
 
 def _find_median_difference(pairs: Sequence[tuple[float, float]]) -> float | None:
-    """Returns the median difference, s; None if it depends on medians that were not reached.
+    """Returns the median difference in s; None if it depends on medians that were not reached.
 
     A median that was not reached may have any value above 0, so that each difference lies
     between two bounds. The median difference is known if the medians of both bounds agree.
     """
     if not pairs:
         return None
-    lower_bounds = [
-        (second_s if math.isfinite(second_s) else 0.0) - first_s for first_s, second_s in pairs
-    ]
-    upper_bounds = [
-        second_s - (first_s if math.isfinite(first_s) else 0.0) for first_s, second_s in pairs
-    ]
+    lower_bounds: list[float] = []
+    upper_bounds: list[float] = []
+    for first_s, second_s in pairs:
+        shortest_first_s = first_s if math.isfinite(first_s) else 0.0
+        shortest_second_s = second_s if math.isfinite(second_s) else 0.0
+        lower_bounds.append(shortest_second_s - first_s)
+        upper_bounds.append(second_s - shortest_first_s)
     low = float(np.median(lower_bounds))
     high = float(np.median(upper_bounds))
     return low if low == high else None
 
 
-def _finite(time_s: float) -> float | None:
-    """Returns a median, or None if the median was not reached."""
+def _replace_infinity(time_s: float) -> float | None:
+    """Returns a median, or None for an infinite median, which was not reached."""
     return time_s if math.isfinite(time_s) else None
 
 

@@ -1,7 +1,10 @@
 """Analysis of an experiment: means, comparisons, mixed models, figures, a methods paragraph.
 
+`analyse_experiment` reads the journals of an experiment's folder and writes tables, figures and
+a report into the folder. `compute_experiment_power` plans the number of participants.
+
 Invariant:
-    - The analysis is a function of the journals alone.
+    - The analysis follows from the journals alone.
     - Practice and catch trials do not count.
     - A trial that was not completed counts, and its completion time is censored: longer than
       that of any completed trial (see `completion_times`).
@@ -49,6 +52,7 @@ from .statistics import (
     ConditionMean,
     MixedModel,
     Row,
+    SimulatedPower,
     average_trials,
     compare_conditions,
     find_least_number,
@@ -67,6 +71,8 @@ MEASURES = (
     "second_taken_j", "succeeded",
 )  # fmt: skip
 """Measures that are compared between conditions if trials have them."""
+_UNCOUNTED_PHASES = ("before", "training", "retention")
+"""Phases of a training that are not compared between conditions."""
 FOLDER = "analysis"
 """Folder of the analysis inside the folder of the experiment."""
 NOT_REACHED = "not reached"
@@ -121,63 +127,89 @@ class ExperimentAnalysis(Result):
         self._exclude = exclude
         protocol = experiment.plan.protocol
         self.unit = experiment.unit
-        order = list(protocol.conditions).index
-        names = {"-".join(group) for group in protocol.groups}
-        if unknown := sorted(exclude.keys() - names):
-            raise UsageError(
-                f"there is no {self.unit} {', '.join(unknown)}: "
-                f"there are {', '.join(sorted(names))}"
-            )
-        kept = (row for row in experiment.to_rows() if row[self.unit] not in exclude)
-        counted = [row for row in kept if not (row["practice"] or row["catch"])]
-        self.learning_rows = sorted(counted, key=lambda row: order(row["condition"]))
-        other_phases = ("before", "training", "retention")
-        self.rows = [row for row in self.learning_rows if row.get("phase") not in other_phases]
+        self._check_excluded()
+        counted = [row for row in experiment.to_rows() if self._is_counted(row)]
+        self.learning_rows = self._sort_by_condition(counted)
+        self.rows = [
+            row for row in self.learning_rows if row.get("phase") not in _UNCOUNTED_PHASES
+        ]
         if not self.rows:
             raise UsageError(f"{experiment.folder}: no trial that counts is done yet")
         self.throughput_rows = list(self._find_throughput())
         self.gain_rows = list(self._find_gains())
-        self.threshold_rows = sorted(
-            self._find_thresholds(), key=lambda row: order(row["condition"])
-        )
-        scores = sorted(experiment.list_scores(), key=lambda row: order(row["condition"]))
+        self.threshold_rows = self._sort_by_condition(list(self._find_thresholds()))
+        scores = self._sort_by_condition(experiment.list_scores())
         self._scores = [row for row in scores if row[self.unit] not in exclude]
-        forms = [form.name for form in protocol.questionnaires if form.after == "block"]
-        self.means: dict[str, list[ConditionMean]] = {}
-        self.comparisons: dict[str, list[Comparison]] = {}
-        examples = self.gain_rows[:1] + self.threshold_rows[:1]
-        keys = [key for row in examples for key in row]
-        unit_measures = [key for key in keys if key.startswith(("gain_", "threshold_"))]
         self.times: list[CompletionTime] = []
         self.time_comparisons: list[CompletionComparison] = []
         if protocol.task.has_limit:
             self._summarise_times()
+        forms = [form.name for form in protocol.questionnaires if form.after == "block"]
         self.absent = self._find_absent(forms)
-        censored = any(time.censored for time in self.times)
-        for measure in (*MEASURES, *forms, *unit_measures):
-            rows = self.of(measure)
-            is_measured = any(row.get(measure) not in (None, "") for row in rows)
-            # a mean of censored times is biased: `times` has their medians instead
-            if is_measured and not (measure == COMPLETION and censored):
-                self.means[measure] = summarise_conditions(rows, measure, unit=self.unit)
-                self.comparisons[measure] = compare_conditions(rows, measure, unit=self.unit)
+        self.means: dict[str, list[ConditionMean]] = {}
+        self.comparisons: dict[str, list[Comparison]] = {}
+        for measure in (*MEASURES, *forms, *self._list_unit_measures()):
+            self._compare_measure(measure)
         self.missing_answers = list(self._count_missing_answers())
         self.models = list(self.fit_models())
         self.methods = self._write_methods()
-        self.paths = list[Path]()
+        self.paths: list[Path] = []
+
+    def _check_excluded(self) -> None:
+        """Raises UsageError if an excluded participant or pair does not exist."""
+        groups = self._experiment.plan.protocol.groups
+        names = {"-".join(group) for group in groups}
+        unknown = sorted(self._exclude.keys() - names)
+        if unknown:
+            raise UsageError(
+                f"there is no {self.unit} {', '.join(unknown)}: "
+                f"there are {', '.join(sorted(names))}"
+            )
+
+    def _is_counted(self, row: Mapping[str, Any]) -> bool:
+        """Returns whether a trial counts: not excluded, not for practice and no catch trial."""
+        if row[self.unit] in self._exclude:
+            return False
+        return not (row["practice"] or row["catch"])
+
+    def _sort_by_condition(self, rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+        """Returns rows in the protocol's order of conditions."""
+        conditions = list(self._experiment.plan.protocol.conditions)
+        return sorted(rows, key=lambda row: conditions.index(row["condition"]))
+
+    def _list_unit_measures(self) -> list[str]:
+        """Returns the measures that each unit has once under a condition."""
+        keys = [key for row in (*self.gain_rows[:1], *self.threshold_rows[:1]) for key in row]
+        return [key for key in keys if key.startswith(("gain_", "threshold_"))]
+
+    def _compare_measure(self, measure: str) -> None:
+        """Summarises and compares a measure, if it has a number in any trial."""
+        # A mean of censored times is biased: `times` has their medians instead.
+        if measure == COMPLETION and self._has_censored_times():
+            return
+        rows = self.of(measure)
+        if any(row.get(measure) not in (None, "") for row in rows):
+            self.means[measure] = summarise_conditions(rows, measure, unit=self.unit)
+            self.comparisons[measure] = compare_conditions(rows, measure, unit=self.unit)
+
+    def _has_censored_times(self) -> bool:
+        """Returns whether some of the trials that count were not completed."""
+        return any(time.censored for time in self.times)
 
     @property
     def _limit_s(self) -> float:
+        """The time limit of a trial, in s."""
         return self._experiment.plan.protocol.task.longest_s
 
     @property
     def _is_reaching(self) -> bool:
+        """Whether the task is to reach targets."""
         return self._experiment.plan.protocol.task.description.startswith("reaching")
 
     def _summarise_times(self) -> None:
         """Summarises the completion times, and compares them if trials were not completed."""
         self.times = summarise_times(self.rows, self._limit_s, unit=self.unit)
-        if any(time.censored for time in self.times):
+        if self._has_censored_times():
             self.time_comparisons = compare_times(self.rows, unit=self.unit)
 
     def _find_absent(self, forms: Sequence[str]) -> dict[str, str]:
@@ -206,16 +238,17 @@ class ExperimentAnalysis(Result):
                 condition = row["condition"] if after[name] == "block" else ""
                 groups.setdefault((name, condition), []).append(row)
         for (name, condition), rows in groups.items():
-            answers: dict[tuple[str, int], list[float | None]] = {}
+            values_of_form: dict[tuple[str, int], list[float | None]] = {}
             for row in rows:
-                answers.setdefault((row["participant"], row["block"]), []).append(row["value"])
+                form_key = (row["participant"], row["block"])
+                values_of_form.setdefault(form_key, []).append(row["value"])
             yield MissingAnswers(
                 questionnaire=name,
                 condition=condition,
                 asked=len(rows),
                 missing=sum(row["value"] is None for row in rows),
-                forms=len(answers),
-                unscored=sum(None in values for values in answers.values()),
+                forms=len(values_of_form),
+                unscored=sum(None in values for values in values_of_form.values()),
             )
 
     def of(self, measure: str) -> Sequence[Row]:
@@ -243,12 +276,11 @@ class ExperimentAnalysis(Result):
             completed = [row for row in rows if row["succeeded"]]
             if len(completed) < 2:
                 continue
-            times_s = [row["completion_s"] for row in completed]
             throughput = measure_throughput(
-                _list_points(completed, "start"),
-                _list_points(completed, "target"),
-                _list_points(completed, "end"),
-                times_s,
+                starts=_list_points(completed, "start"),
+                targets=_list_points(completed, "target"),
+                ends=_list_points(completed, "end"),
+                times_s=[row["completion_s"] for row in completed],
             )
             if throughput is not None:
                 yield {
@@ -263,19 +295,20 @@ class ExperimentAnalysis(Result):
         A gain is the mean before the training minus the mean right after it (transfer), or
         minus the mean in the later test (retention).
         """
-        learnt = self._experiment.plan.protocol.task.learning_measure
-        means = dict[str, Any]()
+        measure = self._experiment.plan.protocol.task.learning_measure
+        means: dict[str, dict[str, dict[str, float]]] = {}
         for phase in ("before", "after", "retention"):
-            if rows := [row for row in self.learning_rows if row.get("phase") == phase]:
-                means[phase] = self._average_learnt(rows, learnt)
+            rows = [row for row in self.learning_rows if row.get("phase") == phase]
+            if rows:
+                means[phase] = self._average_learning(rows, measure)
         means_before = means.pop("before", {})
         for condition, means_by_unit in means_before.items():
-            for unit, before in means_by_unit.items():
-                gains = {}
+            for unit, mean_before in means_by_unit.items():
+                gains: dict[str, float] = {}
                 for phase, phase_means in means.items():
-                    mean = phase_means.get(condition, {}).get(unit)
-                    if mean:
-                        gains[f"gain_{phase}_{learnt}"] = before - mean
+                    later_mean = phase_means.get(condition, {}).get(unit)
+                    if later_mean:
+                        gains[f"gain_{phase}_{measure}"] = mean_before - later_mean
                 yield {self.unit: unit, "condition": condition, **gains}
 
     def _is_censored(self, measure: str) -> bool:
@@ -285,21 +318,22 @@ class ExperimentAnalysis(Result):
             return False
         return not all(map(is_completed, self.learning_rows))
 
-    def _average_learnt(self, rows: Sequence[Row], learnt: str) -> dict[str, dict[str, float]]:
-        """Returns the mean of the measure `learnt` for each condition and unit.
+    def _average_learning(
+        self, rows: Sequence[Row], measure: str
+    ) -> dict[str, dict[str, float]]:
+        """Returns the mean of a learning measure for each condition and unit.
 
-        Completion times of which some are censored are summarised by medians instead. A median
-        longer than the time limit is left out.
+        If some completion times are censored, medians take the place of means. A median that
+        was not reached is left out.
         """
-        if not self._is_censored(learnt):
-            return average_trials(rows, learnt, self.unit)
-        medians = find_unit_medians(rows, self.unit)
-        return {
-            condition: {
-                unit: median for unit, median in unit_medians.items() if math.isfinite(median)
+        if not self._is_censored(measure):
+            return average_trials(rows, measure, self.unit)
+        reached: dict[str, dict[str, float]] = {}
+        for condition, medians in find_unit_medians(rows, self.unit).items():
+            reached[condition] = {
+                unit: median for unit, median in medians.items() if math.isfinite(median)
             }
-            for condition, unit_medians in medians.items()
-        }
+        return reached
 
     def _find_thresholds(self) -> Iterator[dict[str, Any]]:
         """Yields the threshold of each unit and condition.
@@ -311,14 +345,16 @@ class ExperimentAnalysis(Result):
         staircase = plan.protocol.staircase
         if staircase is None:
             return
-        # the first trial of a block stands for its staircase
-        for trial in [trial for trial in plan.trials if trial.trial == 1]:
-            threshold = staircase.find_threshold(plan.judge_choices(trial, choices))
-            unit = "-".join(trial.group)
+        # Each block has a staircase, which its first trial stands for.
+        first_trials = [trial for trial in plan.trials if trial.trial == 1]
+        for planned in first_trials:
+            are_right = plan.judge_choices(planned, choices)
+            threshold = staircase.find_threshold(are_right)
+            unit = "-".join(planned.group)
             if threshold is not None and unit not in self._exclude:
                 yield {
                     self.unit: unit,
-                    "condition": trial.condition,
+                    "condition": planned.condition,
                     staircase.measure: threshold,
                 }
 
@@ -336,15 +372,15 @@ class ExperimentAnalysis(Result):
                 delays[name] = {"delay_ms": round(float(np.mean(delays_ms)), 1)}
         site = scenario.sites[protocol.users[0]]
         control = msgspec.to_builtins(site.control)
-        reasons = ", ".join(
-            f"{name}: {reason}" if reason else name for name, reason in self._exclude.items()
-        )
-        # the paragraph does not mention a fact of ""
+        exclusions: list[str] = []
+        for name, reason in self._exclude.items():
+            exclusions.append(f"{name}: {reason}" if reason else name)
+        # The paragraph does not mention facts that are "".
         facts: dict[str, Any] = {
             "participants": participants,
             "pairs": number if self.unit == "pair" else "",
             "excluded": len(protocol.groups) * len(protocol.users) - participants,
-            "exclusions": reasons,
+            "exclusions": ", ".join(exclusions),
             "training": protocol.training.describe() if protocol.training else "",
             "staircase": protocol.staircase.describe() if protocol.staircase else "",
             "design": protocol.design,
@@ -379,7 +415,7 @@ class ExperimentAnalysis(Result):
             "sign tests": any(test.p is not None for test in self.time_comparisons),
             "mixed models": bool(self.models),
         }
-        return [name for name, computed in is_computed.items() if computed]
+        return [analysis for analysis, computed in is_computed.items() if computed]
 
     def _describe_times(self) -> str:
         """Returns the sentence on trials that were not completed, "" if all were completed."""
@@ -441,10 +477,10 @@ class ExperimentAnalysis(Result):
             "missing_answers.csv": [answers._asdict() for answers in self.missing_answers],
         }
         tables |= {name: rows for name, rows in optional_tables.items() if rows}
-        texts = {
-            name: encode_csv([dict(_flatten(row)) for row in rows])
-            for name, rows in tables.items()
-        }
+        texts: dict[str, str] = {}
+        for name, rows in tables.items():
+            flat_rows = [dict(_flatten(row)) for row in rows]
+            texts[name] = encode_csv(flat_rows)
         texts["methods.txt"] = f"{self.methods}\n"
         texts["analysis.json"] = json.dumps(self.to_dict(), indent=1) + "\n"
         return texts
@@ -458,10 +494,10 @@ class ExperimentAnalysis(Result):
             figures[COMPLETION] = draw_times(self.rows, self._limit_s, unit=self.unit)
         if len({row["trial"] for row in self.learning_rows}) > 1:
             protocol = self._experiment.plan.protocol
-            learnt = "difference" if protocol.staircase else protocol.task.learning_measure
-            limit_s = self._limit_s if self._is_censored(learnt) else None
+            measure = "difference" if protocol.staircase else protocol.task.learning_measure
+            limit_s = self._limit_s if self._is_censored(measure) else None
             figures["learning"] = draw_learning(
-                self.learning_rows, learnt, unit=self.unit, limit_s=limit_s
+                self.learning_rows, measure, unit=self.unit, limit_s=limit_s
             )
         return figures
 
@@ -492,21 +528,22 @@ class ExperimentAnalysis(Result):
         if self.unit == "participant" or len(pairs) < 2 or find_spec("statsmodels") is None:
             return
         for measure in ("force_mean", "force_peak"):
-            rows = []
+            # A trial of a pair becomes a row for each of the two users.
+            rows: list[Row] = []
             for row in self.rows:
                 for user, name in enumerate(row["pair"].split("-"), 1):
                     force_n = row[f"{measure}_user{user}_n"]
-                    rows.append({**row, "participant": name, measure + "_n": force_n})
-            with suppress(UsageError):  # there are too few pairs for a model
-                yield fit_mixed_model(rows, measure + "_n")
+                    rows.append({**row, "participant": name, f"{measure}_n": force_n})
+            # With too few pairs there is no model.
+            with suppress(UsageError):
+                yield fit_mixed_model(rows, f"{measure}_n")
 
     def _list_means(self) -> list[dict[str, Any]]:
         """Returns a row for each measure and condition."""
-        return [
-            {"measure": measure, **mean._asdict()}
-            for measure, means in self.means.items()
-            for mean in means
-        ]
+        rows: list[dict[str, Any]] = []
+        for measure, means in self.means.items():
+            rows += [{"measure": measure, **mean._asdict()} for mean in means]
+        return rows
 
     def to_rows(self) -> list[dict[str, Any]]:
         """Returns a row for each comparison."""
@@ -533,7 +570,7 @@ class ExperimentAnalysis(Result):
     def blocks(self) -> Iterator[Block]:
         """Yields the text: completion, measures, missing numbers, and the methods paragraph.
 
-        With a single unit there are no comparisons, and all measures are in one table.
+        With a single unit there are no comparisons, and one table has all measures.
         """
         yield from self._write_time_blocks()
         units = {row[self.unit] for row in self.rows}
@@ -566,7 +603,7 @@ class ExperimentAnalysis(Result):
         yield (
             f"{COMPLETION}, median over {self.unit}s of the median of each {self.unit}'s trials"
         )
-        yield "a trial that was not completed counts as longer than any"
+        yield "a trial that was not completed counts as longer than all others"
         rows = [
             (
                 time.condition,
@@ -697,7 +734,8 @@ class PowerOfExperiment(Result):
     """Number of participants that an effect needs.
 
     Attributes:
-        d_z: the effect: mean over standard deviation of the differences within participants.
+        d_z: the size of the effect: mean over standard deviation of the differences within
+            participants.
         least: the smallest number of participants for each desired power.
         participants: planned number of participants; None without a plan.
         power: power with the planned number, by the noncentral t distribution.
@@ -711,11 +749,13 @@ class PowerOfExperiment(Result):
         self.least = {
             wanted: find_least_number(d_z, wanted=wanted) for wanted in (0.8, 0.9, 0.95)
         }
-        self.power = self.simulated = None
+        self.power: float | None = None
+        self.simulated: SimulatedPower | None = None
         if participants is not None:
+            self.power = power(d_z, participants)
+            # The difference of two trials has sqrt(2) times the deviation of a trial: 1.
             means = {"first": 0.0, "second": d_z}
             deviation = 0.5**0.5
-            self.power = power(d_z, participants)
             (self.simulated,) = simulate_power(
                 means, participants, trial_deviation=deviation, seed=seed
             )
@@ -775,7 +815,8 @@ def compute_experiment_power(
 
 def _describe_mean(mean: ConditionMean) -> str:
     """Returns a mean as text, with the number of missing values if there are any."""
-    return f"{mean.mean:.4g}" + (f" ({mean.missing} missing)" if mean.missing else "")
+    missing = f" ({mean.missing} missing)" if mean.missing else ""
+    return f"{mean.mean:.4g}{missing}"
 
 
 def _list_points(rows: Sequence[Row], name: str) -> Array:

@@ -1,10 +1,13 @@
-"""An experiment in its folder: a verified log for each trial, journals, and tables.
+"""An experiment in its folder: the log of each trial, journals of the progress, and tables.
+
+`begin_experiment` creates the folder, `Experiment.run` runs the remaining trials with synthetic
+participants, and `trilat experiment run --live` runs them with people.
 
 Invariant:
-    - A folder belongs to one plan, by its digest.
-    - A trial in the journal is never run again, and an interrupted trial is run anew as a
-      whole: nothing is stored twice or lost, whenever the process was killed.
-    - The tables are a function of the journals.
+    - A folder belongs to the plan whose digest it contains.
+    - A trial in the journal is never run again, and an interrupted trial is repeated as a
+      whole. Nothing is stored twice or lost, whenever the process was killed.
+    - The tables follow from the journals.
     - People and synthetic participants never share a folder.
 """
 
@@ -46,9 +49,10 @@ class Note(msgspec.Struct, frozen=True):
         kind: "consent", "questionnaire" or "aborted".
         who: the participant; for a trial all participants.
         number: the trial that the event belongs to, precedes or follows.
-        unix_s: the time by the machine's clock, s.
+        unix_s: the time by the machine's clock, in s.
         text: the name of a questionnaire, or why a trial was aborted.
         answers: the answers by item; None for a missing answer.
+        seed: 0, as the journal expects a seed.
     """
 
     cell: str
@@ -81,7 +85,7 @@ class Experiment(Result):
     Attributes:
         folder: the folder.
         plan: the protocol and its trials.
-        unit: the subject of a table's row: "pair" or "participant".
+        unit: the participants of a trial: "pair" or "participant".
     """
 
     def __init__(self, folder: Path, plan: ExperimentPlan) -> None:
@@ -94,18 +98,22 @@ class Experiment(Result):
         """Opens the journal of trials, to read or to continue the experiment.
 
         Args:
-            people: whether people or synthetic participants continue it; None to read only.
+            people: True if people continue the experiment, False if synthetic participants
+                do; None to read only.
 
         Raises:
             UsageError: the finished trials are of the other kind of participants.
         """
-        if people is not None and any(
-            entry.people != people for entry in self.read_entries().values()
-        ):
-            kind = "synthetic participants: go on without" if people else "people: go on with"
-            raise UsageError(
-                f"{self.folder}: its trials are of {kind} --live, or begin another experiment"
-            )
+        if people is not None:
+            entries = self.read_entries().values()
+            if any(entry.people != people for entry in entries):
+                advice = "people: continue with"
+                if people:
+                    advice = "synthetic participants: continue without"
+                raise UsageError(
+                    f"{self.folder}: its trials are of {advice} --live, "
+                    "or begin another experiment"
+                )
         return RunJournal(
             self.folder / JOURNAL_FILE, self.plan.digest, TrialEntry, self._remedy
         )
@@ -127,23 +135,31 @@ class Experiment(Result):
             return list(journal.done.values())
 
     def list_choices(self) -> Choices:
-        """Returns the choices of the pairs of a staircase so far."""
-        notes = self.read_notes() if self.plan.protocol.staircase else ()
-        chosen = ((note.number, note.answers[CHOICE]) for note in notes if note.text == CHOICE)
-        return {number: choice for number, choice in chosen if choice is not None}
+        """Returns the choices that participants have made in the pairs of a staircase."""
+        if self.plan.protocol.staircase is None:
+            return {}
+        choices: dict[int, float] = {}
+        for note in self.read_notes():
+            choice = note.answers[CHOICE] if note.text == CHOICE else None
+            if choice is not None:
+                choices[note.number] = choice
+        return choices
 
-    def _draw_choices(self, stairs: Staircase) -> None:
-        """Notes the choices of synthetic participants for all pairs, a function of the plan."""
-        choices = dict[int, float]()
+    def _draw_choices(self, staircase: Staircase) -> None:
+        """Notes the choices of synthetic participants for all pairs.
+
+        The choices follow from the plan, so that they can be drawn before any trial is run.
+        """
+        choices: dict[int, float] = {}
         with self.open_notes() as notes:
             for step in self.plan.list_steps():
                 if step.form is None or step.form.name != CHOICE:
                     continue
                 second = step.planned
                 right = self.plan.judge_choices(second, choices)
-                difference = stairs.list_differences(right)[-1]
-                comparison = 1 + (second.phase == COMPARISON)
-                choice = stairs.draw_choice(difference, comparison, second.seed)
+                difference = staircase.list_differences(right)[-1]
+                comparison = 2 if second.phase == COMPARISON else 1
+                choice = staircase.draw_choice(difference, comparison, second.seed)
                 choices[second.number] = choice
                 who = "-".join(second.group)
                 note = Note(
@@ -205,6 +221,7 @@ class Experiment(Result):
     def _describe_trial(
         self, planned: PlannedTrial, entry: TrialEntry, choices: Choices
     ) -> dict[str, Any]:
+        """Returns the row of a trial."""
         row: dict[str, Any] = {
             "trial_number": planned.number,
             self.unit: "-".join(planned.group),
@@ -228,24 +245,29 @@ class Experiment(Result):
         }
 
     def _describe_pair(self, planned: PlannedTrial, choices: Choices) -> dict[str, Any]:
+        """Returns the columns of a trial in a staircase; practice trials have no values."""
         if planned.practice:
             return {"difference": None, "right": None}
         difference, right = self.plan.find_pair(planned, choices)
         return {"difference": difference, "right": None if right is None else int(right)}
 
     def list_answers(self) -> list[dict[str, Any]]:
-        """Returns a row for each item that was asked; the value of a missing answer is None."""
-        return [
-            {
-                **row,
-                "questionnaire": note.text,
-                "item": item,
-                "value": value,
-                "unix_s": note.unix_s,
-            }
-            for row, note in self._read_answer_notes()
-            for item, value in note.answers.items()
-        ]
+        """Returns a row for each item of a questionnaire that people have completed.
+
+        The value of a missing answer is None.
+        """
+        rows: list[dict[str, Any]] = []
+        for columns, note in self._read_answer_notes():
+            for item, value in note.answers.items():
+                row = {
+                    **columns,
+                    "questionnaire": note.text,
+                    "item": item,
+                    "value": value,
+                    "unix_s": note.unix_s,
+                }
+                rows.append(row)
+        return rows
 
     def list_scores(self) -> list[dict[str, Any]]:
         """Returns a row for each answered questionnaire, with its score under its name.
@@ -253,36 +275,36 @@ class Experiment(Result):
         The score is None if an answer is missing.
         """
         forms = {form.name: find_form(form) for form in self.plan.protocol.questionnaires}
-        return [
-            {**row, note.text: forms[note.text].score(note.answers)}
-            for row, note in self._read_answer_notes()
-            if note.text in forms
-        ]
+        rows: list[dict[str, Any]] = []
+        for columns, note in self._read_answer_notes():
+            form = forms.get(note.text)
+            if form is not None:
+                rows.append({**columns, note.text: form.score(note.answers)})
+        return rows
 
     def _read_answer_notes(self) -> Iterator[tuple[dict[str, Any], Note]]:
         """Yields the notes with answers, each with the first columns of its row."""
-        conditions = {
-            (trial.group, trial.block): trial.condition
-            for trial in self.plan.trials
-            if not trial.catch
-        }
+        conditions: dict[tuple[tuple[str, ...], int], str] = {}
+        for trial in self.plan.trials:
+            if not trial.catch:
+                conditions[trial.group, trial.block] = trial.condition
         for note in self.read_notes():
             if not note.answers:
                 continue
-            trial = self.plan.trials[note.number - 1]
+            planned = self.plan.trials[note.number - 1]
             row = {
-                self.unit: "-".join(trial.group),
+                self.unit: "-".join(planned.group),
                 "participant": note.who,
-                "condition": conditions[trial.group, trial.block],
-                "block": trial.block,
+                "condition": conditions[planned.group, planned.block],
+                "block": planned.block,
             }
             yield row, note
 
     def write_tables(self) -> Path:
         """Writes trials.csv, with a row for each trial and the digest of its log.
 
-        With people it also writes questionnaires.csv, and events.csv with the consents and the
-        aborted trials.
+        For an experiment with people, the method also writes questionnaires.csv, and events.csv
+        with the consents and the aborted trials.
 
         Returns:
             The path of trials.csv.
@@ -304,9 +326,8 @@ class Experiment(Result):
         }
         for name, rows in tables.items():
             if rows or name == TRIALS_FILE:
-                write_whole(
-                    self.folder / name, encode_csv(rows), force=True, remedy=self._remedy
-                )
+                text = encode_csv(rows)
+                write_whole(self.folder / name, text, force=True, remedy=self._remedy)
         return self.folder / TRIALS_FILE
 
     def to_dict(self) -> dict[str, Any]:
@@ -333,19 +354,18 @@ class Experiment(Result):
         rows = [row for row in self.to_rows() if not (row["practice"] or row["catch"])]
         total = count_nouns(status.total, "trial")
         yield f"{self.plan.protocol.name}: {status.done} of {total}, in {self.folder}"
-        table = []
+        table: list[tuple[str, ...]] = []
         for condition in self.plan.protocol.conditions:
             trials = [row for row in rows if row["condition"] == condition]
             if trials:
                 completed = sum(map(is_completed, trials))
-                means = [
-                    sum(row[key] for row in trials) / len(trials) for key in _SHOWN_MEASURES
-                ]
                 counts = [str(len(trials)), str(completed), _describe_median(trials)]
-                table.append((condition, *counts, *(f"{mean:.3g}" for mean in means)))
+                means = [_describe_mean(trials, measure) for measure in _SHOWN_MEASURES]
+                table.append((condition, *counts, *means))
         heads = ("condition", "trials", "completed", "completion_s, median", *_SHOWN_MEASURES)
         yield TextTable(heads, table, align="l" + "r" * (len(heads) - 1))
-        if (trial := status.next) is not None:
+        trial = status.next
+        if trial is not None:
             yield f"next: trial {trial.number}, {', '.join(trial.group)}, {trial.condition}"
         for note in self.read_notes():
             if note.kind == "aborted":
@@ -353,14 +373,21 @@ class Experiment(Result):
                 yield f"{trial_name}, was aborted and is made again: {note.text}"
 
 
+_SHOWN_MEASURES = ("error_end_mm", "error_rms_mm", "path_m", "sparc")
+"""Measures whose means the text of the status shows."""
+
+
+def _describe_mean(rows: list[dict[str, Any]], measure: str) -> str:
+    """Returns the text of the mean of a measure over trials."""
+    mean = sum(row[measure] for row in rows) / len(rows)
+    return f"{mean:.3g}"
+
+
 def _describe_median(rows: list[dict[str, Any]]) -> str:
-    """Returns the text of the median completion time of trials, s."""
+    """Returns the text of the median completion time of trials, in s."""
     times_s = [row[COMPLETION] if is_completed(row) else math.inf for row in rows]
     median_s = find_median(times_s)
     return f"{median_s:.3g}" if math.isfinite(median_s) else "not reached"
-
-
-_SHOWN_MEASURES = ("error_end_mm", "error_rms_mm", "path_m", "sparc")
 
 
 def new_experiment(file: str | Path, *, pair: bool = False, force: bool = False) -> Path:
@@ -377,44 +404,46 @@ def new_experiment(file: str | Path, *, pair: bool = False, force: bool = False)
     Raises:
         UsageError: the file exists.
     """
-    template = (
-        resources.files("trilat_net")
-        / "scenarios"
-        / f"_experiment{'_pair' if pair else ''}.txt"
-    )
+    template_name = "_experiment_pair.txt" if pair else "_experiment.txt"
+    template = resources.files("trilat_net") / "scenarios" / template_name
     write_whole(Path(file), template.read_text(encoding="utf-8"), force=force)
     return Path(file)
 
 
 def check_experiment(file: str | Path) -> ExperimentPlan:
-    """Returns the plan of a protocol, if it can be carried out; as `trilat experiment check`.
+    """Returns the plan of a protocol, as `trilat experiment check`.
 
     >>> len(tn.check_experiment(tn.new_experiment("reaching.toml")).trials)
     240
 
     Raises:
-        UsageError: it cannot be carried out; the error names everything that is wrong.
+        UsageError: the protocol cannot be carried out; the error lists all problems.
     """
     return plan_experiment(read_protocol(file), Path(file).parent)
 
 
 def begin_experiment(file: str | Path, out: str | Path | None = None) -> Experiment:
-    """Returns an experiment in a new folder, by default runs/experiment-NAME-N."""
+    """Returns an experiment in a new folder, by default runs/experiment-NAME-N.
+
+    The folder contains the protocol, and the plan with the scenarios as JSON.
+    """
     plan = check_experiment(file)
-    folder = make_results_folder(
-        None if out is None else Path(out), f"experiment-{plan.protocol.name}", force=None
-    )
+    default_name = f"experiment-{plan.protocol.name}"
+    out_path = None if out is None else Path(out)
+    folder = make_results_folder(out_path, default_name, force=None)
     write_whole(folder / PROTOCOL_FILE, Path(file).read_text(encoding="utf-8"))
-    texts = {name: scenario.text for name, scenario in plan.scenarios.items()}
-    trials = [{**one._asdict(), "log": f"{LOGS}/{one.file}"} for one in plan.trials]
-    protocol = msgspec.to_builtins(plan.protocol)
-    facts = {"digest": plan.digest, "protocol": protocol, "trials": trials, "scenarios": texts}
+    facts = {
+        "digest": plan.digest,
+        "protocol": msgspec.to_builtins(plan.protocol),
+        "trials": [{**trial._asdict(), "log": f"{LOGS}/{trial.file}"} for trial in plan.trials],
+        "scenarios": {name: scenario.text for name, scenario in plan.scenarios.items()},
+    }
     write_whole(folder / PLAN_FILE, json.dumps(facts, indent=1) + "\n")
     return Experiment(folder, plan)
 
 
 def open_experiment(folder: str | Path) -> Experiment:
-    """Returns the experiment of a folder; as `trilat experiment status`.
+    """Returns the experiment of a folder, as `trilat experiment status`.
 
     >>> tn.open_experiment("runs/experiment-reaching-001").status().done  # doctest: +SKIP
     240
@@ -429,14 +458,15 @@ def open_experiment(folder: str | Path) -> Experiment:
         raise UsageError(
             f"{path}: holds no experiment; `trilat experiment run FILE` begins one"
         ) from None
-    scenarios = {
-        name: parse_scenario(text, str(path)) for name, text in facts["scenarios"].items()
-    }
+    scenarios = {}
+    for name, text in facts["scenarios"].items():
+        scenarios[name] = parse_scenario(text, str(path))
     protocol = read_protocol(path / PROTOCOL_FILE)
     plan = plan_experiment(protocol, scenarios=scenarios)
     if plan.digest != facts["digest"]:
         raise UsageError(
-            f"{path}: its protocol was changed after it began: begin another experiment"
+            f"{path}: its protocol was changed after the experiment began: "
+            "begin another experiment"
         )
     return Experiment(path, plan)
 
@@ -449,14 +479,14 @@ def run_experiment(
     on: Workers = None,
     progress: Callable[[int, int], None] = ignore_progress,
 ) -> Experiment:
-    """Runs an experiment with synthetic participants; as `trilat experiment run`.
+    """Runs an experiment with synthetic participants, as `trilat experiment run`.
 
     >>> done = tn.run_experiment(tn.new_experiment("reach.toml"), "reach")  # doctest: +SKIP
     >>> done.to_frame().groupby("condition").completion_s.mean()  # doctest: +SKIP
 
     Args:
         source: the file of a protocol, or the folder of an experiment to continue.
-        out: the folder; by default the next free runs/experiment-NAME-N.
+        out: the folder; by default the first of runs/experiment-NAME-N that does not exist.
         jobs: the number of processes; None for one per core.
         on: a Dask scheduler's address or an executor that runs the trials.
         progress: called with the numbers of finished and of all trials.
@@ -464,9 +494,10 @@ def run_experiment(
     Raises:
         UsageError: the protocol cannot be carried out, or the folder holds something else.
     """
-    experiment = (
-        open_experiment(source) if Path(source).is_dir() else begin_experiment(source, out)
-    )
+    if Path(source).is_dir():
+        experiment = open_experiment(source)
+    else:
+        experiment = begin_experiment(source, out)
     return experiment.run(jobs, progress, on)
 
 

@@ -1,7 +1,11 @@
-"""Protocol of an experiment with people, read from a TOML file, and the plan of its trials.
+"""The protocol of an experiment with people, and the plan of its trials.
+
+A protocol is a TOML file. It names the scenario, the conditions (scenario keys with different
+values), the task, and the number of participants and trials. The plan lists all trials in their
+order, with balanced orders of conditions and drawn targets.
 
 Invariant:
-    - The plan is a function of the protocol and of the scenarios of its conditions.
+    - The plan follows from the protocol and from the scenarios of its conditions.
     - The digest of the plan covers the protocol and the text of the scenario of each condition.
       The log of each trial contains the digest, which proves that the trial follows the plan.
     - A protocol that cannot be carried out is refused as a whole, with a list of all problems.
@@ -31,6 +35,7 @@ from .synthetic_participant import ParticipantModel, Share
 from .tasks import AnyTask, ReachTrial
 
 Wait = Annotated[float, Meta(ge=0.0, le=60.0)]
+"""A waiting time, in s."""
 Pseudonym = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_]{1,20}\Z")]
 """Name of a participant; the name becomes part of file names."""
 Count = Annotated[int, Meta(ge=1, le=1000)]
@@ -70,7 +75,7 @@ class Training(Frozen, frozen=True):
         before: number of trials of the learner alone before the training.
         after: number of trials of the learner alone right after the training (transfer).
         retention: number of trials of the learner alone after a rest (retention).
-        rest_s: rest before the retention trials, s.
+        rest_s: rest before the retention trials, in s.
     """
 
     lead: dict[Name, tuple[Share, Share]]
@@ -81,14 +86,14 @@ class Training(Frozen, frozen=True):
 
     def describe(self) -> str:
         """Returns the sentence on the training for a methods paragraph."""
-        parts = ", ".join(
-            f"{first:g} to {last:g} ({name})" for name, (first, last) in self.lead.items()
-        )
+        courses: list[str] = []
+        for condition, (first, last) in self.lead.items():
+            courses.append(f"{first:g} to {last:g} ({condition})")
         retention = ""
         if self.retention:
             retention = f", and {self.retention} more after {self.rest_s:g} s"
         return (
-            f"In these the expert's part of the authority went from {parts}; "
+            f"In these the expert's part of the authority went from {', '.join(courses)}; "
             f"{count_nouns(self.before, 'trial')} before and "
             f"{self.after} after them{retention} were made without it and are compared"
         )
@@ -107,8 +112,8 @@ class Protocol(Frozen, frozen=True):
             docs/experiments.md.
         trials: number of counted trials of a block; a block has all trials of a condition.
         practice: number of practice trials before the counted trials of a block.
-        foreperiod_s: range of the time from the start of a trial until its target appears, s;
-            the time is drawn uniformly.
+        foreperiod_s: range of the time from the start of a trial until its target appears, in
+            s; the time is drawn uniformly.
         seed: seed of orders, targets and synthetic participants.
         set: scenario keys with the same value in all conditions.
         conditions: for each condition by name, the scenario keys that it sets.
@@ -116,10 +121,10 @@ class Protocol(Frozen, frozen=True):
         model: parameters of synthetic participants.
         consent: text that people agree to before their first trial; "" requests no consent.
         questionnaires: the questionnaires, and when people answer them.
-        rest_s: shortest rest between two blocks, s.
-        feedback: the measures that are shown to people after a trial.
-        force_limit_n: largest force of the live hand, N, for the pseudonyms of participants who
-            need a lower limit.
+        rest_s: shortest rest between two blocks, in s.
+        feedback: the measures that people see after a trial.
+        force_limit_n: largest force of the live hand, in N, for each participant who needs a
+            lower limit, by pseudonym.
         catch: trials of another condition within a block; they do not count.
         training: trials in which authority moves from an expert to a learner.
         staircase: pairs of trials that adapt a scenario key to a participant's threshold.
@@ -151,22 +156,26 @@ class Protocol(Frozen, frozen=True):
     def list_phases(
         self, condition: str, random: np.random.Generator
     ) -> list[tuple[str, float | None]]:
-        """Returns phase and `lead` of each trial of a block after practice.
+        """Returns the phase and the lead of each trial of a block after practice.
 
         The lead is the first user's part of the two users' total share at the slave; None keeps
-        the scenario's shares. `random` draws the order in the pairs of a staircase.
+        the scenario's shares.
+
+        Args:
+            condition: condition of the block.
+            random: draws the order in the pairs of a staircase.
         """
+        phases: list[tuple[str, float | None]] = []
         if self.staircase is not None:
-            pairs = [
-                random.permutation([STANDARD, COMPARISON]).tolist()
-                for _ in range(self.trials // 2)
-            ]
-            return [(phase, None) for phase in itertools.chain(*pairs)]
+            for _ in range(self.trials // 2):
+                pair = random.permutation([STANDARD, COMPARISON]).tolist()
+                phases += [(phase, None) for phase in pair]
+            return phases
         training = self.training
         if training is None:
             return [("", None)] * self.trials
         first_lead, last_lead = training.lead[condition]
-        phases: list[tuple[str, float | None]] = [("before", 0.0)] * training.before
+        phases += [("before", 0.0)] * training.before
         leads = np.linspace(first_lead, last_lead, self.trials).tolist()
         phases += [("training", lead) for lead in leads]
         phases += [("after", 0.0)] * training.after
@@ -184,10 +193,13 @@ class Protocol(Frozen, frozen=True):
     @property
     def groups(self) -> list[tuple[str, ...]]:
         """The participants who take part together: single participants, or pairs."""
-        names = self.participants
-        if isinstance(names, int):
-            digits = len(str(names))
-            names = tuple(f"P{number:0{digits}d}" for number in range(1, names + 1))
+        participants = self.participants
+        if isinstance(participants, int):
+            digits = len(str(participants))
+            numbers = range(1, participants + 1)
+            names = tuple(f"P{number:0{digits}d}" for number in numbers)
+        else:
+            names = participants
         size = len(self.users)
         return [names[first : first + size] for first in range(0, len(names), size)]
 
@@ -245,8 +257,8 @@ class Step(NamedTuple):
 
     Attributes:
         kind: "consent", "trial" or "questionnaire".
-        planned: the trial itself, the trial after the consent, or the trial before the
-            questionnaire.
+        planned: the trial of the step; for a consent the next trial, for a questionnaire the
+            trial before.
         form: the questionnaire; None for other kinds.
     """
 
@@ -258,7 +270,9 @@ class Step(NamedTuple):
     def key(self) -> str:
         """The identifier of the step in notes and messages."""
         key = f"{self.kind} {self.planned.number}"
-        return f"{key} {self.form.name}" if self.form else key
+        if self.form is not None:
+            return f"{key} {self.form.name}"
+        return key
 
 
 @dataclass(frozen=True, repr=False)
@@ -266,6 +280,9 @@ class ExperimentPlan(Result):
     """A protocol, the scenario of each condition, and all trials in their order.
 
     Attributes:
+        protocol: the protocol.
+        scenarios: the scenario of each condition, by name.
+        trials: all trials in their order.
         digest: SHA-256 of protocol and scenarios, in hexadecimal digits.
     """
 
@@ -277,12 +294,13 @@ class ExperimentPlan(Result):
     def to_dict(self) -> dict[str, Any]:
         """Returns the plan as `trilat experiment check --json` prints it."""
         protocol = self.protocol
+        uncounted = [trial for trial in self.trials if trial.practice or trial.catch]
         return {
             "name": protocol.name,
             "digest": self.digest,
             "groups": len(protocol.groups),
             "trials": len(self.trials),
-            "counted": sum(not (trial.practice or trial.catch) for trial in self.trials),
+            "counted": len(self.trials) - len(uncounted),
             "conditions": list(protocol.conditions),
             "orders": self.list_orders(),
         }
@@ -290,6 +308,7 @@ class ExperimentPlan(Result):
     def list_steps(self) -> Iterator[Step]:
         """Yields the steps of the experiment in their order."""
         protocol = self.protocol
+        last_trial = self.trials[-1].trial
         for planned in self.trials:
             if protocol.consent and planned.block == planned.trial == 1:
                 yield Step("consent", planned)
@@ -298,30 +317,34 @@ class ExperimentPlan(Result):
             ends_pair = counted > 0 and counted % 2 == 0
             if protocol.staircase is not None and ends_pair:
                 yield Step("questionnaire", planned, protocol.staircase.form)
-            if planned.trial == self.trials[-1].trial:
+            if planned.trial == last_trial:
                 is_last_block = planned.block == len(protocol.conditions)
                 for form in protocol.questionnaires:
                     if is_last_block or form.after == "block":
                         yield Step("questionnaire", planned, find_form(form))
 
     def judge_choices(self, planned: PlannedTrial, choices: Choices) -> list[bool]:
-        """Returns for each choice in a trial's block whether it is the comparison trial.
+        """Returns for each choice in a trial's block whether the choice is right.
 
-        The comparison trial is the trial of its pair with the larger value.
+        The right choice is the comparison trial: the trial of the pair with the larger value.
+
+        Args:
+            planned: any trial of the block.
+            choices: the choices of the participants.
         """
-        first = planned.number - planned.trial
-        block = self.trials[first:][: self.trials[-1].trial]
-        judgements = []
-        for second in block:
+        block_start = planned.number - planned.trial
+        block_end = block_start + self.trials[-1].trial
+        judgements: list[bool] = []
+        for second in self.trials[block_start:block_end]:
             if second.number in choices:
-                right_choice = 1 + (second.phase == COMPARISON)
+                right_choice = 2 if second.phase == COMPARISON else 1
                 judgements.append(choices[second.number] == right_choice)
         return judgements
 
     def find_pair(self, planned: PlannedTrial, choices: Choices) -> tuple[float, bool | None]:
         """Returns the difference within a trial's pair, and whether the choice was right.
 
-        The second is None before the choice.
+        Before the choice, the second value is None.
         """
         staircase = self.protocol.staircase
         assert staircase is not None
@@ -332,7 +355,7 @@ class ExperimentPlan(Result):
         return difference, is_right
 
     def find_scenario(self, planned: PlannedTrial, choices: Choices) -> Scenario:
-        """Returns the scenario of a trial, given the earlier choices of its block."""
+        """Returns the scenario of a trial; a staircase adapts it to the earlier choices."""
         scenario = self.scenarios[planned.condition]
         staircase = self.protocol.staircase
         if staircase is None or planned.practice:
@@ -343,7 +366,7 @@ class ExperimentPlan(Result):
         return load_scenario(scenario, {staircase.key: staircase.standard + difference})
 
     def rest_before_s(self, planned: PlannedTrial) -> float:
-        """Returns the shortest rest before a trial, s."""
+        """Returns the shortest rest before a trial, in s."""
         training = self.protocol.training
         previous = self.trials[max(planned.number - 2, 0)]
         starts_retention = planned.phase == "retention" and previous.phase != "retention"
@@ -371,15 +394,14 @@ class ExperimentPlan(Result):
         users = ", ".join(protocol.users)
         yield f"{protocol.name}: {protocol.title or protocol.task.description}"
         yield f"{facts['groups']} {units} at {users}, {protocol.task.description}"
-        trials = self.trials[-1].trial - protocol.practice
-        blocks = (
-            f"{count_nouns(len(protocol.conditions), 'condition')} of "
-            f"{protocol.practice} + {count_nouns(trials, 'trial')}"
-        )
-        longest_s = protocol.foreperiod_s[1] + protocol.task.longest_s
+        conditions = count_nouns(len(protocol.conditions), "condition")
+        counted = count_nouns(self.trials[-1].trial - protocol.practice, "trial")
+        total = count_nouns(len(self.trials), "trial")
+        _, longest_foreperiod_s = protocol.foreperiod_s
+        longest_s = longest_foreperiod_s + protocol.task.longest_s
         yield (
-            f"{blocks}: {count_nouns(len(self.trials), 'trial')} of at most {longest_s:g} s; "
-            f"design {protocol.design}"
+            f"{conditions} of {protocol.practice} + {counted}: "
+            f"{total} of at most {longest_s:g} s; design {protocol.design}"
         )
         rows = [(name, ", ".join(order)) for name, order in facts["orders"].items()]
         yield TextTable(("", "order of conditions"), rows)
@@ -421,17 +443,20 @@ def plan_experiment(
         UsageError: the protocol cannot be carried out; the error lists all problems.
     """
     problems = list(_find_problems(protocol))
-    condition_scenarios = dict(scenarios or {})
-    source: str | Path = protocol.scenario
-    if folder is not None and (folder / protocol.scenario).is_file():
-        source = folder / protocol.scenario
-    for name, keys in protocol.conditions.items() if scenarios is None else ():
-        try:
+    condition_scenarios: dict[str, Scenario] = {}
+    if scenarios is not None:
+        condition_scenarios |= scenarios
+    else:
+        source: str | Path = protocol.scenario
+        if folder is not None and (folder / protocol.scenario).is_file():
+            source = folder / protocol.scenario
+        for name, keys in protocol.conditions.items():
             settings = _list_keys(protocol.set) | _list_keys(keys)
-            scenario = load_scenario(source, settings)
-            condition_scenarios[name] = _check_scenario(scenario, protocol)
-        except TrilatError as error:
-            problems.append(f"condition {name}: {error}")
+            try:
+                scenario = load_scenario(source, settings)
+                condition_scenarios[name] = _check_scenario(scenario, protocol)
+            except TrilatError as error:
+                problems.append(f"condition {name}: {error}")
     if problems:
         raise UsageError(f"{protocol.name}: " + "; ".join(problems))
     texts = {name: scenario.text for name, scenario in condition_scenarios.items()}
@@ -468,7 +493,7 @@ def _find_problems(protocol: Protocol) -> Iterator[str]:
         foreperiod_s = list(protocol.foreperiod_s)
         yield f"foreperiod_s is from the shorter to the longer time, not {foreperiod_s}"
     if len(set(names)) < len(names):
-        yield "two participants have one pseudonym"
+        yield "two participants have the same pseudonym"
     if unknown := protocol.force_limit_n.keys() - set(names):
         yield f"force_limit_n: there is no participant {', '.join(sorted(unknown))}"
     if protocol.catch is not None and protocol.catch.condition not in protocol.conditions:
@@ -479,14 +504,14 @@ def _find_problems(protocol: Protocol) -> Iterator[str]:
         yield f"training.lead: is a pair of numbers for each of {conditions}"
     exclusive_tables = (training, protocol.catch, protocol.staircase)
     if sum(table is not None for table in exclusive_tables) > 1:
-        yield "an experiment has one of catch trials, a training and a staircase"
+        yield "catch trials, a training and a staircase exclude each other"
     if protocol.staircase is not None:
         yield from _find_staircase_problems(protocol, protocol.staircase)
     if size != 2 and (training is not None or protocol.task.needs_pair):
-        yield "a training, a handover and users who are shown different targets need two users"
+        yield "a training, a handover and a task with two targets need two users"
     forms = [form.name for form in protocol.forms]
     if len(set(forms)) < len(forms):
-        yield "two questionnaires have one name"
+        yield "two questionnaires have the same name"
     for form in protocol.questionnaires:
         try:
             find_form(form)
@@ -511,10 +536,11 @@ def _find_problems(protocol: Protocol) -> Iterator[str]:
 def _find_staircase_problems(protocol: Protocol, staircase: Staircase) -> Iterator[str]:
     """Yields the problems of a protocol with a staircase."""
     if len(protocol.users) != 1:
-        yield "staircase: is of one user, who answers"
+        yield "staircase: needs exactly one user, who answers"
     if protocol.trials % 2:
         yield (
-            f"trials: a staircase is of pairs, their number must be even, is {protocol.trials}"
+            "trials: a staircase consists of pairs of trials: their number must be even, "
+            f"is {protocol.trials}"
         )
     key = staircase.key
     conditions = [name for name, keys in protocol.conditions.items() if key in _list_keys(keys)]
@@ -565,8 +591,8 @@ def limit_forces(
     Raises:
         ScenarioError: a live hand has no force limit, or a lower limit already.
     """
-    limited_sites = {}
-    # not strict: `_find_problems` reports a group that is too small
+    limited_sites: dict[str, Any] = {}
+    # The lengths may differ: `_find_problems` reports a group that is too small.
     for user, name in zip(protocol.users, group, strict=False):
         spec = scenario.sites[user]
         limit_n = protocol.force_limit_n.get(name)
@@ -606,12 +632,13 @@ def list_orders(design: str, conditions: Sequence[str], seed: int) -> list[tuple
         return [tuple(names[random.permutation(count)].tolist()) for _ in range(1000)]
     first_row = list(range(count))
     if design == "williams":
-        # the first row is 0, 1, n - 1, 2, n - 2, ...
+        # The first row is 0, 1, n - 1, 2, n - 2, ...
         first_row = [0]
         for step in range(1, count // 2 + 1):
             first_row += [step, count - step]
         first_row = first_row[:count]
     rows = [[(index + shift) % count for index in first_row] for shift in range(count)]
+    # For an odd number, only the rows and their mirror images together are balanced.
     if design == "williams" and count % 2:
         rows += [row[::-1] for row in rows]
     return [tuple(conditions[index] for index in row) for row in rows]
@@ -620,9 +647,10 @@ def list_orders(design: str, conditions: Sequence[str], seed: int) -> list[tuple
 def _list_trials(protocol: Protocol) -> Iterator[PlannedTrial]:
     """Yields all trials of an experiment in their order."""
     orders = list_orders(protocol.design, list(protocol.conditions), protocol.seed)
+    groups = list(enumerate(protocol.groups))
     blocks = range(len(protocol.conditions))
     number = 0
-    for (index, group), block in itertools.product(enumerate(protocol.groups), blocks):
+    for (index, group), block in itertools.product(groups, blocks):
         condition = orders[index % len(orders)][block]
         random = np.random.default_rng([protocol.seed, index, block, 2])
         phases: list[tuple[str, float | None]] = [("", None)] * protocol.practice
@@ -648,7 +676,7 @@ def _list_trials(protocol: Protocol) -> Iterator[PlannedTrial]:
                 practice=trial < protocol.practice,
                 before=block * len(phases) + trial,
                 target=int(first_target) + target_step,
-                # 31 bits, so that the seed is a positive 32-bit integer
+                # 31 bits, so that the seed is a positive 32-bit integer.
                 seed=int(state[0]) >> 1,
                 catch=is_catch,
                 phase=phase,

@@ -1,7 +1,8 @@
 """Statistics of experiments with people: means, tests, power, and a methods paragraph.
 
-The rows are tidy: each trial is a mapping with `participant`, `pair`, `condition` and the
-measures by their names, as in `trials.csv`. A trial whose value is None or "" does not count.
+All functions read tidy rows: each trial is a mapping with `participant`, `pair`, `condition`
+and the measures by name, as in `trials.csv`. A trial whose value of a measure is None or ""
+does not count for that measure.
 
 Invariant:
     - Trials are averaged per participant and condition before any test, so that more trials
@@ -16,7 +17,7 @@ import re
 import warnings
 from bisect import bisect_left
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import combinations
 from typing import Any, NamedTuple
@@ -41,7 +42,8 @@ _ROUNDING = 1e-12
 
 def import_scipy_stats() -> Any:
     """Returns the module `scipy.stats`."""
-    from scipy import stats  # the import takes half a second, and most commands do not need it
+    # The import takes half a second, and most commands do not need it.
+    from scipy import stats
 
     return stats
 
@@ -67,7 +69,8 @@ def average_trials(
     """
     values: dict[str, dict[str, list[float]]] = {}
     for row in rows:
-        if missing := [key for key in (unit, "condition") if key not in row]:
+        missing = [key for key in (unit, "condition") if key not in row]
+        if missing:
             raise UsageError(
                 f"a row without {' and '.join(missing)}: tidy rows have a key for each"
             )
@@ -76,7 +79,7 @@ def average_trials(
         if value not in (None, ""):
             number = read_number(value, measure, row)
             values_by_unit.setdefault(str(row[unit]), []).append(number)
-    means = {}
+    means: dict[str, dict[str, float]] = {}
     for condition, values_by_unit in values.items():
         means[condition] = {
             name: math.fsum(numbers) / len(numbers) for name, numbers in values_by_unit.items()
@@ -143,11 +146,18 @@ def summarise_conditions(
 ) -> list[ConditionMean]:
     """Returns mean, spread and intervals of each condition that has a number.
 
-    The conditions are in the order of the rows; `seed` is that of the bootstrap.
+    The conditions are in the order of the rows.
+
+    Args:
+        rows: trials, as for `average_trials`.
+        measure: name of the measure.
+        unit: "participant" or "pair".
+        seed: seed of the bootstrap.
     """
     means = average_trials(rows, measure, unit)
-    missing = Counter(str(row["condition"]) for row in rows if row.get(measure) in (None, ""))
-    summaries = []
+    rows_without_value = [row for row in rows if row.get(measure) in (None, "")]
+    missing = Counter(str(row["condition"]) for row in rows_without_value)
+    summaries: list[ConditionMean] = []
     for condition, means_by_unit in means.items():
         if means_by_unit:
             summary = _summarise(condition, list(means_by_unit.values()), seed)
@@ -188,9 +198,10 @@ def bootstrap_interval(values: Sequence[float], seed: int = 0) -> tuple[float, f
     sample = np.asarray(values, dtype=np.float64)
     if sample.size < 2:
         return None
+    # BCa divides by the spread of the sample, and returns NaN for equal values.
     if np.ptp(sample) <= _ROUNDING * np.abs(sample).max():
-        # BCa divides by the spread of the sample and returns NaN for equal values
-        return float(sample.mean()), float(sample.mean())
+        mean = float(sample.mean())
+        return mean, mean
     result = import_scipy_stats().bootstrap(
         (sample,),
         np.mean,
@@ -252,9 +263,9 @@ def compare_conditions(
     cumulative science", Frontiers in Psychology 4:863 (2013), for d_z and d_av.
     """
     means = average_trials(rows, measure, unit)
-    comparisons = [
-        _compare(measure, first, second, means) for first, second in combinations(means, 2)
-    ]
+    comparisons: list[Comparison] = []
+    for first, second in combinations(means, 2):
+        comparisons.append(_compare(measure, first, second, means))
     corrected = correct_holm([comparison.p for comparison in comparisons])
     return [
         comparison._replace(p_holm=p)
@@ -283,7 +294,8 @@ def _compare(
     stats = import_scipy_stats()
     test = stats.ttest_rel(second_means, first_means)
     low, high = test.confidence_interval(CONFIDENCE)
-    mean_deviation = float(first_means.std(ddof=1) + second_means.std(ddof=1)) / 2.0
+    sum_of_deviations = float(first_means.std(ddof=1) + second_means.std(ddof=1))
+    mean_deviation = sum_of_deviations / 2.0
     return untested._replace(
         difference=mean,
         interval=(float(low), float(high)),
@@ -304,8 +316,9 @@ def correct_holm(p: Sequence[float | None]) -> list[float | None]:
     corrected: list[float | None] = [None] * len(p)
     largest = 0.0
     for rank, (value, index) in enumerate(ascending):
-        # a corrected value is never below that of a smaller p
-        largest = max(largest, min(1.0, (len(ascending) - rank) * value))
+        remaining = len(ascending) - rank
+        # A corrected value is never below the corrected value of a smaller p.
+        largest = max(largest, min(1.0, remaining * value))
         corrected[index] = largest
     return corrected
 
@@ -419,15 +432,15 @@ def _fit(formulas: Any, frame: Any, measure: str) -> Any:
         "measure ~ condition", frame, groups="pair", re_formula="1", vc_formula=parts
     )
     fits = []
-    # the gradient method alone may stop before it reaches a variance of 0; Powell's does not
-    # use the gradient
+    # The gradient method alone may stop before it reaches a variance of 0. Powell's method does
+    # not use the gradient.
     for method in ("powell", "lbfgs"):
         with suppress(np.linalg.LinAlgError):
             fits.append(model.fit(reml=True, method=method))
     finite_fits = [fit for fit in fits if np.isfinite([fit.llf, *fit.bse_fe]).all()]
     if not finite_fits:
         raise UsageError(
-            f"{measure}: a mixed model cannot be fitted to it; compare conditions instead"
+            f"{measure}: no mixed model can be fitted to its means; compare conditions instead"
         )
     return max(finite_fits, key=lambda fit: float(fit.llf))
 
@@ -444,7 +457,8 @@ def _find_pairs(rows: Sequence[Row]) -> dict[str, str]:
         pair = "" if row.get("pair") is None else str(row["pair"])
         if pairs.setdefault(user, pair) != pair:
             raise UsageError(
-                f"participant {user} is in pairs {pairs[user]} and {pair}: one pair each"
+                f"participant {user} is in pairs {pairs[user]} and {pair}: "
+                "a participant belongs to one pair"
             )
     if "" in pairs.values() or len(set(pairs.values())) == len(pairs):
         raise UsageError("no pair has two participants: a mixed model is of users within pairs")
@@ -478,7 +492,7 @@ def power(d_z: float, number: int, *, alpha: float = 0.05) -> float:
     Source: Cohen, "Statistical power analysis for the behavioral sciences" (1988).
 
     Args:
-        d_z: the effect: mean over standard deviation of the differences.
+        d_z: the size of the effect: mean over standard deviation of the differences.
         number: number of units.
         alpha: significance level.
 
@@ -493,9 +507,10 @@ def power(d_z: float, number: int, *, alpha: float = 0.05) -> float:
     shift = abs(d_z) * math.sqrt(number)
     freedom = number - 1
     critical = stats.t.ppf(1.0 - alpha / 2.0, freedom)
-    # the lower tail is computed from its mirror image: `nct.cdf` returns NaN for small tails
-    tails = [stats.nct.sf(critical, freedom, sign * shift) for sign in (1.0, -1.0)]
-    return float(sum(tails))
+    upper_tail = stats.nct.sf(critical, freedom, shift)
+    # The lower tail is computed from its mirror image: `nct.cdf` returns NaN for small tails.
+    lower_tail = stats.nct.sf(critical, freedom, -shift)
+    return float(upper_tail + lower_tail)
 
 
 def find_least_number(
@@ -562,16 +577,18 @@ def simulate_power(
         seed: seed of the random numbers.
     """
     generator = np.random.default_rng(seed)
-    experiments = []
+    experiments: list[list[Comparison]] = []
     for _ in range(repetitions):
         effects = generator.normal(0.0, effect_deviation, (number, len(means), 1))
         noise = generator.normal(0.0, trial_deviation, (number, len(means), trials))
         rows = _list_rows(effects + noise, means)
         experiments.append(compare_conditions(rows, "measure"))
-    # of a difference of two means over trials, which both vary by effect and by trial
-    variance = 2.0 * (float(effect_deviation) ** 2 + float(trial_deviation) ** 2 / trials)
+    # Variance of the difference of two means, each of which varies by effect and by trial.
+    effect_variance = float(effect_deviation) ** 2
+    trial_variance = float(trial_deviation) ** 2
+    variance = 2.0 * (effect_variance + trial_variance / trials)
     deviation = math.sqrt(variance)
-    powers = []
+    powers: list[SimulatedPower] = []
     for comparisons in zip(*experiments, strict=True):
         difference = float(means[comparisons[0].second] - means[comparisons[0].first])
         powers.append(_count_significant(comparisons, difference / deviation, alpha))
@@ -588,11 +605,9 @@ def _list_rows(values: Array, means: Mapping[str, float]) -> list[Row]:
     rows: list[Row] = []
     for index, (condition, mean) in enumerate(means.items()):
         for user, deviations in enumerate(values[:, index]):
-            measures = [mean + deviation for deviation in deviations.tolist()]
-            rows += [
-                {"participant": user, "condition": condition, "measure": measure}
-                for measure in measures
-            ]
+            for deviation in deviations.tolist():
+                measure = mean + deviation
+                rows.append({"participant": user, "condition": condition, "measure": measure})
     return rows
 
 
@@ -670,53 +685,66 @@ def write_methods(facts: Mapping[str, Any]) -> str:
     Raises:
         UsageError: a fact is missing or unknown, or a condition has no delay.
     """
+    _check_facts(facts)
+    texts = {key: _format_fact(value, key) for key, value in facts.items()}
+    conditions: list[str] = []
+    for name, condition in facts["conditions"].items():
+        conditions.append(f"{name} ({_format_fact(condition)})")
+    texts["conditions"] = "; ".join(conditions)
+    measures = [" in ".join(filter(None, split_unit(name))) for name in facts["measures"]]
+    texts["measures"] = ", ".join(measures)
+    first_parts = [text.format(texts[key]) for key, text in _METHODS if texts.get(key)]
+    sentences = [
+        f"{''.join(first_parts)} over the trials of a condition",
+        texts.get("completion"),
+        texts.get("answers"),
+    ]
+    sentences += _describe_computed(frozenset(facts.get("computed", ())), texts)
+    text = " ".join(f"{_capitalise(sentence)}." for sentence in sentences if sentence)
+    # The templates are in the plural.
+    singular = re.sub(r"(?<![\w.])1 (participant|pair|block|trial)s\b", r"1 \1", text)
+    return singular.replace("; 1 more were excluded", "; 1 more was excluded")
+
+
+def _check_facts(facts: Mapping[str, Any]) -> None:
+    """Checks that the facts of a methods paragraph are known and complete.
+
+    Raises:
+        UsageError: a fact is missing or unknown, or a condition has no delay.
+    """
     known = [*(key for key, _ in _METHODS), *_ENDING]
-    if missing := [key for key in known if key not in facts and key not in _OPTIONAL]:
+    missing = [key for key in known if key not in facts and key not in _OPTIONAL]
+    if missing:
         raise UsageError(f"a methods paragraph needs {', '.join(missing)}")
-    if unknown := [key for key in facts if key not in known]:
+    unknown = [key for key in facts if key not in known]
+    if unknown:
         raise UsageError(f"{', '.join(unknown)}: facts are {', '.join(known)}")
-    if odd := [name for name in facts.get("computed", ()) if name not in COMPUTED]:
-        raise UsageError(f"{', '.join(odd)}: analyses are {', '.join(COMPUTED)}")
+    unknown_analyses = [name for name in facts.get("computed", ()) if name not in COMPUTED]
+    if unknown_analyses:
+        raise UsageError(f"{', '.join(unknown_analyses)}: analyses are {', '.join(COMPUTED)}")
     for name, condition in facts["conditions"].items():
         if not any(key.startswith("delay") for key in condition):
             raise UsageError(
                 f"condition {name} has no delay: give delay_ms, as measured, "
                 "0 if there was none"
             )
-    texts = {key: _format_fact(value, key) for key, value in facts.items()}
-    texts["conditions"] = "; ".join(
-        f"{name} ({_format_fact(condition)})" for name, condition in facts["conditions"].items()
-    )
-    texts["measures"] = ", ".join(
-        " in ".join(filter(None, split_unit(name))) for name in facts["measures"]
-    )
-    first = "".join(text.format(texts[key]) for key, text in _METHODS if texts.get(key))
-    sentences = [
-        f"{first} over the trials of a condition",
-        texts.get("completion"),
-        texts.get("answers"),
-    ]
-    sentences += _describe_computed(frozenset(facts.get("computed", ())), texts)
-    text = " ".join(f"{_capitalise(sentence)}." for sentence in sentences if sentence)
-    singular = re.sub(r"(?<![\w.])1 (participant|pair|block|trial)s\b", r"1 \1", text)
-    return singular.replace("; 1 more were excluded", "; 1 more was excluded")
 
 
-def _describe_computed(computed: Collection[str], texts: Mapping[str, str]) -> Iterator[str]:
+def _describe_computed(computed: frozenset[str], texts: Mapping[str, str]) -> Iterator[str]:
     """Yields a sentence for each analysis that was computed.
 
-    A sentence says so if the conditions were not compared by any test.
+    If the conditions were not compared by any test, a sentence says this.
     """
     correction = f"with p corrected by {texts['correction']} over all comparisons of a measure"
     level = f", at alpha = {texts['alpha']}" if texts.get("alpha") else ""
     if "t tests" in computed:
-        wilcoxon = (
-            " and by Wilcoxon's signed-rank test beside them" if "wilcoxon" in computed else ""
-        )
+        wilcoxon = ""
+        if "wilcoxon" in computed:
+            wilcoxon = " and by Wilcoxon's signed-rank test beside them"
         tests = "conditions were compared by two-sided paired t tests"
         yield f"{tests}, {correction}{level}{wilcoxon}"
     if "sign tests" in computed:
-        rule = "in which one that was not reached is longer than any that was"
+        rule = "in which a median that was not reached is longer than any that was reached"
         by_sign = f"by exact two-sided sign tests on the medians, {rule}"
         yield f"completion times were compared {by_sign}, {correction}{level}"
     if "mixed models" in computed:
@@ -724,20 +752,19 @@ def _describe_computed(computed: Collection[str], texts: Mapping[str, str]) -> I
             "forces of users were compared by mixed models, "
             "with pair and user as random effects (REML)"
         )
-    if not {"t tests", "sign tests", "mixed models"} & {*computed}:
+    if computed.isdisjoint({"t tests", "sign tests", "mixed models"}):
         yield "conditions were not compared by tests"
     if "effect sizes" in computed:
         yield "effect sizes are Cohen's d_z and d_av"
     if "intervals" in computed:
-        bootstrap = (
-            f" and by the bootstrap (BCa, {RESAMPLES} resamples)"
-            if "bootstrap" in computed
-            else ""
-        )
+        bootstrap = ""
+        if "bootstrap" in computed:
+            bootstrap = f" and by the bootstrap (BCa, {RESAMPLES} resamples)"
         yield f"intervals are of {100 * CONFIDENCE:g} %, by Student's t{bootstrap}"
 
 
 def _capitalise(sentence: str) -> str:
+    """Returns a sentence with a capital first letter; other letters are unchanged."""
     return sentence[0].upper() + sentence[1:]
 
 
@@ -746,10 +773,13 @@ def _format_fact(value: Any, key: str = "") -> str:
     if isinstance(value, str):
         return value
     if isinstance(value, Mapping):
-        return ", ".join(
-            f"{split_unit(name)[0]} {_format_fact(item, name)}" for name, item in value.items()
-        )
+        items: list[str] = []
+        for name, item in value.items():
+            quantity, _ = split_unit(name)
+            items.append(f"{quantity} {_format_fact(item, name)}")
+        return ", ".join(items)
     if isinstance(value, Sequence):
         return ", ".join(_format_fact(item, key) for item in value)
     number = str(value) if isinstance(value, int) else repr(float(value)).removesuffix(".0")
-    return f"{number} {split_unit(key)[1]}".strip()
+    _, unit = split_unit(key)
+    return f"{number} {unit}".strip()
