@@ -1,20 +1,23 @@
-"""An experiment with people: a session for each trial, one page for all of them, and its notes.
+"""Run an experiment with people: a session for each trial, and one page for all sessions.
+
+The participants open their pages once. For each trial this module starts a session, shows it on
+the pages, checks the log of the session, and notes the result. Between trials it collects
+consents and questionnaires.
 
 Invariant:
-    - A trial counts by its log alone. The log is in its place before the journal has the
-      trial, so a process that dies at any moment loses no trial whose session has ended, and
-      counts no other.
-    - Every attempt has a folder of its own. If the trial does not count, that folder stays,
-      with a note of the reason.
+    - A trial counts by its log alone. The log is in its final folder before the journal has the
+      trial. A process that dies at any moment therefore loses no trial whose session has ended,
+      and counts no other trial.
+    - Every attempt at a trial has a folder of its own. If the attempt does not count, the
+      folder stays, with a note of the reason.
 """
 
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
@@ -34,17 +37,20 @@ from .experiment_stage import Stage, TrialWatch
 from .page_server import PageOptions, PageServer
 
 ATTEMPTS = "tries"
+"""Folder of the attempts at trials, in the folder of the experiment."""
 POLL_NS = 20_000_000
+"""Time between two checks for the replies of participants, in ns."""
 FAREWELL_NS = NS_PER_S
-"""Time between the last step and the end of the server, in which every page is told."""
+"""Time between the last step and the end of the server, in ns: every page shows the end."""
 
 EARLY_FAILURE_NS = 60 * NS_PER_S
-"""A session that fails earlier than this, before it has begun, would fail again."""
+"""Time within which a session that fails before its beginning would fail again, in ns."""
 
 SessionRunner = Callable[[TrialWatch, Path, Callable[[], bool]], SessionResult]
-"""A function of the watch of a trial, a folder, and a function that returns True at the start.
+"""A function that runs the session of a trial until the trial is over or people end it.
 
-It runs the session of the trial until the watch is over, or people end the experiment.
+Its arguments are the watch of the trial, the folder of the attempt, and a function that returns
+True once the session may begin.
 """
 
 
@@ -54,7 +60,7 @@ class ExperimentSessions:
 
     Attributes:
         experiment: the experiment.
-        stage: what its pages show.
+        stage: the part of the pages around the sessions.
         clock: the clock of the stage.
         run_session: runs the session of a trial.
         ends: returns True once the experiment must end for now.
@@ -80,10 +86,13 @@ class ExperimentSessions:
         with trials as self._trials, notes as self._notes:
             done = {entry.cell for entry in self._trials.done.values()}
             for step in self.experiment.plan.list_steps():
-                is_trial = step.kind == "trial"
-                if is_trial and step.planned.number in done:
-                    continue
-                if not (self._run_trial(step) if is_trial else self._request_step(step)):
+                if step.kind != "trial":
+                    is_done = self._request_step(step)
+                elif step.planned.number in done:
+                    is_done = True
+                else:
+                    is_done = self._run_trial(step)
+                if not is_done:
                     return False
             self.stage.show_end()
         return True
@@ -98,30 +107,50 @@ class ExperimentSessions:
         cells = {site: f"{step.key} {who}" for site, who in users.items()}
         done = [site for site, cell in cells.items() if (cell, 0) in self._notes.done]
         request = self.stage.request_step(step, rest_s, done)
-        noted = len(self._notes.done)
+        note_count = len(self._notes.done)
         form_name = step.form.name if step.form else ""
         while not request.replies.keys() >= users.keys():
             if self.ends():
                 return False
             self.clock.sleep_until(self.clock.monotonic_ns() + POLL_NS)
+            # A user who is ready for a trial leaves no note.
             if step.kind == "trial":
                 continue
             for site, (answers, _) in list(request.replies.items()):
                 self._add_note(
-                    cells[site],
-                    step.kind,
-                    users[site],
-                    step.planned.number,
-                    form_name,
-                    answers,
+                    cell=cells[site],
+                    kind=step.kind,
+                    who=users[site],
+                    number=step.planned.number,
+                    text=form_name,
+                    answers=answers,
                 )
-        if len(self._notes.done) > noted:
+        if len(self._notes.done) > note_count:
             self.experiment.write_tables()
         return True
 
-    def _add_note(self, cell: str, kind: str, who: str, number: int, *details: Any) -> None:
+    def _add_note(
+        self,
+        *,
+        cell: str,
+        kind: str,
+        who: str,
+        number: int,
+        text: str,
+        answers: Mapping[str, float | None] = {},
+    ) -> None:
+        """Adds a note to the journal, unless the journal has a note of this cell already."""
         unix_s = round(self.clock.unix_ns() / NS_PER_S, 3)
-        self._notes.add(Note(cell, kind, who, number, unix_s, *details))
+        note = Note(
+            cell=cell,
+            kind=kind,
+            who=who,
+            number=number,
+            unix_s=unix_s,
+            text=text,
+            answers=dict(answers),
+        )
+        self._notes.add(note)
 
     def _run_trial(self, step: Step) -> bool:
         """Repeats a trial until one attempt counts.
@@ -140,7 +169,8 @@ class ExperimentSessions:
         for last_attempt in self._list_attempts(planned)[-1:]:
             if any(last_attempt.glob("*.mcap*")):
                 self._record_aborted(planned, "the program was ended")
-            else:  # its session had not begun
+            else:
+                # The session of the attempt had not begun.
                 shutil.rmtree(last_attempt, ignore_errors=True)
         rest_s = plan.rest_before_s(planned)
         while not self._run_attempt(step, trial, path, rest_s):
@@ -150,12 +180,20 @@ class ExperimentSessions:
         return True
 
     def _list_attempts(self, planned: PlannedTrial) -> list[Path]:
-        return sorted((self.experiment.folder / ATTEMPTS).glob(f"{planned.number:05d}-*"))
+        """Returns the folders of the attempts at a trial, the oldest first."""
+        attempts = self.experiment.folder / ATTEMPTS
+        return sorted(attempts.glob(f"{planned.number:05d}-*"))
 
     def _record_aborted(self, planned: PlannedTrial, reason: str) -> None:
-        """Notes why the newest attempt does not count, unless that is noted already."""
-        cell = f"aborted {self._list_attempts(planned)[-1].name}"
-        self._add_note(cell, "aborted", "-".join(planned.group), planned.number, reason)
+        """Notes why the newest attempt does not count, unless the reason is noted already."""
+        last_attempt = self._list_attempts(planned)[-1]
+        self._add_note(
+            cell=f"aborted {last_attempt.name}",
+            kind="aborted",
+            who="-".join(planned.group),
+            number=planned.number,
+            text=reason,
+        )
         self.experiment.write_tables()
 
     def _run_attempt(
@@ -175,6 +213,7 @@ class ExperimentSessions:
         has_begun = False
 
         def begins() -> bool:
+            """Returns True once all users are ready, and shows the trial."""
             nonlocal has_begun
             if not has_begun and request.replies.keys() >= set(self.stage.users):
                 has_begun = True
@@ -206,11 +245,14 @@ class ExperimentSessions:
         return not reason
 
     def _count_trial(self, trial: ExperimentTrial, path: Path) -> str:
-        """Counts a trial by its log; returns why it does not count, "" if it does.
+        """Counts a trial by its log.
 
         Args:
             trial: the trial.
-            path: the log, which is in its place already.
+            path: the log, in its final folder.
+
+        Returns:
+            The reason why the trial does not count; "" if it counts.
         """
         attempts = self._list_attempts(trial.planned)[-1:]
         try:
@@ -236,15 +278,18 @@ class ExperimentSessions:
 
 
 def _find_repeat_reason(watch: TrialWatch, result: SessionResult) -> str:
-    """Returns why a trial must be repeated, "" if it counts.
+    """Returns why a trial must be repeated; "" if the trial counts.
 
-    A trial in which an arm has diverged counts, as a failed one.
+    A trial in which an arm has diverged counts as failed.
     """
     if result.interrupted:
         return "the experiment was interrupted"
-    if watch.aborted or not result.log.exists():
-        return watch.aborted or "; ".join(result.problems) or "there is no log"
-    return "" if watch.diverged else "; ".join(result.problems)
+    problems = "; ".join(result.problems)
+    if watch.aborted:
+        return watch.aborted
+    if not result.log.exists():
+        return problems or "there is no log"
+    return "" if watch.diverged else problems
 
 
 def run_with_people(
@@ -276,6 +321,7 @@ def run_with_people(
             def run_session(
                 watch: TrialWatch, folder: Path, begins: Callable[[], bool]
             ) -> SessionResult:
+                """Runs the session of a trial; a signal to the session ends the experiment."""
                 attend = partial(_show_session, page, idle, watch)
                 result = run_demo(
                     scenario=watch.trial.scenario,
@@ -288,6 +334,7 @@ def run_with_people(
                 return result
 
             def ends() -> bool:
+                """Returns True once a signal or a page has requested the end."""
                 return interrupt.is_requested() or page.end_requested.is_set()
 
             sessions = ExperimentSessions(

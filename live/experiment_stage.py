@@ -1,11 +1,14 @@
 """The steps of an experiment on its pages: consent, readiness, trials, questionnaires.
 
+The `Stage` is the part of the pages around the sessions: it requests steps from the users and
+collects their replies. A `TrialWatch` judges a trial while its session runs.
+
 Invariant:
-    - A reply counts only for the step that its page was shown, and only from the first page of
-      a user's site.
-    - A trial is judged by every record of its slave, as it is later judged by its log.
+    - A reply counts only for the step that the page showed, and only from the first page of a
+      user's site.
+    - A trial is judged by every record of the slave, as it is later judged by its log.
     - Rests and absences are measured on the monotonic clock.
-    - Users are not told the condition.
+    - The pages of users never show the condition.
 """
 
 from collections.abc import Collection, Sequence
@@ -25,11 +28,15 @@ from .page_orders import AbortTrial, StageMessage
 from .session_view import SessionView
 
 MAX_ABSENCE_NS = 8 * NS_PER_S
-"""Absence of a user's page after which a trial is aborted; a reload takes less time."""
+"""Absence of a user's page after which a trial is aborted, in ns; a reload takes less time."""
 END_DELAY_NS = NS_PER_S // 2
-"""Time between the end of a trial and that of its session, so that its mark reaches the log."""
+"""Time between the end of a trial and the end of its session, in ns.
+
+In this time the mark of the trial's end reaches the log.
+"""
 
 Json = dict[str, Any]
+"""A JSON object."""
 
 
 class TrialWatch:
@@ -42,7 +49,7 @@ class TrialWatch:
     Attributes:
         trial: the trial.
         judge: judges the trial, record by record.
-        aborted: why the trial must be repeated; "" if it need not.
+        aborted: why the trial must be repeated; "" if it need not be repeated.
         diverged: whether an arm has diverged, which makes the trial fail.
     """
 
@@ -91,7 +98,7 @@ class TrialWatch:
         """Judges the complete records up to the outcome; returns moments to mark in the log."""
         slave = view.sites[self.trial.slave]
         number = self.trial.planned.number
-        moments = list[str]()
+        moments: list[str] = []
         first = max(self._next_tick, slave.window.first)
         last = slave.complete
         if last < first:
@@ -100,11 +107,12 @@ class TrialWatch:
             moments.append(f"trial {number} begins")
         self._next_tick = last + 1
         rows = slave.window.rows(first, last)
+        are_known = rows.known.tolist()
+        positions = rows.q.tolist()
+        torques = rows.tau_x.tolist()
         ticks = range(first, last + 1)
-        columns = zip(
-            ticks, rows.known.tolist(), rows.q.tolist(), rows.tau_x.tolist(), strict=True
-        )
-        for tick, is_known, q, tau_x in columns:
+        records = zip(ticks, are_known, positions, torques, strict=True)
+        for tick, is_known, q, tau_x in records:
             t_s = tick_ns(tick, slave.window.rate_hz) / NS_PER_S
             if not self._has_appeared and t_s >= self.trial.appears_s:
                 self._has_appeared = True
@@ -120,34 +128,36 @@ class TrialWatch:
         """Returns the target as a page draws it.
 
         Args:
-            t_s: the time of the arms on the page, s.
+            t_s: the time of the arms on the page, in s.
             site: the site of the page's user; "" for other pages.
         """
         goal = self.judge.goal
         trial = self.trial
         users = trial.protocol.users
         user = users.index(site) if site in users else None
-        position = goal.find_target_m(t_s, user)
+        target_m = goal.find_target_m(t_s, user)
         fields: Json = {
-            "target": {"site": trial.slave, "at": position.tolist(), "width_m": goal.width_m}
+            "target": {"site": trial.slave, "at": target_m.tolist(), "width_m": goal.width_m}
         }
         corridor = goal.find_corridor(t_s)
         if corridor is not None:
-            start, width_m = corridor
-            fields["way"] = {"from": start.tolist(), "width_m": width_m}
+            start_m, width_m = corridor
+            fields["way"] = {"from": start_m.tolist(), "width_m": width_m}
         fields["appeared"] = t_s >= goal.appears_s
-        fields["left_s"] = max(0.0, trial.longest_s - max(t_s, goal.appears_s))
+        # The time of a trial runs from the appearance of the target.
+        running_s = max(t_s, goal.appears_s)
+        fields["left_s"] = max(0.0, trial.longest_s - running_s)
         return fields
 
 
 @dataclass
 class StepRequest:
-    """A step that the users are asked to complete.
+    """A step that the users have to complete.
 
     Attributes:
         step: the step.
         from_ns: the end of the users' rest; earlier replies are refused.
-        replies: the answers of the users who have completed the step, by site, and the number
+        replies: for each user who has completed the step, by site, the answers and the number
             of the page that sent them.
     """
 
@@ -157,9 +167,10 @@ class StepRequest:
 
 
 class Stage:
-    """What the pages show around the sessions of an experiment.
+    """The part of the pages around the sessions of an experiment.
 
-    The experiment sets the stage, and the page's server polls it.
+    The experiment requests steps and sets the phase that the pages show. The page's server
+    calls `poll`, `accept` and `describe`.
 
     Attributes:
         users: the sites of the participants.
@@ -183,17 +194,18 @@ class Stage:
     def request_step(
         self, step: Step, rest_s: float = 0.0, done: Collection[str] = ()
     ) -> StepRequest:
-        """Asks the users to complete a step.
+        """Requests that the users complete a step.
 
         Args:
             step: the step.
-            rest_s: the rest before the step, s.
+            rest_s: the rest before the step, in s.
             done: the sites of users who have completed the step already.
 
         Returns:
             The request, which collects the replies.
         """
-        request = StepRequest(step, self._clock.monotonic_ns() + int(rest_s * NS_PER_S))
+        rest_end_ns = self._clock.monotonic_ns() + int(rest_s * NS_PER_S)
+        request = StepRequest(step, rest_end_ns)
         request.replies |= {site: ({}, 0) for site in done}
         self._step = step
         self._watch = None
@@ -219,12 +231,11 @@ class Stage:
             entry: the result of the trial; None if it must be repeated.
             why: the reason for the repetition.
         """
-        measures = {}
-        names = self._plan.protocol.feedback if entry is not None else ()
-        if entry is not None:
-            measures = {name: entry.measures[name] for name in names if name in entry.measures}
-        self._feedback = {"why": why, "measures": measures}
+        self._feedback = {"why": why, "measures": {}}
+        names = self._plan.protocol.feedback
         if entry is not None and names:
+            measures = {name: entry.measures[name] for name in names if name in entry.measures}
+            self._feedback["measures"] = measures
             self._feedback["succeeded"] = entry.succeeded
 
     def show_end(self) -> None:
@@ -245,10 +256,10 @@ class Stage:
         """
         now_ns = self._clock.monotonic_ns()
         request = self._request
-        self._holders = {
-            site: min(number for page_site, number in pages if page_site == site)
-            for site, _ in pages
-        }
+        # The first page of a site has the smallest number.
+        self._holders = {}
+        for site, number in pages:
+            self._holders[site] = min(number, self._holders.get(site, number))
         self._page_seen_ns |= dict.fromkeys(self._holders, now_ns)
         if request is not None and request.step.kind == "trial":
             # A user who leaves is not ready any more.
@@ -259,11 +270,11 @@ class Stage:
             return []
         if view.running and self._phase == "starting":
             self._phase = "trial"
-        absent = [
-            site
-            for site in self.users
-            if now_ns - self._page_seen_ns.get(site, now_ns) > MAX_ABSENCE_NS
-        ]
+        absent: list[str] = []
+        for site in self.users:
+            absence_ns = now_ns - self._page_seen_ns.get(site, now_ns)
+            if absence_ns > MAX_ABSENCE_NS:
+                absent.append(site)
         return self._watch.poll(view, absent)
 
     def accept(self, site: str, page: int, message: StageMessage) -> bool:
@@ -279,12 +290,8 @@ class Stage:
         """
         is_holder = self._holders.get(site) == page
         if isinstance(message, AbortTrial):
-            watch = self._watch
-            if watch is None or watch.over or (site and not is_holder):
-                return False
-            reason = f": {message.why}" if message.why else ""
-            watch.aborted = f"{site or 'the experimenter'} stopped it{reason}"
-            return True
+            is_allowed = is_holder or not site
+            return is_allowed and self._abort_trial(site, message.why)
         request = self._request
         if request is None or self._clock.monotonic_ns() < request.from_ns:
             return False
@@ -298,14 +305,23 @@ class Stage:
         request.replies[site] = (answers, page)
         return True
 
+    def _abort_trial(self, site: str, why: str) -> bool:
+        """Aborts the running trial; returns False if no trial runs."""
+        watch = self._watch
+        if watch is None or watch.over:
+            return False
+        reason = f": {why}" if why else ""
+        watch.aborted = f"{site or 'the experimenter'} stopped it{reason}"
+        return True
+
     def describe(self, role: str, site: str, page: int, t_s: float | None) -> Json:
-        """Returns what a page shows of the stage.
+        """Returns the stage as a page shows it.
 
         Args:
             role: the role of the page.
-            site: the site of its user, or "".
-            page: its number.
-            t_s: the time of the arms on the page, s; None without arms.
+            site: the site of the page's user, or "".
+            page: the number of the page.
+            t_s: the time of the arms on the page, in s; None without arms.
         """
         step = self._step
         request = self._request
@@ -319,20 +335,13 @@ class Stage:
         if step is None:
             return fields
         planned = step.planned
-        replies = {} if request is None else request.replies
-        names = dict(zip(self.users, planned.group, strict=True))
-        users = []
-        for user in self.users:
-            state = "here" if user in self._holders else ""
-            if user in replies:
-                state = "done"
-            users.append({"site": user, "who": names[user], "state": state})
+        # The experiment's thread may end the request at any time.
+        done_sites = () if request is None else tuple(request.replies)
+        slave = self._plan.scenarios[planned.condition].slave
         fields |= {
             "key": step.key,
-            "users": users,
-            "task": protocol.task.render_instructions(
-                self._plan.scenarios[planned.condition].slave
-            ),
+            "users": self._describe_users(step, done_sites),
+            "task": protocol.task.render_instructions(slave),
             "trial": planned.trial,
             "trials": self._plan.trials[-1].trial,
             "block": planned.block,
@@ -345,25 +354,51 @@ class Stage:
         if watch is not None and t_s is not None:
             fields |= watch.describe(t_s, site)
         if role == "experimenter":
-            condition = planned.condition
-            if planned.phase:
-                condition += f", {planned.phase}"
-            elif planned.catch:
-                condition += ", a catch trial"
-            fields |= {
-                "number": planned.number,
-                "of": len(self._plan.trials),
-                "condition": condition,
-            }
-        if role == "user" and site in names:
-            fields |= {
-                "who": names[site],
-                "done": site in replies,
-                "second": self._holders.get(site) != page,
-            }
-            if step.kind == "consent":
-                fields["text"] = protocol.consent
-            if step.form is not None:
-                form = msgspec.to_builtins(step.form)
-                fields["form"] = {**form, "forced": step.form.is_forced}
+            fields |= self._describe_for_experimenter(step)
+        if role == "user" and site in self.users:
+            fields |= self._describe_for_user(step, site, page)
+            fields["done"] = site in done_sites
+        return fields
+
+    def _describe_users(self, step: Step, done_sites: Collection[str]) -> list[Json]:
+        """Returns the users with their pseudonyms and states.
+
+        Args:
+            step: the step.
+            done_sites: the sites of the users who have completed the step.
+        """
+        users: list[Json] = []
+        for site, pseudonym in zip(self.users, step.planned.group, strict=True):
+            state = "here" if site in self._holders else ""
+            if site in done_sites:
+                state = "done"
+            users.append({"site": site, "who": pseudonym, "state": state})
+        return users
+
+    def _describe_for_experimenter(self, step: Step) -> Json:
+        """Returns the fields that only experimenters may see."""
+        planned = step.planned
+        condition = planned.condition
+        if planned.phase:
+            condition += f", {planned.phase}"
+        elif planned.catch:
+            condition += ", a catch trial"
+        return {
+            "number": planned.number,
+            "of": len(self._plan.trials),
+            "condition": condition,
+        }
+
+    def _describe_for_user(self, step: Step, site: str, page: int) -> Json:
+        """Returns the fields for a page of a user."""
+        pseudonyms = dict(zip(self.users, step.planned.group, strict=True))
+        fields: Json = {
+            "who": pseudonyms[site],
+            "second": self._holders.get(site) != page,
+        }
+        if step.kind == "consent":
+            fields["text"] = self._plan.protocol.consent
+        if step.form is not None:
+            form = msgspec.to_builtins(step.form)
+            fields["form"] = {**form, "forced": step.form.is_forced}
         return fields

@@ -1,12 +1,13 @@
-"""The server of the page: its files by HTTP and its socket, from one `websockets` server.
+"""The server of the page of a session: files by HTTP, and a socket for frames and orders.
 
-The server runs in a thread of its own and observes a session, which neither waits for it nor
-needs it: if the server fails, the session continues. In an experiment it shows one session
-after the other, with a stage around them. A browser is opened only if there is one.
+The server runs in a thread of its own and observes a session. The session neither waits for the
+server nor needs it: if the server fails, the session continues. In an experiment the server
+shows one session after the other, with a `Stage` around them. If the machine has a browser, the
+server opens it.
 
 Invariant:
-    - A page receives its next frame when it has drawn an earlier one, so a slow page sees fewer
-      frames and nobody waits for it. The newest state is always sent.
+    - A page receives a frame when it has drawn an earlier frame. A slow page therefore sees
+      fewer frames, and nobody waits for it. The frame always has the newest state.
     - Pages of another origin, pages without a token, and messages that are too many, too large
       or not of the page's role are refused and counted. None of their contents reaches a site.
     - `page_entrance` limits the number of pages of each role.
@@ -70,30 +71,35 @@ from .page_orders import (
 from .session_frames import SessionFrames, render_event
 from .session_view import SessionView
 
-if TYPE_CHECKING:  # an experiment's libraries are for experiments alone
+# The libraries of experiments are loaded for experiments only.
+if TYPE_CHECKING:
     from .experiment_stage import Stage
 
 NICE = -5
-"""Priority of the page's threads and of those that deliver its messages.
+"""Priority of the page's threads, and of the threads that deliver the page's messages.
 
-It is above the normal one, and below that of the sites.
+The priority is above the normal priority, and below that of the sites.
 """
 FRAMES_PER_S = 30
+"""Rate of the frames, in 1/s."""
 FRAMES_AHEAD = 2
-"""Largest number of frames that are sent and not drawn yet: one travels while one is drawn."""
+"""Largest number of frames that a page has not drawn yet: one travels while one is drawn."""
 MAX_EXCESS = 1_000
 """Number of messages beyond the allowed rate after which a page is closed."""
 REQUEST_TIMEOUT_S = 3.0
-"""Longest wait for the encryption of a connection, and again for its request, s."""
+"""Longest wait for the encryption of a connection, and again for its request, in s."""
 ANSWER_TIMEOUT_NS = 10_000_000_000
-"""Time for a page that holds an arm to answer whether another page may take part."""
+"""Time for a page that holds an arm to answer whether another page may take part, in ns."""
 RESTART_S = 1.0
+"""Time between a failure of the server and its restart, in s."""
 SWITCH_POLL_NS = 10_000_000
+"""Time between two checks whether another session is shown, in ns."""
 WAITING_FRAME_STEP = 10
 """Number of frame periods between two frames before a session begins."""
 POINTS_PER_FRAME = 240
-"""Largest number of points of the plots in one frame; a page that was away longer has a gap."""
+"""Largest number of points of the plots in a frame; a page that was away longer has a gap."""
 _POLICY_VIOLATION = 1008
+"""Code with which the server closes a socket (RFC 6455)."""
 _BROKEN = {1002: "broken frames", 1007: "no text", 1009: "too large"}
 """Codes with which the library closes a socket (RFC 6455), and reasons for the counts."""
 _SILENT = logging.getLogger("trilat.page")
@@ -102,18 +108,22 @@ _SILENT.propagate = False
 """The logger of the socket library: messages of strangers are counted, and print nothing."""
 
 RESULTS_TIMEOUT_NS = 600_000_000_000
-"""Longest time for which an open page can load the report and the log."""
+"""Longest time for which an open page can load the report and the log, in ns."""
 MAX_DURATION_S = 3600.0
-"""Longest duration of a session with a page, s, unless the user sets another one."""
+"""Longest duration of a session with a page, in s, unless the user sets another duration."""
 
 _NO_HTTP = b"HTTP/1.1 400 Bad Request\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
 
 
 class Visitor(ServerConnection):
-    """One connection.
+    """A connection to the server.
 
-    Data that are not a request of a page are counted, and answered with 400 if they are not
-    HTTP.
+    Data that are not a request of a page are counted. The reply to data that are not HTTP is
+    400.
+
+    Attributes:
+        refused: counts refusals by reason.
+        strangers: the connections whose role is not known yet.
     """
 
     refused: Counter[str]
@@ -122,17 +132,17 @@ class Visitor(ServerConnection):
     _is_counted = False
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Begins the connection."""
+        """Adds the connection to the strangers."""
         super().connection_made(transport)
         self.strangers.add(self)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Ends the connection."""
+        """Removes the connection from the strangers."""
         self.strangers.remove(self)
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        """Receives data."""
+        """Notes that the connection has sent data, and handles the data."""
         # Browsers open connections in advance and close some unused; those are not counted.
         self._has_received = True
         super().data_received(data)
@@ -149,23 +159,27 @@ class Visitor(ServerConnection):
 
 
 class Page:
-    """One connected page.
+    """A connected page.
 
     Attributes:
-        connection: its socket.
-        number: its number; pages are counted from 1.
-        role: the rights of its user, and the site as which the arms are shown.
-        hands: its hands at the arms.
-        takes_part: whether it may give orders.
-        asks: the pages that it has asked whether it may take part, and when, ns.
-        wake: set when there is a frame that it has not received.
-        drawn, sent, notified: numbers of the last frame that it has drawn, of the last one that
-            it was sent, and of the one before.
-        unseen: numbers of the frames that it has not drawn yet.
-        points, energies, events: how many of these it has received.
-        greeted: whether it has received the constants of the running session.
-        limits: its rate limits.
-        excess: the number of messages that exceeded its rate.
+        connection: the socket of the page.
+        number: the number of the page; pages are counted from 1.
+        role: the rights of the page's user, and the site whose user's view is shown.
+        hands: the hands of the page at the arms.
+        takes_part: whether the page may give orders.
+        asks: the pages that must allow this page to take part, and the time of the request, in
+            ns; None without a request.
+        wake: set when there is a frame that the page has not received.
+        drawn: number of the last frame that the page has drawn.
+        sent: number of the last frame that was sent to the page.
+        notified: number of the frame sent before that.
+        unseen: numbers of the frames that the page has not drawn yet.
+        points: how many points of the plots the page has received.
+        energies: how many points of the energies the page has received.
+        events: how many events the page has received.
+        greeted: whether the page has received the constants of the running session.
+        limits: the limits of the page's message rates.
+        excess: the number of messages that exceeded the limit of all messages.
     """
 
     def __init__(
@@ -222,7 +236,8 @@ class PageOptions:
         """
         if self.tls is None:
             return None
-        read_member_keys(self.tls)  # refuses keys that have ended, or that others can read
+        # Keys that have expired, or that other users can read, are refused.
+        read_member_keys(self.tls)
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         context.load_cert_chain(self.tls / CERTIFICATE, self.tls / PRIVATE_KEY)
         return context
@@ -249,7 +264,7 @@ class PageOptions:
 
 
 class PageServer:
-    """Serves the page of a session; a context manager that opens a browser at its beginning.
+    """Serves the page of a session; a context manager that opens a browser when it is entered.
 
     Args:
         bus: a bus that reaches the session.
@@ -318,12 +333,7 @@ class PageServer:
                 f"{self._host}:{self._port}: cannot listen: {self._problem.strerror}"
             )
         self._say(f"experimenter: {self.address}")
-        screen = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-        if (
-            self._opens
-            and sys.stdout.isatty()
-            and (screen or not sys.platform.startswith("linux"))
-        ):
+        if self._opens and sys.stdout.isatty() and _has_screen():
             self._opening = BrowserOpening(self.address)
             self._opening.open()
         return self
@@ -331,7 +341,8 @@ class PageServer:
     def __exit__(self, *_: object) -> None:
         self._ending.set()
         if self._loop is not None and self._stop is not None:
-            with suppress(RuntimeError):  # its loop has ended already
+            # The loop of the server may have ended already.
+            with suppress(RuntimeError):
                 self._loop.call_soon_threadsafe(self._stop.set)
         self._thread.join(5.0)
         self._opening.remove_file()
@@ -345,14 +356,17 @@ class PageServer:
         while self._next_session is not None and self._thread.is_alive():
             self._clock.sleep_until(self._clock.monotonic_ns() + SWITCH_POLL_NS)
 
-    def _switch_session_if_asked(self) -> None:
+    def _switch_session_if_requested(self) -> None:
+        """Shows the session of the last call of `show`, which then returns."""
         if self._next_session is not None:
+            bus, session = self._next_session
             try:
-                self._switch_session(*self._next_session)
+                self._switch_session(bus, session)
             finally:
                 self._next_session = None
 
     def _switch_session(self, bus: Bus, session: str) -> None:
+        """Observes another session, whose state is new to all pages."""
         self._bus = bus
         self.view = SessionView(bus, self._clock, session)
         self._frames = SessionFrames(self.view)
@@ -374,13 +388,13 @@ class PageServer:
             try:
                 asyncio.run(self._serve())
             except Exception as error:
-                if not self._ready.is_set():
-                    self._problem = (
-                        error if isinstance(error, OSError) else OSError(0, str(error))
-                    )
-                else:
+                if self._ready.is_set():
                     self._count_failure("server", error)
                     self._ending.wait(RESTART_S)
+                elif isinstance(error, OSError):
+                    self._problem = error
+                else:
+                    self._problem = OSError(0, str(error))
             self._ready.set()
 
     def report_refusals(self) -> None:
@@ -388,15 +402,22 @@ class PageServer:
         for reason, count in sorted((+self.refused).items()):
             self._say(f"the page refused {count_nouns(count, 'message')} or requests: {reason}")
 
-    def _count_failure(self, of: str, error: Exception) -> None:
-        """Counts a failure of the page, and prints it the first time; the session continues."""
-        reason = f"{of} failed: {type(error).__name__}"
+    def _count_failure(self, part: str, error: Exception) -> None:
+        """Counts a failure of the page, and prints the first failure of a kind.
+
+        Args:
+            part: the part of the page that failed.
+            error: the error.
+        """
+        reason = f"{part} failed: {type(error).__name__}"
         self.refused[reason] += 1
-        with suppress(OSError, ValueError):  # no terminal any more
-            if self.refused[reason] == 1:
-                self._say(f"the page goes on, though its {reason}: {error}")
+        if self.refused[reason] == 1:
+            # The terminal may have been closed.
+            with suppress(OSError, ValueError):
+                self._say(f"the page continues, though its {reason}: {error}")
 
     async def _serve(self) -> None:
+        """Serves pages until the end."""
         self._loop = asyncio.get_running_loop()
         self._stop = asyncio.Event()
         members = {"refused": self.refused, "strangers": Strangers(self.refused)}
@@ -414,7 +435,8 @@ class PageServer:
             max_queue=32,
             compression=None,
             ping_interval=5,
-            ping_timeout=30,  # long, because the page of a busy machine is slow and not dead
+            # Long, because the page of a busy machine is slow and not dead.
+            ping_timeout=30,
             open_timeout=REQUEST_TIMEOUT_S,
             close_timeout=1,
             logger=_SILENT,
@@ -431,6 +453,7 @@ class PageServer:
 
     @property
     def _base_address(self) -> str:
+        """The address of the page, without query and token."""
         host = f"[{self._host}]" if ":" in self._host else self._host
         return f"{self._scheme}://{host}:{self._port}/"
 
@@ -445,21 +468,22 @@ class PageServer:
         else:
             sites = {} if scenario is None else scenario.sites
             users = [name for name, spec in sites.items() if spec.role == "master"]
-        for role in (*(Role("user", site) for site in users), Role("watcher")):
+        roles = [Role("user", site) for site in users]
+        for role in (*roles, Role("watcher")):
             name = f"{role.kind} {role.site}".rstrip()
             self._say(f"{name}: {self._links.link(self._base_address, role)}")
 
     async def _tick(self) -> None:
         """Receives the session's messages and makes a frame, thirty times a second.
 
-        A failure of one step does not prevent the others.
+        A failure of one step does not prevent the other steps.
         """
         while True:
             begun_ns = self._clock.monotonic_ns()
             steps = (
                 self._desk.poll,
                 self.view.poll,
-                self._switch_session_if_asked,
+                self._switch_session_if_requested,
                 self._poll_stage,
                 self._print_links,
                 self._settle_requests,
@@ -476,6 +500,7 @@ class PageServer:
             await asyncio.sleep(max(0.002, 1.0 / FRAMES_PER_S - spent_s))
 
     def _poll_stage(self) -> None:
+        """Lets the stage judge new records, and marks the stage's moments in the log."""
         if self._stage is None:
             return
         users = [
@@ -485,17 +510,17 @@ class PageServer:
             self._desk.mark(next(iter(self.view.sites)), moment)
 
     def _make_frame(self) -> None:
+        """Makes the next frame, and collects the replies of sites for the pages."""
         self._frame_number += 1
-        for site, channel, accepted, text in self._desk.replies:
-            self._notices.append(
-                {
-                    "n": self._frame_number,
-                    "site": site,
-                    "of": channel,
-                    "ok": accepted,
-                    "text": text,
-                }
-            )
+        for site, channel, is_accepted, text in self._desk.replies:
+            notice = {
+                "n": self._frame_number,
+                "site": site,
+                "of": channel,
+                "ok": is_accepted,
+                "text": text,
+            }
+            self._notices.append(notice)
         self._desk.replies.clear()
         del self._notices[:-20]
         self._frame = self._frames.make_frame() or self._frame
@@ -506,7 +531,8 @@ class PageServer:
         try:
             target = urlsplit(request.path)
             problem = self._find_refusal(request, target.query)
-        except (ValueError, LookupError):  # an invalid address, or two hosts
+        except (ValueError, LookupError):
+            # The address is invalid, or the request has two hosts.
             self.refused["malformed request"] += 1
             return connection.respond(HTTPStatus.BAD_REQUEST, "malformed request\n")
         if problem is not None:
@@ -525,8 +551,9 @@ class PageServer:
         """Returns why a request is refused; None if it is accepted."""
         host = request.headers.get("Host", "")
         name = urlsplit(f"//{host}").hostname or ""
+        # The name of another web site may resolve to this machine (DNS rebinding).
         if self._is_local and name not in HERE:
-            return "foreign host"  # another site's name that resolves to this machine
+            return "foreign host"
         origin = request.headers.get("Origin")
         if origin is not None and origin != f"{self._scheme}://{host}":
             return "foreign origin"
@@ -538,13 +565,12 @@ class PageServer:
         """Serves one page until its connection ends."""
         assert connection.request is not None
         role = self._links.find(urlsplit(connection.request.path).query)
-        assert role is not None  # a request without a role has been refused
+        assert role is not None, "a request without a role has been refused"
         self._page_count += 1
         hands = PageHands(self._bus, self._clock, self.view.session, f"page {self._page_count}")
-        is_first = role.kind == "experimenter" and not any(
-            other.takes_part for other in self.experimenters
-        )
-        takes_part = is_first or role.kind == "user"
+        takes_part = role.kind == "user"
+        if role.kind == "experimenter":
+            takes_part = not any(other.takes_part for other in self.experimenters)
         page = Page(connection, self._page_count, role, hands, takes_part=takes_part)
         self._close_page_for(role)
         self._pages.add(page)
@@ -556,7 +582,8 @@ class PageServer:
         try:
             async for text in connection:
                 self._receive(page, text)
-                if page.excess > MAX_EXCESS:  # its further messages are not even read
+                # Further messages of the page are not even read.
+                if page.excess > MAX_EXCESS:
                     await connection.close(_POLICY_VIOLATION, "too many messages")
                     break
         except ConnectionClosed as closed:
@@ -601,7 +628,7 @@ class PageServer:
             self._count_failure("message", error)
 
     def _handle_message(self, page: Page, message: PageMessage) -> None:
-        """Does what a message of a page requests, if the page may request it."""
+        """Carries out the request of a page's message, if the page may request it."""
         view = self.view
         if not page.role.may(message):
             self.refused["not of its role"] += 1
@@ -634,16 +661,22 @@ class PageServer:
             else:
                 page.hands.move(message, pushes=site.hand.mode == "force")
         elif isinstance(message, StageMessage):
-            is_expected = self._stage is not None and self._stage.accept(
-                page.role.site, page.number, message
-            )
-            if not is_expected:
+            site_name = page.role.site
+            stage = self._stage
+            if stage is None or not stage.accept(site_name, page.number, message):
                 self.refused["was not asked"] += 1
         elif isinstance(message, EndSession) and self._ends:
             self.end_requested.set()
 
     def _request_part(self, page: Page, want: bool) -> None:
-        """Lets a page take part, or no longer. Pages that hold an arm are asked first."""
+        """Handles a page's request to take part.
+
+        If other pages hold an arm, the page takes part only if they agree.
+
+        Args:
+            page: the page.
+            want: False if the page no longer takes part.
+        """
         if not want:
             page.takes_part = False
             page.asks = None
@@ -686,27 +719,21 @@ class PageServer:
     def _list_held_sites(self, page: Page) -> list[str]:
         """Returns the sites whose arms a page holds."""
         sites = (self._frame or {}).get("sites", {})
-        return [
-            name
-            for name, site in sites.items()
-            if page.hands.holds(name, site.get("source", 0))
-        ]
+        held_sites: list[str] = []
+        for name, site in sites.items():
+            if page.hands.holds(name, site.get("source", 0)):
+                held_sites.append(name)
+        return held_sites
 
     async def _send(self, page: Page) -> None:
-        """Sends a page the newest frame, each time it has drawn an earlier one."""
+        """Sends a page the newest frame, each time the page has drawn an earlier frame."""
         encode: Callable[[Any], bytes] = msgspec.json.encode
         with suppress(ConnectionClosed):
             while True:
                 await page.wake.wait()
                 page.wake.clear()
-                if len(page.unseen) >= FRAMES_AHEAD or page.sent == self._frame_number:
-                    continue
-                begins = self._frame is not None
-                if (
-                    not begins
-                    and page.sent
-                    and self._frame_number - page.sent < WAITING_FRAME_STEP
-                ):
+                has_begun = self._frame is not None
+                if not self._is_frame_due(page, has_begun=has_begun):
                     continue
                 scenario = self.view.scenario
                 if scenario is not None and page.role.site not in ("", *scenario.names):
@@ -717,16 +744,29 @@ class PageServer:
                 page.sent = self._frame_number
                 page.unseen.append(page.sent)
                 try:
-                    payload = encode(
-                        self._describe_frame(page)
-                        if page.greeted and begins
-                        else self._describe_greeting(page)
-                    )
+                    if page.greeted and has_begun:
+                        message = self._describe_frame(page)
+                    else:
+                        message = self._describe_greeting(page)
+                    payload = encode(message)
                 except Exception as error:
                     self._count_failure("frame", error)
                     continue
-                page.greeted = begins
+                page.greeted = has_begun
                 await page.connection.send(payload, text=True)
+
+    def _is_frame_due(self, page: Page, *, has_begun: bool) -> bool:
+        """Returns whether the page is to receive the newest frame.
+
+        Args:
+            page: the page.
+            has_begun: False before the session has a frame, when pages receive fewer frames.
+        """
+        if len(page.unseen) >= FRAMES_AHEAD or page.sent == self._frame_number:
+            return False
+        if has_begun or not page.sent:
+            return True
+        return self._frame_number - page.sent >= WAITING_FRAME_STEP
 
     def _describe_greeting(self, page: Page) -> dict[str, Any]:
         """Returns the first message to a page, with the constants of the session."""
@@ -744,9 +784,11 @@ class PageServer:
         return {"hello": fields}
 
     def _describe_stage(self, page: Page, t_s: float | None = None) -> dict[str, Any]:
+        """Returns the stage for a page; {} without an experiment."""
         if self._stage is None:
             return {}
-        return {"stage": self._stage.describe(page.role.kind, page.role.site, page.number, t_s)}
+        role = page.role
+        return {"stage": self._stage.describe(role.kind, role.site, page.number, t_s)}
 
     def _describe_frame(self, page: Page) -> dict[str, Any]:
         """Returns the newest frame for a page."""
@@ -761,30 +803,37 @@ class PageServer:
             "pages": len(self._pages),
             "takes_part": page.takes_part,
             "asks": page.asks is not None,
-            "asked": [
-                other.number
-                for other in self._pages
-                if other.asks is not None and page in other.asks[0]
-            ],
+            "asked": self._list_requests(page),
             "holds": self._list_held_sites(page),
             "refused": sum(self.refused.values()),
             **self._describe_stage(page, state["t"]),
         }
 
+    def _list_requests(self, page: Page) -> list[int]:
+        """Returns the numbers of the pages that ask this page whether they may take part."""
+        numbers: list[int] = []
+        for other in self._pages:
+            if other.asks is not None:
+                asked_pages, _ = other.asks
+                if page in asked_pages:
+                    numbers.append(other.number)
+        return numbers
+
     def _list_notices(self, page: Page) -> list[dict[str, Any]]:
         """Returns the replies of sites that a page has not received yet.
 
-        The replies name keys and commands, which only an experimenter can use. Other roles are
-        told which sites were not stopped.
+        The replies name keys and commands, which only an experimenter can use. Pages of other
+        roles only receive which sites were not stopped.
         """
         notices = [notice for notice in self._notices if notice["n"] > page.notified]
         if page.role.kind == "experimenter":
             return notices
-        return [
-            {**notice, "text": f"{notice['site']} was not stopped"}
-            for notice in notices
-            if notice["of"] == topics.STOP and not notice["ok"]
-        ]
+        refused_stops: list[dict[str, Any]] = []
+        for notice in notices:
+            if notice["of"] == topics.STOP and not notice["ok"]:
+                text = f"{notice['site']} was not stopped"
+                refused_stops.append({**notice, "text": text})
+        return refused_stops
 
     def _describe_as_site(self, site: str) -> dict[str, Any]:
         """Returns the frame for the user of a site."""
@@ -796,7 +845,7 @@ class PageServer:
         return {**self._frames_as_site[site], "points": [], "energies": [], "events": []}
 
     def _describe_all(self, page: Page) -> dict[str, Any]:
-        """Returns the frame for a page that sees everything, with its new points and events."""
+        """Returns the frame for a page that sees everything, with new points and events."""
         frames = self._frames
         view = self.view
         is_first = page.points == 0 and page.energies == 0
@@ -810,10 +859,18 @@ class PageServer:
         return {**(self._frame or {}), "points": points, "energies": energies, "events": events}
 
 
+def _has_screen() -> bool:
+    """Returns whether this machine can show a browser."""
+    if not sys.platform.startswith("linux"):
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
 class PageAttendant(ExitStack):
     """The page of a session that this process runs.
 
-    It is a context manager, because the page outlives the session to show its report.
+    A `PageAttendant` is a context manager: the page is served until the context ends, so that
+    it can show the report after the session.
     """
 
     def __init__(self, options: PageOptions, clock: Clock) -> None:
@@ -836,13 +893,14 @@ class PageAttendant(ExitStack):
     def offer_results(self, paths: Iterable[Path]) -> None:
         """Offers files of the ended session to experimenters while their page is open.
 
-        Ctrl-C ends the offer.
-        The address of a file cannot be guessed, and only these pages receive it.
+        Ctrl-C ends the offer. The address of a file cannot be guessed, and only these pages
+        receive it.
         """
         page = self._page
         clock = self._clock
-        assert page is not None  # `attend` has been called
-        page.view.finish()  # the processes of the session are gone
+        assert page is not None, "`attend` has been called"
+        # The processes of the session have ended.
+        page.view.finish()
         page.files.add_results(paths)
         give_up_ns = clock.monotonic_ns() + RESULTS_TIMEOUT_NS
         with suppress(KeyboardInterrupt):

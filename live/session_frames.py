@@ -187,10 +187,13 @@ class ArmFrames:
         The reference of a shared pose is one point; a reference of the joints has a point for
         each joint.
         """
+        points_m: Array
         if self._model.shares_pose:
-            return records.q_des[-1, :3][np.newaxis] / self._spec.task.scale
-        last = slice(len(records.known) - 1, None)
-        return joint_positions_m(self._model, records.q_des[last])[0]
+            points_m = records.q_des[-1, :3][np.newaxis] / self._spec.task.scale
+        else:
+            last = slice(len(records.known) - 1, None)
+            points_m = joint_positions_m(self._model, records.q_des[last])[0]
+        return points_m
 
     def _describe_grip(self, records: AlignedRecords, force: Array) -> Json:
         """Returns the state of the live hand in the last record; {} without a live hand."""
