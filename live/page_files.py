@@ -1,4 +1,4 @@
-"""The files that the page's server sends: its own, and the report and log of an ended session.
+"""The files that the page's server sends: the page, and the results of an ended session.
 
 Invariant:
     - A page runs scripts of its own server only. A report runs its own scripts, isolated from

@@ -1,4 +1,4 @@
-"""The messages that a page may send, the roles of its users, and how orders reach the sites.
+"""The messages that a page may send, the roles of users, and the orders to the sites.
 
 The page's server reads each message with `read_page_message`, checks with `Role.may` that the
 page's user has the right to send the message, and passes it on: `PageHands` moves the arms that

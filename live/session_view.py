@@ -1,4 +1,4 @@
-"""The present state of a running session, as an observer knows it from the sites' messages.
+"""The present state of a running session, as an observer knows it from its messages.
 
 The pages of a session and `trilat watch` show this state. An observer receives the same
 messages as the recorder, and sends nothing to the sites except requests for missing messages.

@@ -191,6 +191,7 @@ def show_in_terminal(
             display.say("S or space: stop every arm")
 
         def update_display() -> None:
+            """Updates the display, and stops every arm if the key was pressed."""
             watch.update()
             if read_keys is not None and STOP_KEYS.intersection(read_keys()):
                 display.say(

@@ -173,7 +173,9 @@ def _round_diagonal(matrix: Array) -> list[float]:
 
 
 def identify_hand(log: Log | str | Path, site: str = "m1") -> HandImpedance:
-    """Returns mass, damping and stiffness of the hand at an arm, as `trilat identify hand`.
+    """Returns mass, damping and stiffness of the hand at an arm.
+
+    The command is `trilat identify hand`.
 
     >>> hand = tn.identify_hand("run.mcap", "m1")  # doctest: +SKIP
     >>> hand.K.diagonal(), hand.halves["K"].diagonal()  # doctest: +SKIP

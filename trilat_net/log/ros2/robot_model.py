@@ -1,4 +1,4 @@
-"""The model of a site's arm for viewers: its URDF, and the pose of each link at given angles.
+"""The model of a site's arm for viewers: its URDF, and the poses of its links.
 
 A viewer draws the arms of a session in one scene. The arms stand in a row, `SPACING_M` apart,
 below a common frame `WORLD` whose z axis points up. A URDF without shapes gets plain ones, so

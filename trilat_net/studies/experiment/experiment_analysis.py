@@ -1,4 +1,4 @@
-"""Analysis of an experiment: means, comparisons, mixed models, figures, a methods paragraph.
+"""Analysis of an experiment: means, comparisons, figures, and a methods paragraph.
 
 `analyse_experiment` reads the journals of an experiment's folder and writes tables, figures and
 a report into the folder. `compute_experiment_power` plans the number of participants.

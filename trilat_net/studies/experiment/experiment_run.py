@@ -1,4 +1,4 @@
-"""An experiment in its folder: the log of each trial, journals of the progress, and tables.
+"""An experiment in its folder: the log of each trial, journals, and tables.
 
 `begin_experiment` creates the folder, `Experiment.run` runs the remaining trials with synthetic
 participants, and `trilat experiment run --live` runs them with people.
@@ -391,7 +391,7 @@ def _describe_median(rows: list[dict[str, Any]]) -> str:
 
 
 def new_experiment(file: str | Path, *, pair: bool = False, force: bool = False) -> Path:
-    """Writes a protocol with comments, ready to run; as `trilat experiment new`.
+    """Writes a protocol with comments, ready to run, as `trilat experiment new` does.
 
     >>> tn.new_experiment("reaching.toml").name
     'reaching.toml'
@@ -411,7 +411,7 @@ def new_experiment(file: str | Path, *, pair: bool = False, force: bool = False)
 
 
 def check_experiment(file: str | Path) -> ExperimentPlan:
-    """Returns the plan of a protocol, as `trilat experiment check`.
+    """Returns the plan of a protocol, as `trilat experiment check` does.
 
     >>> len(tn.check_experiment(tn.new_experiment("reaching.toml")).trials)
     240
@@ -443,7 +443,7 @@ def begin_experiment(file: str | Path, out: str | Path | None = None) -> Experim
 
 
 def open_experiment(folder: str | Path) -> Experiment:
-    """Returns the experiment of a folder, as `trilat experiment status`.
+    """Returns the experiment of a folder, as `trilat experiment status` does.
 
     >>> tn.open_experiment("runs/experiment-reaching-001").status().done  # doctest: +SKIP
     240
@@ -479,7 +479,7 @@ def run_experiment(
     on: Workers = None,
     progress: Callable[[int, int], None] = ignore_progress,
 ) -> Experiment:
-    """Runs an experiment with synthetic participants, as `trilat experiment run`.
+    """Runs an experiment with synthetic participants, as `trilat experiment run` does.
 
     >>> done = tn.run_experiment(tn.new_experiment("reach.toml"), "reach")  # doctest: +SKIP
     >>> done.to_frame().groupby("condition").completion_s.mean()  # doctest: +SKIP

@@ -487,49 +487,81 @@ def _list_keys(table: Mapping[str, Any], path: str = "") -> dict[str, Any]:
 
 def _find_problems(protocol: Protocol) -> Iterator[str]:
     """Yields the problems of a protocol that are visible without its scenario."""
-    size = len(protocol.users)
-    names = [name for group in protocol.groups for name in group]
-    if protocol.foreperiod_s[0] > protocol.foreperiod_s[1]:
+    shortest_s, longest_s = protocol.foreperiod_s
+    if shortest_s > longest_s:
         foreperiod_s = list(protocol.foreperiod_s)
         yield f"foreperiod_s is from the shorter to the longer time, not {foreperiod_s}"
+    yield from _find_pseudonym_problems(protocol)
+    yield from _find_table_problems(protocol)
+    yield from _find_form_problems(protocol)
+    yield from _find_group_problems(protocol)
+
+
+def _list_pseudonyms(protocol: Protocol) -> list[str]:
+    """Returns the pseudonyms of all participants."""
+    return [name for group in protocol.groups for name in group]
+
+
+def _find_pseudonym_problems(protocol: Protocol) -> Iterator[str]:
+    """Yields the problems with the pseudonyms of participants."""
+    names = _list_pseudonyms(protocol)
     if len(set(names)) < len(names):
         yield "two participants have the same pseudonym"
-    if unknown := protocol.force_limit_n.keys() - set(names):
+    unknown = protocol.force_limit_n.keys() - set(names)
+    if unknown:
         yield f"force_limit_n: there is no participant {', '.join(sorted(unknown))}"
-    if protocol.catch is not None and protocol.catch.condition not in protocol.conditions:
-        yield f"catch.condition: there is no condition {protocol.catch.condition}"
+
+
+def _find_table_problems(protocol: Protocol) -> Iterator[str]:
+    """Yields the problems with catch trials, a training, and a staircase."""
+    catch = protocol.catch
     training = protocol.training
+    staircase = protocol.staircase
+    if catch is not None and catch.condition not in protocol.conditions:
+        yield f"catch.condition: there is no condition {catch.condition}"
     if training is not None and training.lead.keys() != protocol.conditions.keys():
         conditions = ", ".join(protocol.conditions)
         yield f"training.lead: is a pair of numbers for each of {conditions}"
-    exclusive_tables = (training, protocol.catch, protocol.staircase)
-    if sum(table is not None for table in exclusive_tables) > 1:
+    tables = [table for table in (training, catch, staircase) if table is not None]
+    if len(tables) > 1:
         yield "catch trials, a training and a staircase exclude each other"
-    if protocol.staircase is not None:
-        yield from _find_staircase_problems(protocol, protocol.staircase)
-    if size != 2 and (training is not None or protocol.task.needs_pair):
+    if staircase is not None:
+        yield from _find_staircase_problems(protocol, staircase)
+    needs_pair = training is not None or protocol.task.needs_pair
+    if needs_pair and len(protocol.users) != 2:
         yield "a training, a handover and a task with two targets need two users"
-    forms = [form.name for form in protocol.forms]
-    if len(set(forms)) < len(forms):
+
+
+def _find_form_problems(protocol: Protocol) -> Iterator[str]:
+    """Yields the problems with the questionnaires."""
+    names = [form.name for form in protocol.forms]
+    if len(set(names)) < len(names):
         yield "two questionnaires have the same name"
     for form in protocol.questionnaires:
         try:
             find_form(form)
         except UsageError as error:
             yield str(error)
-    if not 1 <= size <= 2 or len(set(protocol.users)) < size:
-        yield f"users are one or two sites, not {', '.join(protocol.users)}"
-    elif len(names) % size:
-        participants = count_nouns(len(names), "participant makes", "participants make")
+
+
+def _find_group_problems(protocol: Protocol) -> Iterator[str]:
+    """Yields the problems with the users, and with the number of participants."""
+    users = protocol.users
+    name_count = len(_list_pseudonyms(protocol))
+    if not 1 <= len(users) <= 2 or len(set(users)) < len(users):
+        yield f"users are one or two sites, not {', '.join(users)}"
+    elif name_count % len(users):
+        participants = count_nouns(name_count, "participant makes", "participants make")
         yield f"{participants} no pairs: their number must be even"
-    rows = len(list_orders(protocol.design, list(protocol.conditions), protocol.seed))
-    if protocol.design in ("williams", "latin") and len(protocol.groups) % rows:
-        units = "pairs" if size == 2 else "participants"
+    orders = list_orders(protocol.design, list(protocol.conditions), protocol.seed)
+    group_count = len(protocol.groups)
+    if protocol.design in ("williams", "latin") and group_count % len(orders):
+        units = "pairs" if len(users) == 2 else "participants"
+        conditions = count_nouns(len(protocol.conditions), "condition")
         yield (
-            f"a {protocol.design} design of "
-            f"{count_nouns(len(protocol.conditions), 'condition')} "
-            f"has {count_nouns(rows, 'order')}: the "
-            f"number of {units} must be a multiple of {rows}, is {len(protocol.groups)}"
+            f"a {protocol.design} design of {conditions} has "
+            f"{count_nouns(len(orders), 'order')}: the number of {units} must be a multiple of "
+            f"{len(orders)}, is {group_count}"
         )
 
 

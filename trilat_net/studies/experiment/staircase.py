@@ -31,7 +31,7 @@ SKIPPED_REVERSALS = 2
 
 
 class Staircase(Frozen, frozen=True):
-    """A key of the scenario that is adapted to the participant's perception, in each condition.
+    """A key of the scenario that is adapted to the perception of each participant.
 
     Attributes:
         key: the key of the scenario.

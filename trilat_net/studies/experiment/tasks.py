@@ -487,11 +487,12 @@ AnyTask = ReachTrial | ContactTrial | TrackTrial
 
 
 def place_slave(arm: Any, shared: Sequence[float]) -> Array:
-    """Returns the position of an end effector, in m, from the coordinates that its site shares.
+    """Returns the position of an end effector, in m, from the coordinates of its site.
 
     Args:
         arm: the arm of the site.
-        shared: joint angles in rad, or the pose of the end effector.
+        shared: the coordinates that the site shares: joint angles in rad, or the pose of the
+            end effector.
     """
     position = shared[:3] if arm.shares_pose else arm.end_effector(shared)
     return np.array(position, dtype=np.float64)
