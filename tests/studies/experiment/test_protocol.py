@@ -150,7 +150,7 @@ def test_digest_knows_what_was_planned() -> None:
         ({"foreperiod_s": [2.0, 1.0]}, "foreperiod_s is from the shorter to the longer time"),
         (
             {"task": {"kind": "reach", "handover_s": 2.0}},
-            "a handover and users .* need two users",
+            "a training, a handover and .* need two users",
         ),
         (
             {"task": {"kind": "track", "apart_m": 0.1}},
