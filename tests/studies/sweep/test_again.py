@@ -61,7 +61,7 @@ def test_where_the_scenario_has_changed_the_rows_own_is_named(
         command, note = build_reproduce_command(results, row, tmp_path)
     finally:
         source.write_text(SHORT)
-    assert "is not what was swept any more" in note
+    assert "has changed since the sweep" in note
     assert (tmp_path / "cell-5-seed-1.toml").read_text() == row["scenario"]
     words = shlex.split(command)
     trilat(*words[1:], cwd=tmp_path)
@@ -70,5 +70,5 @@ def test_where_the_scenario_has_changed_the_rows_own_is_named(
         == row["end_error_rad"]
     )
     source.rename(source.with_suffix(".away"))
-    assert "or not here" in build_reproduce_command(results, row, tmp_path)[1]
+    assert "or is missing" in build_reproduce_command(results, row, tmp_path)[1]
     source.with_suffix(".away").rename(source)

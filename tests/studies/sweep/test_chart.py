@@ -18,8 +18,8 @@ from trilat_net.studies.sweep.stability_map import (
     build_stability_map,
     evaluate_criterion,
     find_criterion_edge,
-    load_place,
-    panel_scenarios,
+    load_grid_scenario,
+    make_panel_loader,
     trace_closed_form,
     trace_linear_analysis,
 )
@@ -77,7 +77,7 @@ def test_lines_depend_on_neither_runs_nor_processes() -> None:
 
 def test_for_short_delays_p_d_has_its_condition_as_line() -> None:
     """The mode at the edge is slow against 1/T there, and the condition exact: within 2 % at 100 ms."""
-    at = partial(load_place, plan_sweep("p_d_margin"), (), *KEYS)
+    at = partial(load_grid_scenario, plan_sweep("p_d_margin"), (), *KEYS)
     damping = PlaneAxis("control.d", (0.46, 0.48, 0.50, 0.52), "d")
     scenarios = [at(100.0, d) for d in damping.values]
     line, _ = trace_linear_analysis(
@@ -90,7 +90,7 @@ def test_for_short_delays_p_d_has_its_condition_as_line() -> None:
 @pytest.mark.long
 def test_coarse_map_has_line_of_linear_analysis_to_its_digits() -> None:
     """Another mode is the rightmost one from 0.6 on: straight between 0.2 and 0.7 the line were at 0.593."""
-    at = partial(load_place, plan_sweep("p_d_margin"), (), *KEYS)
+    at = partial(load_grid_scenario, plan_sweep("p_d_margin"), (), *KEYS)
     damping = PlaneAxis("control.d", (0.2, 0.7, 1.2), "d")
     scenarios = [at(100.0, d) for d in damping.values]
     line, _ = trace_linear_analysis(
@@ -132,7 +132,7 @@ def test_place_of_panel_is_cell_of_plan() -> None:
             for p in drawn.panels
             if p.settings == (("law", cell.law), ("link.playout_ms", playout))
         )
-        at = panel_scenarios(asked, panel, drawn.x.key, drawn.y.key)
+        at = make_panel_loader(asked, panel, drawn.x.key, drawn.y.key)
         delay, damping = cell.values[:2]
         assert isinstance(delay, float)
         assert isinstance(damping, float)

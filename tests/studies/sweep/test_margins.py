@@ -122,7 +122,9 @@ def test_table_tells_edges_islands_and_what_there_is_none_of() -> None:
     linear = grid.headers.index("linear")
     assert [row[linear] for row in grid.rows[:2]] == ["0.5", "2"]  # each beside its own
     assert grid.rows[0][linear + 1] == f"{100 * (0.5 / 0.491 - 1):+.2f} %"
-    assert "not monotone in 1 of 2 places" in SweepMargins(asked(), WITHIN, every[:2]).page()
+    assert (
+        "not monotone at 1 of 2 grid points" in SweepMargins(asked(), WITHIN, every[:2]).page()
+    )
 
 
 def test_the_facts_are_json_and_name_the_command() -> None:

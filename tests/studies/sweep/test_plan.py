@@ -254,7 +254,7 @@ def test_exponents_are_written_out_so_that_whole_numbers_stay_whole() -> None:
 
 def test_a_list_has_words_numbers_and_tables() -> None:
     found = parse_axis(" link.order = newest, in_order ")
-    assert (found.asked, found.key, found.texts) == (
+    assert (found.description, found.key, found.texts) == (
         "link.order=newest, in_order",
         "link.order",
         ("newest", "in_order"),

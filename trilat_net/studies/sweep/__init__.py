@@ -1,5 +1,6 @@
-"""Stability maps: one scenario over a plane of its keys, in virtual time, on all cores;
-docs/sweep.md.
+"""Stability maps: runs of a scenario over a grid of its keys, in virtual time, on all cores.
+
+docs/sweep.md describes the commands.
 """
 
 from .sweep_plan import plan_sweep

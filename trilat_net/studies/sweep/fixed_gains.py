@@ -9,6 +9,7 @@ from typing import Any
 
 import msgspec
 
+from ...scenario import Scenario
 from ...scenario.describe import describe_value
 from ...scenario.imported_code import ImportedLaw
 from ...scenario.laws import identify_law
@@ -28,16 +29,22 @@ def describe_fixed_gains(plan: SweepPlan) -> list[str]:
     first_values = [axis.override(0) for axis in plan.axes]
     for law_overrides in plan.laws.values() or [()]:
         scenario = plan.scenario(*law_overrides, *first_values)
-        sites_of: dict[tuple[str, str], list[str]] = {}
-        for site, spec in scenario.sites.items():
-            gains = ", ".join(_format_gains(plan, site, spec.control)) or "none"
-            law = identify_law(spec.control)
-            sites_of.setdefault((law, gains), []).append(site)
-        for (law, gains), sites in sites_of.items():
-            shared = len(sites) == len(scenario.sites)
-            owner = law if shared else f"{law} of {', '.join(sites)}"
-            texts.append(f"{owner}: {gains}")
+        texts += _describe_laws(plan, scenario)
     return list(dict.fromkeys(texts))
+
+
+def _describe_laws(plan: SweepPlan, scenario: Scenario) -> Iterator[str]:
+    """Yields a text per law and choice of gains in a scenario of the sweep."""
+    sites_of: dict[tuple[str, str], list[str]] = {}
+    for site, spec in scenario.sites.items():
+        law = identify_law(spec.control)
+        gains = ", ".join(_format_gains(plan, site, spec.control)) or "none"
+        sites_of.setdefault((law, gains), []).append(site)
+    for (law, gains), sites in sites_of.items():
+        owner = law
+        if len(sites) < len(scenario.sites):
+            owner = f"{law} of {', '.join(sites)}"
+        yield f"{owner}: {gains}"
 
 
 def _format_gains(plan: SweepPlan, site: str, law: Any) -> Iterator[str]:
@@ -45,6 +52,8 @@ def _format_gains(plan: SweepPlan, site: str, law: Any) -> Iterator[str]:
     settings = law.settings if isinstance(law, ImportedLaw) else msgspec.to_builtins(law)
     swept_keys = {axis.key for axis in plan.axes}
     for key, value in settings.items():
-        paths = {f"control.{key}", f"sites.{site}.control.{key}"}
-        if key != "law" and not swept_keys & paths:
+        common_key = f"control.{key}"
+        site_key = f"sites.{site}.control.{key}"
+        is_swept = common_key in swept_keys or site_key in swept_keys
+        if key != "law" and not is_swept:
             yield f"{key} {describe_value(value)}"

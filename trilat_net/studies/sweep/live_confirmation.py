@@ -35,6 +35,10 @@ Returns the path of its log, which may not exist, and the problems of the sessio
 """
 
 
+GridIndex = tuple[Any, ...]
+"""Position of a run in the grid: its index on each axis, then its law and its seed."""
+
+
 class ConfirmedCell(NamedTuple):
     """One cell that was run live.
 
@@ -86,23 +90,42 @@ def choose_cells_near_edges(
         )
     chosen = []
     for stable in (True, False):
-        candidates = list[GridIndex]()
-        for index in distances:
+        candidates = {}
+        for index, distance in distances.items():
             row = row_at[index]
             short = row["ran_s"] <= MAX_SESSION_S
             if short and CellClass(row["verdict"]).stable is stable:
-                candidates.append(index)
+                candidates[index] = distance
         if not candidates:
             side = "stable" if stable else "other"
             raise UsageError(
                 f"every cell on the {side} side of an edge ran longer than {MAX_SESSION_S:g} s"
             )
-        limit = sorted(distances[index] for index in candidates)[:count][-1]
-        near = [index for index in candidates if distances[index] <= limit]
-        near.sort(key=lambda index: (*map(str, index[2:]), *index[:2]))
-        spread = np.linspace(0, len(near) - 1, min(count, len(near))).round().astype(int)
-        chosen += [row_at[near[n]] for n in spread]
+        chosen += [row_at[index] for index in _choose_nearest(candidates, count)]
     return chosen
+
+
+def _choose_nearest(distances: Mapping[GridIndex, int], count: int) -> list[GridIndex]:
+    """Returns at most `count` of the runs nearest to an edge, spread evenly along the edge.
+
+    The distance of the `count`-th nearest run is the limit: all runs within this limit are
+    candidates.
+
+    Args:
+        distances: distance of each run from the edge, by position in the grid.
+        count: largest number of runs.
+    """
+    nearest = sorted(distances.values())[:count]
+    limit = nearest[-1]
+    near = [index for index, distance in distances.items() if distance <= limit]
+    near.sort(key=_rank_along_edge)
+    spread = np.linspace(0, len(near) - 1, min(count, len(near)))
+    return [near[n] for n in spread.round().astype(int)]
+
+
+def _rank_along_edge(index: GridIndex) -> tuple[Any, ...]:
+    """Returns the sorting key of a run: panel, law and seed first, then the two drawn axes."""
+    return (*map(str, index[2:]), *index[:2])
 
 
 def confirm_cell(row: ResultRow, run: SessionRunner) -> ConfirmedCell:
@@ -117,49 +140,43 @@ def confirm_cell(row: ResultRow, run: SessionRunner) -> ConfirmedCell:
     duration_s = min(row["ran_s"] + extra_s, MAX_SESSION_S + _EXTRA_S)
     scenario = msgspec.structs.replace(parse_scenario(row["scenario"]), duration_s=duration_s)
     path, problems = run(scenario, f"cell-{row['cell']}")
-    log = path if path.exists() else None
+    live = None
     try:
         end = classify_log_end(open_log(path))
     except LogError as error:
         text = "; ".join([*problems, str(error)])
-        return ConfirmedCell(row, virtual, live=None, text=text, log=log)
-    # a divergence ends the session by design and reports a problem
-    if problems and end.behaviour is not EndBehaviour.DIVERGED:
-        return ConfirmedCell(row, virtual, live=None, text="; ".join(problems), log=log)
-    return ConfirmedCell(row, virtual, live=classify_end(end), text=end.text, log=log)
+    else:
+        # a divergence ends the session by design and reports a problem
+        if problems and end.behaviour is not EndBehaviour.DIVERGED:
+            text = "; ".join(problems)
+        else:
+            text = end.text
+            live = classify_end(end)
+    log = path if path.exists() else None
+    return ConfirmedCell(row=row, virtual=virtual, live=live, text=text, log=log)
 
 
 def tabulate_confirmations(
     confirmations: Sequence[ConfirmedCell], axes: Sequence[str]
 ) -> TextTable:
     """Returns a table with a row per cell: its values, both classes, figures and log."""
-    heads = (
-        "cell",
-        *map(label_axis, axes),
-        "seed",
-        "virtual",
-        "live",
-        "",
-        "the log shows",
-        "log",
-    )
+    heads = ["cell", *map(label_axis, axes)]
+    heads += ["seed", "virtual", "live", "", "the log shows", "log"]
     rows = []
     for confirmed in confirmations:
-        row = confirmed.row
-        values = [row[key] for key in axes]
-        texts = [value if isinstance(value, str) else f"{value:g}" for value in values]
-        virtual = confirmed.virtual.value
-        live = "none" if confirmed.live is None else confirmed.live.value
-        agreement = "same" if confirmed.same else "DIFFERS"
-        log = "none" if confirmed.log is None else str(confirmed.log)
-        cell = str(row["cell"])
-        seed = str(row["seed"])
-        rows.append((cell, *texts, seed, virtual, live, agreement, confirmed.text, log))
-    return TextTable(heads, rows)
-
-
-GridIndex = tuple[Any, ...]
-"""Position of a run in the grid: its index on each axis, then its law and its seed."""
+        run = confirmed.row
+        row = [str(run["cell"])]
+        for key in axes:
+            value = run[key]
+            row.append(value if isinstance(value, str) else f"{value:g}")
+        row.append(str(run["seed"]))
+        row.append(confirmed.virtual.value)
+        row.append("none" if confirmed.live is None else confirmed.live.value)
+        row.append("same" if confirmed.same else "DIFFERS")
+        row.append(confirmed.text)
+        row.append("none" if confirmed.log is None else str(confirmed.log))
+        rows.append(tuple(row))
+    return TextTable(tuple(heads), rows)
 
 
 def _index_rows(rows: Sequence[ResultRow], axes: Sequence[str]) -> dict[GridIndex, ResultRow]:
@@ -167,8 +184,9 @@ def _index_rows(rows: Sequence[ResultRow], axes: Sequence[str]) -> dict[GridInde
     ranks: dict[str, dict[Any, int]] = {}
     for key in axes:
         values = {row[key] for row in rows}
-        ordered = sorted(values, key=lambda value: (isinstance(value, str), value))
-        ranks[key] = {value: rank for rank, value in enumerate(ordered)}
+        numbers = sorted(value for value in values if not isinstance(value, str))
+        texts = sorted(value for value in values if isinstance(value, str))
+        ranks[key] = {value: rank for rank, value in enumerate([*numbers, *texts])}
     row_at: dict[GridIndex, ResultRow] = {}
     for row in rows:
         position = [ranks[key][row[key]] for key in axes]
@@ -195,8 +213,13 @@ def _compute_edge_distances(
     distances: dict[GridIndex, int] = {}
     for (axis, *_), indices in lines.items():
         for index in indices:
-            opposite = [other for other in indices if stable[other] is not stable[index]]
-            if opposite:
-                distance = min(abs(other[axis] - index[axis]) for other in opposite)
-                distances[index] = min(distance, distances.get(index, distance))
+            steps = [
+                abs(other[axis] - index[axis])
+                for other in indices
+                if stable[other] is not stable[index]
+            ]
+            if index in distances:
+                steps.append(distances[index])
+            if steps:
+                distances[index] = min(steps)
     return distances

@@ -1,10 +1,15 @@
-"""The figure and the page of a stability map: map.png, map.svg, map.pdf and map.md.
+"""Draws a stability map and writes its page: map.png, map.svg, map.pdf and map.md.
 
-Invariant: the page holds only results, lines and commands, and equal results give equal bytes.
-A cell of the figure is coloured by its classes alone: with several seeds by the stable share of
-the decided runs, hatched where half or more are undecided; or, judged by twins, by its growth
-exponent, white at zero. Cells stay pixels in vector output, since viewers show seams between
-touching shapes; the classes differ in lightness for grey print and colour-blind readers.
+The figure shows a coloured cell per grid point, and the lines of theory on top. With one seed
+the colour is the class of the run. With several seeds it is the share of stable runs among the
+decided ones. If twins judge the map, it is the growth exponent, white at zero.
+
+Invariant:
+    - The page holds only results, lines and commands. Equal results give equal bytes.
+    - The colour of a cell depends on its results alone.
+    - A cell is hatched if half or more of its runs are undecided, or if it has no exponent.
+    - Cells stay pixels in vector output, because viewers show seams between touching shapes.
+    - The colours of the classes differ in lightness, for grey print and colour-blind readers.
 """
 
 import math
@@ -15,6 +20,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import BoundaryNorm, LinearSegmentedColormap, ListedColormap
@@ -48,37 +54,56 @@ CLASS_COLOURS = {
     CellClass.DIVERGED: "#a23b53",
     CellClass.UNDECIDED: "#ffffff",
 }
-"""Light, middle, dark; undecided is white and hatched."""
-_HATCH = "/////"
-_HATCHED: Any = {"facecolor": "none", "edgecolor": "#8a8a8a", "linewidth": 0.0, "hatch": _HATCH}
+"""Colours of the classes: light, medium and dark; undecided cells are white and hatched."""
+_EMPTY_COLOUR = "#f4f4f4"
+"""Colour of cells without runs."""
+_HATCHED: Any = {
+    "facecolor": "none",
+    "edgecolor": "#8a8a8a",
+    "linewidth": 0.0,
+    "hatch": "/////",
+}
 _LINE_STYLES: tuple[dict[str, Any], ...] = (
     {"color": "#000000", "linestyle": "-", "linewidth": 1.2},
     {"color": "#000000", "linestyle": (0, (4, 1.6)), "linewidth": 1.2},
-    {"color": "#ddaa33", "linestyle": "-", "linewidth": 2.6},  # measured, below the others
+    # the last style is that of measured lines, which lie below the others
+    {"color": "#ddaa33", "linestyle": "-", "linewidth": 2.6},
 )
 _VERDICT_EDGE: dict[str, Any] = {"color": "#6b6b6b", "linewidth": 1.6, "alpha": 0.6}
 _EXPONENTS = LinearSegmentedColormap.from_list(
     "exponents", ["#004488", "#ffffff", "#a23b53"], 257
 )
-_CLASSES_OF_SHARES = (CellClass.DIVERGED, CellClass.BOUNDED, CellClass.CONVERGED)
 _SHARES = LinearSegmentedColormap.from_list(
-    "share", [CLASS_COLOURS[one] for one in _CLASSES_OF_SHARES]
+    "share",
+    [
+        CLASS_COLOURS[CellClass.DIVERGED],
+        CLASS_COLOURS[CellClass.BOUNDED],
+        CLASS_COLOURS[CellClass.CONVERGED],
+    ],
 )
-"""Colours of shares: those of the classes, dark where nothing is stable, and ever lighter."""
+"""Colours of stable shares: dark if nothing is stable, lighter with a larger share."""
 _HALO_PT = 2.6
+"""Width of the white halo around a line."""
 _COUNT_PT = 5.0
-_LETTERS_PER_IN = 13
-"""Of titles: those of neighbouring panels stay apart."""
-_LETTER = 0.62
-"""Width of a digit over its size."""
-_FULL_IN = 2.3
+"""Font size of the counts in cells."""
+_DIGIT_WIDTH = 0.62
+"""Width of a digit, relative to the font size."""
+_TITLE_LETTERS_PER_IN = 13
+"""Letters per inch of a panel title; a longer title is broken, to keep clear of its neighbour.
+"""
+_FULL_HEIGHT_IN = 2.3
 """Height of a panel that has a row to itself."""
-_BESIDE_IN = 1.75
-_STRIP_IN = 0.7
+_SHARED_HEIGHT_IN = 1.75
+"""Height of a panel that shares its row."""
+_STRIP_HEIGHT_IN = 0.7
+"""Height of a panel of a map with a single axis."""
 _CAPTION_PT = 5.5
 _CAPTION_LINE_IN = 0.1
 _CAPTION_LETTERS_PER_IN = 25
 _SHARED_LABEL_IN = 0.14
+"""Height of the label that all panels share."""
+_COLOUR_BAR_IN = 0.6
+"""Width of the colour bar with its labels."""
 
 
 def draw_stability_map(
@@ -87,52 +112,85 @@ def draw_stability_map(
     form: FigureSize,
     fixed: Sequence[str] = (),
 ) -> Figure:
-    """Returns the figure of a plane; `fixed` are the gains that were not swept, a text per law."""
-    columns = _columns(len(plane.panels), form)
-    rows = -(-len(plane.panels) // columns)
-    each_in = _STRIP_IN if not plane.y.key else _FULL_IN if columns == 1 else _BESIDE_IN
-    barred = plane.judged_by_twins or plane.seeds > 1
+    """Returns the figure of a stability map.
+
+    Args:
+        plane: the results.
+        lines: the lines of each panel.
+        form: the size of the figure.
+        fixed: the gains that were not swept, a text per law, for the caption.
+    """
+    count = len(plane.panels)
+    columns = _count_columns(count, form)
+    rows = math.ceil(count / columns)
     caption = _wrap_caption(fixed, form)
-    height_in = 0.95 + rows * each_in + _CAPTION_LINE_IN * len(caption)
+    panel_height_in = _choose_panel_height_in(plane, columns)
+    height_in = 0.95 + rows * panel_height_in + _CAPTION_LINE_IN * len(caption)
+    shares_labels = columns * rows > 1
+    has_colour_bar = plane.judged_by_twins or plane.seeds > 1
     with style.styled_figure(form, height_in) as figure:
-        shared = columns * rows > 1
-        low = (
-            _write_caption(figure, caption, height_in, shared_label=shared) if caption else None
-        )
-        grid: list[Any] = list(
-            style.add_panels(figure, rows, columns, sharex=True, sharey=True).flat
-        )
-        for axes in grid[len(plane.panels) :]:
+        x_label_options: dict[str, Any] = {}
+        if caption:
+            caption_top = _write_caption(figure, caption, height_in, shares_labels)
+            x_label_options = {"y": caption_top, "va": "bottom"}
+        panel_grid = style.add_panels(figure, rows, columns, sharex=True, sharey=True)
+        grid: list[Any] = list(panel_grid.flat)
+        for axes in grid[count:]:
             axes.set_axis_off()
-        for axes, panel, drawn in zip(grid, plane.panels, lines, strict=False):
-            _draw_panel(axes, plane, panel, drawn)
-            letters = round((form.width_in - 0.6 * barred) * _LETTERS_PER_IN / columns)
-            broken = len(panel.title) > letters
-            axes.set_title(panel.title.replace(", ", ",\n") if broken else panel.title)
-        for n, axes in enumerate(grid[: len(plane.panels)]):
-            _scale(axes, plane)
-            axes.tick_params(labelleft=n % columns == 0 and bool(plane.y.key))
-            axes.tick_params(labelbottom=n + columns >= len(plane.panels))
-        if not shared:
+
+        titles_in = form.width_in - _COLOUR_BAR_IN * has_colour_bar
+        title_letters = round(titles_in * _TITLE_LETTERS_PER_IN / columns)
+        for axes, panel, panel_lines in zip(grid, plane.panels, lines, strict=False):
+            _draw_panel(axes, plane, panel, panel_lines)
+            title = panel.title
+            if len(title) > title_letters:
+                title = title.replace(", ", ",\n")
+            axes.set_title(title)
+        for n, axes in enumerate(grid[:count]):
+            _set_scale(axes, plane)
+            is_left = n % columns == 0
+            is_bottom = n + columns >= count
+            axes.tick_params(labelleft=is_left and bool(plane.y.key))
+            axes.tick_params(labelbottom=is_bottom)
+
+        if shares_labels:
+            figure.supxlabel(plane.x.label, fontsize=8.0, **x_label_options)
+            figure.supylabel(plane.y.label, fontsize=8.0)
+        else:
             grid[0].set_xlabel(plane.x.label)
             grid[0].set_ylabel(plane.y.label)
-        else:
-            below: Any = {} if low is None else {"y": low, "va": "bottom"}
-            figure.supxlabel(plane.x.label, fontsize=8.0, **below)
-            figure.supylabel(plane.y.label, fontsize=8.0)
-        if barred:
-            _draw_scale(figure, grid, plane)
+        if has_colour_bar:
+            _draw_colour_bar(figure, grid, plane)
         _draw_legend(figure, plane, lines)
+
+        # the layout is computed here: the size of a cell decides whether counts fit into it
         figure.draw(FigureCanvasAgg(figure).get_renderer())  # type: ignore[no-untyped-call]
-        # only now it is known how much room there is
         if plane.seeds > 1 and not plane.judged_by_twins:
             for axes, panel in zip(grid, plane.panels, strict=False):
                 _draw_counts(axes, plane, panel)
     return figure
 
 
+def _count_columns(panels: int, form: FigureSize) -> int:
+    """Returns the number of columns of panels in a figure."""
+    if panels == 1:
+        return 1
+    if form.narrow:
+        return 2
+    if panels <= 3:
+        return panels
+    return 4 if panels in (4, 7, 8) else 3
+
+
+def _choose_panel_height_in(plane: MapPlane, columns: int) -> float:
+    """Returns the height of a panel, in inches."""
+    if not plane.y.key:
+        return _STRIP_HEIGHT_IN
+    return _FULL_HEIGHT_IN if columns == 1 else _SHARED_HEIGHT_IN
+
+
 def _wrap_caption(fixed: Sequence[str], form: FigureSize) -> list[str]:
-    """Returns the lines of the caption: the gains that were not swept."""
+    """Returns the lines of the caption, which names the gains that were not swept."""
     if not fixed:
         return []
     width = round(_CAPTION_LETTERS_PER_IN * form.width_in)
@@ -141,315 +199,458 @@ def _wrap_caption(fixed: Sequence[str], form: FigureSize) -> list[str]:
 
 
 def _write_caption(
-    figure: Figure, caption: Sequence[str], height_in: float, *, shared_label: bool
+    figure: Figure, caption: Sequence[str], height_in: float, shares_labels: bool
 ) -> float:
-    """Writes the caption below the panels, which give way to it; returns where it ends, from 0
-    to 1.
+    """Writes the caption at the bottom of a figure and reserves the space for it.
 
-    The layout engine moves panels, but no label that they share: with `shared_label` they make
-    room for that.
+    Args:
+        figure: the figure.
+        caption: the lines of the caption.
+        height_in: the height of the figure, in inches.
+        shares_labels: True if the panels share a label. The layout engine moves panels but not
+            that label, so that the space for the label is reserved here.
+
+    Returns:
+        The top of the caption, as a share of the height.
     """
-    end = (_CAPTION_LINE_IN * len(caption) + 0.04) / height_in
-    share = end + _SHARED_LABEL_IN / height_in * shared_label
+    top = (_CAPTION_LINE_IN * len(caption) + 0.04) / height_in
+    reserved = top + _SHARED_LABEL_IN / height_in * shares_labels
     engine: Any = figure.get_layout_engine()
-    engine.set(rect=(0.0, share, 1.0, 1.0 - share))
+    engine.set(rect=(0.0, reserved, 1.0, 1.0 - reserved))
     figure.text(
-        0.01,
-        0.02 / height_in,
-        "\n".join(caption),
+        x=0.01,
+        y=0.02 / height_in,
+        s="\n".join(caption),
         va="bottom",
         fontsize=_CAPTION_PT,
         color=style.REFERENCE,
     )
-    return end
-
-
-def _columns(panels: int, form: FigureSize) -> int:
-    if panels == 1:
-        return 1
-    if form.narrow:
-        return 2
-    return panels if panels <= 3 else 4 if panels in (4, 7, 8) else 3
+    return top
 
 
 def _draw_panel(axes: Axes, plane: MapPlane, panel: MapPanel, lines: Sequence[MapLine]) -> None:
-    x = _bounds(plane.x)
-    y = _bounds(plane.y)
+    """Draws the cells of a panel, hatches undecided cells, and draws the lines on top."""
     axes.grid(visible=False)
-    axes.set_facecolor("#f4f4f4")  # where nothing has run
+    axes.set_facecolor(_EMPTY_COLOUR)
+    _draw_cells(axes, plane, panel)
     if plane.judged_by_twins:
-        limit = _find_exponent_limit(plane)
-        shown = np.ma.masked_invalid(panel.exponents_per_s)
-        axes.pcolormesh(x, y, shown, cmap=_EXPONENTS, vmin=-limit, vmax=limit, rasterized=True)
-        for at, edge in find_map_edges(plane, panel):
-            ends = np.interp([edge.low, edge.high], plane.y.values, plane.y.places)
-            axes.vlines(np.interp(at, plane.x.values, plane.x.places), *ends, **_VERDICT_EDGE)
-    elif plane.seeds > 1:
-        shown = np.ma.masked_invalid(panel.share)
-        axes.pcolormesh(x, y, shown, cmap=_SHARES, vmin=0.0, vmax=1.0, rasterized=True)
-    else:
-        classes = np.ma.masked_where(panel.runs == 0, panel.counts.argmax(axis=2))
-        norm = BoundaryNorm(np.arange(len(CELL_CLASSES) + 1) - 0.5, len(CELL_CLASSES))
-        palette = ListedColormap([CLASS_COLOURS[verdict] for verdict in CELL_CLASSES])
-        axes.pcolormesh(x, y, classes, cmap=palette, norm=norm, rasterized=True)
-    for i, row in enumerate(_undecided(plane, panel)):
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], row, [False]]).astype(np.int8)))
-        for start, end in zip(edges[::2], edges[1::2], strict=True):
-            axes.fill_between([x[start], x[end]], y[i], y[i + 1], zorder=1.5, **_HATCHED)
+        _draw_verdict_edges(axes, plane, panel)
+    _hatch_undecided(axes, plane, panel)
     for line in lines:
         _draw_line(axes, plane, line)
 
 
+def _draw_cells(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
+    """Draws the coloured cells of a panel."""
+    colours: dict[str, Any]
+    values: Any
+    if plane.judged_by_twins:
+        limit = _find_exponent_limit(plane)
+        values = np.ma.masked_invalid(panel.exponents_per_s)
+        colours = {"cmap": _EXPONENTS, "vmin": -limit, "vmax": limit}
+    elif plane.seeds > 1:
+        values = np.ma.masked_invalid(panel.share)
+        colours = {"cmap": _SHARES, "vmin": 0.0, "vmax": 1.0}
+    else:
+        most_frequent = panel.counts.argmax(axis=2)
+        values = np.ma.masked_where(panel.runs == 0, most_frequent)
+        count = len(CELL_CLASSES)
+        palette = ListedColormap([CLASS_COLOURS[verdict] for verdict in CELL_CLASSES])
+        colours = {"cmap": palette, "norm": BoundaryNorm(np.arange(count + 1) - 0.5, count)}
+    x = _compute_borders(plane.x)
+    y = _compute_borders(plane.y)
+    axes.pcolormesh(x, y, values, rasterized=True, **colours)
+
+
+def _hatch_undecided(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
+    """Hatches the cells of `_find_undecided`, neighbours of a row as one rectangle."""
+    x = _compute_borders(plane.x)
+    y = _compute_borders(plane.y)
+    for row, undecided in enumerate(_find_undecided(plane, panel)):
+        bottom = y[row]
+        top = y[row + 1]
+        for first, stop in _list_stretches(undecided):
+            sides = [x[first], x[stop]]
+            axes.fill_between(sides, bottom, top, zorder=1.5, **_HATCHED)
+
+
+def _draw_verdict_edges(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
+    """Draws the measured edge of the verdicts in each column as a vertical line."""
+    for x_value, edge in find_map_edges(plane, panel):
+        x = _find_position(plane.x, x_value)
+        low = _find_position(plane.y, edge.low)
+        high = _find_position(plane.y, edge.high)
+        axes.vlines(x, low, high, **_VERDICT_EDGE)
+
+
+def _find_position(axis: PlaneAxis, value: float) -> float:
+    """Returns the drawing position of a value, which may lie between the values of the axis."""
+    return float(np.interp(value, axis.values, axis.positions))
+
+
+def _list_stretches(flags: Array) -> list[tuple[int, int]]:
+    """Returns the stretches of True in a row of flags, as pairs (first, last + 1)."""
+    padded = np.concatenate([[False], flags, [False]])
+    changes = np.flatnonzero(padded[1:] != padded[:-1]).tolist()
+    firsts = changes[::2]
+    stops = changes[1::2]
+    return list(zip(firsts, stops, strict=True))
+
+
 def _draw_line(axes: Axes, plane: MapPlane, line: MapLine) -> None:
-    x, y = (
-        np.concatenate([_bounds(one)[:1], one.places, _bounds(one)[-1:]])
-        for one in (plane.x, plane.y)
-    )
-    spare = _extended(_extended(line.spare, y).T, x).T
-    # a border at zero is a place itself
-    inside = [np.diff(one, append=np.inf) > 0.0 for one in (y, x)]
-    shown = np.ma.masked_invalid(spare[np.ix_(*inside)])
+    """Draws a line as the zero contour of its quantity, extrapolated to the panel's borders."""
+    x = _extend_positions(plane.x)
+    y = _extend_positions(plane.y)
+    spare = _extrapolate_rows(line.spare, y)
+    spare = _extrapolate_rows(spare.T, x).T
+    # a border at zero may coincide with the first position: only one of the two is kept
+    keep_x = np.diff(x, append=np.inf) > 0.0
+    keep_y = np.diff(y, append=np.inf) > 0.0
+    kept_spare = np.ma.masked_invalid(spare[np.ix_(keep_y, keep_x)])
     look = _LINE_STYLES[line.rank % len(_LINE_STYLES)]
-    drawn = axes.contour(
-        x[inside[1]],
-        y[inside[0]],
-        shown,
-        [0.0],
+    contour = axes.contour(
+        x[keep_x],
+        y[keep_y],
+        kept_spare,
+        levels=[0.0],
         colors=look["color"],
         linewidths=look["linewidth"],
     )
     halo = [Stroke(linewidth=_HALO_PT, foreground="#ffffff"), Normal()]
-    drawn.set(linestyle=look["linestyle"], path_effects=halo)
+    contour.set(linestyle=look["linestyle"], path_effects=halo)
 
 
-def _extended(rows: Array, places: Array) -> Array:
-    """Returns a field with a row more at either end, of which the places are the first and the
-    last.
+def _extend_positions(axis: PlaneAxis) -> Array:
+    """Returns the positions of an axis with the borders of the panel at both ends."""
+    borders = _compute_borders(axis)
+    return np.concatenate([borders[:1], axis.positions, borders[-1:]])
+
+
+def _extrapolate_rows(rows: Array, positions: Array) -> Array:
+    """Returns a field with an extrapolated row before the first and after the last.
+
+    Args:
+        rows: the field, shape (n, m).
+        positions: positions of the rows of the result, shape (n + 2,).
     """
-    before, after = (
-        rows[i]
-        + (rows[j] - rows[i]) * (places[at] - places[near]) / (places[far] - places[near])
-        for i, j, at, near, far in ((0, 1, 0, 1, 2), (-1, -2, -1, -2, -3))
-    )
+    before = _extrapolate_row(rows[:2], positions[:3])
+    after = _extrapolate_row(rows[:-3:-1], positions[:-4:-1])
     return np.concatenate([before[np.newaxis], rows, after[np.newaxis]])
 
 
-def _undecided(plane: MapPlane, panel: MapPanel) -> Any:
-    """Returns where half of the runs or more are undecided, or have no exponent, shape (y, x)."""
+def _extrapolate_row(rows: Array, positions: Array) -> Array:
+    """Returns a row outside of a field, on the straight line through the next two rows.
+
+    Args:
+        rows: the next row and the one behind it, shape (2, m).
+        positions: positions of the row outside and of these two rows, shape (3,).
+    """
+    outside, near, far = positions
+    near_row, far_row = rows
+    extrapolated: Array = near_row + (far_row - near_row) * (outside - near) / (far - near)
+    return extrapolated
+
+
+def _find_undecided(plane: MapPlane, panel: MapPanel) -> Any:
+    """Returns True for the cells to be hatched, shape (y, x).
+
+    These are cells with runs of which half or more are undecided or, if twins judge the map,
+    that have no exponent.
+    """
+    has_runs = panel.runs > 0
     if plane.judged_by_twins:
-        return (panel.runs > 0) & np.isnan(panel.exponents_per_s)
-    return (panel.runs > 0) & (
-        2 * panel.counts[:, :, CELL_CLASSES.index(CellClass.UNDECIDED)] >= panel.runs
-    )
+        return has_runs & np.isnan(panel.exponents_per_s)
+    undecided = panel.counts[:, :, CELL_CLASSES.index(CellClass.UNDECIDED)]
+    return has_runs & (2 * undecided >= panel.runs)
 
 
-def _bounds(side: PlaneAxis) -> Array:
-    """Returns the borders of the cells of an axis: half way between its values, shape (n + 1,).
+def _compute_borders(axis: PlaneAxis) -> Array:
+    """Returns the borders of the cells of an axis, halfway between positions, shape (n + 1,).
 
-    None is below zero unless a value is: there is no delay of -100 ms.
+    No border is below zero unless a value is: a delay of -100 ms does not exist.
     """
-    places = side.places
-    if len(places) == 1:
-        return np.array([places[0] - 0.5, places[0] + 0.5])
-    ends = 1.5 * places[[0, -1]] - 0.5 * places[[1, -2]]
-    bounds: Array = np.concatenate([ends[:1], 0.5 * (places[1:] + places[:-1]), ends[1:]])
-    return np.maximum(bounds, 0.0) if side.even and places[0] >= 0.0 else bounds
+    positions = axis.positions
+    if len(positions) == 1:
+        return np.array([positions[0] - 0.5, positions[0] + 0.5])
+    ends = 1.5 * positions[[0, -1]] - 0.5 * positions[[1, -2]]
+    middles = 0.5 * (positions[1:] + positions[:-1])
+    borders: Array = np.concatenate([ends[:1], middles, ends[1:]])
+    if axis.even and positions[0] >= 0.0:
+        return np.maximum(borders, 0.0)
+    return borders
 
 
-def _scale(axes: Axes, plane: MapPlane) -> None:
-    """Gives a panel its ticks: round numbers on an even axis, else every value that there is
-    room for.
+def _set_scale(axes: Axes, plane: MapPlane) -> None:
+    """Sets the limits and ticks of a panel.
+
+    The ticks are round numbers on an evenly spaced axis, else the values of the axis.
     """
-    x = _bounds(plane.x)
-    y = _bounds(plane.y)
+    x = _compute_borders(plane.x)
+    y = _compute_borders(plane.y)
     axes.set_xlim(x[0], x[-1])
     axes.set_ylim(y[0], y[-1])
-    for axis, side in ((axes.xaxis, plane.x), (axes.yaxis, plane.y)):
-        if side.even:
-            axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 2.5, 4, 5, 10]))
-        else:
-            axis.set_major_locator(FixedLocator(list(side.places)))
-            axis.set_major_formatter(FixedFormatter([f"{value:g}" for value in side.values]))
+    _set_ticks(axes.xaxis, plane.x)
+    _set_ticks(axes.yaxis, plane.y)
     if not plane.y.key:
         axes.set_yticks([])
     for spine in ("top", "right"):
         axes.spines[spine].set_visible(True)
 
 
+def _set_ticks(axis: Axis, plane_axis: PlaneAxis) -> None:
+    """Sets the ticks of one axis of a panel."""
+    if plane_axis.even:
+        axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 2.5, 4, 5, 10]))
+        return
+    texts = [f"{value:g}" for value in plane_axis.values]
+    axis.set_major_locator(FixedLocator(list(plane_axis.positions)))
+    axis.set_major_formatter(FixedFormatter(texts))
+
+
 def _find_exponent_limit(plane: MapPlane) -> float:
-    """Returns the exponent of the darkest colours, 1/s, a round number that four fifths are
-    below.
+    """Returns the exponent with the darkest colours, in 1/s.
+
+    The limit is a round number that four fifths of the exponents do not exceed.
     """
-    found = np.abs(np.concatenate([panel.exponents_per_s.ravel() for panel in plane.panels]))
-    least = max(float(np.nanquantile(found, 0.8)), 1e-6)
+    exponents = [panel.exponents_per_s.ravel() for panel in plane.panels]
+    magnitudes = np.abs(np.concatenate(exponents))
+    quantile = float(np.nanquantile(magnitudes, 0.8))
+    least = max(quantile, 1e-6)
     decade = 10.0 ** math.floor(math.log10(least))
-    return next(
-        step * decade for step in (1.0, 2.0, 5.0, 10.0) if step * decade >= least * (1.0 - 1e-9)
-    )
+    for step in (1.0, 2.0, 5.0):
+        if step * decade >= least * (1.0 - 1e-9):  # a limit that `least` equals is enough
+            return step * decade
+    return 10.0 * decade
 
 
-def _draw_scale(figure: Figure, grid: Sequence[Axes], plane: MapPlane) -> None:
-    """Draws what the colours of shares or of exponents mean; a pointed end has all beyond it."""
-    twins = plane.judged_by_twins
-    limit = _find_exponent_limit(plane) if twins else 1.0
-    colours = ScalarMappable(cmap=_EXPONENTS if twins else _SHARES)
-    colours.set_clim(-limit if twins else 0.0, limit)
-    ends = "both" if twins else "neither"
+def _draw_colour_bar(figure: Figure, grid: Sequence[Axes], plane: MapPlane) -> None:
+    """Draws the colour bar of exponents or of stable shares.
+
+    The pointed ends of the bar of exponents stand for all exponents beyond its limits.
+    """
+    if plane.judged_by_twins:
+        limit = _find_exponent_limit(plane)
+        colours = ScalarMappable(cmap=_EXPONENTS)
+        colours.set_clim(-limit, limit)
+        label = "growth exponent of a push (1/s)"
+        pointed = "both"
+    else:
+        colours = ScalarMappable(cmap=_SHARES)
+        colours.set_clim(0.0, 1.0)
+        label = "share of stable runs"
+        pointed = "neither"
     bar = figure.colorbar(
-        colours, ax=list(grid), fraction=0.05, pad=0.02, aspect=30, extend=ends
+        colours, ax=list(grid), fraction=0.05, pad=0.02, aspect=30, extend=pointed
     )
-    if twins:
+    if plane.judged_by_twins:
         bar.set_ticks([-limit, -0.5 * limit, 0.0, 0.5 * limit, limit])
-    bar.set_label("growth exponent of a push (1/s)" if twins else "share of stable runs")
+    bar.set_label(label)
     bar.outline.set_linewidth(0.6)
 
 
 def _draw_counts(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
-    """Writes how many runs were stable, of the decided ones, into places where not all agree:
-    if they fit.
+    """Writes the number of stable and of decided runs into the cells whose runs disagree.
+
+    Nothing is written if the counts do not fit into a cell.
     """
     extent = axes.get_window_extent()
-    width_pt = 72.0 * extent.width / axes.figure.dpi / len(plane.x.values)
-    height_pt = 72.0 * extent.height / axes.figure.dpi / len(plane.y.values)
+    dpi = axes.figure.dpi
+    cell_width_pt = 72.0 * extent.width / dpi / len(plane.x.values)
+    cell_height_pt = 72.0 * extent.height / dpi / len(plane.y.values)
+    letters = 2 * len(str(plane.seeds)) + 1
+    text_width_pt = letters * _DIGIT_WIDTH * _COUNT_PT
+    text_height_pt = 1.2 * _COUNT_PT
+    if cell_width_pt < text_width_pt or cell_height_pt < text_height_pt:
+        return
     stable = panel.stable
     decided = panel.decided
-    letters = 2 * len(str(plane.seeds)) + 1
-    if width_pt < letters * _LETTER * _COUNT_PT or height_pt < 1.2 * _COUNT_PT:
-        return
-    for i, j in np.argwhere((stable > 0) & (stable < decided)):
-        text = f"{stable[i, j]}/{decided[i, j]}"
-        where = plane.x.places[j], plane.y.places[i]
-        axes.text(*where, text, ha="center", va="center", fontsize=_COUNT_PT, color="#000000")
+    disagree = (stable > 0) & (stable < decided)
+    for i, j in np.argwhere(disagree):
+        axes.text(
+            x=plane.x.positions[j],
+            y=plane.y.positions[i],
+            s=f"{stable[i, j]}/{decided[i, j]}",
+            ha="center",
+            va="center",
+            fontsize=_COUNT_PT,
+            color="#000000",
+        )
 
 
 def _draw_legend(figure: Figure, plane: MapPlane, lines: Sequence[Sequence[MapLine]]) -> None:
-    counts = sum(panel.counts.sum(axis=(0, 1)) for panel in plane.panels)
+    """Draws the legend: classes or the edge of the verdicts, hatching, and lines."""
     handles: list[Any] = []
     if plane.judged_by_twins:
         if any(find_map_edges(plane, panel) for panel in plane.panels):
             handles.append(Line2D([], [], label="edge of the verdicts", **_VERDICT_EDGE))
     elif plane.seeds == 1:
-        handles += [
-            Patch(
-                label=one.value,
-                facecolor=CLASS_COLOURS[one],
+        handles += _list_class_handles(plane)
+    if any(_find_undecided(plane, panel).any() for panel in plane.panels):
+        if plane.judged_by_twins:
+            label = "no exponent"
+        elif plane.seeds > 1:
+            label = "half or more undecided"
+        else:
+            label = CellClass.UNDECIDED.value
+        look = {**_HATCHED, "linewidth": 0.5}
+        handles.append(Patch(label=label, **look))
+    line_of_label = {line.label: line for panel_lines in lines for line in panel_lines}
+    for label, line in line_of_label.items():
+        look = _LINE_STYLES[line.rank % len(_LINE_STYLES)]
+        handles.append(Line2D([], [], label=label, **look))
+    style.place_legend(figure, handles, handlelength=1.6)
+
+
+def _list_class_handles(plane: MapPlane) -> list[Patch]:
+    """Returns the legend entries of the decided classes that occur in a map."""
+    counts = sum(panel.counts.sum(axis=(0, 1)) for panel in plane.panels)
+    handles = []
+    for verdict, count in zip(CELL_CLASSES, counts, strict=True):
+        if count and verdict is not CellClass.UNDECIDED:
+            patch = Patch(
+                label=verdict.value,
+                facecolor=CLASS_COLOURS[verdict],
                 edgecolor="#6b6b6b",
                 linewidth=0.5,
             )
-            for one, count in zip(CELL_CLASSES, counts, strict=True)
-            if count and one is not CellClass.UNDECIDED
-        ]
-    if any(_undecided(plane, panel).any() for panel in plane.panels):
-        many = "half or more undecided" if plane.seeds > 1 else CellClass.UNDECIDED.value
-        word = "no exponent" if plane.judged_by_twins else many
-        handles.append(Patch(label=word, **{**_HATCHED, "linewidth": 0.5}))
-    named = {line.label: line for some in lines for line in some}
-    handles += [
-        Line2D([], [], label=text, **_LINE_STYLES[line.rank % len(_LINE_STYLES)])
-        for text, line in named.items()
-    ]
-    style.place_legend(figure, handles, handlelength=1.6)
+            handles.append(patch)
+    return handles
 
 
 _DPI = 300
 
 
 def write_map(chart: StabilityMap, folder: Path, width_in: float = COLUMN_IN) -> list[Path]:
-    """Writes a map into a folder that exists, and returns the paths.
+    """Writes the figure and the page of a map into an existing folder.
+
+    Args:
+        chart: the map.
+        folder: the folder.
+        width_in: width of the figure, in inches.
+
+    Returns:
+        The paths of the files.
 
     Raises:
-        UsageError: there is no such width.
+        UsageError: the width is not that of one or two columns.
     """
     form = make_print_size(width_in)
     figure = draw_stability_map(chart.plane, chart.lines, form, chart.fixed)
-    paths = [folder / f"map.{suffix}" for suffix in ("png", "svg", "pdf", "md")]
-    for path in paths[:-1]:
+    picture_paths = [folder / f"map.{suffix}" for suffix in ("png", "svg", "pdf")]
+    page_path = folder / "map.md"
+    for path in picture_paths:
         style.write_figure(figure, path, _DPI)
-    write_whole(paths[-1], build_map_page(chart, paths[0].name))
-    return paths
+    write_whole(page_path, build_map_page(chart, picture_paths[0].name))
+    return [*picture_paths, page_path]
 
 
 def build_map_page(chart: StabilityMap, picture: str) -> str:
-    """Returns the page of a map, as Markdown."""
-    parts = [
-        f"# {chart.title}",
-        "```sh\n" + "\n".join(chart.commands) + "\n```",
-        f"![map]({picture})",
-    ]
+    """Returns the page of a map in Markdown.
+
+    Args:
+        chart: the map.
+        picture: the name of the picture's file.
+    """
+    commands = "\n".join(chart.commands)
+    parts = [f"# {chart.title}", f"```sh\n{commands}\n```", f"![map]({picture})"]
     parts.append(tabulate_classes(chart.plane).markdown())
-    meanings = dict.fromkeys(
-        f"{line.text}: {line.about}" for lines in chart.lines for line in lines
-    )
-    fixed = [f"gains that were not swept: {text}" for text in chart.fixed]
-    advice = (
-        [FAIR_COMPARISON.replace("trilat compare --tune", "`trilat compare --tune`")]
-        if fixed
-        else []
-    )
-    if notes := [*meanings, *chart.remarks, *fixed, *advice]:
-        parts.append("\n".join(f"- {one}" for one in notes))
+    notes = _list_notes(chart)
+    if notes:
+        parts.append("\n".join(f"- {note}" for note in notes))
     for panel, lines in zip(chart.plane.panels, chart.lines, strict=True):
         table = tabulate_edges(chart.plane, panel, lines)
         if table.rows:
-            parts += [f"## {panel.title}"] if panel.title else []
+            if panel.title:
+                parts.append(f"## {panel.title}")
             parts.append(table.markdown())
     return "\n\n".join(parts) + "\n"
 
 
+def _list_notes(chart: StabilityMap) -> list[str]:
+    """Returns the notes of a map's page: on its lines, and on gains that were not swept."""
+    origins = [f"{line.text}: {line.about}" for lines in chart.lines for line in lines]
+    notes = [*dict.fromkeys(origins), *chart.remarks]
+    notes += [f"gains that were not swept: {text}" for text in chart.fixed]
+    if chart.fixed:
+        notes.append(
+            FAIR_COMPARISON.replace("trilat compare --tune", "`trilat compare --tune`")
+        )
+    return notes
+
+
 def tabulate_classes(plane: MapPlane) -> TextTable:
-    """Returns how many runs had which verdict, a row per panel."""
-    rows = [
-        (panel.title or "all", *(str(int(count)) for count in panel.counts.sum(axis=(0, 1))))
-        for panel in plane.panels
-    ]
+    """Returns a table with the number of runs of each class, a row per panel."""
+    rows = []
+    for panel in plane.panels:
+        counts = panel.counts.sum(axis=(0, 1)).tolist()
+        rows.append((panel.title or "all", *map(str, counts)))
     return TextTable(("runs", *CELL_CLASSES), rows)
 
 
 def tabulate_edges(plane: MapPlane, panel: MapPanel, lines: Sequence[MapLine]) -> TextTable:
-    """Returns the measured edges next to the lines, a row each; none if only one axis was
-    swept.
+    """Returns a table of the measured edges beside the lines, a row per edge.
 
-    Judged by twins an edge is where the exponent is zero, next to that of the verdicts. The
-    difference is that of a line from the middle of the measured edge; "within" where the line
-    lies in the measured edge, as well as its grid can tell.
+    The table is empty if only one axis was swept. If twins judge the map, an edge is a zero of
+    the exponent, and the nearest edge of the verdicts stands beside it.
+
+    The difference is that of a line from the middle of the measured edge, or "within" if the
+    line lies in the measured edge.
     """
-    measured, theory = (
-        [line for line in lines if (line.rank < 0) is own] for own in (True, False)
-    )
+    theory = [line for line in lines if line.rank >= 0]
     heads = [plane.x.label, f"edge of {plane.y.label}", "stable is"]
-    heads += ["edge of the verdicts"] * plane.judged_by_twins
+    if plane.judged_by_twins:
+        heads.append("edge of the verdicts")
     for line in theory:
         heads += [line.text, "difference"]
+
+    verdict_edges = find_map_edges(plane, panel)
+    edges = verdict_edges
+    if plane.judged_by_twins:
+        measured = [line for line in lines if line.rank < 0]
+        edges = [crossing for line in measured for crossing in _list_crossings(line, plane)]
     rows = []
-    verdicts = find_map_edges(plane, panel)
-    zeros = [(x, edge) for line in measured for x, edge in _list_crossings(line, plane)]
-    for x, edge in zeros if plane.judged_by_twins else verdicts:
+    for x, edge in edges:
         row = [f"{x:g}", _format_edge(edge), "below" if edge.stable_below else "above"]
         if plane.judged_by_twins:
-            near = [one for at, one in verdicts if at == x]
-            near.sort(key=lambda one, zero=edge.low: abs(one.middle - zero))  # type: ignore[misc]
-            row.append(_format_edge(near[0]) if near else "-")
+            column_edges = [other for other_x, other in verdict_edges if other_x == x]
+            row.append(_format_nearest_edge(edge.low, column_edges))
+        column = plane.x.values.index(x)
         for line in theory:
-            row += _compare_with_line(edge, line.crossings(plane.x.values.index(x), plane.y))
+            row += _compare_with_line(edge, line.crossings(column, plane.y))
         rows.append(tuple(row))
     return TextTable(tuple(heads), rows)
 
 
 def _list_crossings(line: MapLine, plane: MapPlane) -> Iterator[tuple[float, StableInterval]]:
-    for n, x in enumerate(plane.x.values):
-        for value in line.crossings(n, plane.y):
-            below = max(int(np.searchsorted(plane.y.values, value)) - 1, 0)
-            yield x, StableInterval(value, value, bool(line.spare[below, n] > 0.0))
+    """Yields the crossings of a line with the columns, as edges of zero width."""
+    for column, x in enumerate(plane.x.values):
+        for value in line.crossings(column, plane.y):
+            above = int(np.searchsorted(plane.y.values, value))
+            below = max(above - 1, 0)
+            stable_below = bool(line.spare[below, column] > 0.0)
+            yield x, StableInterval(value, value, stable_below)
 
 
 def _format_edge(edge: StableInterval) -> str:
-    return f"{edge.low:.4g}" if edge.low == edge.high else f"{edge.low:g} to {edge.high:g}"
+    if edge.low == edge.high:
+        return f"{edge.low:.4g}"
+    return f"{edge.low:g} to {edge.high:g}"
+
+
+def _format_nearest_edge(value: float, edges: Sequence[StableInterval]) -> str:
+    """Returns the text of the edge nearest to a value, or "-" without edges."""
+    if not edges:
+        return "-"
+    nearest = min(edges, key=lambda edge: abs(edge.middle - value))
+    return _format_edge(nearest)
 
 
 def _compare_with_line(edge: StableInterval, values: Sequence[float]) -> list[str]:
+    """Returns the table cells of a line's nearest crossing and of its relative difference."""
     if not values:
         return ["-", "-"]
-    value = min(values, key=lambda one: abs(one - edge.middle))
-    if edge.low <= value <= edge.high:
-        return [f"{value:.4g}", "within"]
-    return [f"{value:.4g}", f"{100.0 * (value / edge.middle - 1.0):+.1f} %"]
+    nearest = min(values, key=lambda value: abs(value - edge.middle))
+    if edge.low <= nearest <= edge.high:
+        return [f"{nearest:.4g}", "within"]
+    difference = 100.0 * (nearest / edge.middle - 1.0)
+    return [f"{nearest:.4g}", f"{difference:+.1f} %"]

@@ -274,8 +274,8 @@ def search_margin_task(task: MarginItem) -> GridPointMargin:
     key, low, high, tolerance = task.range
 
     def load(value: float) -> Scenario:
-        overrides = (*task.cell.overrides, format_override(key, value), f"seed={task.seed}")
-        return task.plan.scenario(*overrides)
+        override = format_override(key, value)
+        return task.plan.scenario(*task.cell.overrides, override, f"seed={task.seed}")
 
     def stable(value: float) -> bool | None:
         scenario = load(value)
@@ -380,26 +380,30 @@ class SweepMargins(Result):
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the keys of `trilat sweep --margin --json`."""
-        keys = [axis.key for axis in self.plan.axes[:-1]]
         return {
             "command": self.command,
             "scenario_sha256": self.plan.base.sha256,
             **self.within._asdict(),
-            "places": [
-                {
-                    **dict(zip(keys, point.cell.values, strict=True)),
-                    **({"law": point.cell.law} if self.plan.laws else {}),
-                    "seed": point.seed,
-                    "edges": [span._asdict() for span in point.margin.spans],
-                    "stable_everywhere": point.margin.stable,
-                    "undecided": point.margin.undecided,
-                    "runs": point.margin.runs,
-                    "linear": list(point.linear),
-                    "closed_form": point.closed,
-                    "remark": point.remark,
-                }
-                for point in self.found
-            ],
+            "places": [self._describe_point(point) for point in self.found],
+        }
+
+    def _describe_point(self, point: GridPointMargin) -> dict[str, Any]:
+        """Returns the entry of a grid point in `to_dict`."""
+        margin = point.margin
+        facts: dict[str, Any] = {}
+        for axis, value in zip(self.plan.axes[:-1], point.cell.values, strict=True):
+            facts[axis.key] = value
+        if self.plan.laws:
+            facts["law"] = point.cell.law
+        return facts | {
+            "seed": point.seed,
+            "edges": [span._asdict() for span in margin.spans],
+            "stable_everywhere": margin.stable,
+            "undecided": margin.undecided,
+            "runs": margin.runs,
+            "linear": list(point.linear),
+            "closed_form": point.closed,
+            "remark": point.remark,
         }
 
     def to_rows(self) -> list[dict[str, Any]]:
@@ -422,8 +426,10 @@ class SweepMargins(Result):
         parts += [f"{remark[0].upper()}{remark[1:]}." for remark in remarks]
         islands = sum(len(point.margin.spans) > 1 for point in self.found)
         if islands:
-            where = f"in {islands} of {count_nouns(len(self.found), 'place')}"
-            parts.append(f"Stability is not monotone {where}: they have several edges.")
+            points = count_nouns(len(self.found), "grid point")
+            parts.append(
+                f"Stability is not monotone at {islands} of {points}: several edges each."
+            )
         fixed = "; ".join(describe_fixed_gains(self.plan))
         advice = FAIR_COMPARISON.replace("trilat compare --tune", "`trilat compare --tune`")
         parts.append(f"Gains that were not swept: {fixed}. {advice[0].upper()}{advice[1:]}.")

@@ -48,6 +48,8 @@ from .sweep_plan import SweepPlan, format_override, label_axis, label_setting
 from .sweep_results import SweepResults
 
 RunCounts = NDArray[np.int64]
+PanelSettings = tuple[tuple[str, Any], ...]
+"""The setting of the axes that are not drawn, as pairs of key and value."""
 
 CELL_CLASSES = tuple(CellClass)
 """The order of the last axis of `MapPanel.counts`."""
@@ -72,10 +74,13 @@ class PlaneAxis(NamedTuple):
     def even(self) -> bool:
         """True if the values are equally spaced."""
         steps = np.diff(self.values)
-        return len(steps) < 2 or bool(np.ptp(steps) <= 1e-6 * np.abs(steps).max())
+        if len(steps) < 2:
+            return True
+        tolerance = 1e-6 * np.abs(steps).max()
+        return bool(np.ptp(steps) <= tolerance)
 
     @property
-    def places(self) -> Array:
+    def positions(self) -> Array:
         """Drawing positions of the values: the values if equally spaced, else indices."""
         if self.even:
             return np.array(self.values)
@@ -87,7 +92,7 @@ class MapPanel(NamedTuple):
 
     Attributes:
         title: the setting of the axes that are not drawn, in words; "" without such axes.
-        settings: this setting, as pairs of key and value; with the key "law" if laws are swept.
+        settings: the same setting as pairs; with the key "law" if laws are swept.
         counts: number of runs per grid point and class, shape (y, x, 4), in the order of
             `CELL_CLASSES`.
         exponents_per_s: mean growth exponents over the seeds, in 1/s, shape (y, x); NaN without
@@ -95,7 +100,7 @@ class MapPanel(NamedTuple):
     """
 
     title: str
-    settings: tuple[tuple[str, Any], ...]
+    settings: PanelSettings
     counts: RunCounts
     exponents_per_s: Array
 
@@ -115,7 +120,8 @@ class MapPanel(NamedTuple):
     @property
     def decided(self) -> RunCounts:
         """Number of decided runs per grid point, shape (y, x)."""
-        return self.runs - self.counts[:, :, CELL_CLASSES.index(CellClass.UNDECIDED)]
+        undecided = self.counts[:, :, CELL_CLASSES.index(CellClass.UNDECIDED)]
+        return self.runs - undecided
 
     @property
     def share(self) -> Array:
@@ -165,7 +171,8 @@ def build_plane(
     """
     if not rows:
         raise UsageError("no cell has run: there is nothing to draw")
-    drawn = [key for key in axes if all(is_number(row[key]) for row in rows)][:2]
+    numeric = [key for key in axes if all(is_number(row[key]) for row in rows)]
+    drawn = numeric[:2]
     if not drawn:
         raise UsageError(
             f"a map needs an axis of numbers, and {', '.join(axes)} has words only"
@@ -177,47 +184,64 @@ def build_plane(
     if len(plane_axes) == 1:
         plane_axes.append(PlaneAxis("", (0.0,), ""))
     x, y = plane_axes
+
     panel_keys = [key for key in axes if key not in drawn and len(values[key]) > 1]
-    row_settings = [tuple((key, row[key]) for key in panel_keys) for row in rows]
-    all_settings = list(dict.fromkeys(row_settings))
-    if len(all_settings) > MAX_PANELS:
+    rows_of: dict[PanelSettings, list[Mapping[str, Any]]] = {}
+    for row in rows:
+        settings = tuple((key, row[key]) for key in panel_keys)
+        rows_of.setdefault(settings, []).append(row)
+    if len(rows_of) > MAX_PANELS:
         raise UsageError(
             f"a map has at most {MAX_PANELS} panels, and {', '.join(panel_keys)} would make "
-            f"{len(all_settings)}: sweep fewer values of what is not drawn"
+            f"{len(rows_of)}: sweep fewer values of the axes that are not drawn"
         )
-    shape = (len(y.values), len(x.values))
-    panels: dict[tuple[tuple[str, Any], ...], MapPanel] = {}
-    for settings in all_settings:
-        counts = np.zeros((*shape, len(CELL_CLASSES)), dtype=np.int64)
+    panels = []
+    for settings, panel_rows in rows_of.items():
         title = _format_panel_title(settings, scenario)
-        panels[settings] = MapPanel(title, settings, counts, np.zeros(shape))
-    columns = {value: n for n, value in enumerate(x.values)}
-    lines = {value: n for n, value in enumerate(y.values)}
-    classes = {verdict.value: n for n, verdict in enumerate(CELL_CLASSES)}
-    for row, settings in zip(rows, row_settings, strict=True):
-        i = lines[row[y.key]] if y.key else 0
-        j = columns[row[x.key]]
-        panel = panels[settings]
-        panel.counts[i, j, classes[row["verdict"]]] += 1
+        counts, exponents_per_s = _collect_runs(panel_rows, x, y)
+        panels.append(MapPanel(title, settings, counts, exponents_per_s))
+    return MapPlane(scenario.name, x, y, tuple(panels))
+
+
+def _collect_runs(
+    rows: Sequence[Mapping[str, Any]], x: PlaneAxis, y: PlaneAxis
+) -> tuple[RunCounts, Array]:
+    """Returns the class counts and the mean exponents of a panel, see `MapPanel`.
+
+    Args:
+        rows: the runs of the panel.
+        x: the horizontal axis.
+        y: the vertical axis; with an empty key if only one axis is drawn.
+    """
+    shape = (len(y.values), len(x.values))
+    counts: RunCounts = np.zeros((*shape, len(CELL_CLASSES)), dtype=np.int64)
+    exponents_per_s: Array = np.zeros(shape)
+    index_of_x = {value: index for index, value in enumerate(x.values)}
+    index_of_y = {value: index for index, value in enumerate(y.values)}
+    index_of_class = {verdict.value: index for index, verdict in enumerate(CELL_CLASSES)}
+    for row in rows:
+        i = index_of_y[row[y.key]] if y.key else 0
+        j = index_of_x[row[x.key]]
+        counts[i, j, index_of_class[row["verdict"]]] += 1
         exponent = row.get("exponent_per_s")
-        panel.exponents_per_s[i, j] += np.nan if exponent is None else exponent
-    for panel in panels.values():
-        panel.exponents_per_s[...] /= np.maximum(panel.runs, 1)
-        panel.exponents_per_s[panel.runs == 0] = np.nan
-    return MapPlane(scenario.name, x, y, tuple(panels.values()))
+        exponents_per_s[i, j] += np.nan if exponent is None else exponent
+    runs = counts.sum(axis=2)
+    exponents_per_s /= np.maximum(runs, 1)
+    exponents_per_s[runs == 0] = np.nan
+    return counts, exponents_per_s
 
 
-def _format_panel_title(settings: Sequence[tuple[str, Any]], scenario: Scenario) -> str:
+def _format_panel_title(settings: PanelSettings, scenario: Scenario) -> str:
     """Returns the settings of a panel in words, as in "p d, delay 200 ms"."""
-    words = []
+    texts = []
     for key, value in settings:
         if not isinstance(value, str):
-            words.append(label_setting(key, value, scenario))
+            texts.append(label_setting(key, value, scenario))
         elif key == "law":
-            words.append(value)
+            texts.append(value)
         else:
-            words.append(value.replace("_", " "))
-    return ", ".join(words)
+            texts.append(value.replace("_", " "))
+    return ", ".join(texts)
 
 
 class StableInterval(NamedTuple):
@@ -252,8 +276,13 @@ def find_map_edges(plane: MapPlane, panel: MapPanel) -> list[tuple[float, Stable
         decided = np.flatnonzero(np.isfinite(share) & (share != 0.5))
         stable = share[decided] > 0.5
         for n in np.flatnonzero(stable[1:] != stable[:-1]):
-            low, high = decided[n : n + 2].tolist()
-            edge = StableInterval(y[low], y[high], bool(stable[n]), high == low + 1)
+            below, above = decided[n : n + 2].tolist()
+            edge = StableInterval(
+                low=y[below],
+                high=y[above],
+                stable_below=bool(stable[n]),
+                sharp=above == below + 1,
+            )
             edges.append((x, edge))
     return edges
 
@@ -305,32 +334,57 @@ def _evaluate_damping_criterion(scenario: Scenario) -> StabilityCriterion | None
     Under this condition the loop has no root on the unit circle for all masses down to d h. No
     damping stabilises lighter arms at this tick rate (docs/errata.md, 13).
     """
+    if scenario.scheme != "second_order":
+        return None
     delays_s = _delays_s(scenario)
     rates_hz = {spec.rate_hz for spec in scenario.sites.values()}
-    gains = [_scalar_gains(spec) for spec in scenario.sites.values()]
-    K = [gain[0] for gain in gains if gain]
-    d = [gain[1] for gain in gains if gain]
-    if delays_s is None or len(K) < len(gains):
-        return None
-    if len(rates_hz) > 1 or scenario.scheme != "second_order":
+    if delays_s is None or len(rates_hz) > 1:
         return None
     rate_hz = rates_hz.pop()
+    K = []
+    d = []
+    for spec in scenario.sites.values():
+        gains = _scalar_gains(spec)
+        if gains is None:
+            return None
+        K.append(gains[0])
+        d.append(gains[1])
     if max(d) / rate_hz >= min(map(_least_inertia, scenario.arms.values())):
         return None
-    ticks = [max(1, math.ceil(delay_s * rate_hz - _ROUNDING)) for delay_s in delays_s]
-    source = "P+d: sufficient whatever the arms weigh, and necessary for the worst masses"
+    ticks = []
+    for delay_s in delays_s:
+        delay_ticks = math.ceil(delay_s * rate_hz - _ROUNDING)
+        ticks.append(max(1, delay_ticks))
     if len(K) == 2:
-        symbol = r"$4\,d_1 d_2 = (T_1 + T_2)^2 K_1 K_2$"
-        excess = _excess_of_two(K, d, 0.5 * sum(ticks), rate_hz)
-        return StabilityCriterion(symbol, "4 d1 d2 = (T1 + T2)² K1 K2", source, excess)
+        return StabilityCriterion(
+            symbol=r"$4\,d_1 d_2 = (T_1 + T_2)^2 K_1 K_2$",
+            text="4 d1 d2 = (T1 + T2)² K1 K2",
+            source=_DAMPING_SOURCE,
+            excess=_excess_of_two(K, d, 0.5 * sum(ticks), rate_hz),
+        )
+    are_equal = len({*K}) == len({*d}) == len({*ticks}) == 1
     least = find_least_reversible(scenario.alpha)
-    if len({*K}) > 1 or len({*d}) > 1 or len({*ticks}) > 1 or least is None:
+    if not are_equal or least is None:
         return None
-    excess = d[0] - K[0] * _compute_required_share(least, ticks[0]) * ticks[0] / rate_hz
+    share = _compute_required_share(least, ticks[0])
+    required_d = K[0] * share * ticks[0] / rate_hz
+    excess = d[0] - required_d
     if -least < COMMON_MOTION_SHARE:
-        return StabilityCriterion(r"$d = 0.2172\,K\,T$", "d = 0.2172 K T", source, excess)
-    symbol = r"$d = |\lambda_{\min}(\alpha)|\,K\,T$"
-    return StabilityCriterion(symbol, "d = abs(lambda_min(alpha)) K T", source, excess)
+        return StabilityCriterion(
+            symbol=r"$d = 0.2172\,K\,T$",
+            text="d = 0.2172 K T",
+            source=_DAMPING_SOURCE,
+            excess=excess,
+        )
+    return StabilityCriterion(
+        symbol=r"$d = |\lambda_{\min}(\alpha)|\,K\,T$",
+        text="d = abs(lambda_min(alpha)) K T",
+        source=_DAMPING_SOURCE,
+        excess=excess,
+    )
+
+
+_DAMPING_SOURCE = "P+d: sufficient whatever the arms weigh, and necessary for the worst masses"
 
 
 def _scalar_gains(spec: SiteSpec) -> tuple[float, float] | None:
@@ -339,7 +393,9 @@ def _scalar_gains(spec: SiteSpec) -> tuple[float, float] | None:
     None unless all joints have the same gains: the arm couples its joints.
     """
     law: Any = spec.control
-    if law.kind is not PD or law.gravity != 1.0 or len({*law.K}) + len({*law.d}) > 2:
+    if law.kind is not PD or law.gravity != 1.0:
+        return None
+    if len({*law.K}) > 1 or len({*law.d}) > 1:
         return None
     return law.K[0], law.d[0]
 
@@ -350,11 +406,13 @@ def _tick_angles(ticks: float) -> tuple[Array, Array, Array]:
     The angles go from almost 0 to almost pi. They are denser over the first turn of a delay of
     `ticks`, up to phi = 2 pi / `ticks`.
     """
-    first_turn = np.linspace(0.0, min(2.0 * np.pi / ticks, 3.0), 400)[1:]
+    full_turn = min(2.0 * np.pi / ticks, 3.0)
+    first_turn = np.linspace(0.0, full_turn, 400)[1:]
     half_circle = np.linspace(0.0, np.pi, 400)[1:-1]
     phi = np.concatenate([[1e-7 / ticks], first_turn, half_circle])
     t = np.tan(0.5 * phi)
-    return phi, 2.0 * t, 2.0 * t**3 / (1.0 + 3.0 * t**2)
+    lag = 2.0 * t**3 / (1.0 + 3.0 * t**2)
+    return phi, 2.0 * t, lag
 
 
 def _compute_required_share(least: float, ticks: int) -> float:
@@ -365,10 +423,12 @@ def _compute_required_share(least: float, ticks: int) -> float:
         ticks: the delay T, in ticks.
     """
     phi, w, lag = _tick_angles(ticks)
-    shares = [
-        (lag * (1.0 - a * np.cos(ticks * phi)) - a * np.sin(ticks * phi)) / (w * ticks)
-        for a in (least, 1.0)
-    ]
+    cosine = np.cos(ticks * phi)
+    sine = np.sin(ticks * phi)
+    shares = []
+    for eigenvalue in (least, 1.0):
+        damping = lag * (1.0 - eigenvalue * cosine) - eigenvalue * sine
+        shares.append(damping / (w * ticks))
     return float(np.max(shares))
 
 
@@ -378,10 +438,13 @@ def _excess_of_two(K: list[float], d: list[float], ticks: float, rate_hz: float)
     The scheme's lag reduces each damping, and T1 + T2 is 2 `ticks`.
     """
     phi, w, lag = _tick_angles(ticks)
-    first_damping = np.maximum(d[0] - K[0] * lag / (w * rate_hz), 0.0)
-    second_damping = np.maximum(d[1] - K[1] * lag / (w * rate_hz), 0.0)
-    delay_s = np.abs(np.sin(ticks * phi) + lag * np.cos(ticks * phi)) / (w * rate_hz)
-    excess = np.sqrt(first_damping * second_damping) - math.sqrt(K[0] * K[1]) * delay_s
+    w_rad_s = w * rate_hz
+    damping_1 = np.maximum(d[0] - K[0] * lag / w_rad_s, 0.0)
+    damping_2 = np.maximum(d[1] - K[1] * lag / w_rad_s, 0.0)
+    delayed = np.sin(ticks * phi) + lag * np.cos(ticks * phi)
+    delay_s = np.abs(delayed) / w_rad_s
+    stiffness = math.sqrt(K[0] * K[1])
+    excess = np.sqrt(damping_1 * damping_2) - stiffness * delay_s
     return float(2.0 * np.min(excess))
 
 
@@ -393,7 +456,8 @@ def _least_inertia(arm: ArmModel) -> float:
     """
     if arm.chain is not None:
         return min(joint.armature_kg_m2 for joint in arm.chain.joints)
-    extreme_poses = PlacedArm(0.0, arm.lengths_m, np.array([[0.0, 0.0], [0.0, np.pi]]))
+    poses = np.array([[0.0, 0.0], [0.0, np.pi]])
+    extreme_poses = PlacedArm(0.0, arm.lengths_m, poses)
     inertia_kg_m2 = extreme_poses.inertia_matrix(arm.theta).T
     return float(np.linalg.eigvalsh(inertia_kg_m2).min())
 
@@ -413,12 +477,17 @@ def _evaluate_sampling_criterion(scenario: Scenario) -> StabilityCriterion | Non
         h_s = 1.0 / spec.rate_hz
         if law.kind is not Adaptive or max(delays_s) > h_s:
             return None
-        excess.append(min(law.Kp) - max(law.Gamma[_GRAVITY]) * spec.arm.g_m_s2**2 * h_s)
-    source = (
-        "a rule for arms of about 1 m and no delay: "
-        "the estimate of gravity against the lag of a tick"
+        required_kp = max(law.Gamma[_GRAVITY]) * spec.arm.g_m_s2**2 * h_s
+        excess.append(min(law.Kp) - required_kp)
+    return StabilityCriterion(
+        symbol=r"$\Gamma g^2 h = K_p$",
+        text="Gamma g² h = Kp",
+        source=(
+            "a rule for arms of about 1 m and no delay: "
+            "the estimate of gravity against the lag of a tick"
+        ),
+        excess=min(excess),
     )
-    return StabilityCriterion(r"$\Gamma g^2 h = K_p$", "Gamma g² h = Kp", source, min(excess))
 
 
 def _delays_s(scenario: Scenario) -> list[float] | None:
@@ -428,23 +497,23 @@ def _delays_s(scenario: Scenario) -> list[float] | None:
     """
     delays_s = []
     for name in scenario.names:
+        shares = scenario.dominance[name]
         for peer in scenario.peers(name):
-            if scenario.dominance[name].get(peer, 0.0) == 0.0:
+            if shares.get(peer, 0.0) == 0.0:
                 continue
             link: LinkBase = scenario.links[f"{peer}->{name}"]
             if not isinstance(link, ConstantDelay | NoDelay):
                 return None
             if link.random or link.loss or link.outages_s:
                 return None
-            delays_s.append(max(link.moments().mean_ms, link.playout_ms) / 1e3)
+            delay_ms = max(link.moments().mean_ms, link.playout_ms)
+            delays_s.append(delay_ms / 1e3)
     return delays_s
 
 
-ScenarioAt = Callable[[float, float], Scenario]
-"""The scenario of a panel at (x, y)."""
+PanelLoader = Callable[[float, float], Scenario]
+"""Loads the scenario of a panel at values of x and y."""
 
-_NEIGHBOURS = (slice(None, -1), slice(1, None))
-"""The grid points of an axis without the last, and without the first."""
 _MAX_ROOT_STEPS = 500
 LINEAR_ANALYSIS = "linear analysis"
 _ABOUT = "where the rightmost root of the loop, linearised, crosses the imaginary axis"
@@ -469,15 +538,16 @@ class MapLine(NamedTuple):
     rank: int
 
     @property
-    def there(self) -> bool:
-        """True if the line crosses the map.
+    def crosses_map(self) -> bool:
+        """True if the line passes between grid points.
 
-        The line does if four neighbouring grid points all have a value, and only some of them
-        are on its stable side.
+        This is so if four neighbouring grid points all have a value, and only some of them are
+        on the stable side of the line.
         """
-        corners = np.array(
-            [self.spare[rows, columns] for rows in _NEIGHBOURS for columns in _NEIGHBOURS]
-        )
+        spare = self.spare
+        lower = spare[:-1]
+        upper = spare[1:]
+        corners = np.array([lower[:, :-1], lower[:, 1:], upper[:, :-1], upper[:, 1:]])
         has_values = np.isfinite(corners).all(axis=0)
         stable = (corners > 0.0).sum(axis=0)
         crossed = has_values & (stable > 0) & (stable < len(corners))
@@ -490,7 +560,8 @@ class MapLine(NamedTuple):
         crossings = list[float]()
         for n in _find_sign_changes(spare):
             step = values[n + 1] - values[n]
-            crossings.append(values[n] + step * spare[n] / (spare[n] - spare[n + 1]))
+            change = spare[n] - spare[n + 1]
+            crossings.append(values[n] + step * spare[n] / change)
         return crossings
 
 
@@ -507,17 +578,23 @@ def trace_zero_exponent(panel: MapPanel) -> MapLine | None:
         spare=-panel.exponents_per_s,
         rank=-1,
     )
-    return line if line.there else None
+    return line if line.crosses_map else None
 
 
-def trace_closed_form(at: ScenarioAt, x: PlaneAxis, y: PlaneAxis) -> MapLine | None:
-    """Returns the line of the closed-form criterion; None if no line crosses the map."""
+def trace_closed_form(load: PanelLoader, x: PlaneAxis, y: PlaneAxis) -> MapLine | None:
+    """Returns the line of the closed-form criterion; None if no line crosses the map.
+
+    Args:
+        load: loads the scenario at values of x and y.
+        x: the horizontal axis.
+        y: the vertical axis.
+    """
     first: StabilityCriterion | None = None
     columns = []
     for x_value in x.values:
 
         def evaluate(y_value: float, x_value: float = x_value) -> StabilityCriterion | None:
-            return evaluate_criterion(at(x_value, y_value))
+            return evaluate_criterion(load(x_value, y_value))
 
         criteria = [evaluate(y_value) for y_value in y.values]
         applicable = [criterion for criterion in criteria if criterion is not None]
@@ -539,7 +616,7 @@ def trace_closed_form(at: ScenarioAt, x: PlaneAxis, y: PlaneAxis) -> MapLine | N
         spare=np.array(columns).T,
         rank=0,
     )
-    return line if line.there else None
+    return line if line.crosses_map else None
 
 
 def trace_linear_analysis(
@@ -568,7 +645,7 @@ def trace_linear_analysis(
         spare=np.array(spare).T,
         rank=1,
     )
-    return line if line.there else None, remarks
+    return line if line.crosses_map else None, remarks
 
 
 def _find_sign_changes(values: Sequence[float]) -> list[int]:
@@ -702,12 +779,12 @@ def build_stability_map(
     y = plane.y
     if not y.key or len(y.values) < 2:
         return stability_map
-    loaders = [panel_scenarios(plan, panel, x.key, y.key) for panel in plane.panels]
+    loaders = [make_panel_loader(plan, panel, x.key, y.key) for panel in plane.panels]
     panel_lines = [
         [trace_zero_exponent(panel), trace_closed_form(load, x, y)]
         for panel, load in zip(plane.panels, loaders, strict=True)
     ]
-    remarks: dict[str, None] = {}
+    remarks = list[str]()
     if linearly:
         tasks = [(load, x_value, y) for load in loaders for x_value in x.values]
         with open_worker_pool(jobs, on, most=len(tasks)) as pool:
@@ -716,19 +793,20 @@ def build_stability_map(
             panel_columns = [next(columns) for _ in x.values]
             line, line_remarks = trace_linear_analysis(panel_columns, y)
             lines.append(line)
-            remarks |= dict.fromkeys(line_remarks)
+            remarks += line_remarks
     crossing = [tuple(line for line in lines if line is not None) for lines in panel_lines]
-    return stability_map._replace(lines=tuple(crossing), remarks=tuple(remarks))
+    distinct_remarks = tuple(dict.fromkeys(remarks))
+    return stability_map._replace(lines=tuple(crossing), remarks=distinct_remarks)
 
 
-def _analyse_column(task: tuple[ScenarioAt, float, PlaneAxis]) -> GrowthColumn:
+def _analyse_column(task: tuple[PanelLoader, float, PlaneAxis]) -> GrowthColumn:
     """Returns the linear analysis of one column of a panel; any worker can do it."""
-    at, x, y = task
-    scenarios = [at(x, y_value) for y_value in y.values]
+    load, x, y = task
+    scenarios = [load(x, y_value) for y_value in y.values]
     return compute_growth_column(scenarios, y.key, y.values)
 
 
-def panel_scenarios(plan: SweepPlan, panel: MapPanel, x: str, y: str) -> ScenarioAt:
+def make_panel_loader(plan: SweepPlan, panel: MapPanel, x: str, y: str) -> PanelLoader:
     """Returns the function that loads the scenario at any point of a panel; it is picklable.
 
     Args:
@@ -739,12 +817,14 @@ def panel_scenarios(plan: SweepPlan, panel: MapPanel, x: str, y: str) -> Scenari
     """
     settings = dict(panel.settings)
     only_law = next(iter(plan.laws), "")
-    law_overrides = plan.laws.get(settings.pop(LAW_AXIS, only_law), ())
-    overrides = [format_override(key, value) for key, value in settings.items()]
-    return partial(load_place, plan, (*law_overrides, *overrides), x, y)
+    law = settings.pop(LAW_AXIS, only_law)
+    law_overrides = plan.laws.get(law, ())
+    overrides = [*law_overrides]
+    overrides += [format_override(key, value) for key, value in settings.items()]
+    return partial(load_grid_scenario, plan, tuple(overrides), x, y)
 
 
-def load_place(
+def load_grid_scenario(
     plan: SweepPlan, fixed: Sequence[str], x: str, y: str, x_value: float, y_value: float
 ) -> Scenario:
     """Returns the scenario at a point of a panel, which may lie between its cells.

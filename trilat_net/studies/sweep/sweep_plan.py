@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...analysis.metrics.log_metrics import find_quantity
-from ...errors import ScenarioError, UsageError, count_nouns
+from ...errors import ScenarioError, UsageError
 from ...fields import is_number, split_unit, suggest_nearest
 from ...scenario import Scenario, apply_overrides
 from ...scenario.code_consent import allow_own_code
@@ -34,9 +34,9 @@ from . import sweep_cell
 _ON_GRID = Decimal("1e-9")
 """Largest distance from the grid, in steps, at which the end of a range is included."""
 _KEYS_WITH_OPTIONS = {
-    "seed": "seeds have an option of their own, as in --seeds 1..20",
-    "duration_s": "how long a cell runs follows from its verdict: "
-    "--duration says how long at first, --longest how long at most",
+    "seed": "seeds have their own option, as in --seeds 1..20",
+    "duration_s": "the duration of a cell depends on its verdict: --duration sets the first "
+    "one, --longest the limit",
 }
 """Keys that cannot be swept, each with the option that sets the key instead."""
 _MAX_AXIS_VALUES = 10**12
@@ -63,12 +63,12 @@ class SweepAxis(NamedTuple):
     """One axis of a sweep.
 
     Attributes:
-        asked: the description of the axis: "KEY=a:b:step" or "KEY=v1,v2,v3".
+        description: the axis as a text: "KEY=a:b:step" or "KEY=v1,v2,v3".
         key: the scenario key that the axis varies.
         texts: the values of the axis, as texts of overrides.
     """
 
-    asked: str
+    description: str
     key: str
     texts: tuple[str, ...] | _Steps
 
@@ -143,7 +143,7 @@ def _join_values(values: Any) -> str:
 
 def _build_range(key: str, first: Decimal, last: Decimal, step: Decimal) -> _Steps:
     if step == 0:
-        raise ScenarioError(f"a step of 0 never comes from {first:f} to {last:f}", path=key)
+        raise ScenarioError(f"a step of 0 does not lead from {first:f} to {last:f}", path=key)
     if (last - first) * step < 0:
         right = f"{min(first, last):f}:{max(first, last):f}:{abs(step):f}"
         problem = f"a step of {step:f} does not lead from {first:f} to {last:f}"
@@ -160,16 +160,15 @@ def _parse_decimal(key: str, text: str) -> Decimal:
         number = Decimal(text)
     except InvalidOperation:
         problem = (
-            f"a range is of numbers, a:b:step, and {text!r} is none; "
-            "words go as in KEY=first,second"
+            f"a range a:b:step is of numbers, and {text!r} is not a number; "
+            "list words as in KEY=first,second"
         )
         raise ScenarioError(problem, path=key) from None
     if not number.is_finite():
-        raise ScenarioError(f"a range is of finite numbers, and {text!r} is none", path=key)
-    if abs(number) > Decimal("1e18") or (number and abs(number) < Decimal("1e-18")):
-        raise ScenarioError(
-            f"{text} is beyond what a range is for: from 1e-18 to 1e18", path=key
-        )
+        raise ScenarioError(f"a range is of finite numbers, not {text!r}", path=key)
+    size = abs(number)
+    if size > Decimal("1e18") or 0 < size < Decimal("1e-18"):
+        raise ScenarioError(f"a range is of sizes from 1e-18 to 1e18, not {text}", path=key)
     return number
 
 
@@ -181,14 +180,14 @@ def _parse_list(key: str, text: str) -> tuple[str, ...]:
     """
     texts = tuple(part.strip() for part in _split_outside_brackets(text, ","))
     if "" in texts:
-        raise ScenarioError(f"is empty: say which values, {_VALUES_EXAMPLE}", path=key)
+        raise ScenarioError(f"is empty: list the values, {_VALUES_EXAMPLE}", path=key)
     values = list[Any]()
     for value_text in texts:
         value = _parse_value(value_text)
         if value in values:
             raise ScenarioError(f"has {value_text} twice", path=key)
         if isinstance(value, float) and not math.isfinite(value):
-            raise ScenarioError(f"must be finite numbers, one is {value_text}", path=key)
+            raise ScenarioError(f"must be finite numbers, not {value_text}", path=key)
         values.append(value)
     return texts
 
@@ -298,7 +297,7 @@ class SweepPlan(NamedTuple):
         """
         if not 0 <= number < self.cells:
             raise UsageError(
-                f"there is no cell {number}: they are numbered from 0 to {self.cells - 1}"
+                f"there is no cell {number}: cells are numbered from 0 to {self.cells - 1}"
             )
         rest = number
         indices = list[int]()
@@ -334,7 +333,7 @@ class SweepPlan(NamedTuple):
             "source": self.written.label,
             "folder": None if self.written.folder is None else str(self.written.folder),
             "overrides": list(self.overrides),
-            "over": [axis.asked for axis in self.axes],
+            "over": [axis.description for axis in self.axes],
             "laws": list(self.laws),
             "seeds": list(self.seeds),
             "longest_s": self.longest_s,
@@ -403,8 +402,8 @@ def plan_sweep(
         longest_s = plan.default_longest_s
     elif not base.duration_s <= longest_s <= MAX_SCENARIO_S:
         raise UsageError(
-            "--longest is how long an undecided cell may run, "
-            f"from its {base.duration_s:g} s to {MAX_SCENARIO_S:g} s, not {longest_s:g}"
+            "--longest is the longest duration of an undecided cell, from "
+            f"{base.duration_s:g} s to {MAX_SCENARIO_S:g} s, not {longest_s:g}"
         )
     plan = plan._replace(longest_s=longest_s)
     for law_index in range(plan.shape[0]):
@@ -466,12 +465,11 @@ def _resolve_seeds(seeds: int | Sequence[int], scenario_seed: int) -> tuple[int,
     if isinstance(seeds, int | str):
         if isinstance(seeds, str) or not 1 <= seeds <= MAX_SEEDS:
             raise UsageError(
-                f"--seeds is how many, 1 to {MAX_SEEDS}, or which, as in 1..20; not {seeds}"
+                f"--seeds is a number from 1 to {MAX_SEEDS}, or a list as in 1..20; not {seeds}"
             )
         seeds = range(scenario_seed, scenario_seed + seeds)
     if len(seeds) > MAX_SEEDS:
-        seed_count = count_nouns(len(seeds), "seed is", "seeds are")
-        raise UsageError(f"{seed_count} more than {MAX_SEEDS}")
+        raise UsageError(f"--seeds has {len(seeds)} seeds, more than {MAX_SEEDS}")
     for seed in seeds:
         if not 0 <= seed < 2**63:
             raise UsageError(f"a seed is from 0 to 2^63 - 1, not {seed}")
@@ -579,8 +577,8 @@ def _check_axes(plan: SweepPlan, law_index: int) -> None:
             if digest in value_of_digest:
                 raise ScenarioError(
                     f"{value_of_digest[digest]} and {text} are the same experiment: "
-                    "nothing here follows this key; a site or link may have one of its own, "
-                    "as in sites.NAME.control or links.A->B",
+                    "no site or link uses this key; each may have its own value, as in "
+                    "sites.NAME.control or links.A->B",
                     path=axis.key,
                     source=plan.written.label,
                 )
@@ -629,17 +627,20 @@ _GAINS = {
 
 def label_axis(key: str, scenario: Scenario | None = None) -> str:
     """Returns the label of an axis, as "delay (ms)" for link.delay_ms."""
-    words, unit = describe_key(key, scenario)
-    return f"{words} ({unit})" if unit else words
+    quantity, unit = describe_key(key, scenario)
+    return f"{quantity} ({unit})" if unit else quantity
 
 
 def label_setting(key: str, value: Any, scenario: Scenario | None = None) -> str:
     """Returns a key with its value, as "delay 200 ms" for link.delay_ms = 200."""
-    words, unit = describe_key(key, scenario)
+    quantity, unit = describe_key(key, scenario)
     if isinstance(value, bool):
-        value = str(value).lower()
-    number = f"{value:g}" if is_number(value) else str(value).replace("_", " ")
-    return " ".join(word for word in (words, number, unit) if word)
+        text = str(value).lower()
+    elif is_number(value):
+        text = f"{value:g}"
+    else:
+        text = str(value).replace("_", " ")
+    return " ".join(part for part in (quantity, text, unit) if part)
 
 
 def describe_key(key: str, scenario: Scenario | None = None) -> tuple[str, str]:
@@ -649,11 +650,11 @@ def describe_key(key: str, scenario: Scenario | None = None) -> tuple[str, str]:
     if last.isdigit() and folders:  # an element of a list over joints or parameters
         number = f"[{last}]"
         last = folders.pop()
-    words, unit = split_unit(last)
+    quantity, unit = split_unit(last)
     if not unit and len(last) <= 3:  # a symbol
-        words = last
+        quantity = last
     owner = _describe_owner(folders, scenario)
-    return f"{words}{number}{owner}", _GAINS.get(last) or unit.replace("^2", "²")
+    return f"{quantity}{number}{owner}", _GAINS.get(last) or unit.replace("^2", "²")
 
 
 def _describe_owner(folders: list[str], scenario: Scenario | None) -> str:
@@ -686,7 +687,7 @@ def build_sweep_command(plan: SweepPlan, *more: str) -> str:
     """
     arguments = set_options(plan.overrides)
     for axis in plan.axes:
-        arguments += ["--over", axis.asked]
+        arguments += ["--over", axis.description]
     scenario_seed = plan.base.seed
     count = len(plan.seeds)
     if plan.seeds != tuple(range(scenario_seed, scenario_seed + count)):

@@ -65,7 +65,8 @@ class SweepResults(Result):
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the keys of `trilat sweep --json`."""
-        return {"plan": self.plan.facts(), "runs": [dict(row) for row in self.rows]}
+        runs = [dict(row) for row in self.rows]
+        return {"plan": self.plan.facts(), "runs": runs}
 
     def of_cell(self, number: int) -> list[ResultRow]:
         """Returns the runs of a cell, one per seed.
@@ -86,34 +87,44 @@ def build_result_rows(plan: SweepPlan, entries: Sequence[CellRun]) -> list[Resul
     """Returns the rows of finished runs, ordered by cell and then by seed."""
     seed_rank = {seed: rank for rank, seed in enumerate(plan.seeds)}
     runs_of_cell = Counter(entry.cell for entry in entries)
+    ordered = sorted(entries, key=lambda entry: (entry.cell, seed_rank[entry.seed]))
     rows: list[ResultRow] = []
-    for entry in sorted(entries, key=lambda entry: (entry.cell, seed_rank[entry.seed])):
-        cell = plan.cell(entry.cell)
-        suffix = "" if runs_of_cell[entry.cell] == 1 else f"-seed-{entry.seed}"
-        duration_s = reproduction_duration_s(plan, entry.outcome)
-        axis_keys = [axis.key for axis in plan.axes]
-        log = f"cell-{cell.number}{suffix}.mcap"
-        rows.append(
-            {
-                "cell": cell.number,
-                **dict(zip(axis_keys, cell.values, strict=True)),
-                "law": entry.law,
-                "seed": entry.seed,
-                "random": entry.random,
-                **entry.metrics,
-                **msgspec.to_builtins(entry.outcome),
-                "scenario_sha256": entry.sha256,
-                "command": build_sim_command(
-                    plan=plan,
-                    overrides=cell.overrides,
-                    seed=entry.seed,
-                    duration_s=duration_s,
-                    log=log,
-                ),
-                "scenario": apply_diff(entry.scenario, plan.base.text),
-            }
-        )
+    for entry in ordered:
+        has_seeds = runs_of_cell[entry.cell] > 1
+        suffix = f"-seed-{entry.seed}" if has_seeds else ""
+        rows.append(_build_row(plan, entry, f"cell-{entry.cell}{suffix}.mcap"))
     return rows
+
+
+def _build_row(plan: SweepPlan, entry: CellRun, log: str) -> ResultRow:
+    """Returns the row of a finished run.
+
+    Args:
+        plan: the sweep.
+        entry: the run.
+        log: file name of the log that the row's command records.
+    """
+    cell = plan.cell(entry.cell)
+    command = build_sim_command(
+        plan=plan,
+        overrides=cell.overrides,
+        seed=entry.seed,
+        duration_s=reproduction_duration_s(plan, entry.outcome),
+        log=log,
+    )
+    axis_keys = [axis.key for axis in plan.axes]
+    return {
+        "cell": cell.number,
+        **dict(zip(axis_keys, cell.values, strict=True)),
+        "law": entry.law,
+        "seed": entry.seed,
+        "random": entry.random,
+        **entry.metrics,
+        **msgspec.to_builtins(entry.outcome),
+        "scenario_sha256": entry.sha256,
+        "command": command,
+        "scenario": apply_diff(entry.scenario, plan.base.text),
+    }
 
 
 def build_sim_command(
@@ -136,7 +147,9 @@ def reproduction_duration_s(plan: SweepPlan, outcome: CellResult) -> float:
     """
     if outcome.diverged_s is None:
         return outcome.ran_s
-    return max(outcome.ran_s, min(plan.longest_s, plan.base.duration_s * 2.0**outcome.extended))
+    extended_s = plan.base.duration_s * 2.0**outcome.extended
+    planned_s = min(plan.longest_s, extended_s)
+    return max(outcome.ran_s, planned_s)
 
 
 _SCENARIO_COLUMN = "scenario_changes"
@@ -153,9 +166,10 @@ def encode_results(plan: SweepPlan, rows: Sequence[ResultRow]) -> str:
     kinds = _list_result_columns(plan)
     lines = []
     for row in rows:
+        line = {name: _format_cell(row[name], kind) for name, kind in kinds.items()}
         changes = diff_lines(row["scenario"], plan.base.text)
-        cells = {name: _format_cell(row[name], kind) for name, kind in kinds.items()}
-        lines.append({**cells, _SCENARIO_COLUMN: json.dumps(changes, ensure_ascii=False)})
+        line[_SCENARIO_COLUMN] = json.dumps(changes, ensure_ascii=False)
+        lines.append(line)
     return encode_csv(lines, [*kinds, _SCENARIO_COLUMN])
 
 
@@ -210,17 +224,17 @@ def read_results(path: Path) -> SweepResults:
     """
     file = path / RESULTS_FILE if path.is_dir() else path
     if not file.is_file():
-        more = f"; go on with it: trilat sweep --resume {path}" if path.is_dir() else ""
-        raise UsageError(f"{file}: there are no results of a sweep{more}")
-    request = file.with_name(PLAN_FILE)
-    if not request.is_file():
+        hint = f"; continue it with: trilat sweep --resume {path}" if path.is_dir() else ""
+        raise UsageError(f"{file}: there are no results of a sweep{hint}")
+    plan_file = file.with_name(PLAN_FILE)
+    if not plan_file.is_file():
         raise UsageError(
             f"{file}: holds no results of a sweep: there is no {PLAN_FILE} beside it"
         )
     try:
-        plan = plan_from_json(json.loads(request.read_text(encoding="utf-8")))
+        plan = plan_from_json(json.loads(plan_file.read_text(encoding="utf-8")))
     except (OSError, ValueError, KeyError, TypeError):
-        raise UsageError(f"{request}: cannot be read as the plan of a sweep") from None
+        raise UsageError(f"{plan_file}: cannot be read as the plan of a sweep") from None
     csv.field_size_limit(_LONGEST_CELL)
     try:
         with file.open(encoding="utf-8", newline="") as stream:
@@ -235,9 +249,8 @@ def read_results(path: Path) -> SweepResults:
 
 def _read_row(line: Mapping[str, str], plan: SweepPlan) -> ResultRow:
     """Returns a line of the table as a row, with its scenario as text."""
-    row = {
-        name: _parse_cell(line[name], kind) for name, kind in _list_result_columns(plan).items()
-    }
+    kinds = _list_result_columns(plan)
+    row = {name: _parse_cell(line[name], kind) for name, kind in kinds.items()}
     changes = json.loads(line[_SCENARIO_COLUMN])
     return {**row, "scenario": apply_diff(changes, plan.base.text)}
 
@@ -295,16 +308,25 @@ def collect_grid_points(results: SweepResults) -> list[GridPoint]:
     """Returns the grid points of a sweep, in the order of the cells."""
     rows_of: dict[tuple[int, str], list[ResultRow]] = {}
     for row in results.rows:
-        rows_of.setdefault((row["cell"], row["law"]), []).append(row)
+        position = (row["cell"], row["law"])
+        rows_of.setdefault(position, []).append(row)
     points = []
     totals = list_totals(results.plan)
     for (cell, law), rows in rows_of.items():
         counts = Counter(row["verdict"] for row in rows)
-        kept = [row for row in rows if row["diverged_s"] is None]
-        means = tuple(mean_interval([row.get(key) for row in kept]) for key in totals)
-        values = results.plan.cell(cell).values
-        class_counts = tuple(counts[verdict.value] for verdict in CellClass)
-        points.append(GridPoint(cell, law, values, class_counts, means))
+        within_limits = [row for row in rows if row["diverged_s"] is None]
+        means = []
+        for key in totals:
+            values = [row.get(key) for row in within_limits]
+            means.append(mean_interval(values))
+        point = GridPoint(
+            cell=cell,
+            law=law,
+            values=results.plan.cell(cell).values,
+            counts=tuple(counts[verdict.value] for verdict in CellClass),
+            means=tuple(means),
+        )
+        points.append(point)
     return points
 
 
@@ -343,14 +365,13 @@ _MAX_DOUBTFUL_SHOWN = 8
 
 def describe_sweep_plan(plan: SweepPlan) -> list[str]:
     """Returns the lines that describe a sweep before it runs."""
-    sizes = " x ".join(str(len(axis.texts)) for axis in plan.axes) or "1"
+    counts = [str(len(axis.texts)) for axis in plan.axes]
+    sizes = " x ".join(counts) or "1"
     laws = f" x laws {', '.join(plan.laws)}" if plan.laws else ""
-    count = len(plan.seeds)
-    seeds = (
-        f"seed {plan.seeds[0]}"
-        if count == 1
-        else f"{count_nouns(count, 'seed')} each where anything is random"
-    )
+    if len(plan.seeds) == 1:
+        seeds = f"seed {plan.seeds[0]}"
+    else:
+        seeds = f"{count_nouns(len(plan.seeds), 'seed')} each where anything is random"
     lines = [f"{plan.base.name}: {count_nouns(plan.cells, 'cell')} ({sizes}{laws}), {seeds}"]
     for axis in plan.axes:
         texts = axis.texts
@@ -359,7 +380,7 @@ def describe_sweep_plan(plan: SweepPlan) -> list[str]:
             values = [texts[0], texts[1], "...", texts[-1]]
         else:
             values = [texts[n] for n in range(count)]
-        lines.append(f"  over {axis.asked}: {', '.join(values)}")
+        lines.append(f"  over {axis.description}: {', '.join(values)}")
     first_s = plan.base.duration_s
     longest_s = plan.longest_s
     extended = f", an undecided one up to {longest_s:g} s" if longest_s > first_s else ""
@@ -374,30 +395,47 @@ def summarize_sweep(results: SweepResults) -> Iterator[str]:
     verdicts = ", ".join(f"{counts[verdict.value]} {verdict.value}" for verdict in CellClass)
     runs = count_nouns(len(rows), "run")
     yield f"{runs} of {count_nouns(results.plan.cells, 'cell')}: {verdicts}"
+
     extended = [row for row in rows if row["extended"]]
     if extended:
         longest_s = max(row["ran_s"] for row in extended)
         first_s = results.plan.base.duration_s
-        continued = f"and continued, the longest to {longest_s:g} s"
-        yield f"{len(extended)} were undecided after {first_s:g} s {continued}"
-    kept = [row for row in rows if row["diverged_s"] is None]
-    ranges = []
-    metrics = map(find_quantity, results.plan.metrics)
-    quantities = {metric.key: (metric.name, metric.unit) for metric in metrics}
-    for key, (name, unit) in {**quantities, **_TOTALS}.items():
-        values = [row[key] for row in kept if row.get(key) is not None]
-        if values:
-            text = f"{name} {min(values):.3g} to {max(values):.3g} {unit}"
-            ranges.append(text.rstrip())
+        yield (
+            f"{len(extended)} were undecided after {first_s:g} s and continued, the longest to "
+            f"{longest_s:g} s"
+        )
+
+    within_limits = [row for row in rows if row["diverged_s"] is None]
+    ranges = _list_ranges(results.plan, within_limits)
     if ranges:
-        yield f"within their limits {len(kept)}: {', '.join(ranges)}"
-    rates = [row["exponent_per_s"] for row in rows if row.get("exponent_per_s") is not None]
+        yield f"within their limits {len(within_limits)}: {', '.join(ranges)}"
+
+    rates = _list_values(rows, "exponent_per_s")
     if rates:
         growing = sum(rate > 0.0 for rate in rates)
         interval = f"{min(rates):+.3g} to {max(rates):+.3g} /s"
         yield f"growth exponents of small pushes {interval}: {growing} of {len(rates)} grow"
+
     if len(results.plan.seeds) > 1:
         yield from _summarize_seeds(results)
+
+
+def _list_ranges(plan: SweepPlan, rows: Sequence[ResultRow]) -> list[str]:
+    """Returns the range of each quantity over runs, as texts; metrics of the plan first."""
+    metrics = map(find_quantity, plan.metrics)
+    quantities = {metric.key: (metric.name, metric.unit) for metric in metrics}
+    ranges = []
+    for key, (name, unit) in {**quantities, **_TOTALS}.items():
+        values = _list_values(rows, key)
+        if values:
+            text = f"{name} {min(values):.3g} to {max(values):.3g} {unit}"
+            ranges.append(text.rstrip())
+    return ranges
+
+
+def _list_values(rows: Sequence[ResultRow], key: str) -> list[float]:
+    """Returns the values of a column, without missing values."""
+    return [row[key] for row in rows if row.get(key) is not None]
 
 
 def _summarize_seeds(results: SweepResults) -> Iterator[str]:
@@ -449,8 +487,8 @@ def build_reproduce_command(
     try:
         text, source_folder = read_source(source)
         written = plan.written._replace(text=text, folder=source_folder)
-        current = plan._replace(written=written).scenario(*overrides, f"seed={row['seed']}")
-        digest = current.sha256
+        current_plan = plan._replace(written=written)
+        digest = current_plan.scenario(*overrides, f"seed={row['seed']}").sha256
     except ScenarioError:
         digest = ""
     if digest == row["scenario_sha256"]:
@@ -461,4 +499,5 @@ def build_reproduce_command(
     duration_s = reproduction_duration_s(plan, results.outcome(row))
     options = ["--duration", f"{duration_s:.12g}", "-o", f"{name}.mcap"]
     command = format_command("sim", str(file), *options)
-    return command, f"{source} is not what was swept any more, or not here; as it ran: {file}"
+    note = f"{source} has changed since the sweep, or is missing; as it ran: {file}"
+    return command, note

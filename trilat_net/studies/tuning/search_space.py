@@ -287,8 +287,9 @@ def _list_search_spaces() -> Iterator[SearchSpace]:
 
 def _read_range(gain: str, entry: GainRange) -> TunedGain:
     """Returns the gain that an entry of a built-in law's `tune` describes."""
-    low, high, unit, *roles = entry
-    return TunedGain(gain, unit, low, high, *roles)
+    low, high, unit = entry[:3]
+    role = entry[3] if len(entry) == 4 else ""
+    return TunedGain(gain, unit, low, high, where=role)
 
 
 SEARCH_SPACES = {space.law: space for space in _list_search_spaces()}

@@ -169,7 +169,9 @@ class CandidateSearch:
         sampled = (budget + 1) // 2
         refinements = len(REFINEMENT_STEPS)
         share, remainder = divmod(budget - sampled, refinements)
-        self.rounds = [sampled, *(share + (n < remainder) for n in range(refinements))]
+        self.rounds = [sampled]
+        for n in range(refinements):
+            self.rounds.append(share + (n < remainder))  # the first rounds take the remainder
 
     @property
     def points(self) -> list[ObjectivePoint | None]:
@@ -325,8 +327,11 @@ class TuningPlan(NamedTuple):
     @property
     def runs(self) -> int:
         """Number of runs, with those of the printed gains and of twins."""
-        candidates = len(self.spaces) * self.budget + len(self.build_paper_scenarios(self.base))
-        return candidates * (1 + self.twin) * (1 + len(self.others))
+        paper_candidates = len(self.build_paper_scenarios(self.base))
+        candidates = len(self.spaces) * self.budget + paper_candidates
+        seeds = 1 + len(self.others)
+        runs_per_seed = 2 if self.twin else 1
+        return candidates * seeds * runs_per_seed
 
     @property
     def twin(self) -> bool:
