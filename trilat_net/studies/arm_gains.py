@@ -133,11 +133,11 @@ class ArmGains(Result):
     def blocks(self) -> Iterator[Block]:
         """Yields the loop, a row per joint, the edge, the runs, and the line to paste."""
         yield (
-            f"{self.arm}: {self.sites} such arms, {self.law}, {self.rate_hz} Hz, {self.delay}, "
-            f"damping ratio {self.damping:g}, margin {self.margin:g}"
+            f"{self.arm}: {self.sites} equal arms, {self.law}, {self.rate_hz} Hz, "
+            f"{self.delay}, damping ratio {self.damping:g}, margin {self.margin:g}"
         )
         header = [key.replace("_", " ") for key in self.joints[0]]
-        rows = [[_format_cell(value) for value in row.values()] for row in self.joints]
+        rows = [[_format_cell(value) for value in joint.values()] for joint in self.joints]
         yield TextTable(header, rows, align="lr")
         yield from self._describe_edge()
         for run in self.runs:
@@ -167,15 +167,20 @@ class ArmGains(Result):
 
 def _format_cell(value: Any) -> str:
     """Returns a table's cell: a number with four digits, a text, or "-"."""
-    return f"{value:.4g}" if isinstance(value, float) else value or "-"
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return value or "-"
 
 
 def _describe_run(run: Mapping[str, Any]) -> str:
     """Returns a sentence on a run that confirms the edge or the gains."""
-    gains = "these gains" if run["share"] is None else f"{run['share']:g} of the edge"
-    result = {None: "is undecided", True: "decays", False: "grows"}[run["stable"]]
-    if run["rate_per_s"]:
-        result += f" {run['rate_per_s']:+.3g} /s"
+    share = run["share"]
+    gains = "these gains" if share is None else f"{share:g} of the edge"
+    behaviours = {None: "is undecided", True: "decays", False: "grows"}
+    result = behaviours[run["stable"]]
+    rate_per_s = run["rate_per_s"]
+    if rate_per_s:
+        result += f" {rate_per_s:+.3g} /s"
     predicted = f"by its roots {run['predicted_per_s']:+.3g} /s"
     return f"run of {run['ran_s']:.4g} s at {gains}: {result}; {predicted}"
 
@@ -249,6 +254,11 @@ def _build_loop(
     names = _SITES[sites]
     gains = {gain: _NO_GAIN for gain in ("K", "d", "Kd") if gain in BUILT_IN[law].tune}
     share = 1.0 / (sites - 1)
+    roles = {}
+    dominance = {}
+    for name in names:
+        roles[name] = {"role": "slave" if name == "s" else "master"}
+        dominance[name] = {peer: share for peer in names if peer != name}
     tables = {
         "name": "tune",
         "duration_s": _SHORTEST_S,
@@ -257,29 +267,31 @@ def _build_loop(
         "control": {"law": law, **gains},
         "limits": {"tau_limit_nm": 1e9, "qd_limit_rad_s": _SMALL},
         "link": dict(link),
-        "sites": {name: {"role": "slave" if name == "s" else "master"} for name in names},
-        "dominance": {name: {peer: share for peer in names if peer != name} for name in names},
+        "sites": roles,
+        "dominance": dominance,
     }
     scenario = load_scenario(tables, overrides)
     if getattr(scenario.controls[0], "gravity", 1.0) != 1.0:
         raise UsageError(
             "--set control.gravity: only with exact gravity is every pose an equilibrium"
         )
-    without_friction = {
-        name: re.sub(r"<dynamics\b[^>/]*", "<dynamics", text)
-        for name, text in scenario.urdf.items()
-    }
+    without_friction = {}
+    for name, text in scenario.urdf.items():
+        without_friction[name] = re.sub(r"<dynamics\b[^>/]*", "<dynamics", text)
     return msgspec.structs.replace(scenario, urdf=without_friction)
 
 
 def _draw_poses(scenario: Scenario, count: int, seed: int) -> Array:
     """Returns random poses within the joints' limits, shape (count, n)."""
     ranges = []
-    model = read_arm(scenario.sites[scenario.names[0]].arm, scenario.urdf)
+    first_site = scenario.sites[scenario.names[0]]
+    model = read_arm(first_site.arm, scenario.urdf)
     for joint in model.joints:
         half = _HALF_SLIDE_M if joint.kind == "prismatic" else _HALF_TURN
         middle = min(max(joint.lower, 0.0), joint.upper)
-        ranges.append((max(joint.lower, middle - half), min(joint.upper, middle + half)))
+        lower = max(joint.lower, middle - half)
+        upper = min(joint.upper, middle + half)
+        ranges.append((lower, upper))
     low, high = np.transpose(ranges)
     random = np.random.Generator(np.random.Philox(seed))
     shares = random.uniform(_SLACK, 1.0 - _SLACK, (count, len(low)))
@@ -315,9 +327,10 @@ class _GainSearch:
         self.rate_hz = self.conditions.sites[0].rate_hz
         if self.conditions.varying:
             used = find_samples_in_use(self.conditions).used.values()
-            ages = np.concatenate([np.arange(len(samples)) - samples for samples in used])
-            age = float(np.quantile(ages, quantile, method="higher"))
-            self.constant_conditions = self.fix_age(age / self.rate_hz)
+            ages_by_link = [np.arange(len(samples)) - samples for samples in used]
+            ages = np.concatenate(ages_by_link)
+            age_ticks = float(np.quantile(ages, quantile, method="higher"))
+            self.constant_conditions = self.fix_age(age_ticks / self.rate_hz)
         self.age_s = float(self.constant_conditions.age_s.max())
         # the heaviest mass is stable up to this k, (2 zeta / T)^2; there the damping shall have
         # its margin to the sampled-data limit
@@ -341,9 +354,13 @@ class _GainSearch:
 
     def _find_lightest(self) -> tuple[float, Array]:
         """Returns the largest eigenvalue of m M^-1 over the poses, and the joints' shares."""
+        # m M^-1 has the eigenvalues of the symmetric m^(1/2) M^-1 m^(1/2)
         root = np.sqrt(self.inertia)
-        pairs = [np.linalg.eigh(root * np.linalg.inv(M) * root[:, np.newaxis]) for M in self._M]
-        values, vectors = max(pairs, key=lambda pair: float(pair[0][-1]))
+        decompositions = []
+        for M in self._M:
+            scaled = root * np.linalg.inv(M) * root[:, np.newaxis]
+            decompositions.append(np.linalg.eigh(scaled))
+        values, vectors = max(decompositions, key=lambda pair: float(pair[0][-1]))
         return float(values[-1]), vectors[:, -1] ** 2
 
     def fix_age(self, age_s: float) -> OperatingConditions:
@@ -361,16 +378,19 @@ class _GainSearch:
             softer: divisor of the stiffness.
         """
         law: Any = self._scenario.controls[0]
-        defaults = {
-            name: getattr(law.kind, name)[0] for name in ("d", "Kd") if name in law.kind.tune
-        }
-        damping = 2.0 * self._damping * math.sqrt(k) * self.inertia / sum(defaults.values())
+        defaults = {}
+        for name in ("d", "Kd"):
+            if name in law.kind.tune:
+                defaults[name] = getattr(law.kind, name)[0]
+        default_sum = sum(defaults.values())
+        # the damping per unit of the default gains
+        damping = 2.0 * self._damping * math.sqrt(k) * self.inertia / default_sum
         gains = {"K": k / softer * self.inertia}
-        gains |= {name: default * damping for name, default in defaults.items()}
-        rounded = {
-            name: tuple(float(f"{value:.4g}") for value in values)
-            for name, values in gains.items()
-        }
+        for name, default in defaults.items():
+            gains[name] = default * damping
+        rounded = {}
+        for name, values in gains.items():
+            rounded[name] = tuple(float(f"{value:.4g}") for value in values)
         return msgspec.structs.replace(law, **rounded)
 
     def find_root(
@@ -378,10 +398,13 @@ class _GainSearch:
     ) -> CharacteristicRoot:
         """Returns the rightmost root of a loop with a law at rest in a pose."""
         sites = tuple(site._replace(gains=law.linear_gains(site.theta)) for site in loop.sites)
+        poses = np.tile(pose, (len(sites), 1))
         theta = np.array([site.theta for site in sites])
-        rest = Equilibrium(np.tile(pose, (len(sites), 1)), theta, "a pose", 0.0)
+        rest = Equilibrium(poses, theta, "a pose", 0.0)
         root = find_rightmost_root(loop._replace(sites=sites), rest, sampled=sampled)
-        return root or CharacteristicRoot(complex(_NO_ROOT_PER_S), 1, ())
+        if root is None:
+            return CharacteristicRoot(complex(_NO_ROOT_PER_S), 1, ())
+        return root
 
     def find_least_edge(
         self,
@@ -433,14 +456,17 @@ class _GainSearch:
         constant, pose = self.find_least_edge(
             self.constant_conditions, self._poses, self._least
         )
-        k = constant
-        continuous = math.inf
-        link = next(iter(self._scenario.links.values()))
         varies = self.conditions.varying
-        delay_s = self.age_s if varies else 1e-3 * link.moments().mean_ms
+        if varies:
+            delay_s = self.age_s
+        else:
+            link = next(iter(self._scenario.links.values()))
+            delay_s = 1e-3 * link.moments().mean_ms
+        continuous = math.inf
         if delay_s > 0.0:  # without a delay the continuous loop is passive
             fixed = self.fix_age(delay_s)
             continuous, _ = self.find_least_edge(fixed, [pose], self._least, sampled=False)
+        k = constant
         if varies:
             k, _ = self.find_least_edge(self.conditions, [pose], 0.5 * constant)
         lightest, _ = self._find_lightest()
@@ -463,7 +489,8 @@ class _GainSearch:
     def trace_edge(self, pose: Array) -> list[tuple[float, float]]:
         """Returns pairs of a delay, s, and the k of the sampled loop's edge in a pose."""
         most = max(4.0 * self.age_s * self.rate_hz, 8.0)
-        ages_s = np.unique(np.round(np.geomspace(1.0, most, _CURVE_POINTS))) / self.rate_hz
+        ages_ticks = np.round(np.geomspace(1.0, most, _CURVE_POINTS))
+        ages_s = np.unique(ages_ticks) / self.rate_hz
         curve = []
         for age_s in ages_s:
             start = (2.0 * self._damping / age_s) ** 2
@@ -486,22 +513,21 @@ class _GainSearch:
             The run as in `ArmGains.runs`.
         """
         predicted_per_s = self.find_root(law, pose, self.conditions).s.real
-        sites = {
-            name: msgspec.structs.replace(
-                spec, control=law, q0_rad=tuple((pose + push * (n == 0)).tolist())
-            )
-            for n, (name, spec) in enumerate(self._scenario.sites.items())
-        }
+        sites = {}
+        for n, (name, spec) in enumerate(self._scenario.sites.items()):
+            start = pose + push * (n == 0)
+            q0_rad = tuple(start.tolist())
+            sites[name] = msgspec.structs.replace(spec, control=law, q0_rad=q0_rad)
         run = FusedRun(msgspec.structs.replace(self._scenario, sites=sites))
         slowest_per_s = max(abs(predicted_per_s), _SETTLES / _LONGEST_S)
         first_s = max(_SHORTEST_S, _SETTLES / slowest_per_s)
-        for end_s in (first_s * 2.0 ** np.arange(_EXTENSIONS)).tolist():
+        durations_s = first_s * 2.0 ** np.arange(_EXTENSIONS)
+        for end_s in durations_s.tolist():
             run.advance_to(end_s)
             speed = np.max([site[:, 1] for site in run.maxima], axis=0)
             t_s = np.arange(len(speed)) / BUCKETS_PER_S
-            fit = fit_envelopes(
-                t_s, speed[:, np.newaxis], _STILL * speed.max(), falls_first=True
-            )[0]
+            floor = _STILL * speed.max()
+            fit = fit_envelopes(t_s, speed[:, np.newaxis], floor, falls_first=True)[0]
             diverged = run.diverged_s is not None
             if diverged or fit.trend in _IS_STABLE:
                 break
@@ -590,17 +616,17 @@ def tune_arm(
     laws: list[tuple[float | None, Any]] = [(None, tuned_law)]
     laws += [(share, search.build_law(share * edge["k_per_s2"])) for share in SHARES]
     runs = list[dict[str, Any]]()
-    for share, run_law in laws:
+    for run_share, run_law in laws:
         progress(1 + len(runs), 1 + len(laws))
-        runs.append(search.confirm(run_law, share, pose, push))
-    gains = {
-        name: list(getattr(tuned_law, name))
-        for name in ("K", "Kd", "d")
-        if name in tuned_law.kind.tune
-    }
-    assignments = ", ".join(
-        f"{name} = {msgspec.json.encode(values).decode()}" for name, values in gains.items()
-    )
+        runs.append(search.confirm(run_law, run_share, pose, push))
+    gains = {}
+    assignments = []
+    for name in ("K", "Kd", "d"):
+        if name in tuned_law.kind.tune:
+            values = list(getattr(tuned_law, name))
+            gains[name] = values
+            assignments.append(f"{name} = {msgspec.json.encode(values).decode()}")
+    agree = runs[0]["stable"] is True and all(run["agrees"] for run in runs)
     return ArmGains(
         arm=Path(arm).name,
         law=law,
@@ -613,8 +639,8 @@ def tune_arm(
         joints=_tabulate_joints(scenario, search.inertia, gains),
         edge=edge,
         runs=runs,
-        agree=runs[0]["stable"] is True and all(run["agrees"] for run in runs),
-        line=f'control = {{ law = "{law}", {assignments} }}',
+        agree=agree,
+        line=f'control = {{ law = "{law}", {", ".join(assignments)} }}',
         curve=search.trace_edge(pose) if curve else [],
     )
 
@@ -624,14 +650,14 @@ def _tabulate_joints(
 ) -> list[dict[str, Any]]:
     """Returns a row per joint: m, the gains, their unit, and the error at the effort limit."""
     model = scenario.arms[scenario.names[0]]
-    errors = map(finite_or_none, np.divide(model.efforts, gains["K"]).tolist())
+    errors = np.divide(model.efforts, gains["K"]).tolist()
     units = zip(model.joint_units("N m"), model.joint_units("rad"), strict=True)
     columns = {
         "joint": model.joint_names,
         "inertia": inertia.tolist(),
         **gains,
         "unit": ["/".join(pair) for pair in units],
-        "error_at_effort_limit": list(errors),
+        "error_at_effort_limit": [finite_or_none(error) for error in errors],
     }
     rows = zip(*columns.values(), strict=True)
     return [dict(zip(columns, row, strict=True)) for row in rows]

@@ -44,7 +44,7 @@ Workers = str | Executor | None
 BATCH_S = 0.4
 """Duration of a batch of items: with 20 ms per item its overhead is below 1 %."""
 CLUSTER_BATCH_S = 2.0
-"""The same on a cluster, where a batch costs scheduler, worker and this process about 20 ms."""
+"""Duration of a batch on a cluster, where each batch has an overhead of about 20 ms."""
 MAX_BATCH = 400
 """Largest number of items in a batch."""
 _SMALLEST = 16
@@ -96,7 +96,7 @@ def run_batch(
     if required is not None:
         check_this_worker(required)
     clock = SystemClock()
-    began_ns = clock.monotonic_ns()
+    start_ns = clock.monotonic_ns()
     results: list[Any] = []
     error = None
     with allowing_any_settings(allowed):
@@ -106,7 +106,7 @@ def run_batch(
             except Exception as raised:
                 error = raised  # `WorkerPool` raises it when it collects the results
                 break
-    return _BatchResult(results, (clock.monotonic_ns() - began_ns) * 1e-9, error)
+    return _BatchResult(results, (clock.monotonic_ns() - start_ns) * 1e-9, error)
 
 
 class _Batch(NamedTuple):
@@ -157,7 +157,7 @@ class _Feed(Generic[T]):
         self._wall_s = self._wall_s + wall_s
 
     def pop_batch(self, *, idle: bool) -> list[tuple[int, T]]:
-        """Returns the next batch as pairs of number and item; [] if there is none now.
+        """Returns the next batch as pairs of number and item; [] if no item can run now.
 
         Args:
             idle: no batch is in flight. Only then does an item that may kill its worker leave
@@ -248,7 +248,7 @@ class WorkerPool:
             count: number of items, if known.
 
         Raises:
-            RunFailed: an item killed its workers, or there are no workers any more.
+            RunFailed: an item killed its workers, or no workers are left.
             UsageError: a worker does not meet the requirements.
         """
         if self._executor is None:
@@ -417,7 +417,7 @@ def check_workers(jobs: int | None, on: Workers) -> None:
     """Refuses --jobs together with --on.
 
     Raises:
-        UsageError: both are given.
+        UsageError: both options are present.
     """
     if on is not None and jobs is not None:
         raise UsageError(

@@ -136,7 +136,8 @@ class ReachTask:
         self._radius_m = radius_m
         self._within_m = within_m
         self._stay_s = stay_s
-        self._since_s = self._last_s = 0.0
+        self._reached_s = 0.0
+        self._last_s = 0.0
 
     def begin(self, random: np.random.Generator, scene: Scene) -> None:
         """Draws a goal, uniformly over the part of the sphere that the end effector reaches.
@@ -144,33 +145,38 @@ class ReachTask:
         Raises:
             UsageError: no drawn position is within reach.
         """
-        start = scene.end_effector_m[self._site]
+        start_m = scene.end_effector_m[self._site]
         for _ in range(scene.draws):
-            direction = random.normal(size=len(start))
+            direction = random.normal(size=len(start_m))
             # the root makes the density uniform over the area or the volume
-            share = random.uniform() ** (1.0 / len(start))
-            position = start + self._radius_m * share * direction / np.linalg.norm(direction)
-            if scene.can_reach(self._site, position):
+            share = random.uniform() ** (1.0 / len(start_m))
+            offset_m = self._radius_m * share * direction / np.linalg.norm(direction)
+            position_m = start_m + offset_m
+            if scene.can_reach(self._site, position_m):
                 break
         else:
+            positions = count_nouns(scene.draws, "position")
             raise UsageError(
-                "the task has no goal: the end effector can reach none of "
-                f"{count_nouns(scene.draws, 'position')} "
+                f"the task has no goal: the end effector can reach none of {positions} "
                 f"within {self._radius_m:g} m around the start of {self._site}; "
                 "start from another pose (sites.NAME.q0_rad), or use your own task"
             )
-        self.goal = position
-        self._since_s = self._last_s = scene.t_s
+        self.goal = position_m
+        self._reached_s = scene.t_s
+        self._last_s = scene.t_s
 
     def judge(self, scene: Scene) -> Judgement:
         """Returns the reward of a step, and whether the goal was kept for long enough."""
-        distance_m = float(np.linalg.norm(scene.end_effector_m[self._site] - self.goal))
+        from_goal_m = scene.end_effector_m[self._site] - self.goal
+        distance_m = float(np.linalg.norm(from_goal_m))
         step_s = scene.t_s - self._last_s
         self._last_s = scene.t_s
         if distance_m > self._within_m:
-            self._since_s = scene.t_s
-        done = scene.t_s - self._since_s >= self._stay_s
-        return Judgement(-distance_m * step_s + float(done), succeeded=done)
+            self._reached_s = scene.t_s
+        stayed_s = scene.t_s - self._reached_s
+        succeeded = stayed_s >= self._stay_s
+        reward = -distance_m * step_s + float(succeeded)
+        return Judgement(reward, succeeded=succeeded)
 
 
 class ActedHand(HandPlayer):
@@ -186,8 +192,9 @@ class ActedHand(HandPlayer):
         self._actions = actions
 
     def request_action(self, k: int, arrays: SiteArrays) -> None:  # noqa: ARG002 - already observed
-        """Decides as the action of the current step says."""
-        self.hand.accept_decision(k, self._actions[k // self.hand.period_ticks].tolist())
+        """Passes the action of the current step to the hand as its decision."""
+        action = self._actions[k // self.hand.period_ticks]
+        self.hand.accept_decision(k, action.tolist())
 
 
 class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
@@ -260,31 +267,40 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         self._leads = leads
         self.task: EpisodeTask = task or ReachTask(leads)
         self._base = self._prepare(load_scenario(scenario, set, duration_s=duration_s))
-        if self._base.sites[user].rate_hz % rate_hz:
-            raise UsageError(
-                f"rate_hz must divide the tick rate of {user}, {self._base.sites[user].rate_hz}"
-            )
-        self._ticks_per_step = self._base.sites[user].rate_hz // rate_hz
+        tick_rate_hz = self._base.sites[user].rate_hz
+        if tick_rate_hz % rate_hz:
+            raise UsageError(f"rate_hz must divide the tick rate of {user}, {tick_rate_hz}")
+        self._ticks_per_step = tick_rate_hz // rate_hz
+
         hand = self._build_hand_site(self._base).describe()
-        self._action_limit = hand.limit if hand.mode == "force" else self._find_reach()
-        self._action_size = hand.size
+        limit = hand.limit if hand.mode == "force" else self._find_reach()
         dtype = np.float32 if flat else np.float64
-        limit = self._action_limit
+        self._action_limit = limit
+        self._action_size = hand.size
         self.action_space: Any = spaces.Box(-limit, limit, (hand.size,), dtype)
+
         self._begin(self._base)
         self.task.begin(np.random.default_rng(0), self._build_scene())
-        bounds = {"alpha": 1.0, "grip": 1.0, "goal": self.task.bound}
-        boxes: dict[str, Any] = {}
-        for name, values in self._observe(self._build_scene()).items():
-            bound = bounds.get(name, FAR)
-            boxes[name] = spaces.Box(-bound, bound, values.shape, np.float64)
-        self._dict_space = spaces.Dict(boxes)
+        self._dict_space = self._build_dict_space(self._build_scene())
         self.observation_space: Any = self._dict_space
         self.observation_names: list[str] = []
         if flat:
             self.observation_space = _flatten_space(self._dict_space)
             self.observation_names = _name_numbers(self._dict_space)
         self._flat = flat
+
+    def _build_dict_space(self, scene: Scene) -> spaces.Dict:
+        """Returns the space of observations as a dictionary.
+
+        Args:
+            scene: a state of an episode, whose observation has the shapes of all observations.
+        """
+        bounds = {"alpha": 1.0, "grip": 1.0, "goal": self.task.bound}
+        boxes: dict[str, Any] = {}
+        for name, values in self._observe(scene).items():
+            bound = bounds.get(name, FAR)
+            boxes[name] = spaces.Box(-bound, bound, values.shape, np.float64)
+        return spaces.Dict(boxes)
 
     def _prepare(self, scenario: Scenario) -> Scenario:
         """Returns an experiment in which the user's arm has a live hand only."""
@@ -295,6 +311,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         if self._mode:
             hand = replace(hand, mode=self._mode)
         sites = {**scenario.sites, self._user: replace(spec, hands=(hand,))}
+        # the scenario's hands of the user are gone, and with them the values that they draw
         drawn = {
             key: distribution
             for key, distribution in scenario.drawn.items()
@@ -325,7 +342,9 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
             return 2.0 * math.pi
         if arm.chain is None:
             return float(sum(arm.lengths_m))
-        return 1.5 * float(np.linalg.norm(arm.end_effector(spec.q0_rad))) + 1.0
+        # a chain's reach is not known in closed form: a generous bound
+        start_distance_m = float(np.linalg.norm(arm.end_effector(spec.q0_rad)))
+        return 1.5 * start_distance_m + 1.0
 
     def _begin(self, scenario: Scenario) -> None:
         """Prepares the run of an episode."""
@@ -334,9 +353,8 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         self._actions = list[Array]()
         self._player = ActedHand(self._build_hand_site(scenario), self._actions)
         self._plants = make_plant_players(scenario)
-        self._run = FusedRun(
-            scenario, keep=1, hands={self._user: self._player}, plants=self._plants
-        )
+        hands = {self._user: self._player}
+        self._run = FusedRun(scenario, keep=1, hands=hands, plants=self._plants)
         self._run.plan([scenario.ticks(name) for name in scenario.names])
         self._ticks = scenario.ticks(self._user)
         self._tick_rate_hz = scenario.sites[self._user].rate_hz
@@ -345,24 +363,23 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         """Returns the true state of the episode at the current step."""
         names = self.scenario.names
         arms = self.scenario.arms
-        run = self._run
-        q = {
-            name: row[: arms[name].counts.joints]
-            for name, row in zip(names, run.q, strict=True)
-        }
-        positions = {
-            name: np.array(arms[name].end_effector(angles.tolist()))
-            for name, angles in q.items()
-        }
+        q = {}
+        positions_m = {}
+        for name, row in zip(names, self._run.q, strict=True):
+            arm = arms[name]
+            angles_rad = row[: arm.counts.joints]
+            q[name] = angles_rad
+            positions_m[name] = np.array(arm.end_effector(angles_rad.tolist()))
         bodies = {}
         for site, plant in self._plants.items():
             poses = np.reshape(plant.state.bodies, (-1, 7))
             bodies[site] = dict(zip(self.scenario.bodies_m(site), poses, strict=True))
+        user_arrays = self._run.arrays(names.index(self._user))
         return Scene(
             t_s=self._k / self._tick_rate_hz,
             q=q,
-            end_effector_m=positions,
-            view=self._player.view(self._k, run.arrays(names.index(self._user))),
+            end_effector_m=positions_m,
+            view=self._player.view(self._k, user_arrays),
             bodies=bodies,
             can_reach=partial(self._can_reach, q),
             draws=MOST_DRAWS[arms[self._leads].chain is not None],
@@ -377,37 +394,48 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         parts = self._observe(scene)
         if not self._flat:
             return parts
-        numbers = np.concatenate([np.ravel(parts[name]) for name in self._dict_space])
-        return numbers.astype(np.float32)
+        arrays = [np.ravel(parts[name]) for name in self._dict_space]
+        return np.concatenate(arrays).astype(np.float32)
 
     def _observe(self, scene: Scene) -> dict[str, Array]:
         """Returns the parts of an observation by name."""
         view = scene.view
+        peers = view.peers
         parts = {
-            name: getattr(view, name)
-            for name in ("q", "qd", "pose", "q_des", "tau_x", "target")
+            "q": view.q,
+            "qd": view.qd,
+            "pose": view.pose,
+            "q_des": view.q_des,
+            "tau_x": view.tau_x,
+            "target": view.target,
+            "peer_q": np.array([peer.q for peer in peers]),
+            "peer_qd": np.array([peer.qd for peer in peers]),
+            "peer_tau_x": np.array([peer.tau_x for peer in peers]),
+            "alpha": np.array([peer.alpha for peer in peers]),
+            "age_s": np.array([peer.age_s for peer in peers]),
+            "grip": np.array([view.grip]),
+            "goal": np.array(self.task.goal, dtype=np.float64),
         }
-        for name in ("q", "qd", "tau_x"):
-            parts[f"peer_{name}"] = np.array([getattr(peer, name) for peer in view.peers])
         if self._base.arms[self._user].shares_pose:
             # a rotation vector jumps where it passes half a turn
             parts["q_des"] = expand_poses(parts["q_des"])
             parts["peer_q"] = expand_poses(parts["peer_q"])
-        parts["alpha"] = np.array([peer.alpha for peer in view.peers])
-        parts["age_s"] = np.array([peer.age_s for peer in view.peers])
-        parts["grip"] = np.array([view.grip])
-        parts["goal"] = np.array(self.task.goal, dtype=np.float64)
         return parts
 
     def _describe_step(self, scene: Scene, *, succeeded: bool) -> dict[str, Any]:
-        """Returns the facts of a step; the first two have the names of gym-hil."""
-        links = np.asarray(self._run.arrays(self.scenario.names.index(self._leads)).links)
+        """Returns the facts of a step; the first two have the names of gym-hil.
+
+        The teacher is the other user with the largest share in the site that does the task.
+        """
+        leading_site = self.scenario.names.index(self._leads)
+        links = np.asarray(self._run.arrays(leading_site).links)
         peers = self.scenario.peers(self._leads)
         shares = dict(zip(peers, links["alpha"].tolist(), strict=True))
-        others = {name: share for name, share in shares.items() if name != self._user}
-        teacher = max(others, key=lambda name: others[name], default=self._user)
+        user_share = shares.get(self._user, 0.0)
+        teachers = {name: share for name, share in shares.items() if name != self._user}
+        teacher = max(teachers, key=lambda name: teachers[name], default=self._user)
         return {
-            "is_intervention": others.get(teacher, 0.0) > shares.get(self._user, 0.0),
+            "is_intervention": teachers.get(teacher, 0.0) > user_share,
             "teleop_action": scene.end_effector_m[teacher],
             "dominance": shares,
             "t_s": scene.t_s,
@@ -427,7 +455,9 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         """
         self._runs = False
         super().reset(seed=seed)
-        overrides = {key: _draw(self.np_random, values) for key, values in self._vary.items()}
+        overrides = {}
+        for key, values in self._vary.items():
+            overrides[key] = _draw(self.np_random, values)
         overrides["seed"] = int(self.np_random.integers(2**31))
         overrides |= options or {}
         self._begin(load_scenario(self._base, overrides))
@@ -448,16 +478,18 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
             raise EpisodeError("there is no episode, or it has ended: call reset first")
         self._actions.append(checked)
         self._k += self._ticks_per_step
+        next_ns = tick_ns(self._k, self._tick_rate_hz)
         try:
-            self._run.step_to(tick_ns(self._k, self._tick_rate_hz) - 1)
+            self._run.step_to(next_ns - 1)
         except ValueError as error:
             raise UsageError(f"an action: {error}") from None
         scene = self._build_scene()
-        diverged = self._run.diverged_s is not None
         result = self.task.judge(scene)
         judgement = Judgement(*result) if isinstance(result, tuple) else Judgement(result)
+        diverged = self._run.diverged_s is not None
         terminated = judgement.succeeded or judgement.failed or diverged
-        truncated = self._k + self._ticks_per_step > self._ticks and not terminated
+        has_next_step = self._k + self._ticks_per_step <= self._ticks
+        truncated = not (terminated or has_next_step)
         self._runs = not (terminated or truncated)
         info = self._describe_step(scene, succeeded=judgement.succeeded)
         observation = self._format_observation(scene)
@@ -496,10 +528,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         if not (self._runs or self._actions):
             raise EpisodeError("there is no episode to be drawn: call reset first")
         # imported here, because the import of Matplotlib takes a second
-        from ..reporting.episode_picture import (
-            EpisodePicture,
-            is_position,
-        )
+        from ..reporting.episode_picture import EpisodePicture, is_position
 
         if self._picture is None:
             self._picture = EpisodePicture(self.scenario, self._leads)
@@ -518,8 +547,10 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         if not self._actions:
             raise UsageError("an episode has a log once it has a step")
         player = ActedHand(self._build_hand_site(self.scenario), self._actions)
-        scenario = replace(self.scenario, duration_s=self._k / self._tick_rate_hz)
-        record_virtual(scenario, Path(path), force=force, hands={self._user: player.track})
+        hands = {self._user: player.track}
+        elapsed_s = self._k / self._tick_rate_hz
+        scenario = replace(self.scenario, duration_s=elapsed_s)
+        record_virtual(scenario, Path(path), force=force, hands=hands)
         return Path(path)
 
 
@@ -528,17 +559,20 @@ def _flatten_space(parts: spaces.Dict) -> spaces.Box:
     boxes = [box for box in parts.values() if isinstance(box, spaces.Box)]
     low = np.concatenate([np.ravel(box.low) for box in boxes])
     high = np.concatenate([np.ravel(box.high) for box in boxes])
-    return spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
+    return spaces.Box(
+        low=low.astype(np.float32),
+        high=high.astype(np.float32),
+        dtype=np.float32,
+    )
 
 
 def _name_numbers(parts: spaces.Dict) -> list[str]:
     """Returns the name of each number of a flat observation, as "peer_q[1][0]"."""
     names = []
     for part, box in parts.items():
-        names += [
-            part + "".join(f"[{index}]" for index in indices)
-            for indices in np.ndindex(box.shape or ())
-        ]
+        for indices in np.ndindex(box.shape or ()):
+            subscripts = [f"[{index}]" for index in indices]
+            names.append(part + "".join(subscripts))
     return names
 
 

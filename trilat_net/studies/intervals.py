@@ -44,9 +44,11 @@ class MeanInterval(NamedTuple):
 def mean_interval(values: Sequence[float | None]) -> MeanInterval | None:
     """Returns the mean of at least two numbers; None for fewer, or if a number is missing."""
     known = [value for value in values if value is not None]
-    if len(known) < 2 or len(known) < len(values):
+    count = len(known)
+    if count < 2 or count < len(values):
         return None
     from scipy.special import stdtrit  # the import takes long
 
-    spread = float(np.std(known, ddof=1) / np.sqrt(len(known)))
-    return MeanInterval(float(np.mean(known)), float(stdtrit(len(known) - 1, 0.975)) * spread)
+    standard_error = float(np.std(known, ddof=1) / np.sqrt(count))
+    quantile = float(stdtrit(count - 1, 0.975))
+    return MeanInterval(mean=float(np.mean(known)), half=quantile * standard_error)

@@ -55,13 +55,18 @@ class LogComparison(Result):
         if len(names) > 1:
             yield f"logs of different scenarios: {', '.join(sorted(names))}"
         if self.differences:
+            header = ("differs", *self.metrics.columns)
             rows = [(str(difference), *difference.values) for difference in self.differences]
-            yield from ("", TextTable(("differs", *self.metrics.columns), rows))
+            yield ""
+            yield TextTable(header, rows)
         else:
             yield "the same experiment"
-        yield from ("", _tabulate_quantities(self.metrics, self.means), "")
+        yield ""
+        yield _tabulate_quantities(self.metrics, self.means)
+        yield ""
         for name, lines in self.remarks.items():
-            yield from (MarkedText("[bold]note[/bold]", f"{name}: {line}") for line in lines)
+            for line in lines:
+                yield MarkedText("[bold]note[/bold]", f"{name}: {line}")
         reasons = list(self._explain_missing_values())
         yield from reasons[:_MOST_REASONS]
         if len(reasons) > _MOST_REASONS:
@@ -76,15 +81,15 @@ class LogComparison(Result):
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the keys of `trilat compare --json`."""
-        logs = [
-            {
+        logs = []
+        for name, log in zip(self.metrics.columns, self.logs, strict=True):
+            entry = {
                 "name": name,
                 "file": log.source,
                 "scenario": log.scenario.name,
                 "sha256": log.scenario.sha256,
             }
-            for name, log in zip(self.metrics.columns, self.logs, strict=True)
-        ]
+            logs.append(entry)
         facts: dict[str, Any] = {
             "logs": logs,
             "differences": [difference._asdict() for difference in self.differences],
@@ -92,20 +97,20 @@ class LogComparison(Result):
             **comparison_to_json(self.metrics),
         }
         if self.means:
-            pairs = zip(self.metrics.rows, self.means, strict=True)
-            facts["means"] = {row.quantity.key: mean._asdict() for row, mean in pairs if mean}
+            means = {}
+            for row, mean in zip(self.metrics.rows, self.means, strict=True):
+                if mean is not None:
+                    means[row.quantity.key] = mean._asdict()
+            facts["means"] = means
         return facts
 
     def to_rows(self) -> list[dict[str, Any]]:
         """Returns a row per quantity."""
-        return [
-            {
-                "key": row.quantity.key,
-                "unit": row.quantity.unit,
-                **dict(zip(self.metrics.columns, row.values, strict=True)),
-            }
-            for row in self.metrics.rows
-        ]
+        rows = []
+        for row in self.metrics.rows:
+            values = dict(zip(self.metrics.columns, row.values, strict=True))
+            rows.append({"key": row.quantity.key, "unit": row.quantity.unit, **values})
+        return rows
 
 
 def compare(*logs: str | Path | Log) -> LogComparison:
@@ -125,10 +130,10 @@ def compare(*logs: str | Path | Log) -> LogComparison:
             "name at least two logs; or a scenario, as in: trilat compare --tune free"
         )
     names = name_columns([Path(log.sources[0]) for log in opened])
-    remarks = {
-        name: [describe_judgement(certify_run(log)), *check_final_posture(log)]
-        for name, log in zip(names, opened, strict=True)
-    }
+    remarks = {}
+    for name, log in zip(names, opened, strict=True):
+        verdict = describe_judgement(certify_run(log))
+        remarks[name] = [verdict, *check_final_posture(log)]
     metrics = compare_metrics(opened, names)
     return LogComparison(
         logs=tuple(opened),
@@ -144,7 +149,8 @@ def name_columns(files: Sequence[Path]) -> list[str]:
 
     The part is the shortest that makes the names differ.
     """
-    for depth in range(1, max(len(file.parts) for file in files) + 1):
+    most_parts = max(len(file.parts) for file in files)
+    for depth in range(1, most_parts + 1):
         names = ["/".join(file.with_suffix("").parts[-depth:]) for file in files]
         if len(set(names)) == len(names):
             return names
@@ -159,7 +165,8 @@ def average_repeats(
     The list is empty for other logs.
     """
     first = logs[0].scenario
-    if len({log.scenario.seed for log in logs}) < len(logs):
+    seeds = {log.scenario.seed for log in logs}
+    if len(seeds) < len(logs):
         return []
     if any(reseed_scenario(log.scenario, first.seed) != first for log in logs):
         return []

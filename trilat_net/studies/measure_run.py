@@ -77,12 +77,14 @@ class RecordBatch(NamedTuple):
 
     def since(self, t_ns: int) -> "RecordBatch":
         """Returns the records after a time, ns."""
-        return self._slice(int(np.searchsorted(self.t_ns, t_ns, side="right")), None)
+        first = np.searchsorted(self.t_ns, t_ns, side="right")
+        return self._slice(int(first), None)
 
     def between(self, from_ns: int, to_ns: int) -> "RecordBatch":
         """Returns the records from `from_ns` until before `to_ns`."""
-        first, stop = np.searchsorted(self.t_ns, (from_ns, to_ns)).tolist()
-        return self._slice(first, stop)
+        first = np.searchsorted(self.t_ns, from_ns)
+        stop = np.searchsorted(self.t_ns, to_ns)
+        return self._slice(int(first), int(stop))
 
     def reduce(self, into: Array = NO_BUCKETS) -> Array:
         """Returns the buckets of a verdict with these records, see `reduce_to_buckets`."""
@@ -96,7 +98,8 @@ class RecordBatch(NamedTuple):
 
 def join_batches(batches: Sequence[RecordBatch]) -> RecordBatch:
     """Returns consecutive batches as one."""
-    return RecordBatch._make(map(np.concatenate, zip(*batches, strict=True)))
+    columns = zip(*batches, strict=True)
+    return RecordBatch._make(np.concatenate(parts) for parts in columns)
 
 
 def _build_batch(axes: Sequence[float], t_ns: Ints, used: Ints, *vectors: Array) -> RecordBatch:
@@ -136,8 +139,12 @@ def run_in_batches(
             return
         t_ns = np.array([record.t_ns for record in records], dtype=np.int64)
         used = np.array([record.used for record in records], dtype=np.int64)
-        vectors = [np.array([getattr(record, key) for record in records]) for key in _VECTORS]
-        receivers[name](_build_batch(scenario.arms[name].axes, t_ns, used, *vectors))
+        vectors = []
+        for key in _VECTORS:
+            rows = [getattr(record, key) for record in records]
+            vectors.append(np.array(rows))
+        axes = scenario.arms[name].axes
+        receivers[name](_build_batch(axes, t_ns, used, *vectors))
         records.clear()
 
     with process.pause_gc():
@@ -150,7 +157,10 @@ def run_in_batches(
                 diverged_at_s = output.t_ns / NS_PER_S
     for name in pending:
         flush(name)
-    return diverged_at_s, sum(count.late for site in sites.values() for count in site.counts())
+    late_samples = 0
+    for site in sites.values():
+        late_samples += sum(count.late for count in site.counts())
+    return diverged_at_s, late_samples
 
 
 def run_compiled_in_batches(
@@ -168,18 +178,19 @@ def run_compiled_in_batches(
         The time at which the first site left its limits, s, or None.
     """
     run = FusedRun(scenario, keep=BATCH_RECORDS + 1)
-    columns = [scenario.layout(name).columns() for name in scenario.names]
-    period_s = BATCH_RECORDS / max(spec.rate_hz for spec in scenario.sites.values())
+    columns = {name: scenario.layout(name).columns() for name in scenario.names}
+    fastest_hz = max(spec.rate_hz for spec in scenario.sites.values())
+    period_s = BATCH_RECORDS / fastest_hz
+    empty = slice(0, 0)
     while run.ran_s < scenario.duration_s and run.diverged_s is None:
         run.advance_to(min(run.ran_s + period_s, scenario.duration_s))
-        for name, site_columns, (t_ns, rows) in zip(
-            scenario.names, columns, run.pop_records(), strict=True
-        ):
+        for name, (t_ns, rows) in zip(scenario.names, run.pop_records(), strict=True):
             if not len(t_ns):
                 continue
-            vectors = [rows[:, site_columns.get(key, slice(0, 0))] for key in _VECTORS]
+            vectors = [rows[:, columns[name].get(key, empty)] for key in _VECTORS]
             used = np.zeros((len(t_ns), 0), np.int64)
-            receivers[name](_build_batch(scenario.arms[name].axes, t_ns, used, *vectors))
+            axes = scenario.arms[name].axes
+            receivers[name](_build_batch(axes, t_ns, used, *vectors))
     return run.diverged_s
 
 
@@ -189,11 +200,9 @@ def run_whole(scenario: Scenario) -> tuple[dict[str, RecordBatch], RunEnd]:
     receivers = {name: batches[name].append for name in batches}
     diverged_s = run_compiled_in_batches(scenario, receivers)
     records = {name: join_batches(site_batches) for name, site_batches in batches.items()}
-    trace = RunTrace(
-        [batch.reduce() for batch in records.values()],
-        [batch.tau_x[-1] for batch in records.values()],
-        diverged_s,
-    )
+    buckets = [batch.reduce() for batch in records.values()]
+    last_tau_x = [batch.tau_x[-1] for batch in records.values()]
+    trace = RunTrace(buckets, last_tau_x, diverged_s)
     return records, classify_run_end(scenario, trace)
 
 
@@ -209,9 +218,8 @@ class WindowStats:
 
     def __init__(self, window: ExpectWindow, scenario: Scenario, site: str) -> None:
         spec = scenario.sites[site]
-        self._from_ns, self._to_ns = (
-            round(t_s * NS_PER_S) for t_s in (window.from_s, window.to_s)
-        )
+        self._from_ns = round(window.from_s * NS_PER_S)
+        self._to_ns = round(window.to_s * NS_PER_S)
         self._period_ns = NS_PER_S // spec.rate_hz + 1
         self._arm = build_arm_rows(scenario, site)
         self._walls = list_walls(spec)
@@ -222,7 +230,9 @@ class WindowStats:
         self._q_least = np.full(joints, math.inf)
         self._q_most = np.full(joints, -math.inf)
         self._push_sum = np.zeros(joints)
-        self._force_sum = self._force_squares = self._force_peak = 0.0
+        self._force_sum = 0.0
+        self._force_squares = 0.0
+        self._force_peak = 0.0
         self._was_touching: bool | None = None
         self._hits = 0
 
@@ -233,16 +243,24 @@ class WindowStats:
         if not len(inside.t_ns):
             return
         self._records += len(inside.t_ns)
-        for key, values in zip(self._peaks, (inside.e, inside.qd, inside.tau), strict=True):
-            self._peaks[key] = max(self._peaks[key], float(np.abs(values).max()))
-        self._q_least = np.minimum(self._q_least, inside.q.min(axis=0))
-        self._q_most = np.maximum(self._q_most, inside.q.max(axis=0))
+        self._raise_peak("error_peak_rad", inside.e)
+        self._raise_peak("speed_peak_rad_s", inside.qd)
+        self._raise_peak("torque_peak_nm", inside.tau)
+        q_least = inside.q.min(axis=0)
+        q_most = inside.q.max(axis=0)
+        self._q_least = np.minimum(self._q_least, q_least)
+        self._q_most = np.maximum(self._q_most, q_most)
         self._push_sum -= inside.tau_x.sum(axis=0)
         if self._walls:
             tip = self._arm.place_end_effector(inside.q, inside.qd)
             t_s = inside.t_ns / NS_PER_S
             forces = [wall_force(wall, t_s, tip) for wall in self._walls]
             self._add_wall_force(np.sum(forces, axis=0))
+
+    def _raise_peak(self, key: str, values: Array) -> None:
+        """Raises a peak to the largest absolute value."""
+        largest = float(np.abs(values).max())
+        self._peaks[key] = max(self._peaks[key], largest)
 
     def _add_wall_force(self, force: Array) -> None:
         """Adds the force of the walls at the next records, shape (K,), N."""
@@ -262,20 +280,26 @@ class WindowStats:
         """
         if not self._records or self._last_ns < self._to_ns - self._period_ns:
             return {}
+        ranges = {}
         angles = zip(self._q_least.tolist(), self._q_most.tolist(), strict=True)
-        ranges = {f"q{n}_rad": Range(*ends) for n, ends in enumerate(angles, 1)}
-        push_nm = (self._push_sum / self._records).tolist()
+        for n, (least, most) in enumerate(angles, 1):
+            ranges[f"q{n}_rad"] = Range(least, most)
+
+        single_values = dict(self._peaks)
+        pushes_nm = (self._push_sum / self._records).tolist()
+        for n, push_nm in enumerate(pushes_nm, 1):
+            single_values[f"push{n}_mean_nm"] = push_nm
         mean_n = self._force_sum / self._records
-        variance = max(0.0, self._force_squares / self._records - mean_n * mean_n)
-        single_values = {
-            **self._peaks,
-            **{f"push{n}_mean_nm": push for n, push in enumerate(push_nm, 1)},
-            "wall_mean_n": mean_n,
-            "wall_deviation_n": math.sqrt(variance),
-            "wall_peak_n": self._force_peak,
-            "wall_hits": float(self._hits),
-        }
-        return {**ranges, **{key: Range(value, value) for key, value in single_values.items()}}
+        mean_square = self._force_squares / self._records
+        variance = max(0.0, mean_square - mean_n * mean_n)
+        single_values["wall_mean_n"] = mean_n
+        single_values["wall_deviation_n"] = math.sqrt(variance)
+        single_values["wall_peak_n"] = self._force_peak
+        single_values["wall_hits"] = float(self._hits)
+
+        for key, value in single_values.items():
+            ranges[key] = Range(value, value)
+        return ranges
 
 
 _BUCKET_NS = NS_PER_S // BUCKETS_PER_S
@@ -301,7 +325,9 @@ class SiteStats:
             for window in scenario.expect.windows
         ]
         self.records = 0
-        self.peak_error_rad = self.peak_torque_nm = self.peak_speed_rad_s = 0.0
+        self.peak_error_rad = 0.0
+        self.peak_torque_nm = 0.0
+        self.peak_speed_rad_s = 0.0
         self.unsynchronised_ns = -1
         self.age_max_ms = np.zeros(len(peer_rates))
         self._age_sum_ms = np.zeros(len(peer_rates))
@@ -316,50 +342,61 @@ class SiteStats:
             return
         error = np.abs(rows.e)
         largest = error.max(axis=1)
+        torque_nm = np.abs(rows.tau)
+        speed_rad_s = np.abs(rows.qd)
         self.records += len(largest)
         self.peak_error_rad = max(self.peak_error_rad, float(largest.max()))
-        self.peak_torque_nm = max(self.peak_torque_nm, float(np.abs(rows.tau).max()))
-        self.peak_speed_rad_s = max(self.peak_speed_rad_s, float(np.abs(rows.qd).max()))
+        self.peak_torque_nm = max(self.peak_torque_nm, float(torque_nm.max()))
+        self.peak_speed_rad_s = max(self.peak_speed_rad_s, float(speed_rad_s.max()))
         self._squares = self._squares + (error * error).sum(axis=0)
         unsynchronised = np.flatnonzero(largest >= self._synchronised_rad)
         if len(unsynchronised):
             self.unsynchronised_ns = int(rows.t_ns[unsynchronised[-1]])
+
         known = rows.used >= 0
-        age_ms = (rows.t_ns[:, None] - rows.used * NS_PER_S // self._peer_rates) * 1e-6
+        sent_ns = rows.used * NS_PER_S // self._peer_rates
+        age_ms = (rows.t_ns[:, None] - sent_ns) * 1e-6
         age_ms[~known] = 0.0
         self.age_max_ms = np.maximum(self.age_max_ms, age_ms.max(axis=0))
         self._age_sum_ms += age_ms.sum(axis=0)
         self._age_records += known.sum(axis=0)
+
         self._buckets = rows.reduce(self._buckets)
         for window in filter(None, self.windows):
             window.add(rows)
+
+        # a batch is dropped once the batch after it covers the last second
         self._tail.append(rows)
-        while len(self._tail) > 1 and self._tail[1].t_ns[0] < rows.t_ns[-1] - _END_NS:
+        last_second_ns = rows.t_ns[-1] - _END_NS
+        while len(self._tail) > 1 and self._tail[1].t_ns[0] < last_second_ns:
             del self._tail[0]
 
     @property
     def last_ns(self) -> int:
         """Nominal time of the last record, ns; -1 before the first."""
-        return int(self._tail[-1].t_ns[-1]) if self._tail else -1
+        if not self._tail:
+            return -1
+        return int(self._tail[-1].t_ns[-1])
 
     @property
     def rms_error_rad(self) -> float:
         """Root mean square of e of the worst joint, rad."""
-        return float(np.sqrt(self._squares.max() / max(1, self.records)))
+        mean_square = self._squares.max() / max(1, self.records)
+        return float(np.sqrt(mean_square))
 
     @property
     def link_ages(self) -> list["LinkAge"]:
         """Age of each peer's sample in use; None for a peer without samples."""
-        rows = zip(
-            self._age_sum_ms.tolist(),
-            self._age_records.tolist(),
-            self.age_max_ms.tolist(),
-            strict=True,
-        )
-        return [
-            LinkAge(total / records, most) if records else LinkAge(None, None)
-            for total, records, most in rows
-        ]
+        sums_ms = self._age_sum_ms.tolist()
+        record_counts = self._age_records.tolist()
+        largest_ms = self.age_max_ms.tolist()
+        ages = []
+        for sum_ms, count, most_ms in zip(sums_ms, record_counts, largest_ms, strict=True):
+            if count:
+                ages.append(LinkAge(mean_ms=sum_ms / count, max_ms=most_ms))
+            else:
+                ages.append(LinkAge(mean_ms=None, max_ms=None))
+        return ages
 
     def end(self, end_ns: int) -> RecordBatch:
         """Returns the records of the last second before `end_ns`.
@@ -376,7 +413,9 @@ class SiteStats:
     @property
     def tau_x(self) -> Array:
         """The torque of operator and environment at the last record, shape (n,), N m."""
-        return self._tail[-1].tau_x[-1] if self._tail else np.zeros(1)
+        if not self._tail:
+            return np.zeros(1)
+        return self._tail[-1].tau_x[-1]
 
 
 class LinkAge(msgspec.Struct, frozen=True):
@@ -444,38 +483,39 @@ def compute_run_metrics(
     """
     with_records = {name: tally for name, tally in tallies.items() if tally.records}
     all_ran = len(with_records) == len(tallies)
-    end_ns = max((tally.last_ns for tally in with_records.values()), default=0)
-    trace = RunTrace(
-        [tally.buckets for tally in tallies.values()],
-        [tally.tau_x for tally in tallies.values()],
-        diverged_at_s,
-    )
-    # to the end of the period after the last tick
-    durations_s = [
-        tally.last_ns / NS_PER_S + 1.0 / scenario.sites[name].rate_hz
-        for name, tally in with_records.items()
-    ]
-    unsynchronised_ns = [tally.unsynchronised_ns for tally in with_records.values()]
-    ends_synchronised = not any(
-        tally.unsynchronised_ns == tally.last_ns for tally in with_records.values()
-    )
+    buckets = [tally.buckets for tally in tallies.values()]
+    last_tau_x = [tally.tau_x for tally in tallies.values()]
+    trace = RunTrace(buckets, last_tau_x, diverged_at_s)
+
     synchronised_at_s = None
-    if all_ran and ends_synchronised:
-        synchronised_at_s = max(0, *unsynchronised_ns) / NS_PER_S
-    ends = {name: tally.end(end_ns) for name, tally in with_records.items()}
-    end_errors_rad = [float(np.abs(end.e).max(initial=0.0)) for end in ends.values()]
-    end_poses_rad = {
-        name: tuple(tally.end(tally.last_ns).q[-1].tolist())
-        for name, tally in with_records.items()
-    }
+    if all_ran:
+        synchronised_at_s = _find_synchronisation_s(list(with_records.values()))
+    end_ns = max((tally.last_ns for tally in with_records.values()), default=0)
+    durations_s = []
+    ends = []
+    end_errors_rad = []
+    end_poses_rad = {}
+    for name, tally in with_records.items():
+        # to the end of the period after the last tick
+        period_s = 1.0 / scenario.sites[name].rate_hz
+        durations_s.append(tally.last_ns / NS_PER_S + period_s)
+        end = tally.end(end_ns)
+        ends.append(end)
+        end_errors_rad.append(float(np.abs(end.e).max(initial=0.0)))
+        last_pose_rad = tally.end(tally.last_ns).q[-1]
+        end_poses_rad[name] = tuple(last_pose_rad.tolist())
+
     ages = {}
     for name, tally in tallies.items():
-        for peer, age in zip(scenario.peers(name), tally.link_ages, strict=True):
+        peers = scenario.peers(name)
+        for peer, age in zip(peers, tally.link_ages, strict=True):
             ages[f"{peer}->{name}"] = age
-    windows = zip(*(tally.windows for tally in tallies.values()), strict=True)
+    windows_by_site = [tally.windows for tally in tallies.values()]
+    windows = zip(*windows_by_site, strict=True)
 
     def find_largest(name: str) -> float | None:
-        return max((getattr(tally, name) for tally in with_records.values()), default=None)
+        values = [getattr(tally, name) for tally in with_records.values()]
+        return max(values, default=None)
 
     return RunMetrics(
         simulated_s=max(durations_s, default=0.0),
@@ -484,7 +524,7 @@ def compute_run_metrics(
         peak_error_rad=find_largest("peak_error_rad"),
         rms_error_rad=find_largest("rms_error_rad"),
         end_error_rad=max(end_errors_rad, default=None),
-        end_spread_rad=_compute_end_spread_rad(list(ends.values())) if all_ran else None,
+        end_spread_rad=_compute_end_spread_rad(ends) if all_ran else None,
         end_pose_rad=end_poses_rad,
         peak_torque_nm=find_largest("peak_torque_nm"),
         peak_speed_rad_s=find_largest("peak_speed_rad_s"),
@@ -493,6 +533,20 @@ def compute_run_metrics(
         missing=missing,
         windows=tuple(map(_merge_windows, windows)),
     )
+
+
+def _find_synchronisation_s(tallies: Sequence[SiteStats]) -> float | None:
+    """Returns the time from which all sites stay synchronised, in s.
+
+    None if a site is not synchronised at its last record.
+
+    Args:
+        tallies: statistics of all sites, each with records.
+    """
+    if any(tally.unsynchronised_ns == tally.last_ns for tally in tallies):
+        return None
+    last_ns = max(tally.unsynchronised_ns for tally in tallies)
+    return max(0, last_ns) / NS_PER_S
 
 
 def _merge_windows(windows: Sequence[WindowStats | None]) -> dict[str, Range]:
@@ -521,14 +575,17 @@ def _compute_end_spread_rad(ends: Sequence[RecordBatch]) -> float | None:
     """
     if not all(len(end.t_ns) for end in ends):
         return None
-    if len({end.q.shape[1] for end in ends}) > 1:
+    joint_counts = {end.q.shape[1] for end in ends}
+    if len(joint_counts) > 1:
         return None
     first_common_ns = max(end.t_ns[0] for end in ends)
     times_ns = ends[0].t_ns[ends[0].t_ns >= first_common_ns]
-    poses: Array = np.array(
-        [end.q[np.searchsorted(end.t_ns, times_ns, side="right") - 1] for end in ends]
-    )
-    return float((poses.max(axis=0) - poses.min(axis=0)).max(initial=0.0))
+    poses = []
+    for end in ends:
+        latest = np.searchsorted(end.t_ns, times_ns, side="right") - 1
+        poses.append(end.q[latest])
+    spread: Array = np.max(poses, axis=0) - np.min(poses, axis=0)
+    return float(spread.max(initial=0.0))
 
 
 def measure_virtual_run(scenario: Scenario) -> RunMetrics:
@@ -540,8 +597,8 @@ def measure_virtual_run(scenario: Scenario) -> RunMetrics:
     diverged_at_s, late_samples = run_in_batches(scenario, receivers)
     missing = 0
     if diverged_at_s is None:
-        records = sum(tally.records for tally in tallies.values())
-        missing = sum(map(scenario.ticks, scenario.names)) - records
+        expected = sum(scenario.ticks(name) for name in scenario.names)
+        missing = expected - sum(tally.records for tally in tallies.values())
     return compute_run_metrics(
         scenario,
         tallies,
@@ -592,7 +649,8 @@ def measure_log(log: Log, expect: Expect | None = None) -> RunMetrics:
         late_samples=late_samples,
         missing=missing,
     )
-    return msgspec.structs.replace(metrics, metrics=measure_run(log, scenario.expect.metrics))
+    expected_metrics = measure_run(log, scenario.expect.metrics)
+    return msgspec.structs.replace(metrics, metrics=expected_metrics)
 
 
 class ExpectationResult(msgspec.Struct, frozen=True):
@@ -628,10 +686,13 @@ def evaluate_expectations(expect: Expect, metrics: RunMetrics) -> list[Expectati
             outcomes.append(_compare_with_limit(key, _read_metric(key, metrics), limit))
     outcomes += _evaluate_poses(expect, metrics)
     if expect.no_gaps:
-        missing = f"{metrics.missing} missing"
-        outcomes.append(
-            ExpectationResult("no_gaps", metrics.missing == 0, missing, "0 missing")
+        gaps = ExpectationResult(
+            key="no_gaps",
+            held=metrics.missing == 0,
+            measured=f"{metrics.missing} missing",
+            limit="0 missing",
         )
+        outcomes.append(gaps)
     outcomes += _evaluate_windows(expect, metrics)
     outcomes += _evaluate_metrics(expect, metrics)
     return outcomes
@@ -662,10 +723,14 @@ def _read_metric(key: str, metrics: RunMetrics) -> float | None:
         value: float | None = getattr(metrics, name)
         return value
     is_mean = key.startswith("mean")
-    ages = [age.mean_ms if is_mean else age.max_ms for age in metrics.ages.values()]
-    known = [age for age in ages if age is not None]
+    ages_ms = []
+    for age in metrics.ages.values():
+        age_ms = age.mean_ms if is_mean else age.max_ms
+        if age_ms is None:
+            return None
+        ages_ms.append(age_ms)
     choose = min if "_min_" in key else max
-    return choose(known) if known and len(known) == len(ages) else None
+    return choose(ages_ms) if ages_ms else None
 
 
 def _compare_with_limit(key: str, measured: float | None, limit: float) -> ExpectationResult:
@@ -677,8 +742,9 @@ def _compare_with_limit(key: str, measured: float | None, limit: float) -> Expec
         limit: the limit, in the same unit.
     """
     is_minimum = "_min_" in key
-    unit = split_unit(key)[1]
-    limit_text = f"{'≥' if is_minimum else '≤'} {limit:g} {unit}".rstrip()
+    relation = "≥" if is_minimum else "≤"
+    _, unit = split_unit(key)
+    limit_text = f"{relation} {limit:g} {unit}".rstrip()
     if measured is None:
         return ExpectationResult(key, False, "never", limit_text)
     distance = measured - limit if is_minimum else limit - measured
@@ -694,28 +760,36 @@ def _compare_with_limit(key: str, measured: float | None, limit: float) -> Expec
 
 def _evaluate_poses(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:
     """Yields the outcome of each expected end pose."""
-    tolerance = expect.end_pose_within_rad
+    tolerance_rad = expect.end_pose_within_rad
     for site, expected in expect.end_pose_rad.items():
         key = f"end_pose_rad.{site}"
-        limit = f"({', '.join(f'{angle:g}' for angle in expected)}) ± {tolerance:g} rad"
+        expected_angles = ", ".join(f"{angle:g}" for angle in expected)
+        limit = f"({expected_angles}) ± {tolerance_rad:g} rad"
         reached = metrics.end_pose_rad.get(site)
         if reached is None:
             yield ExpectationResult(key, False, "never", limit)
             continue
-        error = max(abs(a - b) for a, b in zip(reached, expected, strict=True))
-        text = f"({', '.join(f'{angle:.4f}' for angle in reached)}) rad"
-        margin = (tolerance - error) / tolerance
-        yield ExpectationResult(key, error <= tolerance, text, limit, margin)
+        distances_rad = [abs(a - b) for a, b in zip(reached, expected, strict=True)]
+        error_rad = max(distances_rad)
+        angles = ", ".join(f"{angle:.4f}" for angle in reached)
+        yield ExpectationResult(
+            key=key,
+            held=error_rad <= tolerance_rad,
+            measured=f"({angles}) rad",
+            limit=limit,
+            margin=(tolerance_rad - error_rad) / tolerance_rad,
+        )
 
 
 def _evaluate_windows(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:
     """Yields the outcome of each quantity of each window."""
     for window, ranges in zip(expect.windows, metrics.windows, strict=True):
+        site = f" {window.site}" if window.site else ""
+        period = f"{window.from_s:g}-{window.to_s:g} s"
         for key, limits in window.limits:
-            site = f" {window.site}" if window.site else ""
-            # as in "wall_mean_n s 9-15 s"
-            name = f"{key}{site} {window.from_s:g}-{window.to_s:g} s"
-            yield _compare_with_range(name, ranges.get(key), limits, split_unit(key)[1])
+            name = f"{key}{site} {period}"  # as in "wall_mean_n s 9-15 s"
+            _, unit = split_unit(key)
+            yield _compare_with_range(name, ranges.get(key), limits, unit)
 
 
 def _evaluate_metrics(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:
