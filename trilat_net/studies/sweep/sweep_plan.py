@@ -160,7 +160,7 @@ def _parse_decimal(key: str, text: str) -> Decimal:
         number = Decimal(text)
     except InvalidOperation:
         problem = (
-            f"a range a:b:step is of numbers, and {text!r} is not a number; "
+            f"a range is of numbers, a:b:step, and {text!r} is not a number; "
             "list words as in KEY=first,second"
         )
         raise ScenarioError(problem, path=key) from None
