@@ -185,12 +185,12 @@ def whole(source: str) -> Change:
 
 
 SPOILT: list[tuple[Change, str]] = [
-    (mode("", 0o777), "others may write it, and so say who takes part: chmod go-w"),
-    (mode("", 0o770), "others may write it"),
-    (mode(MEMBERS, 0o666), "members.json: others may write it"),
-    (mode(MEMBERS, 0o620), "members.json: others may write it"),
-    (mode(AUTHORITY, 0o664), "authority.pem: others may write it"),
-    (mode(CERTIFICATE, 0o646), "certificate.pem: others may write it"),
+    (mode("", 0o777), "others can write it and decide who takes part: chmod go-w"),
+    (mode("", 0o770), "others can write it"),
+    (mode(MEMBERS, 0o666), "members.json: others can write it"),
+    (mode(MEMBERS, 0o620), "members.json: others can write it"),
+    (mode(AUTHORITY, 0o664), "authority.pem: others can write it"),
+    (mode(CERTIFICATE, 0o646), "certificate.pem: others can write it"),
     (mode(PRIVATE_KEY, 0o640), "can be read by others: chmod 600"),
     (lambda keys: (keys / "m1" / MEMBERS).unlink(), "members.json: No such file"),
     (lambda keys: (keys / "m1" / PRIVATE_KEY).unlink(), "private.key: No such file"),
@@ -206,13 +206,13 @@ SPOILT: list[tuple[Change, str]] = [
         lambda keys: (keys / "m1" / CERTIFICATE).write_text("secret"),
         "damaged, no keys of `trilat keys new`",
     ),
-    (say(member="m2"), "the certificate is that of m1, and members.json names m2"),
+    (say(member="m2"), "the certificate is for m1, but members.json names m2"),
     (say(members=["m2", "s"]), "members.json does not list m1"),
-    (say(members=["m1", "*"]), "a member's name is at most 64 letters"),
-    (say(members=["m1", "m1"]), "every member is named once"),
-    (say(members=["m1", 7]), "a member's name is at most 64 letters"),
-    (take(CERTIFICATE, "k/m2"), "the certificate is that of m2, and members.json names m1"),
-    (take(PRIVATE_KEY, "k/m2"), "the private key is not that of the certificate"),
+    (say(members=["m1", "*"]), "a member's name has at most 64 letters"),
+    (say(members=["m1", "m1"]), "each member once"),
+    (say(members=["m1", 7]), "a member's name has at most 64 letters"),
+    (take(CERTIFICATE, "k/m2"), "the certificate is for m2, but members.json names m1"),
+    (take(PRIVATE_KEY, "k/m2"), "private key and certificate do not belong together"),
     (take(AUTHORITY, "others/m1"), "the authority has not signed this certificate"),
     (take(CERTIFICATE, "others/m1"), "the authority has not signed this certificate"),
     (whole("old"), "the certificate ended on"),
@@ -233,7 +233,7 @@ def test_keys_that_are_spoilt_are_refused(change: Change, reason: str, keys: Pat
 
 def test_the_keys_of_all_are_no_members(made: Path, tmp_path: Path) -> None:
     trilat(*RECORD, made / "k", cwd=tmp_path).refuses(
-        "holds the keys of all; name the folder of one member"
+        "has the keys of all members; name the folder of one member"
     )
 
 
@@ -261,11 +261,11 @@ NEW = [
     (["m1", "--host", "robot:7447"], "one host name or address"),
     (["m1", "--host", ""], "one host name or address"),
     (["m1", "--host", "robot.example\n"], "one host name or address"),
-    (["*"], "a member's name is at most 64 letters, digits, _ and -"),
-    (["m" * 65], "a member's name is at most 64 letters"),
-    (["authority"], "and not authority"),
-    (["../m1"], "a member's name is at most 64 letters"),
-    (["m1", "m1"], "every member is named once"),
+    (["*"], "a member's name has at most 64 letters, digits, _ and -"),
+    (["m" * 65], "a member's name has at most 64 letters"),
+    (["authority"], "and is not authority"),
+    (["../m1"], "a member's name has at most 64 letters"),
+    (["m1", "m1"], "each member once"),
 ]
 
 

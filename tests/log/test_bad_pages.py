@@ -175,7 +175,7 @@ def test_without_anything_to_save_no_file_is_made(kind: str, tmp_path: Path) -> 
         data[begin + PAGE_BYTES : begin + 2 * PAGE_BYTES] = bytes(PAGE_BYTES)
     data[8:PAGE_BYTES] = bytes(PAGE_BYTES - 8)
     (tmp_path / "zz.mcap").write_bytes(b"precious")
-    with pytest.raises(NothingSaved, match="nothing in it that could be saved") as error:
+    with pytest.raises(NothingSaved, match="nothing in this file could be saved") as error:
         recovered(bytes(data), tmp_path)
     expected = (
         "without the scenario no message can be checked"

@@ -204,7 +204,7 @@ def test_a_part_that_cannot_be_meant_is_refused(number: float) -> None:
 
 def test_to_continue_and_to_replace_at_once_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="give one of them"):
-        LogStorage(tmp_path / "run.mcap", force=True, carry_on=True).first()
+        LogStorage(tmp_path / "run.mcap", force=True, carry_on=True).find_first_part()
 
 
 def recorded_on(room: int, path: Path, messages: list[Message]) -> list[Message]:

@@ -366,7 +366,7 @@ def test_nothing_is_replaced_unasked_and_the_file_itself_never(tmp_path: Path) -
 def test_where_there_is_nothing_to_save_no_file_is_made(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "x.mcap"
     path.write_bytes(content)
-    with pytest.raises(NothingSaved, match="there is nothing in it that could be saved"):
+    with pytest.raises(NothingSaved, match="nothing in this file could be saved"):
         recover(path)
     assert list(tmp_path.iterdir()) == [path]
     with pytest.raises(LogError, match="cannot be read"):
@@ -398,7 +398,7 @@ def test_the_exit_code_says_what_came_of_it(
     for fact in told:
         assert fact in done.out
     if code == 1:
-        done.refuses("there is nothing in it that could be saved", code=1)
+        done.refuses("nothing in this file could be saved", code=1)
         return
     assert done.err == ""
     done = trilat("verify", "run.mcap", cwd=tmp_path)

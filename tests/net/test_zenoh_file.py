@@ -178,7 +178,7 @@ def test_all_keys_that_contradict_a_session_are_named_at_once() -> None:
     with pytest.raises(UsageError) as refused:
         checked(stated)
     message = str(refused.value)
-    assert message.startswith(f"{SOURCE}: {len(WRONG) + 2} settings cannot be taken: ")
+    assert message.startswith(f"{SOURCE}: {len(WRONG) + 2} settings cannot be accepted: ")
     assert [key for key in WRONG if f"{key}: " not in message] == []
     assert "root_ca_certificate: /nowhere.pem cannot be read" in message
     assert "access_control: has no `enabled: true`" in message
@@ -190,9 +190,9 @@ def test_all_keys_that_zenoh_refuses_are_named_at_once(tmp_path: Path) -> None:
     with pytest.raises(UsageError) as refused:
         read_zenoh_file(path)
     message = str(refused.value)
-    assert "4 settings cannot be taken" in message
+    assert "4 settings cannot be accepted" in message
     for part in (
-        "mod: no key of Zenoh's; did you mean mode?",
+        "mod: Zenoh has no such key; did you mean mode?",
         "connect: invalid type",
         "link/foo",
         "tx/lease",
@@ -244,11 +244,11 @@ def test_certificate_that_cannot_be_read_is_said_before_anything_begins(tmp_path
         ("{\n  mode: 'peer',\n  a: [1\n}", "line 3, column 7: no JSON5: expected"),
         ("{mode:", "line 2, column 1: no JSON5: expected"),
         ("[" * 100_000, f"no JSON5: nested deeper than {MAX_DEPTH}"),
-        ("{foo: 1}", "foo: no key of Zenoh's; there are id, metadata, mode"),
-        ("{mod: 'peer'}", r"mod: no key of Zenoh's; did you mean mode\?"),
+        ("{foo: 1}", "foo: Zenoh has no such key; there are id, metadata, mode"),
+        ("{mod: 'peer'}", r"mod: Zenoh has no such key; did you mean mode\?"),
         (
             "{transport: {link: {tls: {root_ca_cert: 'x'}, tx: {lease: 9000}}}}",
-            r"transport/link/tls/root_ca_cert: no key of Zenoh's; did you mean root_ca_certificate\?",
+            r"transport/link/tls/root_ca_cert: Zenoh has no such key; did you mean root_ca_certificate\?",
         ),
         (
             "{transport: {link: {tx: {keep_alive: 'x'}}}}",

@@ -278,7 +278,8 @@ def record_command(
         choice=parse_channel_filter(include or [], exclude or []),
         views_hz=parse_viz_rate(views),
     )
-    storage.first()  # refuses an existing file before the recorder waits for the session
+    # refuses an existing file before the recorder waits for the session
+    storage.find_first_part()
     if not os.access(path.parent, os.W_OK):
         raise UsageError(f"{path}: cannot be written: {path.parent} is not a writable folder")
     page = path.parent / "report.html"

@@ -17,6 +17,7 @@ import re
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from itertools import islice
 from typing import NamedTuple
 
 from ..errors import ScenarioError, WireError, count_nouns
@@ -52,11 +53,12 @@ class RangeSet:
     def insert(self, first: int, last: int) -> None:
         """Inserts a range of numbers that the set does not contain yet."""
         index = self._count_started(first)
-        follows_previous = index > 0 and self._ranges[index - 1][1] == first - 1
-        if follows_previous:
-            self._ranges[index - 1] = self._ranges[index - 1][0], last
-        else:
-            self._ranges.insert(index, (first, last))
+        if index > 0:
+            previous_first, previous_last = self._ranges[index - 1]
+            if previous_last == first - 1:
+                self._ranges[index - 1] = previous_first, last
+                return
+        self._ranges.insert(index, (first, last))
         del self._ranges[: -self._max_ranges]
 
     def remove(self, number: int, last: int | None = None) -> bool:
@@ -85,9 +87,9 @@ class RangeSet:
         return self._ranges[index]
 
     def find_from(self, number: int) -> tuple[int, int] | None:
-        """Returns the part at or above a number of the first range that reaches the number.
+        """Returns the first range that reaches a number, without its part below the number.
 
-        Returns None if the set has no number at or above it.
+        Returns None if the set has no number at or above that number.
         """
         index = max(0, self._count_started(number) - 1)
         for first, last in self._ranges[index : index + 2]:
@@ -97,7 +99,7 @@ class RangeSet:
 
 
 MAX_GAPS = 50_000
-"""Number of gaps that an account stores; of lower gaps it keeps the number of messages only."""
+"""Number of gaps that an account stores. Of lower gaps it counts only the messages."""
 SHOWN_GAPS = 20
 """Number of gaps that a text lists."""
 
@@ -110,8 +112,8 @@ class Account:
         duplicate: messages that arrived although their number had been received.
         reordered: messages that arrived after a message with a higher number.
         refilled: messages that were missing, and then came from the sender's memory.
-        unpublished: numbers that no message has. Their sender skipped them, or ended before
-            them and started again behind them.
+        unpublished: numbers that no message has, because the sender skipped these numbers, or
+            ended before them and started again behind them.
         last: largest number that is known to exist; -1 before the first message.
         silence_ns: the longest time between two arrivals, in ns; 0 without arrival times.
     """
@@ -124,8 +126,10 @@ class Account:
         self.unpublished = 0
         self.last = -1
         self.silence_ns = 0
-        self._abandoned_below = 0  # no member has the missing numbers below this one
-        self._newest = -1  # largest number that arrived without a request
+        # No member has the missing messages below this number.
+        self._abandoned_below = 0
+        # Largest number that arrived without a request.
+        self._newest = -1
         self._last_arrival_ns: int | None = None
         self._gaps = RangeSet(MAX_GAPS)
 
@@ -164,9 +168,9 @@ class Account:
         return is_new
 
     def add_expected(self, published: int) -> None:
-        """Adds the first `published` messages to the expected ones.
+        """Adds the first `published` messages to the expected messages.
 
-        Those that are not known yet count as missing.
+        Messages that are not known yet count as missing.
         """
         if published > self.last + 1:
             self._gaps.insert(self.last + 1, published - 1)
@@ -177,8 +181,8 @@ class Account:
 
         Args:
             first: first number of the sender's next start, or after a pause.
-            published: number of messages that exist at least; the missing ones among these
-                stay missing.
+            published: number of messages that exist at least; missing messages among them stay
+                missing.
 
         Returns:
             The lowest number that counts as never published, or `first` if there is none.
@@ -238,15 +242,11 @@ class Account:
                 from 0 as well. Their counts are added.
         """
         starts = (*before, self)
-        counts = {
-            "expected": sum(start.expected for start in starts),
-            "received": sum(start.received for start in starts),
-            "missing": sum(start.missing for start in starts),
-            "duplicate": sum(start.duplicate for start in starts),
-            "reordered": sum(start.reordered for start in starts),
-            "refilled": sum(start.refilled for start in starts),
-        }
-        text = ", ".join(f"{name} {count}" for name, count in counts.items())
+        counts = []
+        for name in ("expected", "received", "missing", "duplicate", "reordered", "refilled"):
+            total = sum(getattr(start, name) for start in starts)
+            counts.append(f"{name} {total}")
+        text = ", ".join(counts)
         text += f", largest gap {self.largest_gap}"
         gaps = self.format_gaps(SHOWN_GAPS)
         if gaps:
@@ -267,11 +267,11 @@ class Account:
             most: largest number of gaps.
             base: number of the message that this account counts as 0.
         """
-        pairs = zip(self._gaps, range(most), strict=False)
-        return [f"{base + first}-{base + last}" for (first, last), _ in pairs]
+        gaps = islice(self._gaps, most)
+        return [f"{base + first}-{base + last}" for first, last in gaps]
 
     def _add(self, number: int) -> bool:
-        """Adds a number to the received ones; returns False if it had been added before."""
+        """Adds a received number; returns False if the number had been added before."""
         if number > self.last:
             self.add_expected(number)
             self.last = number
@@ -295,10 +295,14 @@ class StartGap:
     def __init__(self, account: Account, under_way: int) -> None:
         self._account = account
         self._under_way = under_way
-        self._reported = 0  # messages that the earlier start published, as others report
-        self._first_silent = -1  # first number that never arrived
-        self._first_unpublished = -1  # first number that counts as never published
-        self._next_first = -1  # first number of the next start; -1 before it
+        # Messages that the earlier start published, as others report.
+        self._reported = 0
+        # First number that never arrived.
+        self._first_silent = -1
+        # First number that counts as never published.
+        self._first_unpublished = -1
+        # First number of the next start; -1 before the next start.
+        self._next_first = -1
 
     def begin_next_start(self, first: int, published: int) -> None:
         """Starts the next start of the sender.
@@ -364,8 +368,11 @@ class Coverage(NamedTuple):
         return min(map(self._share, self.expected), default=0.0)
 
     def _share(self, site: str) -> float:
+        """Returns the share of judged ticks of a site; 1 for a site without ticks."""
         expected = self.expected[site]
-        return min(1.0, self.judged.get(site, 0) / expected) if expected else 1.0
+        if not expected:
+            return 1.0
+        return min(1.0, self.judged.get(site, 0) / expected)
 
     def __str__(self) -> str:
         incomplete = [site for site in self.expected if self._share(site) < 1.0]
@@ -374,6 +381,7 @@ class Coverage(NamedTuple):
         return ", ".join(map(self._describe_site, incomplete))
 
     def _describe_site(self, site: str) -> str:
+        """Returns the coverage of a site as a text."""
         ticks = count_nouns(self.expected[site], "tick")
         percent = _format_percent(self._share(site))
         return f"{site} {self.judged.get(site, 0)} of {ticks} ({percent})"
@@ -396,7 +404,7 @@ def _format_percent(share: float) -> str:
 
 
 OVERRUN = "overrun"
-"""Kind of the event that lists ticks which a site skipped."""
+"""Kind of the event that lists the ticks that a site skipped."""
 LAST = "last"
 """Kind of the event that states how many ticks others received of an earlier start."""
 MAX_STARTS = 64
@@ -435,10 +443,12 @@ class SessionAccounts:
         self._accounts: dict[str, Account] = {}
         # Accounts of events by boot: every start of a member numbers its events from 0.
         self._starts: dict[str, dict[int, Account]] = {}
-        self._bases: dict[str, int] = {}  # numbers of the messages that accounts count as 0
+        # Numbers of the messages that accounts count as 0, by topic.
+        self._bases: dict[str, int] = {}
         self._start_gaps: dict[tuple[str, int], StartGap] = {}
 
     def _topic(self, member: str, channel: str) -> str:
+        """Returns the topic of a member's channel."""
         return "/" + topics.key(self._session, member, channel)
 
     def open_channel(self, topic: str) -> None:
@@ -483,8 +493,8 @@ class SessionAccounts:
             starts[event.boot] = Account() if starts else self._accounts[topic]
             self._accounts[topic] = starts[event.boot]
         account = starts.get(event.boot, self._accounts[topic])
-        is_first_start = account is next(iter(starts.values()))
-        if is_first_start:
+        first_start = next(iter(starts.values()))
+        if account is first_start:
             is_new = self.count_message(topic, number, account)
         else:
             is_new = account.receive(number)
@@ -518,7 +528,8 @@ class SessionAccounts:
 
     def _apply_overrun(self, event: Event) -> None:
         """Marks the ranges of ticks that an event lists as skipped."""
-        for first_digits, last_digits in re.findall(r"(\d{1,12})-(\d{1,12})", event.command):
+        ranges = re.findall(r"(\d{1,12})-(\d{1,12})", event.command)
+        for first_digits, last_digits in ranges:
             first = int(first_digits)
             last = int(last_digits)
             if first <= last < event.ticks:
@@ -536,10 +547,12 @@ class SessionAccounts:
         """Counts the messages of `skipped` ticks before `tick` as never published."""
         for channel in (topics.STATE, topics.LINK):
             topic = self._topic(site, channel)
-            if topic in self._accounts:
-                base = self._bases.get(topic, 0)
-                first, published = skipped_numbers(channel, tick, skipped, self._rates_hz[site])
-                self._accounts[topic].mark_unpublished(first - base, published - base)
+            account = self._accounts.get(topic)
+            if account is None:
+                continue
+            base = self._bases.get(topic, 0)
+            first, published = skipped_numbers(channel, tick, skipped, self._rates_hz[site])
+            account.mark_unpublished(first - base, published - base)
 
     def count_message(self, topic: str, number: int, account: Account | None = None) -> bool:
         """Counts a message by its number in its channel.
@@ -555,39 +568,47 @@ class SessionAccounts:
         base = self._bases.setdefault(topic, number if self._continued else 0)
         if number < base:
             return True
-        return (account or self._accounts[topic]).receive(number - base)
+        account = account or self._accounts[topic]
+        return account.receive(number - base)
 
     def _find_start_gaps(self, site: str, boot: int) -> Iterator[tuple[str, StartGap]]:
         """Yields the channels of a site, with the gap before its start `boot`."""
         for channel in (topics.STATE, topics.LINK):
             topic = self._topic(site, channel)
-            is_known = (topic, boot) in self._start_gaps
+            if topic not in self._accounts:
+                continue
+            gap = self._start_gaps.get((topic, boot))
             has_room = len(self._start_gaps) < MAX_STARTS * len(self._rates_hz)
-            if topic in self._accounts and (is_known or has_room):
+            if gap is None and has_room:
                 under_way = count_under_way(channel, self._rates_hz[site])
                 gap = StartGap(self._accounts[topic], under_way)
-                yield channel, self._start_gaps.setdefault((topic, boot), gap)
+                self._start_gaps[topic, boot] = gap
+            if gap is not None:
+                yield channel, gap
 
     def add_expected_ticks(self, site: str, ticks: int) -> None:
-        """Adds the messages of a site's first `ticks` ticks to the expected ones.
+        """Adds the messages of a site's first `ticks` ticks to the expected messages.
 
-        Those that the log lacks count as missing.
+        Messages that the log lacks count as missing.
         """
         for channel in (topics.STATE, topics.LINK):
             published = count_messages(channel, ticks, self._rates_hz[site])
             self._add_expected(site, channel, published)
 
     def _add_expected(self, member: str, channel: str, published: int) -> None:
+        """Adds the first `published` messages of a channel to the expected messages."""
         topic = self._topic(member, channel)
-        if topic in self._accounts:
-            self._accounts[topic].add_expected(published - self._bases.get(topic, 0))
+        account = self._accounts.get(topic)
+        if account is not None:
+            base = self._bases.get(topic, 0)
+            account.add_expected(published - base)
 
     def format_accounts(self) -> dict[str, str]:
         """Returns the accounts as texts, by topic, as a file stores them."""
         texts = {}
         for topic, account in self._accounts.items():
-            is_of_site = topic.split("/")[-2] in self._rates_hz
-            if not account.expected and not is_of_site:
+            member = topic.split("/")[-2]
+            if not account.expected and member not in self._rates_hz:
                 continue
             earlier_starts = list(self._starts.get(topic, {}).values())[:-1]
             base = self._bases.get(topic, 0)
@@ -602,11 +623,10 @@ class SessionAccounts:
     def list_gaps(self, topic: str) -> list[tuple[int, int]]:
         """Returns the ranges (first, last) of missing numbers of a topic."""
         base = self._bases.get(topic, 0)
-        return [
-            (base + first, base + last)
-            for account in self.list_starts(topic)
-            for first, last in account.gaps
-        ]
+        gaps = []
+        for account in self.list_starts(topic):
+            gaps += [(base + first, base + last) for first, last in account.gaps]
+        return gaps
 
     def coverage(self) -> Coverage:
         """Returns the number of records and of ticks of every site.
@@ -647,7 +667,9 @@ class SessionAccounts:
         for site in self.unknown_ends:
             topic = self._topic(site, topics.STATE)
             account = self._accounts.get(topic)
-            count = 0 if account is None else self._bases.get(topic, 0) + account.expected
+            count = 0
+            if account is not None:
+                count = self._bases.get(topic, 0) + account.expected
             if count < self._ticks[site]:
                 last = f"tick {count - 1}" if count else "none"
                 ticks = count_nouns(self._ticks[site], "tick")

@@ -6,10 +6,11 @@ sequence number and by its content. Damage that keeps all four consistent can on
 numbers inside a single message, and is shorter than that message.
 
 Invariant:
-    - A message is accepted only if the message decodes by the schema of its channel, comes from
-      the member of its channel and from the same boot as the message before, has the next
-      number of its channel, is stored with that number and with its time of sending, and was
-      logged within its chunk and not before the preceding message.
+    - An accepted message decodes by the schema of its channel.
+    - It comes from the member of its channel, and from the same boot as the message before.
+    - It has the next number of its channel, and is stored with that number and with its time
+      of sending.
+    - It was logged within its chunk, and not before the preceding message.
     - No message is accepted after the first message that fails.
     - In virtual time, the boot of every message identifies the scenario, including its seed. A
       chunk from a run of another scenario is refused even if a checksum covers the chunk.
@@ -99,8 +100,8 @@ def find_origins(data: bytes, most: int = _SAMPLED_MESSAGES) -> MessageOrigins:
 def has_foreign_boots(about: Mapping[str, str], boots: set[tuple[str, int]]) -> bool:
     """Returns True if all messages are from another session than the given one.
 
-    This can be told only in virtual time, where the boots follow from the scenario. In real
-    time, and without messages, the result is False.
+    Only in virtual time do the boots follow from the scenario. In real time, and without
+    messages, the result is False.
 
     Args:
         about: metadata of the session.
@@ -109,9 +110,8 @@ def has_foreign_boots(about: Mapping[str, str], boots: set[tuple[str, int]]) -> 
     if about.get("driver") != VIRTUAL_DRIVER:
         return False
     digest = about.get("scenario_sha256", "")
-    return bool(boots) and all(
-        boot != compute_virtual_boot(digest, sender) for sender, boot in boots
-    )
+    own_boots = [boot == compute_virtual_boot(digest, sender) for sender, boot in boots]
+    return bool(boots) and not any(own_boots)
 
 
 class ContentCheck:
@@ -208,7 +208,9 @@ class ContentCheck:
         elif self.owns_channel(topic):
             self._check_session_message(topic, sequence, publish_ns, payload)
         else:
-            raise UnreadableRecord(f"a message of {topic[:80]!r} is none of this session")
+            raise UnreadableRecord(
+                f"a message of {topic[:80]!r} belongs to no member of this session"
+            )
         self.accept(topic, sequence, log_ns, payload)
 
     def _decode(self, topic: str, payload: bytes) -> tuple[AnyMessage, MessageIdentity]:
@@ -234,11 +236,11 @@ class ContentCheck:
         member = topic.split("/")[-2]
         if identity.sender != member:
             raise UnreadableRecord(
-                f"a message of {topic} says that {identity.sender[:40]!r} sent it"
+                f"a message of {topic} names {identity.sender[:40]!r} as its sender"
             )
         boot = self._find_boot(member)
         if boot is not None and message.boot != boot:
-            raise UnreadableRecord(f"a message of {topic} is of another start of {member}")
+            raise UnreadableRecord(f"a message of {topic} is of another boot of {member}")
         if identity.sequence >= 0 and sequence != identity.sequence & 0xFFFFFFFF:
             raise UnreadableRecord(
                 f"number {identity.sequence} of {topic} is stored as {sequence}"

@@ -1,4 +1,4 @@
-"""Read a log from one file, or from several files that are parts of one session.
+"""Reading of a log from one file, or from several files that are parts of one session.
 
     log = open_log("run.mcap")
     log["m1"].t_s, log["m1"].q
@@ -118,9 +118,9 @@ class Log(Result, Mapping[str, SiteLog]):
         self._contents = contents
         self._sites: dict[str, SiteLog] = {}
         self.unreadable: list[str] = []
-        self.events = [
-            event for topic in self._event_topics() for event in self._read_events(topic)
-        ]
+        self.events: list[Event] = []
+        for topic in self._event_topics():
+            self.events += self._read_events(topic)
 
     def headline(self) -> str:
         """Returns a line on the session: its driver, sites, length and records."""
@@ -129,14 +129,18 @@ class Log(Result, Mapping[str, SiteLog]):
         except LogError:
             summary = "with records that cannot be read"
         kind = f"{self.driver} session {self.session['session']} of {', '.join(self.sites)}"
-        return f"{self.source}: {kind}; {summary}{'' if self.complete else '; not finished'}"
+        state = "" if self.complete else "; not finished"
+        return f"{self.source}: {kind}; {summary}{state}"
 
     def _describe_records(self) -> str:
+        """Returns the length of the session, and the numbers of its records, as a text."""
         last_times_s = [float(self[name].t_s[-1]) for name in self.sites if len(self[name])]
         length_s = max(last_times_s, default=0.0)
         records = sum(len(self[name]) for name in self.sites)
-        missing = sum(map(self.missing, self.sites)) or "none"
-        text = f"{length_s:.3f} s, {count_nouns(records, 'record')}, {missing} missing"
+        missing = sum(self.missing(name) for name in self.sites)
+        text = (
+            f"{length_s:.3f} s, {count_nouns(records, 'record')}, {missing or 'none'} missing"
+        )
         if self.unknown_ends:
             text += f"; {describe_unknown_ends(self.unknown_ends)}"
         if self.diverged_s is not None:
@@ -160,16 +164,17 @@ class Log(Result, Mapping[str, SiteLog]):
 
     def to_rows(self) -> list[dict[str, Any]]:
         """Returns a row per site."""
-        return [
-            {
+        rows = []
+        for name, part in self.items():
+            row = {
                 "site": name,
-                "rate_hz": self[name].rate_hz,
-                "records": len(self[name]),
+                "rate_hz": part.rate_hz,
+                "records": len(part),
                 "missing": self.missing(name),
-                "last_s": float(self[name].t_s[-1]) if len(self[name]) else None,
+                "last_s": float(part.t_s[-1]) if len(part) else None,
             }
-            for name in self.sites
-        ]
+            rows.append(row)
+        return rows
 
     def to_frame(self, name: str = "", kind: str = "") -> "pandas.DataFrame":
         """Returns a table of the log as a pandas data frame.
@@ -193,13 +198,17 @@ class Log(Result, Mapping[str, SiteLog]):
         return list(self.sites)
 
     def _topic(self, member: str, channel: str) -> str:
+        """Returns the topic of a member's channel."""
         return "/" + topics.key(self.session["session"], member, channel)
 
     def _event_topics(self) -> list[str]:
-        named = {self._topic(member, topics.EVENT) for member in (*self.sites, topics.RECORDER)}
-        return sorted(named & self._contents.channels.keys())
+        """Returns the topics of the members' events, as far as the log has them."""
+        members = (*self.sites, topics.RECORDER)
+        event_topics = {self._topic(member, topics.EVENT) for member in members}
+        return sorted(event_topics & self._contents.channels.keys())
 
     def _channel(self, topic: str) -> ChannelMessages:
+        """Returns the messages of a topic, as far as the log has them."""
         return self._contents.channels.get(topic) or ChannelMessages()
 
     def _decode(self, topic: str, kind: type[M]) -> list[M]:
@@ -211,12 +220,10 @@ class Log(Result, Mapping[str, SiteLog]):
         readable = ChannelMessages()
         problem = ""
         messages: list[M] = []
-        for payload, log_ns, publish_ns in zip(
-            channel.payloads, channel.log_ns, channel.publish_ns, strict=True
-        ):
+        for n, payload in enumerate(channel.payloads):
             try:
                 messages.append(decode(payload, kind, READABLE))
-                readable.add(payload, log_ns, publish_ns)
+                readable.add(payload, channel.log_ns[n], channel.publish_ns[n])
             except WireError as error:
                 problem = problem or str(error)
         if problem:
@@ -237,9 +244,10 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @cached_property
     def diverged_s(self) -> float | None:
-        """Time at which the first site left its limits, s, which ended the run; else None."""
+        """Time at which the first site left its limits and ended the run, in s; else None."""
         times_s = [part.diverged_s for part in self.values()]
-        return min((time_s for time_s in times_s if time_s is not None), default=None)
+        known_times_s = [time_s for time_s in times_s if time_s is not None]
+        return min(known_times_s, default=None)
 
     def warn_if_diverged(self) -> None:
         """Issues a Python warning if the run diverged.
@@ -263,9 +271,11 @@ class Log(Result, Mapping[str, SiteLog]):
         """
         if self._contents.complete or len(self.sources) == 1:
             return self._contents.complete
-        ticks = self._stated_ticks
-        lacks = any(name not in ticks or self.missing(name) for name in self.sites)
-        return self._contents.ended and not lacks
+        stated = self._stated_ticks
+        are_sites_complete = all(
+            name in stated and not self.missing(name) for name in self.sites
+        )
+        return self._contents.ended and are_sites_complete
 
     @property
     def executed_sites(self) -> tuple[str, ...]:
@@ -282,9 +292,11 @@ class Log(Result, Mapping[str, SiteLog]):
     @property
     def part(self) -> int:
         """Number of the file among the parts of a log; 0 for a whole log or several parts."""
+        if len(self.sources) > 1:
+            return 0
         number = self._contents.metadata.get(PART, {}).get("index", "0")
         is_number = number.isdecimal() and len(number) < 10
-        return int(number) if len(self.sources) == 1 and is_number else 0
+        return int(number) if is_number else 0
 
     @cached_property
     def accounts(self) -> dict[str, str]:
@@ -298,15 +310,15 @@ class Log(Result, Mapping[str, SiteLog]):
             return written
         accounts = SessionAccounts(self.session["session"], self.scenario)
         for name in self.sites:
-            sequences = {
-                self._topic(name, topics.STATE): self[name].tick.tolist(),
-                self._topic(name, topics.LINK): [stats.tick for stats in self.link_stats(name)],
-            }
-            for topic in (*sequences, self._topic(name, topics.EVENT)):
-                accounts.open_channel(topic)
-            for topic, numbers in sequences.items():
-                for number in numbers:
-                    accounts.receive(topic, number)
+            record_topic = self._topic(name, topics.STATE)
+            link_topic = self._topic(name, topics.LINK)
+            accounts.open_channel(record_topic)
+            accounts.open_channel(link_topic)
+            accounts.open_channel(self._topic(name, topics.EVENT))
+            for tick in self[name].tick.tolist():
+                accounts.receive(record_topic, tick)
+            for stats in self.link_stats(name):
+                accounts.receive(link_topic, stats.tick)
         for event in self.events:
             if event.member in self.sites and event.n >= 0:
                 accounts.receive_event(self._topic(event.member, topics.EVENT), event.n, event)
@@ -367,26 +379,30 @@ class Log(Result, Mapping[str, SiteLog]):
         return {site: self._find_absences(site, starts) for site, starts in self.starts.items()}
 
     def _find_absences(self, site: str, starts: list[tuple[int, int]]) -> list[tuple[int, int]]:
-        end_ticks = [
-            event.ticks - 1
-            for event in self.events
-            if event.kind == "end" and event.member == site
-        ]
-        executed = np.array([*self[site].tick.tolist(), *end_ticks], dtype=np.int64)
+        """Returns the absences of a site, see `absences`.
+
+        Args:
+            site: name of the site.
+            starts: its starts, as (first tick, boot).
+        """
+        end_events = [event for event in self.events if event.kind == "end"]
+        end_ticks = [event.ticks - 1 for event in end_events if event.member == site]
+        executed_ticks = [*self[site].tick.tolist(), *end_ticks]
+        executed = np.array(executed_ticks, dtype=np.int64)
         under_way = count_under_way(topics.STATE, self[site].rate_hz)
         absences: list[tuple[int, int]] = []
         for first, boot in starts:
             begin = int(executed[executed < first].max(initial=-1)) + 1
-            received_ticks = [
-                event.ticks
-                for event in self.events
-                if event.kind == LAST and event.boots.get(site) == boot
-            ]
-            known = min(first, max(received_ticks, default=0))
+            received = 0
+            for event in self.events:
+                if event.kind == LAST and event.boots.get(site) == boot:
+                    received = max(received, event.ticks)
+            received = min(first, received)
             # a few more ticks may be records that were in transit when the site was lost
-            if known - begin > under_way:
-                begin = known
-            if absences and begin == absences[-1][0]:  # the start in between had no tick
+            if received - begin > under_way:
+                begin = received
+            # the start in between had no tick
+            if absences and begin == absences[-1][0]:
                 absences.pop()
             if begin < first:
                 absences.append((begin, first - 1))
@@ -416,12 +432,13 @@ class Log(Result, Mapping[str, SiteLog]):
         return max(ticks, recorded) - self.absent_ticks(site)
 
     def _is_gone(self, site: str) -> bool:
-        """True if the last event about a site states that it was lost or left."""
+        """Returns True if the last event about a site states that the site was lost or left."""
         kinds = ("lost", "left", "back", "admit")
         events = [event for event in self.events if event.about == site and event.kind in kinds]
         if not events:
             return False
-        return max(events, key=lambda event: event.t_ns).kind in ("lost", "left")
+        last = max(events, key=lambda event: event.t_ns)
+        return last.kind in ("lost", "left")
 
     def missing(self, site: str) -> int:
         """Returns the number of missing records of a site.
@@ -441,7 +458,10 @@ class Log(Result, Mapping[str, SiteLog]):
         and of its peers are used.
         """
         stated = self._stated_ticks
-        last = {name: stated.get(name, self[name].last_tick + 1) - 1 for name in self.sites}
+        last = {}
+        for name in self.sites:
+            ticks = stated.get(name, self[name].last_tick + 1)
+            last[name] = ticks - 1
         for name in self.sites:
             peers = self[name].peers
             unknown = {index: peer for index, peer in enumerate(peers) if peer not in stated}
@@ -479,7 +499,8 @@ class Log(Result, Mapping[str, SiteLog]):
         )
         ticks = self.scenario.ticks(site)
         last = part.last_tick
-        if last >= ticks:  # a damaged tick would make counts and arrays of any size
+        # a damaged tick would make counts and arrays of any size
+        if last >= ticks:
             raise LogError(
                 f"{self.source}: {site} has a record of tick {last}; the scenario has {ticks}"
             )
@@ -488,16 +509,17 @@ class Log(Result, Mapping[str, SiteLog]):
     def changes(self, site: str) -> dict[int, list[str]]:
         """Returns the texts of the changes that a site applied, by tick, in order.
 
-        They are in its records. Changes whose record is missing are taken from its events.
+        The changes are in its records. Changes whose record is missing are taken from its
+        events.
         """
         changes = self[site].changes()
-        events = [
-            event for event in self.events if event.kind == "change" and event.member == site
-        ]
-        recorded = set(self[site].tick.tolist()) if events else set()
-        for event in events:
-            if event.ticks not in recorded:
-                changes.setdefault(event.ticks, []).append(event.command)
+        change_events = [event for event in self.events if event.kind == "change"]
+        site_events = [event for event in change_events if event.member == site]
+        if site_events:
+            recorded = set(self[site].tick.tolist())
+            for event in site_events:
+                if event.ticks not in recorded:
+                    changes.setdefault(event.ticks, []).append(event.command)
         return dict(sorted(changes.items()))
 
     def commands(self, site: str) -> dict[int, list[CoreChange]]:
@@ -509,9 +531,8 @@ class Log(Result, Mapping[str, SiteLog]):
         commands = {}
         try:
             for tick, texts in self.changes(site).items():
-                commands[tick] = [
-                    parse_core_change(self.scenario, site, text) for text in texts
-                ]
+                changes = [parse_core_change(self.scenario, site, text) for text in texts]
+                commands[tick] = changes
         except ScenarioError as error:
             raise LogError(f"{self.source}: {error}") from None
         return commands
@@ -558,9 +579,8 @@ class Log(Result, Mapping[str, SiteLog]):
         log_ns = np.concatenate(log_times)
         publish_ns = np.concatenate(publish_times)
         order = np.argsort(log_ns, kind="stable")
-        return TimedMessages(
-            [events[n] for n in order.tolist()], log_ns[order], publish_ns[order]
-        )
+        ordered_events = [events[n] for n in order.tolist()]
+        return TimedMessages(ordered_events, log_ns[order], publish_ns[order])
 
     def recorder_stats(self) -> list[RecorderStats]:
         """Returns the statistics of the recorder, in order."""
@@ -627,9 +647,9 @@ def open_log(
         more: further parts.
         progress: called now and then with the number of bytes read and their total.
         law: files of control laws that the log names and that may run when the log is executed,
-            see docs/code-that-runs.md. Laws of runs of this process may run without that.
-        other_version: whether these files may have another hash than the log names.
-        remember: whether these laws may also run for other logs that name their hashes, with
+            see docs/code-that-runs.md. Laws of runs of this process need no permission.
+        other_version: True if these files may have another hash than the log names.
+        remember: True if these laws may also run for other logs that name their hashes, with
             the same settings.
 
     Raises:
@@ -665,6 +685,7 @@ def open_logs(*sources: str | Path, progress: Progress | None = None) -> list[Lo
 def _read_parts(
     sources: Sequence[str | Path | BinaryIO], progress: Progress | None
 ) -> list[LogContents]:
+    """Returns the contents of files; reports the progress over all files together."""
     files: list[tuple[BinaryIO, str]] = []
     parts: list[LogContents] = []
     with ExitStack() as stack:
@@ -680,10 +701,12 @@ def _read_parts(
                     f"a log is a path, or a file opened for reading, not {source!r:.80}"
                 )
         sizes = [_measure_size(stream) for stream, _ in files]
-        for n, (stream, name) in enumerate(files):
+        start = 0
+        for (stream, name), size in zip(files, sizes, strict=True):
             with _convert_errors(name):
-                shifted = shift_progress(progress, sum(sizes[:n]), sum(sizes))
+                shifted = shift_progress(progress, start, sum(sizes))
                 parts.append(read_contents(stream, name, shifted))
+            start += size
     return parts
 
 
@@ -711,9 +734,8 @@ def read_link_delays(path: Path, link: str) -> list[TracePoint]:
 
     These are the delays of the network, as the receiver's records have them in `rx`, without
     the delays that the scenario injected. A negative delay is an error of the clocks and counts
-    as
-    0. If a sample arrived twice, the shorter delay counts. A sample was sent if the sender has
-    a record of its tick; a lost sample has an infinite delay.
+    as 0. If a sample arrived twice, the shorter delay counts. A sample was sent if the sender
+    has a record of its tick; a lost sample has an infinite delay.
 
     Args:
         path: the log.
@@ -729,7 +751,7 @@ def read_link_delays(path: Path, link: str) -> list[TracePoint]:
         hint = suggest_nearest(link, list(links)) or "."
         raise ValueError(f"has no link {link!r}{hint} Its links are {', '.join(links)}")
     if not links[link]:
-        raise ValueError(f"nothing came over {link} in it")
+        raise ValueError(f"no sample arrived over {link}")
     return links[link]
 
 
@@ -765,7 +787,8 @@ def _iterate_delays(log: Log, site: str, index: int, peer: str) -> Iterator[Trac
     for state in states:
         for sender, tick, delay_us in state.rx:
             if sender == index and tick >= 0:
-                delays_us[tick] = min(delays_us.get(tick, MAX_DELAY_US), max(delay_us, 0))
+                earlier_us = delays_us.get(tick, MAX_DELAY_US)
+                delays_us[tick] = min(earlier_us, max(delay_us, 0))
     if not delays_us:
         return
     longest_ns = 1000 * max(delays_us.values())
@@ -776,14 +799,13 @@ def _iterate_delays(log: Log, site: str, index: int, peer: str) -> Iterator[Trac
     ticks = {*sent, *delays_us} if sent else range(max(delays_us) + 1)
     for tick in sorted(ticks):
         stamp_ns = tick * NS_PER_S // rate_hz
-        stamp_s = stamp_ns // 1000 / 1e6  # whole microseconds, as the core counts
+        # whole microseconds, as the core counts
+        stamp_s = stamp_ns // 1000 / 1e6
         if tick in delays_us:
             yield stamp_s, delays_us[tick] / 1e3
             continue
-        may_be_unseen = any(
-            stamp_ns <= end_ns and stamp_ns + longest_ns >= start_ns
-            for start_ns, end_ns in gaps
-        )
+        latest_ns = stamp_ns + longest_ns
+        may_be_unseen = any(stamp_ns <= end and latest_ns >= start for start, end in gaps)
         if not may_be_unseen:
             yield stamp_s, math.inf
 
@@ -794,11 +816,13 @@ def _find_gaps_ns(states: Sequence[State]) -> list[tuple[int, float]]:
     Records are missing in these times: between records, before the first record, and after the
     last record.
     """
-    gaps: list[tuple[int, float]] = [
-        (before.t_ns, after.t_ns)
-        for before, after in pairwise(states)
-        if after.tick != before.tick + 1
-    ]
-    if states and states[0].tick > 0:
+    if not states:
+        return [(0, math.inf)]
+    gaps: list[tuple[int, float]] = []
+    for before, after in pairwise(states):
+        if after.tick != before.tick + 1:
+            gaps.append((before.t_ns, after.t_ns))
+    if states[0].tick > 0:
         gaps.append((0, states[0].t_ns))
-    return [*gaps, (states[-1].t_ns if states else 0, math.inf)]
+    gaps.append((states[-1].t_ns, math.inf))
+    return gaps

@@ -87,9 +87,8 @@ class LogWriter:
             self._views.receivers if self._views else {}
         )
         self._last_log_ns = 0
-        self._file = McapWriter(
-            stream, f"trilat-net {log_layout.collect_provenance()['version_trilat-net']}"
-        )
+        provenance = log_layout.collect_provenance()
+        self._file = McapWriter(stream, f"trilat-net {provenance['version_trilat-net']}")
         self._view_channels = StandardChannels(
             self._file, self._views.channels if self._views else {}
         )
@@ -104,7 +103,7 @@ class LogWriter:
             "epoch_unix_ns": str(epoch_unix_ns),
             DIGESTS_KEY: ALGORITHM,
         }
-        about |= {**log_layout.collect_provenance(), **choice.facts(), **(facts or {})}
+        about |= {**provenance, **choice.facts(), **(facts or {})}
         with self._translate_disk_errors():
             self._file.add_metadata(log_layout.SESSION, about)
             if part:
@@ -216,6 +215,7 @@ class LogWriter:
             raise self._end_with_error(error) from None
 
     def _add_view_message(self, topic: str, data: bytes, publish_ns: int, log_ns: int) -> None:
+        """Writes a message of a channel for viewers."""
         publish_ns = min(publish_ns, log_layout.MAX_TIME_NS)
         self._file.add_message(self._view_channels[topic], log_ns, data, publish_ns)
 
@@ -267,7 +267,7 @@ class LogWriter:
 
     def _end_with_error(self, error: OSError) -> LogRefused:
         """Ends the log after a failed write; returns the error to raise."""
-        text = f"the log cannot be written: {error.strerror}; what was flushed before is intact"
+        text = f"the log cannot be written: {error.strerror}; flushed messages are intact"
         self._end_reason = self._end_reason or text
         return LogRefused(text)
 
@@ -312,7 +312,7 @@ class LogStorage:
         """True if the log has parts from the start."""
         return self.split_bytes is not None or self.split_ns is not None
 
-    def first(self) -> tuple[int, str]:
+    def find_first_part(self) -> tuple[int, str]:
         """Finds the first part to write.
 
         Returns:
@@ -336,7 +336,7 @@ class LogStorage:
         )
         if self.splits and parts and not self.force:
             raise UsageError(
-                f"{parts[max(parts)]}: exists; choose another name, carry on behind it with "
+                f"{parts[max(parts)]}: exists; choose another name, continue the log with "
                 "--continue, or replace it with --force"
             )
         return int(self.splits), ""
@@ -390,7 +390,7 @@ class LogParts:
         self.current_accounts: Callable[[], Mapping[str, str]] = dict
         self._storage = storage
         self._begin_writer = begin
-        self._number, self._previous = storage.first()
+        self._number, self._previous = storage.find_first_part()
         self._previous_digest = ""
         # Remaining parts of a replaced log would seem to belong to the new log.
         if storage.force and storage.splits:

@@ -1,9 +1,9 @@
 """Writer of MCAP files.
 
-Messages go into chunks, chunks into a stream, and an index to the end of the file. The writer
-`mcap.writer.Writer` is not used: it keeps a dictionary for every chunk, which takes 46 MiB an
-hour at ten chunks a second with twelve channels, and needs three times as long. The tests read
-the files of this writer with that package.
+Messages go into chunks, chunks into a stream, and an index to the end of the file. The package
+`mcap` has a writer as well, but that writer keeps a dictionary for every chunk, which takes
+46 MiB an hour at ten chunks a second with twelve channels, and needs three times as long. The
+tests read the files of this writer with that package.
 
 Invariant:
     - The same calls give the same bytes.
@@ -65,13 +65,23 @@ def pack_text(text: str) -> bytes:
     """Returns a text in the form of a record: its length, then its bytes in UTF-8."""
     # The name of a file may contain surrogates, which UTF-8 cannot encode.
     data = text.encode(errors="backslashreplace")
-    return struct.pack("<I", len(data)) + data
+    return _pack_bytes(data)
 
 
 def pack_text_map(texts: Mapping[str, str]) -> bytes:
     """Returns a map of texts in the form of a record."""
     data = b"".join(pack_text(key) + pack_text(value) for key, value in texts.items())
+    return _pack_bytes(data)
+
+
+def _pack_bytes(data: bytes) -> bytes:
+    """Returns bytes behind their number in 32 bits."""
     return struct.pack("<I", len(data)) + data
+
+
+def _pack_long_bytes(data: bytes) -> bytes:
+    """Returns bytes behind their number in 64 bits."""
+    return struct.pack("<Q", len(data)) + data
 
 
 def pack_record(opcode: int, body: bytes) -> bytes:
@@ -105,10 +115,13 @@ class McapWriter:
         self._open_chunk = bytearray()
         # Index of the open chunk: per channel log time, offset, log time, offset, ...
         self._entries: dict[int, list[int]] = {}
-        self._counts: dict[int, int] = {}  # messages per channel
-        self._span_ns: tuple[int, int] | None = None  # first and last log time of all chunks
+        # Number of messages per channel.
+        self._counts: dict[int, int] = {}
+        # First and last log time of all chunks.
+        self._span_ns: tuple[int, int] | None = None
+        # Records of the summary and their numbers, by kind.
         self._summary = {opcode: bytearray() for opcode in _SUMMARY}
-        self._summary_counts: Counter[Opcode] = Counter()  # records of the summary, by kind
+        self._summary_counts: Counter[Opcode] = Counter()
         self._chain = RunningDigest()
         header = pack_text(profile) + pack_text(library)
         self._chain.add_entry(Opcode.HEADER, header)
@@ -142,7 +155,8 @@ class McapWriter:
         messages = self.messages - self._chain.messages
         index_bytes = 16 * messages + 25 * len(self._entries) + 200
         # Zstandard may expand data that it cannot compress, by less than 1/128.
-        return len(self._open_chunk) + len(self._open_chunk) // 128 + index_bytes
+        data_bytes = len(self._open_chunk) + len(self._open_chunk) // 128
+        return data_bytes + index_bytes
 
     @property
     def duration_s(self) -> float:
@@ -154,7 +168,7 @@ class McapWriter:
         """Writes a schema, and returns its number."""
         number = self._summary_counts[Opcode.SCHEMA] + 1
         body = struct.pack("<H", number) + pack_text(name) + pack_text(encoding)
-        body += struct.pack("<I", len(data)) + data
+        body += _pack_bytes(data)
         self._chain.add_entry(Opcode.SCHEMA, body)
         self._write(self._add_to_summary(Opcode.SCHEMA, body))
         return number
@@ -175,11 +189,8 @@ class McapWriter:
             metadata: metadata of the channel.
         """
         number = len(self._counts) + 1
-        body = (
-            struct.pack("<HH", number, schema_id)
-            + pack_text(topic)
-            + pack_text(message_encoding)
-        )
+        body = struct.pack("<HH", number, schema_id)
+        body += pack_text(topic) + pack_text(message_encoding)
         body += pack_text_map(metadata or {})
         self._chain.add_entry(Opcode.CHANNEL, body)
         self._write(self._add_to_summary(Opcode.CHANNEL, body))
@@ -226,11 +237,12 @@ class McapWriter:
         """Writes an attachment, before the open chunk; times are in ns, 0 if unknown."""
         times = struct.pack("<QQ", log_time, create_time)
         names = pack_text(name) + pack_text(media_type)
-        body = times + names + struct.pack("<Q", len(data)) + data
+        body = times + names + _pack_long_bytes(data)
         body += struct.pack("<I", zlib.crc32(body))
         self._chain.add_entry(Opcode.ATTACHMENT, body)
         record = pack_record(Opcode.ATTACHMENT, body)
-        extent = struct.pack("<QQ", self._write(record), len(record))
+        offset = self._write(record)
+        extent = struct.pack("<QQ", offset, len(record))
         index = extent + times + struct.pack("<Q", len(data)) + names
         self._add_to_summary(Opcode.ATTACHMENT_INDEX, index)
 
@@ -255,12 +267,13 @@ class McapWriter:
         self._chain.add_records(self._open_chunk, self.messages - self._chain.messages)
         data = self._compressor.compress(self._open_chunk)
         used = {channel: entries for channel, entries in self._entries.items() if entries}
+        # every other entry is a log time
         start_ns = min(min(entries[::2]) for entries in used.values())
         end_ns = max(max(entries[::2]) for entries in used.values())
         unpacked_bytes = len(self._open_chunk)
         crc = zlib.crc32(self._open_chunk)
         head = _CHUNK.pack(start_ns, end_ns, unpacked_bytes, crc) + pack_text(_COMPRESSION)
-        record = pack_record(Opcode.CHUNK, head + struct.pack("<Q", len(data)) + data)
+        record = pack_record(Opcode.CHUNK, head + _pack_long_bytes(data))
         chunk_offset = self._write(record)
         index_start = self.position
         index_offsets = b""
@@ -271,7 +284,7 @@ class McapWriter:
             self._entries[channel] = []
         # The fields of a chunk index in their order; see the specification of MCAP.
         index = struct.pack("<QQQQ", start_ns, end_ns, chunk_offset, len(record))
-        index += struct.pack("<I", len(index_offsets)) + index_offsets
+        index += _pack_bytes(index_offsets)
         index += struct.pack("<Q", self.position - index_start) + pack_text(_COMPRESSION)
         index += struct.pack("<QQ", len(data), unpacked_bytes)
         self._add_to_summary(Opcode.CHUNK_INDEX, index)
@@ -315,9 +328,8 @@ class McapWriter:
             first_ns,
             last_ns,
         )
-        counts = b"".join(
-            struct.pack("<HQ", channel, count)
-            for channel, count in self._counts.items()
-            if count
-        )
-        return head + struct.pack("<I", len(counts)) + counts
+        counts = b""
+        for channel, count in self._counts.items():
+            if count:
+                counts += struct.pack("<HQ", channel, count)
+        return head + _pack_bytes(counts)

@@ -13,7 +13,6 @@ from bisect import bisect_right
 from collections import Counter
 from collections.abc import Hashable, Sequence
 from contextlib import suppress
-from itertools import chain
 from typing import Any
 
 from ..errors import LogError, WireError
@@ -47,22 +46,22 @@ def merge_parts(parts: Sequence[LogContents]) -> LogContents:
     first = ordered[0]
     last = ordered[-1]
     _check_digests(parts)
+    damaged = [damage for part in ordered for damage in part.damaged]
     topic_names = dict.fromkeys(topic for part in ordered for topic in part.channels)
-    all_whole = all(part.ended and not part.damaged for part in parts)
-    indices = sorted(map(_part_index, parts))
+    all_ended = all(part.ended for part in parts)
+    all_present = sorted(map(_part_index, parts)) == [*range(1, len(parts) + 1)]
     states = list(DigestState)  # from best to worst
-    worst_chain = max(
-        (part.chain for part in parts), key=lambda chain: states.index(chain.state)
-    )
+    chains = [part.chain for part in parts]
+    worst_chain = max(chains, key=lambda chain: states.index(chain.state))
     return LogContents(
         sources=tuple(part.source for part in ordered),
         session=first.session,
         scenario=first.scenario,
         metadata={**first.metadata, ACCOUNTS: _sum_other_counts(ordered)},
         channels={topic: _merge_channel(topic, ordered) for topic in topic_names},
-        complete=all_whole and indices == [*range(1, len(parts) + 1)],
+        complete=all_ended and not damaged and all_present,
         ended=last.ended,
-        damaged=[damage for part in ordered for damage in part.damaged],
+        damaged=damaged,
         chain=worst_chain,
     )
 
@@ -87,9 +86,11 @@ def _check_digests(parts: Sequence[LogContents]) -> None:
     for part in parts:
         stated = part.metadata.get(PART, {}).get(PREVIOUS_DIGEST_KEY)
         before = finished.get(_part_index(part) - 1)
-        if stated and before is not None and before.metadata[DIGESTS].get("records") != stated:
+        if not stated or before is None:
+            continue
+        if before.metadata[DIGESTS].get("records") != stated:
             raise LogError(
-                f"{part.source}: does not follow {before.source}: that file was another one"
+                f"{part.source}: does not follow {before.source}: it followed another file"
             )
 
 
@@ -115,9 +116,10 @@ def _sum_other_counts(parts: Sequence[LogContents]) -> dict[str, str]:
         recorder = _recorder_boot(part) or part.source
         last_counts[recorder] = part.metadata.get(ACCOUNTS, {})
     sums: Counter[str] = Counter()
-    for name, count in chain.from_iterable(counts.items() for counts in last_counts.values()):
-        if not name.startswith("/") and count.isdecimal():
-            sums[name] += int(count)
+    for counts in last_counts.values():
+        for name, count in counts.items():
+            if not name.startswith("/") and count.isdecimal():
+                sums[name] += int(count)
     return {name: str(count) for name, count in sums.items()}
 
 
@@ -140,11 +142,10 @@ def _recorder_boot(part: LogContents) -> int:
 
 def identify_session(part: LogContents) -> dict[str, str]:
     """Returns the facts that all parts of a session share, and that identify the session."""
-    facts = {
-        name: part.session.get(name, "unknown")
-        for name in ("session", "driver", "epoch_unix_ns")
-    }
-    return {**facts, "scenario": hashlib.sha256(part.scenario).hexdigest()[:16]}
+    names = ("session", "driver", "epoch_unix_ns")
+    facts = {name: part.session.get(name, "unknown") for name in names}
+    facts["scenario"] = hashlib.sha256(part.scenario).hexdigest()[:16]
+    return facts
 
 
 def _merge_channel(topic: str, parts: Sequence[LogContents]) -> ChannelMessages:
@@ -153,8 +154,10 @@ def _merge_channel(topic: str, parts: Sequence[LogContents]) -> ChannelMessages:
     if len(topic_parts) == 1:
         return topic_parts[0].channels[topic]
     merged = ChannelMessages()
-    merged_indices: dict[Hashable, int] = {}  # index of each message in `merged`, by its key
-    part_ends: list[int] = []  # number of merged messages after each part
+    # Index of each message in `merged`, by its key.
+    merged_indices: dict[Hashable, int] = {}
+    # Number of merged messages after each part.
+    part_ends: list[int] = []
     for part in topic_parts:
         channel = part.channels[topic]
         # Messages are compared with earlier parts only: a part may repeat its own messages.
@@ -167,9 +170,9 @@ def _merge_channel(topic: str, parts: Sequence[LogContents]) -> ChannelMessages:
                 merged.add(payload, channel.log_ns[number], channel.publish_ns[number])
             elif merged.payloads[index] != payload:
                 other = topic_parts[bisect_right(part_ends, index)]
+                message = _describe_message(topic, key)
                 raise LogError(
-                    f"{other.source} and {part.source} differ: "
-                    f"{_describe_message(topic, key)} is not the same"
+                    f"{other.source} and {part.source} differ: {message} is not the same"
                 )
         merged_indices |= new_indices
         part_ends.append(len(merged.payloads))
@@ -192,14 +195,13 @@ def _list_keys(topic: str, channel: ChannelMessages, source: str) -> Sequence[Ha
                 return [decode(payload, LinkStats, READABLE).tick for payload in payloads]
             case topics.EVENT:
                 events = [decode(payload, Event, READABLE) for payload in payloads]
-                # Events have no number before version 3; then their content is the key.
-                keys = zip(events, payloads, strict=True)
-                return [
-                    (event.boot, event.n) if event.n >= 0 else payload
-                    for event, payload in keys
-                ]
-        stats = (decode(payload, RecorderStats, READABLE) for payload in payloads)
-        return [(statistics.boot, statistics.t_ns) for statistics in stats]
+                keys: list[Hashable] = []
+                for event, payload in zip(events, payloads, strict=True):
+                    # Events have no number before version 3; then their content is the key.
+                    keys.append((event.boot, event.n) if event.n >= 0 else payload)
+                return keys
+        statistics = [decode(payload, RecorderStats, READABLE) for payload in payloads]
+        return [(message.boot, message.t_ns) for message in statistics]
     except WireError as error:
         raise LogError(f"{source}: a message on {topic} cannot be read: {error}") from None
 

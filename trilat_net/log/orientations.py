@@ -1,10 +1,10 @@
-"""Convert orientations to time series without jumps: unit quaternions, or six numbers.
+"""Orientations as time series without jumps: unit quaternions, or six numbers.
 
-A record has an orientation as a rotation vector, axis times angle, at most half a turn long.
-This vector jumps by a whole turn where the angle passes half a turn, as for a tool that points
-down, although the orientation does not jump. Near half a turn the vector moves up to pi / 2
-times as far as the orientation, and no choice of branches is continuous for every motion of
-several turns. Time series that leave the program therefore have one of these forms:
+A record stores an orientation as a rotation vector, axis times angle, at most half a turn long.
+When the angle passes half a turn, as for a tool that points down, the vector jumps by a whole
+turn, although the orientation does not jump. Near half a turn the vector moves up to pi / 2
+times as far as the orientation. No choice of branches is continuous for every motion of several
+turns. Time series that leave the program therefore have one of these forms:
 
 - Unit quaternions w, x, y, z. Each quaternion is nearest to the quaternion before, and the
   first has w >= 0. A turn by a small angle moves the quaternion by half of that angle.
@@ -48,7 +48,10 @@ def compute_quaternion_parts(turns: Array) -> tuple[Array, Array]:
         w, shape (K, 1), and (x, y, z), shape (K, 3).
     """
     angle = np.linalg.norm(turns, axis=1, keepdims=True)
-    return np.cos(0.5 * angle), 0.5 * np.sinc(angle / (2.0 * np.pi)) * turns
+    w = np.cos(0.5 * angle)
+    # sin(a / 2) / a, also for a = 0: sinc(x) = sin(pi x) / (pi x)
+    sine_by_angle = 0.5 * np.sinc(angle / (2.0 * np.pi))
+    return w, sine_by_angle * turns
 
 
 def compute_quaternions(turns: Array) -> Array:
@@ -57,7 +60,8 @@ def compute_quaternions(turns: Array) -> Array:
     Args:
         turns: rotation vectors, shape (K, 3), rad.
     """
-    return align_signs(np.hstack(compute_quaternion_parts(turns)))
+    w, v = compute_quaternion_parts(turns)
+    return align_signs(np.hstack([w, v]))
 
 
 def align_signs(quaternions: Array) -> Array:
@@ -67,7 +71,8 @@ def align_signs(quaternions: Array) -> Array:
         quaternions: the quaternions, shape (K, 4), in order of time.
     """
     dots = np.einsum("ki,ki->k", quaternions[1:], quaternions[:-1])
-    signs = np.cumprod(np.where(dots < 0.0, -1.0, 1.0))
+    changes = np.where(dots < 0.0, -1.0, 1.0)
+    signs = np.cumprod(changes)
     aligned = quaternions.copy()
     aligned[1:] *= signs[:, np.newaxis]
     return aligned
@@ -84,17 +89,20 @@ def compute_matrix_columns(turns: Array) -> Array:
     """
     rows = np.reshape(turns, (-1, 3))
     w, v = compute_quaternion_parts(rows)
-    double = 2.0 * v
     # twice the products of the components of the quaternion
+    double = 2.0 * v
     wx, wy, wz = (w * double).T
     xx, yy, zz = (v * double).T
-    xy = 2.0 * v[:, 0] * v[:, 1]
-    xz = 2.0 * v[:, 0] * v[:, 2]
-    yz = 2.0 * v[:, 1] * v[:, 2]
+    double_x, double_y, _ = double.T
+    _, y, z = v.T
+    xy = double_x * y
+    xz = double_x * z
+    yz = double_y * z
     first_column = [1.0 - yy - zz, xy + wz, xz - wy]
     second_column = [xy - wz, 1.0 - xx - zz, yz + wx]
     columns = np.stack([*first_column, *second_column], axis=1)
-    return columns.reshape(*np.shape(turns)[:-1], len(MATRIX_ENTRIES))
+    shape = np.shape(turns)[:-1]
+    return columns.reshape(*shape, len(MATRIX_ENTRIES))
 
 
 def expand_poses(x: Array) -> Array:
@@ -118,9 +126,9 @@ def expand_poses(x: Array) -> Array:
     """
     if x.shape[-1] != POSE:
         return x
-    return np.concatenate(
-        [x[..., :POSITION], compute_matrix_columns(x[..., POSITION:])], axis=-1
-    )
+    positions = x[..., :POSITION]
+    orientations = compute_matrix_columns(x[..., POSITION:])
+    return np.concatenate([positions, orientations], axis=-1)
 
 
 def choose_nearest_vectors(turns: Array, references: Array) -> Array:
@@ -136,14 +144,15 @@ def choose_nearest_vectors(turns: Array, references: Array) -> Array:
     angle = np.linalg.norm(turns, axis=1, keepdims=True)
     axis = np.divide(turns, angle, out=np.zeros_like(turns), where=angle > 0.0)
     projection = np.einsum("ki,ki->k", axis, references)[:, np.newaxis]
-    whole_turns = np.round((projection - angle) / (2.0 * np.pi))
-    return np.asarray(turns + 2.0 * np.pi * whole_turns * axis)
+    turn_counts = np.round((projection - angle) / (2.0 * np.pi))
+    whole_turns = 2.0 * np.pi * turn_counts * axis
+    return np.asarray(turns + whole_turns)
 
 
 def compute_continuous_vectors(turns: Array) -> Array:
     """Returns rotation vectors of the same rotations without jumps at half a turn.
 
-    They may be up to a whole turn long, and jump there.
+    The vectors may be up to a whole turn long, and jump at a whole turn.
 
     Args:
         turns: rotation vectors, shape (K, 3), rad, in order of time.
@@ -152,14 +161,15 @@ def compute_continuous_vectors(turns: Array) -> Array:
     w = quaternions[:, :1]
     v = quaternions[:, 1:]
     sine = np.linalg.norm(v, axis=1, keepdims=True)
-    angle_by_sine = np.divide(
-        2.0 * np.arctan2(sine, w), sine, out=np.full_like(w, 2.0), where=sine > 0.0
-    )
+    angle = 2.0 * np.arctan2(sine, w)
+    # the limit of angle / sine for small angles is 2
+    limit = np.full_like(w, 2.0)
+    angle_by_sine = np.divide(angle, sine, out=limit, where=sine > 0.0)
     return np.asarray(angle_by_sine * v)
 
 
 class QuaternionSigns:
-    """Chooses the signs of the quaternions of a stream.
+    """Choice of the signs of the quaternions of a stream.
 
     Each quaternion is nearest to the quaternion before, and the first has w >= 0.
 

@@ -1,4 +1,4 @@
-"""Decode fields of many records into arrays.
+"""Fields of many records, decoded into arrays.
 
 Every function raises `WireError` for the first payload that is not a valid record.
 
@@ -33,7 +33,7 @@ _TYPES: dict[str, Any] = {
     "mode": _MODE,
     "rx": list[Stamp],
 }
-"""Types of fields that are narrower here than in `State`, where any value is decoded."""
+"""Types of fields that `State` declares more widely, for the check of their values."""
 _DEFAULTS = {"sent_ns": 0}
 """Values of fields that records of older versions do not have."""
 
@@ -45,10 +45,11 @@ def decode_ticks(payloads: Sequence[bytes]) -> Ints:
     """
     if any(len(payload) > MAX_BYTES for payload in payloads):
         raise _find_error(payloads)
-    versions_and_ticks = decode_ints(payloads, "v", "tick").reshape(-1, 2)
-    if not np.isin(versions_and_ticks[:, 0], READABLE).all():
+    rows = decode_ints(payloads, "v", "tick").reshape(-1, 2)
+    versions = rows[:, 0]
+    if not np.isin(versions, READABLE).all():
         raise _find_error(payloads)
-    return versions_and_ticks[:, 1].copy()
+    return rows[:, 1].copy()
 
 
 def decode_ints(payloads: Sequence[bytes], *fields: str) -> Ints:
@@ -57,7 +58,8 @@ def decode_ints(payloads: Sequence[bytes], *fields: str) -> Ints:
     The values of one record follow each other, in the order of `fields`.
     """
     values = _decode_fields(payloads, *fields)
-    if len(fields) > 1:  # each value is a tuple with one number per field
+    if len(fields) > 1:
+        # each value is a tuple with one number per field
         values = chain.from_iterable(values)
     return _to_array(payloads, values, np.int64, len(fields) * len(payloads))
 
@@ -76,12 +78,14 @@ def decode_vectors(payloads: Sequence[bytes], layout: Layout, *fields: str) -> d
     """
     lengths = layout.lengths()
     present = [field for field in fields if field in lengths]
-    vectors = {field: np.zeros((len(payloads), 0)) for field in fields if field not in lengths}
+    absent = [field for field in fields if field not in lengths]
+    vectors = {field: np.zeros((len(payloads), 0)) for field in absent}
     if not present:
         return vectors
     row_length = sum(lengths[field] for field in present)
     values = chain.from_iterable(_decode_fields(payloads, *present, layout=layout))
-    if len(present) > 1:  # each value is a vector of one field
+    if len(present) > 1:
+        # each value is a vector of one field
         values = chain.from_iterable(values)
     numbers: Array = _to_array(
         payloads=payloads,
@@ -106,7 +110,8 @@ def decode_vectors(payloads: Sequence[bytes], layout: Layout, *fields: str) -> d
 
 def decode_strings(payloads: Sequence[bytes], field: str) -> NDArray[np.object_]:
     """Returns a field of every record as an array of objects, such as strings, shape (K,)."""
-    return _to_array(payloads, _decode_fields(payloads, field), np.object_, len(payloads))
+    values = _decode_fields(payloads, field)
+    return _to_array(payloads, values, np.object_, len(payloads))
 
 
 def decode_per_peer(
@@ -123,8 +128,8 @@ def decode_per_peer(
     Returns:
         Per peer the integers of all records, shape (K,).
     """
-    # a struct with an attribute per peer decodes faster than a dict; names of peers need not be
-    # identifiers, so the attributes have names of their own
+    # A struct with an attribute per peer decodes faster than a dict. The name of a peer may be
+    # no identifier, so the attributes have names of their own.
     attributes = [f"peer{n}" for n in range(len(peers))]
     peer_struct = msgspec.defstruct(
         "Peers",
@@ -133,9 +138,12 @@ def decode_per_peer(
         gc=False,
     )
     decoder = _make_decoder({field: peer_struct})
-    get_numbers = attrgetter(*(f"{field}.{attribute}" for attribute in attributes))
-    values: Iterator[Any] = map(get_numbers, map(decoder.decode, payloads))
-    if len(peers) > 1:  # each value is a tuple with one number per peer
+    paths = [f"{field}.{attribute}" for attribute in attributes]
+    get_numbers = attrgetter(*paths)
+    records = map(decoder.decode, payloads)
+    values: Iterator[Any] = map(get_numbers, records)
+    if len(peers) > 1:
+        # each value is a tuple with one number per peer
         values = chain.from_iterable(values)
     numbers = _to_array(payloads, values, np.int64, len(peers) * len(payloads))
     rows = numbers.reshape(-1, len(peers))
@@ -167,7 +175,8 @@ def _decode_fields(
     """Yields the value of a field of every record; of several fields a tuple of values."""
     get_values: Callable[[Any], Any] = attrgetter(*fields)
     decoder = _find_decoder(fields, layout)
-    return map(get_values, map(decoder.decode, payloads))
+    records = map(decoder.decode, payloads)
+    return map(get_values, records)
 
 
 @cache
@@ -191,7 +200,8 @@ def _make_decoder(types: dict[str, Any]) -> msgspec.msgpack.Decoder[Any]:
             fields.append((name, kind, _DEFAULTS[name]))
         else:
             fields.append((name, kind))
-    return msgspec.msgpack.Decoder(msgspec.defstruct("Fields", fields, frozen=True, gc=False))
+    struct = msgspec.defstruct("Fields", fields, frozen=True, gc=False)
+    return msgspec.msgpack.Decoder(struct)
 
 
 def _to_array(

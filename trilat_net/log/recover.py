@@ -54,7 +54,8 @@ from .running_digest import DIGESTS, RECOVERED, DigestState
 from .torn_chunk import TornChunk
 
 _UNOPENED = "other MCAP programs open the new file, commands of trilat-net do not"
-_UNPROVEN = "without a checksum, and without the scenario no message can be checked"
+_UNPROVEN = "has no checksum, and the log has no scenario by which to check messages"
+_NO_SCENARIO = "the log has no scenario, without which no message can be checked"
 _MAX_REASONS = 3
 """Number of losses that the error message names if nothing can be saved."""
 MAX_LISTED_LOSSES = 20
@@ -193,7 +194,7 @@ def recover(
         raise UsageError(f"{output}: is a directory; name a file with -o")
     if output.exists() and path.exists() and output.samefile(path):
         raise UsageError(
-            f"{output}: is the file itself, which is not touched; choose another name with -o"
+            f"{output}: is the source file, which is never changed; choose another name with -o"
         )
     try:
         with open_regular(path) as stream:
@@ -209,11 +210,12 @@ def recover(
 def _recover(
     stream: BinaryIO, result: Recovery, force: bool, progress: Progress | None
 ) -> Recovery:
+    """Recovers an open source file, and completes its result; see `recover`."""
     reader = McapReader(stream, str(result.path), progress, kept=False)
     survey = RecoverySurvey(reader.scanner)
     if survey.why_empty:
         raise NothingSaved(
-            f"{result.path}: there is nothing in it that could be saved: {survey.why_empty}"
+            f"{result.path}: nothing in this file could be saved: {survey.why_empty}"
         )
     restored = _restore_scenario(survey, result.path)
     working = result.output.with_name(result.output.name + ".recovering")
@@ -352,7 +354,7 @@ class _FileCopy:
             losses = [text for text in self._result.lost if _UNOPENED not in text]
             reasons = "; ".join(losses[:_MAX_REASONS])
             raise NothingSaved(
-                f"{self._result.path}: there is nothing in it that could be saved: {reasons}"
+                f"{self._result.path}: nothing in this file could be saved: {reasons}"
             )
         self._finish()
 
@@ -367,6 +369,7 @@ class _FileCopy:
             )
 
     def _report_damaged(self) -> None:
+        """Adds the damaged parts that the reader has passed since the last call."""
         for damage in self._scanner.damaged[self._reported :]:
             if damage.offset <= self._data_end:
                 self._result.add_loss(str(damage), damage.length)
@@ -400,9 +403,10 @@ class _FileCopy:
         elif opcode == Opcode.ATTACHMENT:
             self._copy_attachment(content)
         else:
-            raise UnreadableRecord(f"a record of kind {opcode} is unknown here")
+            raise UnreadableRecord(f"the kind {opcode} of this record is unknown")
 
     def _copy_metadata(self, content: bytes) -> None:
+        """Copies a metadata record, unless the recovery writes that record itself."""
         entry = mcap_records.parse_record(Opcode.METADATA, content)
         is_regenerated = self._accounts is not None and entry.name in (ACCOUNTS, DIGESTS)
         if entry.name == RECOVERED or is_regenerated:
@@ -421,7 +425,7 @@ class _FileCopy:
         name = entry.name
         problem = "" if mcap_records.has_right_crc(content) else "its CRC differs"
         if name == SCENARIO and entry.data != self._survey.attachments.get(SCENARIO):
-            problem = problem or "it is not that of this session"
+            problem = problem or "it belongs to another session"
         if problem:
             name = f"{name}{DAMAGED_SUFFIX}"
             self._result.add_loss(f"attachment {entry.name}: {problem}; it is kept as {name}")
@@ -445,9 +449,11 @@ class _FileCopy:
         elif frame.opcode == Opcode.MESSAGE_INDEX:
             size = int.from_bytes(content[2:6], "little")
             if size != len(content) - 6 or size % 16:
-                raise UnreadableRecord("a record (message index) is none")
+                raise UnreadableRecord("a message index has the wrong length")
         elif frame.offset < self._data_end:
-            raise UnreadableRecord(f"a record of kind {frame.opcode} stands among the data")
+            raise UnreadableRecord(
+                f"an index record of kind {frame.opcode} lies among the data"
+            )
 
     def _copy_chunk(self, frame: mcap_records.RecordFrame, data: bytes) -> None:
         """Copies the records of an unpacked chunk whose checksum, if any, is right."""
@@ -475,7 +481,7 @@ class _FileCopy:
         elif self.is_session_log:
             raise UnreadableRecord(f"a message {_UNPROVEN}")
         elif self._survey.is_chunked:
-            raise UnreadableRecord("a message stands outside of the chunks")
+            raise UnreadableRecord("a message lies outside of the chunks")
         else:
             self._copy_chunk_record(mcap_records.OP_MESSAGE, content)
 
@@ -531,9 +537,9 @@ class _FileCopy:
             )
             if is_session_topic and self._content is None:
                 self.is_session_log = True
-                raise UnreadableRecord("its scenario, without which no message can be checked")
+                raise UnreadableRecord(_NO_SCENARIO)
             if opcode == Opcode.CHANNEL and not self._is_plausible(entry.topic):
-                raise UnreadableRecord("a channel is none of this session")
+                raise UnreadableRecord("a channel belongs to no member of this session")
             self._define(opcode, content)
             return
         if opcode != mcap_records.OP_MESSAGE:
@@ -542,7 +548,7 @@ class _FileCopy:
         payload = content[mcap_records.MESSAGE_HEAD.size :]
         channel = self._find_channel(number, payload)
         if channel is None:
-            raise UnreadableRecord(f"a message is of channel {number}, which no record names")
+            raise UnreadableRecord(f"a message is of channel {number}, which no record defines")
         if self._content is not None:
             self._content.check(
                 topic=channel[1],
@@ -556,6 +562,7 @@ class _FileCopy:
             raise UnreadableRecord("a message was logged outside of its chunk")
 
     def _define(self, opcode: int, content: bytes) -> None:
+        """Notes the definition of a schema or channel; the first definition holds."""
         entry = mcap_records.parse_record(opcode, content)
         known = self._definitions.setdefault((opcode, entry.id), entry)
         if known != entry:
@@ -671,7 +678,7 @@ class _FileCopy:
         self._result.salvaged = self._out.messages - messages_before
         size = count_nouns(torn.length, "byte")
         salvaged = count_nouns(self._result.salvaged, "message")
-        reason = f" before {problem}" if problem else ""
+        reason = f" until this problem: {problem}" if problem else ""
         self._result.add_loss(
             f"the end of a chunk that was cut off at byte {torn.offset}; of its {size} "
             f"{salvaged} could be saved{reason}",
@@ -685,7 +692,7 @@ class _FileCopy:
             The problem that ended the copy; "" if all blocks were copied.
         """
         if self._content is None and self.is_session_log:
-            return "its scenario, without which no message can be checked"
+            return _NO_SCENARIO
         try:
             torn = TornChunk.read(self._scanner, offset)
             for records in torn.iterate_blocks():
@@ -699,22 +706,22 @@ class _FileCopy:
         result = self._result
         for number, count in self._unnamed.items():
             result.add_loss(
-                f"{count_nouns(count, 'message')} of channel {number}, which no record names"
+                f"{count_nouns(count, 'message')} of channel {number}, which no record defines"
             )
         for topic in self._topics_without_schema:
             result.add_loss(f"the schema of {topic}")
         for topic in self._misnamed:
-            result.add_loss(
-                f"the definition of {topic}; its messages name it, and it was made again"
-            )
+            result.add_loss(f"the definition of {topic}, which was restored from its messages")
         for number in self._contradicted:
-            result.add_loss(f"what channel or schema {number} is: the file says it in two ways")
+            result.add_loss(
+                f"the meaning of channel or schema {number}: the file defines it in two ways"
+            )
         self._report_missing_head()
         stated = self._survey.count
         if stated is not None and self._out.messages < stated and result.lossless:
             missing = stated - self._out.messages
             result.add_loss(
-                f"{missing} of the {count_nouns(stated, 'message')} that it says it has"
+                f"{missing} of the {count_nouns(stated, 'message')} that the file lists"
             )
 
     def _report_missing_head(self) -> None:
@@ -730,8 +737,8 @@ class _FileCopy:
         # Only the metadata name the hash by which a scenario file can be recognized.
         if has_metadata:
             advice = (
-                f". If the file that was run stands beside the log as {SCENARIO}, recover "
-                "puts it in"
+                f". If the scenario file of the run lies beside the log as {SCENARIO}, recover "
+                "restores it"
             )
         # The most important loss comes first, because lists show only the first losses.
         self._result.lost.insert(0, f"{loss}; {_UNOPENED}{advice}")

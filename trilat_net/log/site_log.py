@@ -38,9 +38,9 @@ BLOCK_RECORDS = 1 << 11
 """Number of records that are decoded together."""
 HEAVY_BYTES = 12 << 20
 HEAVY_RATIO = 10
-"""Records are heavy if their decoded form needs more memory than `HEAVY_BYTES` and than
-`HEAVY_RATIO` times their payloads. Only few heavy records are kept decoded, because a file can
-be built to need much memory.
+"""Records are heavy if their decoded form is larger than `HEAVY_BYTES`, and also larger than
+`HEAVY_RATIO` times their payloads. Only few heavy records are kept decoded, because a hostile
+file could otherwise fill the memory.
 """
 HEAVY_BLOCK = 128
 """Number of heavy records that are decoded together."""
@@ -80,7 +80,9 @@ def compute_task_errors(x: Array, x_des: Array, axes: Sequence[float]) -> Array:
     """
     e: Array = x - x_des
     if e.shape[1] > POSITION:
-        e[:, POSITION:] = _compute_rotation_errors(x[:, POSITION:], x_des[:, POSITION:])
+        rotation = x[:, POSITION:]
+        reference = x_des[:, POSITION:]
+        e[:, POSITION:] = _compute_rotation_errors(rotation, reference)
     e *= np.array(axes)
     return e
 
@@ -103,9 +105,10 @@ def _compute_rotation_errors(rotation: Array, reference: Array) -> Array:
     # two quaternions stand for the same rotation: choose the shorter turn
     p *= np.where(w < 0.0, -1.0, 1.0)
     sine = np.linalg.norm(p, axis=1, keepdims=True)
-    angle_by_sine = np.divide(
-        2.0 * np.arctan2(sine, abs(w)), sine, out=np.full_like(w, 2.0), where=sine > 0.0
-    )
+    angle = 2.0 * np.arctan2(sine, abs(w))
+    # the limit of angle / sine for small angles is 2
+    limit = np.full_like(w, 2.0)
+    angle_by_sine = np.divide(angle, sine, out=limit, where=sine > 0.0)
     return np.asarray(angle_by_sine * p)
 
 
@@ -125,15 +128,21 @@ class LazyRecords(Sequence[State]):
         blocks = HEAVY_BLOCKS if heavy else MAX_DECODED_RECORDS // size
         self._payloads = payloads
         self._size = size
-        self._get_block = lru_cache(maxsize=blocks)(
-            lambda number: decode_block(payloads[number * size : (number + 1) * size])
-        )
+
+        @lru_cache(maxsize=blocks)
+        def get_block(number: int) -> list[State]:
+            """Returns the records of the block with a number."""
+            first = number * size
+            return decode_block(payloads[first : first + size])
+
+        self._get_block = get_block
 
     def __len__(self) -> int:
         return len(self._payloads)
 
     def __iter__(self) -> Iterator[State]:
-        for number in range(-(-len(self._payloads) // self._size)):
+        blocks = -(-len(self._payloads) // self._size)
+        for number in range(blocks):
             yield from self._get_block(number)
 
     @overload
@@ -146,7 +155,8 @@ class LazyRecords(Sequence[State]):
         row = index + len(self) if index < 0 else index
         if not 0 <= row < len(self):
             raise IndexError(f"record {index} of {len(self)}")
-        return self._get_block(row // self._size)[row % self._size]
+        block = self._get_block(row // self._size)
+        return block[row % self._size]
 
 
 def decode_records(payloads: Sequence[bytes], decode_block: DecodeStates) -> Sequence[State]:
@@ -244,8 +254,7 @@ class _RecordVector(cached_property[Array]):
 
 
 _HTML = "trilat_net.reporting.site_html"
-"""Module that renders the records of a site in a notebook, imported when a notebook needs it.
-"""
+"""Module that renders the records of a site, imported only when a notebook needs it."""
 
 
 class SiteLog:
@@ -326,6 +335,7 @@ class SiteLog:
         return html
 
     def _read(self, decode_column: Callable[..., T], *arguments: Any) -> T:
+        """Returns decoded columns, read-only; raises LogError if a record cannot be read."""
         try:
             return freeze(decode_column(self.payloads, *arguments))
         except WireError as error:
@@ -334,7 +344,7 @@ class SiteLog:
             ) from None
 
     def prepare(self, *fields: str) -> None:
-        """Decodes several vectors in one pass, three times as fast as one after the other.
+        """Decodes several vectors in one pass, which is three times as fast.
 
         Args:
             fields: names of the vectors.
@@ -344,6 +354,7 @@ class SiteLog:
             self.__dict__.update(self._read_vectors(*missing))
 
     def _read_vectors(self, *fields: str) -> dict[str, Array]:
+        """Returns vectors of every record, by field."""
         return self._read(record_columns.decode_vectors, self.layout, *fields)
 
     def numbers(self, field: str) -> Ints:
@@ -355,15 +366,16 @@ class SiteLog:
 
         Args:
             first: index of the first number in `mem`.
-            count: how many numbers.
+            count: number of numbers.
 
         Raises:
             LogError: the `mem` of a record is shorter.
         """
+        parts = [row[first : first + count] for row in self.mem]
         try:
-            rows = np.array([row[first : first + count] for row in self.mem], dtype=np.float64)
-            return rows.reshape(len(self), count)
-        except ValueError:  # rows of different lengths, or too short rows
+            return np.array(parts, dtype=np.float64).reshape(len(self), count)
+        except ValueError:
+            # parts of different lengths, or too short parts
             needed = f"{count_nouns(first + count, 'number')} in `mem`"
             raise LogError(
                 f"{self._source}: a record of {self.name} does not have {needed}"
@@ -374,9 +386,12 @@ class SiteLog:
         return self._decode([self.payloads[n]])[0]
 
     def _decode(self, payloads: Sequence[bytes]) -> list[State]:
-        return self._read(
-            lambda _: [decode(payload, State, READABLE, self.layout) for payload in payloads]
-        )
+        """Returns some records, decoded and checked as a whole."""
+
+        def decode_states(_: Sequence[bytes]) -> list[State]:
+            return [decode(payload, State, READABLE, self.layout) for payload in payloads]
+
+        return self._read(decode_states)
 
     @cached_property
     def states(self) -> Sequence[State]:
@@ -406,7 +421,11 @@ class SiteLog:
     @property
     def missing(self) -> int:
         """Number of ticks before the last record that have no record."""
-        return self.last_tick - int(np.count_nonzero(np.diff(self.tick))) if len(self) else 0
+        if not len(self):
+            return 0
+        # each record with a new tick fills one tick after the first record
+        later_ticks = int(np.count_nonzero(np.diff(self.tick)))
+        return self.last_tick - later_ticks
 
     @property
     def skipped(self) -> int:
@@ -481,6 +500,7 @@ class SiteLog:
         return self._compute_orientation(self.q_des)
 
     def _compute_orientation(self, poses: Array) -> Array:
+        """Returns the orientations of poses as unit quaternions, shape (K, 4) or (K, 0)."""
         if not self.layout.task or self.layout.shared != POSE:
             return freeze(np.zeros((len(self), 0)))
         return freeze(compute_quaternions(poses[:, POSITION:]))
@@ -501,9 +521,9 @@ class SiteLog:
     def e(self) -> Array:
         """Position error q - q_des, Eq. (9), shape (K, n), rad.
 
-        In task space it is x - x_des, shape (K, m), m. The error of an orientation is the
-        rotation vector from the reference to the end effector, rad, at most half a turn long.
-        It is the error of the control law, and jumps where it passes half a turn.
+        In task space the error is x - x_des, shape (K, m), m. The error of an orientation is
+        the rotation vector from the reference to the end effector, rad, at most half a turn
+        long. The control law uses this vector, which jumps where it passes half a turn.
         """
         if self.layout.task:
             return compute_task_errors(self.x, self.q_des, self.axes)
@@ -541,10 +561,10 @@ class SiteLog:
 
     @cached_property
     def _changes(self) -> dict[int, list[str]]:
-        lists = self._read(record_columns.decode_strings, "cmd").tolist()
-        return {
-            tick: texts for tick, texts in zip(self.tick.tolist(), lists, strict=True) if texts
-        }
+        """The texts of `cmd`, by tick, of the records that have any."""
+        texts = self._read(record_columns.decode_strings, "cmd").tolist()
+        pairs = zip(self.tick.tolist(), texts, strict=True)
+        return {tick: tick_texts for tick, tick_texts in pairs if tick_texts}
 
     def changes(self) -> dict[int, list[str]]:
         """Returns the changes that the site applied, by tick, as texts of `cmd`."""
@@ -561,5 +581,6 @@ class SiteLog:
             rate_hz: tick rate of the peer, Hz.
         """
         used = self.used[peer]
-        age_ns = self.t_ns - used * NS_PER_S // rate_hz
+        stamp_ns = used * NS_PER_S // rate_hz
+        age_ns = self.t_ns - stamp_ns
         return np.where(used >= 0, age_ns / NS_PER_S, np.nan)

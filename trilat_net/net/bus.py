@@ -3,8 +3,8 @@
 `zenoh_bus` implements the protocol over Eclipse Zenoh.
 
 Invariant:
-    - An arriving message costs a site's bus thread no more than a time stamp, the decoding, and
-      an append or a short reply. The decoding function raises nothing.
+    - For an arriving message, a site's bus thread does no more than stamp and decode the
+      message, and append it or send a short reply. The decoding function raises nothing.
     - Messages wait in bounded rings until the loop polls them. On overflow the oldest message
       is dropped; the receiver notices the gap by the numbers of the messages.
     - Only the recorder uses callbacks (`Bus.tap`).
@@ -94,8 +94,8 @@ class Bus(Protocol):
 
         Args:
             key: the key.
-            answer: returns the reply to a payload, or None for no reply. It must be short,
-                because messages wait meanwhile, and must raise nothing.
+            answer: returns the reply to a payload, or None for no reply. The function must be
+                short, because messages wait meanwhile, and must raise nothing.
         """
 
     def query(self, key: str, payload: bytes = b"") -> Inbox:
@@ -113,20 +113,21 @@ class Bus(Protocol):
 
 @lru_cache(256)
 def _compile_expression(expression: str) -> re.Pattern[str]:
-    patterns = []
+    """Returns the regular expression of a key expression, for keys behind a slash."""
+    pattern = ""
     for chunk in expression.split("/"):
-        literals = map(re.escape, chunk.split("$*"))
         if chunk == "**":
-            patterns.append("(?:/[^/]+)*")
+            pattern += "(?:/[^/]+)*"
         elif chunk == "*":
-            patterns.append("/[^/]+")
+            pattern += "/[^/]+"
         else:
-            patterns.append("/" + "[^/]*".join(literals))
-    return re.compile("".join(patterns))
+            literals = map(re.escape, chunk.split("$*"))
+            pattern += "/" + "[^/]*".join(literals)
+    return re.compile(pattern)
 
 
 def matches_key(expression: str, key: str) -> bool:
-    """True if a key expression matches a key.
+    """Returns True if a key expression matches a key.
 
     In an expression, `*` stands for one chunk, `**` for any number of chunks, and `$*` for any
     part of a chunk.
@@ -137,7 +138,10 @@ def matches_key(expression: str, key: str) -> bool:
 class BoundedRing(Generic[T]):
     """A bounded ring, which drops its oldest entry on overflow.
 
-    One thread may call `put` while another one calls `poll`.
+    One thread may call `put` while another thread calls `poll`.
+
+    Args:
+        capacity: largest number of entries.
     """
 
     def __init__(self, capacity: int = RING_CAPACITY) -> None:
@@ -155,7 +159,12 @@ class BoundedRing(Generic[T]):
 class StampingRing(BoundedRing[tuple[T, int]]):
     """The `StampedInbox` of every bus.
 
-    One thread may call `receive` while another one calls `poll`.
+    One thread may call `receive` while another thread calls `poll`.
+
+    Args:
+        now_ns: clock that stamps the arrivals.
+        read: decodes a payload, and raises nothing.
+        capacity: largest number of entries.
     """
 
     def __init__(

@@ -103,10 +103,9 @@ class OffsetEstimate(NamedTuple):
             offset_ns: value that is used for the offset at that instant.
         """
         passed_s = (local_ns - self.local_ns) / NS_PER_S
-        upper_drift = self.drift_high
-        lower_drift = self.drift_low
-        if passed_s < 0.0:
-            upper_drift, lower_drift = lower_drift, upper_drift
+        is_later = passed_s >= 0.0
+        upper_drift = self.drift_high if is_later else self.drift_low
+        lower_drift = self.drift_low if is_later else self.drift_high
         error_above = self.high_ns - offset_ns + passed_s * upper_drift
         error_below = offset_ns - self.low_ns - passed_s * lower_drift
         return max(0, math.ceil(max(error_above, error_below)))
@@ -196,21 +195,21 @@ class _AdmissibleLines:
         intervals_s = self._ceiling_times_s[:, None] - self._floor_times_s[None, :]
         gaps = self._relaxed_ceilings[:, None] - self._relaxed_floors[None, :]
         slopes = np.divide(gaps, intervals_s, out=np.zeros_like(gaps), where=intervals_s != 0.0)
-        # A ceiling after a floor limits the slope from above, a ceiling before one from below.
-        self.steepest = float(np.min(slopes, where=intervals_s > 0.0, initial=DRIFT_LIMIT))
-        self.flattest = float(np.max(slopes, where=intervals_s < 0.0, initial=-DRIFT_LIMIT))
+        # A ceiling after a floor limits the slope from above, a ceiling before a floor limits
+        # the slope from below.
+        steepest = np.min(slopes, where=intervals_s > 0.0, initial=DRIFT_LIMIT)
+        flattest = np.max(slopes, where=intervals_s < 0.0, initial=-DRIFT_LIMIT)
+        self.steepest = float(steepest)
+        self.flattest = float(flattest)
         simultaneous_gap = np.min(gaps, where=intervals_s == 0.0, initial=0.0)
         self.exist = bool(simultaneous_gap >= 0.0 and self.flattest <= self.steepest)
 
     def _read_columns(self, limits: deque[OffsetLimit]) -> tuple[Array, Array]:
         """Returns the times (s from now) and the offsets (ns from the base) of limits."""
-        times_ns = np.array(
-            [min(0, limit.local_ns - self._now_ns) for limit in limits], dtype=np.float64
-        )
-        offsets_ns = np.array(
-            [limit.offset_ns - self._base_ns for limit in limits], dtype=np.float64
-        )
-        return times_ns / NS_PER_S, offsets_ns
+        times_ns = [min(0, limit.local_ns - self._now_ns) for limit in limits]
+        offsets_ns = [limit.offset_ns - self._base_ns for limit in limits]
+        times_s = np.array(times_ns, dtype=np.float64) / NS_PER_S
+        return times_s, np.array(offsets_ns, dtype=np.float64)
 
     def estimate(self) -> OffsetEstimate:
         """Returns the line in the middle, with the spread of all admissible lines now."""
@@ -235,24 +234,26 @@ class _AdmissibleLines:
     def _estimate_slope(self) -> float:
         """Returns the drift: weighted least squares of one slope for ceilings and floors, ns/s.
 
-        A window of slow messages says little, so the weight of a limit falls with its distance
-        from the tightest one. That distance depends on the slope, so the weights are computed
-        anew in each of some rounds (iteratively reweighted least squares).
+        A window of slow messages has little information, so the weight of a limit falls with
+        its distance from the tightest limit. The distance depends on the slope, so each round
+        computes new weights (iteratively reweighted least squares).
         """
+        sides = (
+            (self._ceiling_times_s, self._ceilings, 1.0),
+            (self._floor_times_s, self._floors, -1.0),
+        )
         slope = 0.0
         prior_weight = _PRIOR_DRIFT**-2
         for round_index in range(_WEIGHTING_ROUNDS):
             numerator = 0.0
             denominator = prior_weight
-            for times, values, sign in (
-                (self._ceiling_times_s, self._ceilings, 1.0),
-                (self._floor_times_s, self._floors, -1.0),
-            ):
-                level = sign * (values - slope * times)
-                excess = (level - level.min()) if round_index else np.zeros_like(level)
+            for times, values, sign in sides:
+                distance = sign * (values - slope * times)
+                # In the first round the slope is unknown, so that all weights are equal.
+                excess = distance - distance.min() if round_index else np.zeros_like(distance)
                 weights = (excess + _NOISE_NS) ** -2.0
-                total_weight = weights.sum()
-                from_mean = times - (weights * times).sum() / total_weight
+                mean_time = (weights * times).sum() / weights.sum()
+                from_mean = times - mean_time
                 numerator += float((weights * from_mean * values).sum())
                 denominator += float((weights * from_mean**2).sum())
             slope = numerator / denominator
@@ -282,11 +283,10 @@ class _SlewSegment:
         self._joined_offset_ns = estimate.extrapolate_ns(self._joined_ns)
         self._approach_rate = (self._joined_offset_ns - offset_ns) / SLEW_NS
         self._drift_per_ns = estimate.drift / NS_PER_S
-        # The bound is convex over the slew, so it is largest at one of the two ends.
-        self.bound_ns = max(
-            estimate.error_bound_ns(start_ns, offset_ns),
-            estimate.error_bound_ns(self._joined_ns, self._joined_offset_ns),
-        )
+        # The bound is convex over the slew, so the largest bound is at one of the two ends.
+        start_bound_ns = estimate.error_bound_ns(start_ns, offset_ns)
+        joined_bound_ns = estimate.error_bound_ns(self._joined_ns, self._joined_offset_ns)
+        self.bound_ns = max(start_bound_ns, joined_bound_ns)
 
     def evaluate_ns(self, local_ns: int) -> int:
         """Returns the offset in use at an instant of the local clock, in ns."""
@@ -302,7 +302,11 @@ class _SlewSegment:
 
 
 class SlewedOffset:
-    """The offset in use over time: the other clock minus the local clock, without steps."""
+    """The offset in use over time: the other clock minus the local clock, without steps.
+
+    Args:
+        estimate: the first estimate, which the offset equals at first.
+    """
 
     def __init__(self, estimate: OffsetEstimate) -> None:
         segment = _SlewSegment(estimate.local_ns, estimate.offset_ns, estimate)
@@ -340,4 +344,7 @@ class SlewedOffset:
         return self._select_segment(local_ns).error_bound_ns(local_ns)
 
     def _select_segment(self, local_ns: int) -> _SlewSegment:
-        return self._segment if local_ns >= self._segment.start_ns else self._previous_segment
+        """Returns the segment that holds at an instant of the local clock."""
+        if local_ns >= self._segment.start_ns:
+            return self._segment
+        return self._previous_segment
