@@ -1,7 +1,7 @@
-"""Run all sites of a scenario in one compiled loop, without a log.
+"""Runs of all sites of a scenario in one compiled loop, without a log.
 
-The loop runs at about 1000 times real time. In place of records it keeps the peaks of every 50
-ms and sums over the run.
+The loop runs at about 1000 times real time. In place of records it keeps the peaks of every
+50 ms, and sums over the run.
 
 Invariant:
     - The result equals that of `execution.virtual` with its default network, bit for bit.
@@ -53,36 +53,36 @@ from ..scenario.own_plant import PlantPlayer
 from ..scenario.validate import refuse_external_arms
 
 
-def _find_float_words(dtype: np.dtype[np.generic]) -> NDArray[np.bool_]:
-    """Returns which words of eight bytes of a data type hold a floating-point number."""
+def _mark_floats(dtype: np.dtype[np.generic]) -> NDArray[np.bool_]:
+    """Returns, for each eight bytes of a data type, True if they are a float."""
     if dtype.fields is None:
         return np.full(max(1, dtype.itemsize // 8), dtype.base.kind == "f")
     is_float = np.zeros(dtype.itemsize // 8, dtype=bool)
     for field_dtype, offset, *_ in dtype.fields.values():
         start = offset // 8
         stop = (offset + field_dtype.itemsize) // 8
-        is_float[start:stop] = _find_float_words(field_dtype)
+        is_float[start:stop] = _mark_floats(field_dtype)
     return is_float
 
 
 class RunState:
-    """The arrays that a run changes, as words of eight bytes in the memory of the run.
+    """The arrays that a run changes, as 64-bit integers in the memory of the run.
 
     Args:
         arrays: the arrays.
     """
 
     def __init__(self, arrays: Sequence[NDArray[np.generic]]) -> None:
-        self._words: list[NDArray[np.int64]] = []
+        self._bits: list[NDArray[np.int64]] = []
         self._floats: list[NDArray[np.bool_]] = []
         for array in arrays:
-            if array.size:
-                flat = array.reshape(-1).view(np.int64)
-                assert np.shares_memory(
-                    flat, array
-                )  # changes of a copy would not reach the run
-                self._words.append(flat)
-                self._floats.append(np.tile(_find_float_words(array.dtype), array.size))
+            if not array.size:
+                continue
+            flat = array.reshape(-1).view(np.int64)
+            # changes of a copy would not reach the run
+            assert np.shares_memory(flat, array)
+            self._bits.append(flat)
+            self._floats.append(np.tile(_mark_floats(array.dtype), array.size))
 
     def scale_difference(self, other: "RunState", factor: float) -> None:
         """Multiplies the difference to another state of the same scenario by a factor.
@@ -94,17 +94,17 @@ class RunState:
             other: the other state.
             factor: the factor.
         """
-        arrays = zip(self._words, other._words, self._floats, strict=True)
-        for words, other_words, is_float in arrays:
+        arrays = zip(self._bits, other._bits, self._floats, strict=True)
+        for bits, other_bits, is_float in arrays:
             if factor == 0.0:
-                words[:] = other_words
+                bits[:] = other_bits
                 continue
-            changed = np.flatnonzero((words != other_words) & is_float)
-            x = words.view(np.float64)[changed]
-            y = other_words.view(np.float64)[changed]
+            changed = np.flatnonzero((bits != other_bits) & is_float)
+            x = bits.view(np.float64)[changed]
+            y = other_bits.view(np.float64)[changed]
             mixed: Array = y + factor * (x - y)
-            words[:] = other_words
-            words.view(np.float64)[changed] = np.where(np.isfinite(mixed), mixed, y)
+            bits[:] = other_bits
+            bits.view(np.float64)[changed] = np.where(np.isfinite(mixed), mixed, y)
 
 
 def check_fusable(scenario: Scenario, plants: Collection[str] = ()) -> None:
@@ -204,8 +204,8 @@ class FusedRun:
     """A run of all sites of a scenario in a compiled loop.
 
     Compiled laws run in the loop. Laws in plain Python are called between its stages, tick by
-    tick. The loop pauses at the ticks at which a hand has to see its arm, and after every tick
-    of a site whose arm is moved by a plant.
+    tick. The loop pauses before the ticks at which a hand has to see its arm, and after every
+    tick of a site whose arm is moved by a plant.
 
     Args:
         scenario: the scenario.
@@ -253,23 +253,26 @@ class FusedRun:
         self._progress["rate_hz"] = [scenario.sites[name].rate_hz for name in names]
         self._progress["unsettled_ns"] = -1
         self._progress["diverged_ns"] = -1
-        self._taken = np.zeros((count, count - 1), dtype=np.int64)
+        self._next_samples = np.zeros((count, count - 1), dtype=np.int64)
         self._sent = self._allocate_records(keep)
         joints = max(max(layout.joints, layout.shared) for layout in self._layouts)
         self._peaks = np.full((count, 0, 3 * joints), -1.0)
         self._sums: RowArray = np.zeros(count, sums_dtype(joints))
+        # the torque sources of a site are its hands, then its environment
         self._sums["first_environment"] = [
             len(spec.hands) if spec.environment else -1 for spec in scenario.sites.values()
         ]
         self._plants = {i: plants[name] for i, name in enumerate(names) if name in plants}
         self._torque_columns = {i: self._layouts[i].columns()["tau"] for i in self._plants}
-        self._popped_ticks = [0] * count  # by site, see `pop_records`
-        self._action_ends = dict[int, int]()  # by site the tick after the hand's last action
-        self._plant_ticks = dict.fromkeys(self._plants, 0)  # by site the tick of its plant
+        # By site: the first tick that `pop_records` has not returned yet, the tick after the
+        # last action of the hand, and the tick of the plant.
+        self._popped_ticks = [0] * count
+        self._action_ends: dict[int, int] = {}
+        self._plant_ticks = dict.fromkeys(self._plants, 0)
         self._selected: dict[int, SiteArrays] = {}
 
     def _allocate_records(self, keep: int) -> RecentRecords:
-        """Returns room for the last records of every site, of a power of two of records.
+        """Returns memory for the last records of every site; their number is a power of two.
 
         Records are kept for `pop_records`, until the slowest peer has received them, and until
         the latest sample of a recorded run has arrived.
@@ -289,15 +292,16 @@ class FusedRun:
         self, hands: Mapping[str, HandActor], setups: Sequence[SiteSetup]
     ) -> None:
         """Connects live hands to their sites and prepares the feed for their actions."""
-        self._hands = {
-            i: hands[setup.name] for i, setup in enumerate(setups) if setup.name in hands
-        }
-        if not self._hands:
-            return
         rows = [-1] * len(setups)
-        for i in self._hands:
-            rows[i] = _find_live_row(setups[i])
-        size = max((setups[i].layout.hand - 3) // 2 for i in self._hands)
+        sizes = []
+        for i, setup in enumerate(setups):
+            if setup.name in hands:
+                self._hands[i] = hands[setup.name]
+                rows[i] = _find_live_row(setup)
+                sizes.append(_count_coordinates(setup))
+        if not sizes:
+            return
+        size = max(sizes)
         actions = np.zeros((len(setups), 0, 1 + 2 * size))
         feed = self._inputs.feed._replace(hands=actions, hand_indices=np.array(rows))
         self._inputs = self._inputs._replace(feed=feed)
@@ -309,7 +313,8 @@ class FusedRun:
         if self._tables.channel is None:
             return
         count = len(setups)
-        sent = np.zeros((count, max(setup.channel.record_size for setup in setups)))
+        sent_size = max(setup.channel.record_size for setup in setups)
+        sent = np.zeros((count, sent_size))
         for i, setup in enumerate(setups):
             if setup.law_factory is not None:
                 arrays = select_site(self._tables, i, setup.layout)
@@ -410,6 +415,7 @@ class FusedRun:
         return tick_ns(self._action_ends[i], int(progress["rate_hz"]))
 
     def _step_piece(self, last_ns: int) -> None:
+        """Executes the planned ticks up to a time, ns, without a pause for programs."""
         compiled = [law for law in self._laws.values() if isinstance(law, CompiledLaw)]
         try:
             if len(compiled) < len(self._laws):
@@ -419,7 +425,7 @@ class FusedRun:
                     last_ns=last_ns,
                     settled_rad=self._settled_rad,
                     progress=self._progress,
-                    next_samples=self._taken,
+                    next_samples=self._next_samples,
                     sent=self._sent,
                     feed=self._inputs.feed,
                     peaks=self._peaks,
@@ -430,12 +436,13 @@ class FusedRun:
                 )
         except LawFailed:
             raise
-        except Exception as error:  # any error that a compiled law raises
+        except Exception as error:
+            # any error that a compiled law raises
             failures = [law.find_failure(error) for law in compiled]
             raise next(filter(None, failures), error) from None
 
     def _run_plain_until(self, last_ns: int) -> None:
-        """Does the work of `run_until`, and calls laws in plain Python between the stages."""
+        """Executes ticks as `run_until` does, and calls plain laws between the stages."""
         progress = self._progress
         tables = self._tables
         while True:
@@ -447,7 +454,7 @@ class FusedRun:
                 sense_site(
                     i=i,
                     progress=progress,
-                    next_samples=self._taken,
+                    next_samples=self._next_samples,
                     sent=self._sent,
                     feed=self._inputs.feed,
                     arrays=tables,
@@ -490,8 +497,8 @@ class FusedRun:
             progress.ticks = count
             if progress.tick < count:
                 progress.t_ns = tick_ns(progress.tick, progress.rate_hz)
-        rates_hz = self._progress["rate_hz"]
-        longest_s = max(count / rate_hz for count, rate_hz in zip(ticks, rates_hz, strict=True))
+        pairs = zip(ticks, self._progress["rate_hz"], strict=True)
+        longest_s = max(count / rate_hz for count, rate_hz in pairs)
         buckets = math.ceil(longest_s * BUCKETS_PER_S) + 1
         peaks = np.full((len(ticks), buckets, self._peaks.shape[2]), -1.0)
         peaks[:, : self._peaks.shape[1]] = self._peaks
@@ -504,8 +511,9 @@ class FusedRun:
 
     @cached_property
     def _state(self) -> RunState:
+        """The arrays of the run that change while it is executed."""
         tables = self._tables
-        arrays = [self._progress, self._taken, *self._sent, self._sums]
+        arrays = [self._progress, self._next_samples, *self._sent, self._sums]
         arrays += [array for array in tables if isinstance(array, np.ndarray)]
         if tables.channel is not None:
             arrays += tables.channel
@@ -525,8 +533,8 @@ class FusedRun:
     def scale_difference(self, other: "FusedRun", factor: float) -> None:
         """Multiplies the difference to another run of the same scenario by a factor.
 
-        The state becomes other + factor (state - other), see `RunState.scale_difference`. A run
-        that has programs cannot do that, because their state is unknown.
+        The state becomes other + factor (state - other), see `RunState.scale_difference`. The
+        runs have no programs, because the state of a program is unknown.
 
         Args:
             other: the other run, at the same time.
@@ -540,10 +548,11 @@ class FusedRun:
             if isinstance(law, PlainLaw):
                 memory = np.array(law.memory)
                 other_memory = np.array(other._laws[i].memory)
-                law.restore((other_memory + factor * (memory - other_memory)).tolist())
+                mixed = other_memory + factor * (memory - other_memory)
+                law.restore(mixed.tolist())
 
     def arrays(self, i: int) -> SiteArrays:
-        """Returns the arrays of a site before its next tick, which are only to be read."""
+        """Returns the arrays of a site before its next tick, for reading only."""
         if i not in self._selected:
             self._selected[i] = select_site(self._tables, i, self._layouts[i])
         return self._selected[i]
@@ -559,7 +568,8 @@ class FusedRun:
 
     def measure_distance(self, other: "FusedRun", field: str) -> float:
         """Returns the largest difference of a field of the sites' states from another run."""
-        return float(np.abs(self._tables.site[field] - other._tables.site[field]).max())
+        difference = self._tables.site[field] - other._tables.site[field]
+        return float(np.abs(difference).max())
 
     def run_and_sample(self, until_s: float) -> tuple[Array, Array]:
         """Continues the run to `until_s` and samples its last quarter at 100 times.
@@ -584,8 +594,8 @@ class FusedRun:
     @property
     def settled_s(self) -> float | None:
         """Time from which every |e| is below `settled_rad`, s; None if never until the end."""
-        last = int(np.argmax(self._progress["unsettled_ns"]))  # the site that settles last
-        progress: Row = self._progress[last]
+        last_site = int(np.argmax(self._progress["unsettled_ns"]))
+        progress: Row = self._progress[last_site]
         if progress.unsettled_ns < 0:
             return 0.0
         if progress.unsettled_ns == tick_ns(progress.tick - 1, progress.rate_hz):
@@ -615,7 +625,9 @@ class FusedRun:
         """Errors, effort and contact over the whole run."""
         sums = self._sums
         ticks = self._progress["tick"].astype(np.float64)
-        mean_effort = np.mean(sums["effort"] / (self._tables.site["joints"][:, 0] * ticks))
+        joints = self._tables.site["joints"][:, 0]
+        mean_effort = np.mean(sums["effort"] / (joints * ticks))
+        mean_errors = sums["errors"] / ticks[:, None]
         force_peak_n = None
         if self._has_wall:
             force_peak_n = float(sums["force_peak_n"].max())
@@ -623,7 +635,7 @@ class FusedRun:
         if (sums["first_environment"] >= 0).any():
             walls_j = float(sums["environment_j"].sum())
         return RunTotals(
-            rms_error_rad=float(np.sqrt(sums["errors"] / ticks[:, None]).max()),
+            rms_error_rad=float(np.sqrt(mean_errors).max()),
             effort_nm=float(np.sqrt(mean_effort)),
             force_peak_n=force_peak_n,
             walls_j=walls_j,
@@ -631,6 +643,7 @@ class FusedRun:
 
     @property
     def _has_wall(self) -> bool:
+        """True if the environment of some site has a wall."""
         specs = self._scenario.sites.values()
         return any(isinstance(part, Wall) for spec in specs for part in spec.environment)
 
@@ -656,10 +669,8 @@ class FusedRun:
     @property
     def tau_x(self) -> list[Array]:
         """The exogenous torque of each site's last record, shape (n,) each, N m."""
-        return [
-            row[layout.columns()["tau_x"]]
-            for row, layout in zip(self.records, self._layouts, strict=True)
-        ]
+        pairs = zip(self.records, self._layouts, strict=True)
+        return [row[layout.columns()["tau_x"]] for row, layout in pairs]
 
     def pop_records(self) -> list[tuple[IntArray, Array]]:
         """Returns the records of each site since the last call, as far as they are kept.
@@ -686,6 +697,7 @@ class FusedRun:
         return np.array([self._last_row(i) for i in range(len(self._progress))])
 
     def _last_row(self, i: int) -> Array:
+        """Returns the last record of a site."""
         pages = self._sent.t_ns.shape[1]
         last_tick = int(self._progress[i]["tick"]) - 1
         row: Array = self._sent.rows[i, last_tick % pages]
@@ -697,12 +709,12 @@ def explain_not_repeatable(log: Log, *, own_laws: bool = False) -> str:
 
     Args:
         log: the log.
-        own_laws: whether laws that are code from outside may run.
+        own_laws: True if laws that are code from outside may run.
     """
     scenario = log.scenario
     if scenario.external:
         arms = ", ".join(sorted(scenario.external))
-        return f"how the arm of {arms}, outside of the program, would have replied is not known"
+        return f"the reaction of the arm of {arms}, outside of the program, is not known"
     if find_user_laws(scenario) and not own_laws:
         return "laws from outside may not run (--law FILE)"
     if set(log.executed_sites) != set(log.sites):
@@ -736,8 +748,9 @@ def _read_changes(log: Log) -> list[tuple[int, int, CoreChange]]:
     """Returns the changes of all sites in order of time, see `RunInputs`."""
     timed_changes = []
     for i, name in enumerate(log.scenario.names):
+        rate_hz = log[name].rate_hz
         for tick, changes in log.commands(name).items():
-            t_ns = tick * NS_PER_S // log[name].rate_hz
+            t_ns = tick * NS_PER_S // rate_hz
             timed_changes += [(t_ns, (tick, i, change)) for change in changes]
     timed_changes.sort(key=lambda timed: timed[0])
     return [change for _, change in timed_changes]
@@ -755,7 +768,8 @@ def _read_arrivals(log: Log, ticks: int) -> tuple[IntArray, IntArray, int]:
         sample to its arrival, ns.
     """
     names = log.scenario.names
-    first = np.zeros((len(names), max(len(names) - 1, 1), ticks + 1), dtype=np.int64)
+    most_peers = max(len(names) - 1, 1)
+    first = np.zeros((len(names), most_peers, ticks + 1), dtype=np.int64)
     samples: list[IntArray] = []
     total = 0
     late_ns = 0
@@ -763,10 +777,12 @@ def _read_arrivals(log: Log, ticks: int) -> tuple[IntArray, IntArray, int]:
         part = log[name]
         counts, rows = part.arrivals
         arrival_ticks = np.repeat(part.tick, counts)
+        senders = rows[:, 0]
+        sent_ticks = rows[:, 1]
         for j, peer in enumerate(part.peers):
-            is_known = (rows[:, 1] >= 0) & (rows[:, 1] <= log[peer].last_tick)
-            selected = (rows[:, 0] == j) & is_known
-            sample_ticks = rows[selected, 1]
+            is_known = (sent_ticks >= 0) & (sent_ticks <= log[peer].last_tick)
+            selected = (senders == j) & is_known
+            sample_ticks = sent_ticks[selected]
             stamps_ns = sample_ticks * NS_PER_S // log[peer].rate_hz
             # no sample is in use before the first tick after its stamp (L2)
             earliest = -(-(stamps_ns + 1) * part.rate_hz // NS_PER_S)
@@ -776,22 +792,22 @@ def _read_arrivals(log: Log, ticks: int) -> tuple[IntArray, IntArray, int]:
             first[i, j] = total + starts
             samples.append(sample_ticks[order])
             total += len(sample_ticks)
-            ages_ns = delivery_ticks * NS_PER_S // part.rate_hz - stamps_ns
+            deliveries_ns = delivery_ticks * NS_PER_S // part.rate_hz
+            ages_ns = deliveries_ns - stamps_ns
             late_ns = max(late_ns, int(ages_ns.max(initial=0)))
     return first, np.concatenate([*samples, np.zeros(0, np.int64)]), late_ns
 
 
 def _add_hands(feed: ReplayedInputs, log: Log, ticks: int) -> ReplayedInputs:
     """Returns a feed with the recorded actions of live hands."""
-    setups = [
-        log.scenario.setup(name)._replace(law_factory=None) for name in log.scenario.names
-    ]
+    names = log.scenario.names
+    setups = [log.scenario.setup(name) for name in names]
     rows = [_find_live_row(setup) for setup in setups]
     if max(rows) < 0:
         return feed
-    size = max((setup.layout.hand - 3) // 2 for setup in setups)
+    size = max(_count_coordinates(setup) for setup in setups)
     actions = np.zeros((len(setups), ticks, 1 + 2 * size))
-    for i, name in enumerate(log.scenario.names):
+    for i, name in enumerate(names):
         if rows[i] >= 0:
             _write_actions(actions[i], 0, log[name].hand)
     return feed._replace(hands=actions, hand_indices=np.array(rows))
@@ -813,6 +829,14 @@ def _write_actions(feed_actions: Array, k: int, actions: Array) -> None:
     rows[:, 0] = actions[:, 0]
     rows[:, 1 : 1 + count] = target
     rows[:, 1 + size : 1 + size + count] = target + rate
+
+
+def _count_coordinates(setup: SiteSetup) -> int:
+    """Returns the number of coordinates of a site's live hand, see `HandInForce`.
+
+    An action has grip, number and source, then the target and the rate of each coordinate.
+    """
+    return (setup.layout.hand - 3) // 2
 
 
 def _find_live_row(setup: SiteSetup) -> int:

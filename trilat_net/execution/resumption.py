@@ -1,4 +1,4 @@
-"""Read the inputs of a site from its log, and restore its state in the middle of the log.
+"""Recorded inputs of a site, and restoration of its state in the middle of a log.
 
 Invariant (L3):
     - Two consecutive records and the contents of the links suffice to restore a site.
@@ -30,7 +30,7 @@ ArrivalEntry = Sequence[int]
 
 
 ReceivedMotion = State | Arrival
-"""A sample of a peer, as it was recorded or as it is computed now."""
+"""A sample of a peer: a record, or an arrival that is computed now."""
 
 
 def read_output(state: State, peers: tuple[str, ...]) -> TickRecord:
@@ -90,7 +90,13 @@ def make_arrival(
         qd = sample.xd
         tau_x = sample.wrench
     return Arrival(
-        peer=peer, tick=tick, q=q, qd=qd, latency_us=latency_us, tau_x=tau_x, ch=sample.ch
+        peer=peer,
+        tick=tick,
+        q=q,
+        qd=qd,
+        latency_us=latency_us,
+        tau_x=tau_x,
+        ch=sample.ch,
     )
 
 
@@ -105,12 +111,12 @@ def select_peer_channels(
     """
     selected = []
     for arrival in arrivals:
-        if arrival.ch:
-            link = links[arrival.peer]
-            arrival = arrival._replace(
-                ch=link.channel.select_for_peer(arrival.ch, link.index_at_peer)
-            )
-        selected.append(arrival)
+        if not arrival.ch:
+            selected.append(arrival)
+            continue
+        link = links[arrival.peer]
+        numbers = link.channel.select_for_peer(arrival.ch, link.index_at_peer)
+        selected.append(arrival._replace(ch=numbers))
     return selected
 
 
@@ -149,7 +155,7 @@ class RecordedInputs(Generic[Change]):
         samples: the samples of each peer, by tick.
         ends: last tick of each peer.
         assumed: per peer the ticks of samples that are assumed to have arrived in a gap.
-        lacking: per peer the ticks of samples that arrived and whose own record is missing.
+        lacking: per peer the ticks of samples that arrived but whose record is missing.
     """
 
     def __init__(
@@ -169,7 +175,7 @@ class RecordedInputs(Generic[Change]):
         self.lacking: list[set[int]] = [set() for _ in part.peers]
 
     def pop_changes(self, tick: int) -> list[tuple[int, Change]]:
-        """Returns the changes up to a tick and removes them; each with its own tick."""
+        """Returns the changes up to a tick, each with its tick, and removes these changes."""
         popped: list[tuple[int, Change]] = []
         while self._changes and self._changes[-1][0] <= tick:
             change_tick, changes = self._changes.pop()
@@ -197,32 +203,31 @@ class RecordedInputs(Generic[Change]):
         return select_peer_channels(arrivals, self._links), missing
 
     def add_lacking(self, entries: Sequence[ArrivalEntry]) -> None:
-        """Notes samples that arrived and whose own record is missing, as entries of `rx`."""
+        """Notes samples that arrived but whose record is missing, as entries of `rx`."""
         for peer, tick, _ in entries:
             self.lacking[peer].add(tick)
 
     def can_resume(self, row: int, *, detached: bool = False) -> bool:
-        """True if the site can be restored at a record, see `resume`.
+        """Returns True if the site can be restored at a record, see `resume`.
 
-        The two records before the record have to be consecutive, and the samples in use have to
-        be known. Unknown samples do not matter to a site that rests by a reference of its own.
+        The records of the two ticks before have to exist, and the samples in use have to be
+        known. Unknown samples do not matter to a site that rests by a reference of its own.
 
         Args:
             row: row of the record.
-            detached: whether the site follows a reference of its own while it rests.
+            detached: True if the site follows a reference of its own while it rests.
         """
         states = self._part.states
         if row < 2:
             return False
-        ticks = [state.tick for state in states[row - 2 : row]]
-        if ticks != [states[row].tick - 2, states[row].tick - 1]:
+        tick = states[row].tick
+        if [states[row - 2].tick, states[row - 1].tick] != [tick - 2, tick - 1]:
             return False
         if detached and states[row - 1].mode in RESTING_MODES:
             return True
         in_use = read_output(states[row - 1], self._part.peers).used
-        return all(
-            used < 0 or used in known for used, known in zip(in_use, self.samples, strict=True)
-        )
+        pairs = zip(in_use, self.samples, strict=True)
+        return all(used < 0 or used in samples for used, samples in pairs)
 
     def resume(self, site: Site, row: int, changes: Sequence[CoreChange] = ()) -> None:
         """Restores the state of a site before the tick of a record, where it `can_resume`.
@@ -242,7 +247,7 @@ class RecordedInputs(Generic[Change]):
         waiting: list[Arrival] = []
         for peer, used in enumerate(last.used):
             in_use.append(self._find_in_use(peer, used, len(last.q_des)))
-            # a sample older than the one in use is never used again
+            # a sample older than the sample in use is never used again
             self.lacking[peer] = {tick for tick in self.lacking[peer] if tick >= used}
             rate_hz = site.peer_rate_hz(peer)
             certain, self.assumed[peer] = self._find_waiting(row, peer, used, rate_hz)
@@ -269,10 +274,11 @@ class RecordedInputs(Generic[Change]):
             unknown = (0.0,) * size
             sample = Arrival(peer, used, unknown, unknown)
             self.lacking[peer].add(used)
-        return select_peer_channels([make_arrival(peer, used, sample)], self._links)[0]
+        arrival = make_arrival(peer, used, sample)
+        return select_peer_channels([arrival], self._links)[0]
 
     def is_uncertain(self, state: State, output: TickRecord) -> bool:
-        """True if a sample is in use whose arrival or content is not in the log.
+        """Returns True if the arrival or content of a sample in use is not in the log.
 
         Args:
             state: a record of the site.
@@ -280,16 +286,16 @@ class RecordedInputs(Generic[Change]):
         """
         for peer, name in enumerate(self._part.peers):
             logged = state.used.get(name, -1)
-            if output.used[peer] in self.assumed[peer] or logged in self.assumed[peer]:
-                return True
-            if logged in self.lacking[peer]:
+            executed = output.used[peer]
+            assumed = self.assumed[peer]
+            if logged in assumed or executed in assumed or logged in self.lacking[peer]:
                 return True
         return False
 
     def _find_waiting(
         self, row: int, peer: int, used: int, rate_hz: int
     ) -> tuple[set[int], set[int]]:
-        """Returns the samples newer than the one in use that arrived before a record.
+        """Returns the samples newer than the sample in use that arrived before a record.
 
         Args:
             row: row of the record.
@@ -311,11 +317,7 @@ class RecordedInputs(Generic[Change]):
             next_listed = listing.first_ticks[position]
         last_sent = -(-t_ns * rate_hz // NS_PER_S) - 1
         newest_probable = max(last_sent, next_listed - 1)
-        newest_listed = -1
-        for state in states[max(0, row - _LOOK_BACK) : row]:
-            for sender, tick, _ in state.rx:
-                if sender == peer:
-                    newest_listed = max(newest_listed, tick)
+        newest_listed = self._find_newest_listed(row, peer)
         # a sample waits no longer than the longest delay of any link
         oldest = (t_ns - MAX_DELAY_US * 1000) * rate_hz // NS_PER_S
         start = max(used + 1, oldest)
@@ -331,14 +333,24 @@ class RecordedInputs(Generic[Change]):
                 certain.add(tick)
         return certain, probable
 
+    def _find_newest_listed(self, row: int, peer: int) -> int:
+        """Returns the newest sample of a peer in the records before a row; -1 without one."""
+        newest = -1
+        for state in self._part.states[max(0, row - _LOOK_BACK) : row]:
+            for sender, tick, _ in state.rx:
+                if sender == peer:
+                    newest = max(newest, tick)
+        return newest
+
     @cached_property
     def _listings(self) -> "list[_PeerListing]":
-        """Which records list the samples of each peer."""
+        """The records that list samples, by the index of the peer."""
         listings = [_PeerListing({}, [], []) for _ in self.samples]
         for row, state in enumerate(self._part.states):
             for peer, tick, _ in state.rx:
+                # a damaged record may list any peer
                 if not 0 <= peer < len(listings):
-                    continue  # a damaged record
+                    continue
                 listing = listings[peer]
                 listing.first_rows.setdefault(tick, row)
                 if not listing.rows or listing.rows[-1] != row:

@@ -1,4 +1,4 @@
-"""Execute a run again together with twins: copies of the run that are displaced a little.
+"""Twins of a run: copies that are displaced a little and executed together with the run.
 
 The difference between a twin and its run shows whether small displacements grow or decay.
 
@@ -33,8 +33,9 @@ from .fused import FusedRun, RunInputs, explain_not_repeatable, read_run_inputs
 PUSH_RAD = 1e-6
 """The usual size of a push, rad."""
 LARGEST = 1e-4
-"""A difference larger than this, rad or rad/s, and larger than ten times its push, is scaled
-down at the end of a window.
+"""Largest difference, rad or rad/s, at the end of a window.
+
+A larger difference is scaled down if it also exceeds ten times its push.
 """
 SMALLEST = 1e-12
 """A difference smaller than this is lost in the rounding of the numbers."""
@@ -50,8 +51,8 @@ class Push(NamedTuple):
         field: the displaced field: "q", rad; "qd", rad/s; or "theta_hat".
         by: the displacement of each site and number, shape (N, n).
         at_s: time of the push, s since the epoch.
-        again: whether a twin whose difference has decayed is pushed again at the end of a
-            window; else the twin ends there.
+        again: True if a twin whose difference has decayed is pushed again at the end of a
+            window; otherwise the twin ends there.
         largest: a difference larger than this is scaled down; math.inf: never.
     """
 
@@ -108,11 +109,11 @@ class Twins(NamedTuple):
 
 def list_joints(scenario: Scenario) -> tuple[str, ...]:
     """Returns the names of all joints, site by site."""
-    return tuple(
-        f"{name} joint {joint + 1}"
-        for name in scenario.names
-        for joint in range(scenario.layout(name).joints)
-    )
+    joints = []
+    for name in scenario.names:
+        count = scenario.layout(name).joints
+        joints += [f"{name} joint {number}" for number in range(1, count + 1)]
+    return tuple(joints)
 
 
 def choose_pushes(scenario: Scenario, count: int) -> list[Push]:
@@ -128,7 +129,8 @@ def choose_pushes(scenario: Scenario, count: int) -> list[Push]:
     if learns and count > 2:
         targets.append(("theta", PUSH_RAD))
     random_count = max(1, min(3, count - len(joint_targets) - len(targets)))
-    targets += [("q", factor * PUSH_RAD) for factor in (1.0, 1e-3, 1e3)[:random_count]]
+    random_factors = (1.0, 1e-3, 1e3)[:random_count]
+    targets += [("q", factor * PUSH_RAD) for factor in random_factors]
     targets += [(target, PUSH_RAD) for target in joint_targets]
     pushes = []
     for target, size in targets[:count]:
@@ -138,8 +140,9 @@ def choose_pushes(scenario: Scenario, count: int) -> list[Push]:
 
 
 LEAST_PUSH = 1e-11
+"""A smaller push is lost in the rounding of the numbers."""
 MOST_PUSH = 1.0
-"""A smaller push is lost in the rounding of the numbers; a larger push makes another run."""
+"""A larger push makes another run."""
 _TARGET = re.compile(r"(?:([a-z][a-z0-9_]*)\.)?(qd?|theta)([1-9]\d*)?")
 """Target of a push: optional site, kind, and optional number from 1."""
 
@@ -163,26 +166,20 @@ def parse_push(
         UsageError: the scenario has no such target, or the size is out of range.
     """
     match = _TARGET.fullmatch(target)
-    site, kind, number = match.groups() if match else (None, "", "1")
-    layouts = {name: scenario.layout(name) for name in scenario.names}
-    if kind == "theta":
-        noun = "estimate"
-        counts = _count_estimates(scenario)
-    else:
-        noun = "joint"
-        counts = [layout.joints for layout in layouts.values()]
-    # the sites that have the target
-    owners = [
-        i
-        for i, name in enumerate(layouts)
-        if site in (None, name) and counts[i] >= int(number or 1)
-    ]
+    if match is None:
+        raise UsageError(_describe_targets(scenario, target))
+    site, kind, number = match.groups()
+    counts = _count_estimates(scenario) if kind == "theta" else _count_joints(scenario)
+    owners = []
+    for i, name in enumerate(scenario.names):
+        if site in (None, name) and counts[i] >= int(number or 1):
+            owners.append(i)
     if not owners or (number and not site):
         raise UsageError(_describe_targets(scenario, target))
     if not LEAST_PUSH <= abs(size) <= MOST_PUSH:
         raise UsageError(
-            f"--push {target}={size:g}: a push is of a size from {LEAST_PUSH:g} "
-            f"to {MOST_PUSH:g}"
+            f"--push {target}={size:g}: the size of a push is from {LEAST_PUSH:g} to "
+            f"{MOST_PUSH:g}"
         )
     generator = np.random.Generator(np.random.Philox(0))
     displacements = np.zeros((len(counts), max(counts)))
@@ -192,14 +189,8 @@ def parse_push(
         else:
             direction = generator.uniform(-1.0, 1.0, counts[i])
         displacements[i, : counts[i]] = size * direction
-    owner = f"all {noun}s"
-    if number:
-        owner = f"{site} {noun} {number}"
-    elif site:
-        owner = f"all {noun}s of {site}"
-    unit = {"q": "rad at", "qd": "rad/s at", "theta": "of"}[kind]
     return Push(
-        name=f"{size:g} {unit} {owner}",
+        name=f"{size:g} {_describe_target(site, kind, number)}",
         field="theta_hat" if kind == "theta" else kind,
         by=displacements,
         at_s=at_s,
@@ -208,12 +199,29 @@ def parse_push(
     )
 
 
+def _describe_target(site: str | None, kind: str, number: str | None) -> str:
+    """Returns the target of a push behind its size, as in "rad at m1 joint 1"."""
+    noun = "estimate" if kind == "theta" else "joint"
+    unit = {"q": "rad at", "qd": "rad/s at", "theta": "of"}[kind]
+    if number:
+        return f"{unit} {site} {noun} {number}"
+    if site:
+        return f"{unit} all {noun}s of {site}"
+    return f"{unit} all {noun}s"
+
+
+def _count_joints(scenario: Scenario) -> list[int]:
+    """Returns the number of joints of each site."""
+    return [scenario.layout(name).joints for name in scenario.names]
+
+
 def _count_estimates(scenario: Scenario) -> list[int]:
     """Returns the number of estimated parameters of each site; 0 for laws that do not learn."""
-    return [
-        scenario.layout(name).parameters if scenario.gains(name).law is Law.ADAPTIVE else 0
-        for name in scenario.names
-    ]
+    counts = []
+    for name in scenario.names:
+        learns = scenario.gains(name).law is Law.ADAPTIVE
+        counts.append(scenario.layout(name).parameters if learns else 0)
+    return counts
 
 
 def _describe_targets(scenario: Scenario, target: str) -> str:
@@ -235,7 +243,7 @@ def run_twins(log: Log, pushes: Sequence[Push], *, own_laws: bool = False) -> Tw
     Args:
         log: the log.
         pushes: the pushes.
-        own_laws: whether laws that are code from outside may run.
+        own_laws: True if laws that are code from outside may run.
 
     Raises:
         NotRepeatable: the run cannot be executed again, or differs from its records here.
@@ -261,9 +269,8 @@ def run_virtual_twins(scenario: Scenario, pushes: Sequence[Push], duration_s: fl
         ScenarioError: virtual time cannot run the scenario.
         NotRepeatable: a push is not within the run.
     """
-    ticks = [
-        max(1, round(duration_s * scenario.sites[name].rate_hz)) for name in scenario.names
-    ]
+    rates_hz = [scenario.sites[name].rate_hz for name in scenario.names]
+    ticks = [max(1, round(duration_s * rate_hz)) for rate_hz in rates_hz]
     return _TwinRuns(scenario, pushes, ticks).run()
 
 
@@ -303,10 +310,12 @@ class _TwinRuns:
         twins = len(pushes)
         buckets = math.ceil(self._ends_s[-1] * BUCKETS_PER_S) + 1
         joints = len(self._joints)
-        self._largest = np.full((twins, buckets, joints), -np.inf)  # see `TwinPath`
+        # The arrays of the paths of all twins, see `TwinPath`.
+        self._largest = np.full((twins, buckets, joints), -np.inf)
         self._last = np.zeros((twins, buckets, joints))
         self._scales = np.zeros((twins, buckets))
-        self._scale = np.zeros(twins)  # the present entry of `_scales` of each twin
+        # Present scale of each twin.
+        self._scale = np.zeros(twins)
         self._speed = np.zeros((buckets, joints))
         self._pushed: list[list[int]] = [[] for _ in pushes]
         self._died: list[int | None] = [None for _ in pushes]
@@ -346,16 +355,19 @@ class _TwinRuns:
             speed = np.maximum.reduceat(np.abs(qd), starts, axis=0)
             self._speed[cells] = np.maximum(self._speed[cells], speed)
         for n, twin in enumerate(self._twins):
-            if self._pushed[n] and self._died[n] is None:
+            is_pushed = bool(self._pushed[n])
+            if is_pushed and self._died[n] is None:
                 twin.step_to(last_ns)
                 self._measure_difference(n, records, twin.pop_records())
-                if not twin.has_programs:  # the state of a program cannot be copied
+                # the state of a program cannot be copied
+                if not twin.has_programs:
                     self._renew_difference(n, end_s)
-            elif not self._pushed[n] and self._pushes[n].at_s <= end_s:
+            elif not is_pushed and self._pushes[n].at_s <= end_s:
                 twin.copy_state(self._run)
                 self._push(n, end_s)
 
     def _push(self, n: int, at_s: float) -> None:
+        """Displaces the state of twin `n` at a time, s."""
         push = self._pushes[n]
         self._twins[n].displace(push.field, push.by)
         self._pushed[n].append(round(at_s * BUCKETS_PER_S))
@@ -374,8 +386,9 @@ class _TwinRuns:
                 self._same &= bool(difference == 0.0)
                 if not difference <= SAME_RUN:
                     raise NotRepeatable(
-                        f"no twins: executed again, {signal} of {name} is off by "
-                        f"{difference:.2g}: it is not the run of these records (trilat verify)"
+                        f"no twins: in the repeated run, {signal} of {name} differs by "
+                        f"{difference:.2g} from the records, so it is another run (see trilat "
+                        "verify)"
                     )
 
     def _split_buckets(
@@ -394,10 +407,10 @@ class _TwinRuns:
             and the velocities of the run and of the twin, rad/s, a row per tick.
         """
         column = 0
-        for layout, (t_ns, rows), (twin_ns, twin_rows) in zip(
-            self._layouts, records, twin_records, strict=True
-        ):
+        sites = zip(self._layouts, records, twin_records, strict=True)
+        for layout, (t_ns, rows), (twin_ns, twin_rows) in sites:
             qd = layout.columns()["qd"]
+            # a run that diverged ends before its twin, or after it
             count = min(len(t_ns), len(twin_ns))
             if count:
                 buckets = t_ns[:count] * BUCKETS_PER_S // NS_PER_S
@@ -424,16 +437,23 @@ class _TwinRuns:
             self._scales[n, cells[0].reshape(-1)] = self._scale[n]
 
     def _renew_difference(self, n: int, end_s: float) -> None:
-        """Scales down a large difference; pushes or ends a twin without a difference."""
+        """Scales down a large difference; pushes or ends a twin without a difference.
+
+        Args:
+            n: index of the twin.
+            end_s: end of the window, s.
+        """
         twin = self._twins[n]
         push = self._pushes[n]
         bucket = round(end_s * BUCKETS_PER_S)
-        q = twin.measure_distance(self._run, "q")
-        qd = twin.measure_distance(self._run, "qd")
+        distance_q = twin.measure_distance(self._run, "q")
+        distance_qd = twin.measure_distance(self._run, "qd")
+        distance = max(distance_q, distance_qd)
         size = float(np.abs(push.by).max())
+        largest = max(push.largest, 10.0 * size)
+        # velocities alone decide on a decay: a twin may rest at another position
         last_second = self._largest[n, max(0, bucket - BUCKETS_PER_S) : bucket]
         recent = last_second.max(initial=-np.inf) - self._scale[n]
-        # velocities alone decide: a twin may rest at another position
         decayed = recent < math.log(SMALLEST)
         if decayed and push.again:
             twin.copy_state(self._run)
@@ -444,8 +464,8 @@ class _TwinRuns:
             died = int(larger[-1]) + 1 if len(larger) else self._pushed[n][0]
             self._died[n] = died
             self._largest[n, died:] = -np.inf
-        elif push.largest < math.inf and not max(q, qd) <= max(push.largest, 10.0 * size):
-            factor = size / max(q, qd)
+        elif push.largest < math.inf and not distance <= largest:
+            factor = size / distance
             twin.scale_difference(self._run, factor)
             self._scale[n] -= math.log(factor)
 
@@ -469,6 +489,7 @@ def _plan_windows(end_s: float, pushes: Sequence[Push]) -> Array:
 
 
 SAME_RUN = 1e-7
-"""Largest difference, rad, rad/s or N m, of a run from its records. The last bits differ if the
-run is executed on another platform.
+"""Largest difference, rad, rad/s or N m, of a run from its records.
+
+The last bits differ if the run is executed on another platform.
 """
