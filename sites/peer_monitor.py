@@ -1,25 +1,30 @@
-"""Presence of the other members during a run: joins, departures, and the end events of members.
+"""Presence of the other members during a run: joins, departures and ends.
 
 Invariant:
-    - Of each site, only the boot counts with which the session began. Under the rule `glide`,
-      boots that were admitted since then count as well.
-    - Another boot of a site is admitted once the token of the previous one is gone, or its end
-      event was received.
+    - Messages of a site count only if they come from the boot with which the session began.
+      Under the rule `glide`, boots that were admitted later count as well.
+    - A new boot of a site is admitted once the token of the previous boot is gone, or the end
+      event of the previous boot was received.
     - A recorder may join at any time.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
+from typing import TypeVar
 
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus, Inbox
 from trilat_net.net.membership import EventPublisher, read_messages
 from trilat_net.net.messages import Event
 
-RETURN_NS = 1_000_000_000
-"""A site that is heard for longer than this after its token was lost counts as present.
+T = TypeVar("T")
 
-After a reconnection its new token may be reported late.
+RETURN_NS = 1_000_000_000
+"""Time after the loss of a site's token from which a message of the site proves its presence.
+
+After a reconnection the new token of the site may be reported late.
 """
+_INBOX_CAPACITY = 256
+"""Number of events of a member that wait at most."""
 
 
 class PeerMonitor:
@@ -30,16 +35,17 @@ class PeerMonitor:
         session: the session's name.
         site: the name of this site.
         peers: the names of its peers.
-        admits: whether sites may leave and rejoin.
+        admits: True if sites may leave and rejoin.
 
     Attributes:
         boots: the boots of the session's members, by name.
         recorders: boots of the recorders that are present.
         stored: boots of the recorders that have stored all messages of this site.
-        ended_by: text of the event with which a member ended the run for all, else "".
+        ended_by: text of the event with which a member ended the run for all; "" before such
+            an event.
         ended_member: the name of that member.
-        departed: the sites that have left, by name: the time, ns since the epoch, and a
-            sentence.
+        departed: time of departure, ns since the epoch, and a sentence, by the name of a site
+            that has left.
         admitted: join events of admitted sites that the loop has not applied yet.
         changed: True once a peer has published a change.
     """
@@ -57,17 +63,21 @@ class PeerMonitor:
         self.changed = False
         self._site = site
         self._admits = admits
-        self._events = {
-            peer: bus.inbox(topics.key(session, peer, topics.EVENT), 256) for peer in peers
-        }
-        self._recorder_events = bus.inbox(
-            topics.key(session, topics.RECORDER, topics.EVENT), 256
-        )
+        self._events: dict[str, Inbox] = {}
+        for peer in peers:
+            event_key = topics.key(session, peer, topics.EVENT)
+            self._events[peer] = bus.inbox(event_key, _INBOX_CAPACITY)
+        recorder_key = topics.key(session, topics.RECORDER, topics.EVENT)
+        self._recorder_events = bus.inbox(recorder_key, _INBOX_CAPACITY)
         self._presence = bus.presence(topics.presence_key(session, "*"))
+        # Members and boots whose tokens are alive.
         self._alive: set[tuple[str, str]] = set()
+        # Boots whose end event was received.
         self._ended: set[int] = set()
+        # Boots that were refused, each of which is announced once.
         self._refused: set[int] = set()
-        self._first_ticks: dict[int, int] = {}  # the first ticks of the admitted boots
+        # First ticks of the admitted boots.
+        self._first_ticks: dict[int, int] = {}
 
     @property
     def all_stored(self) -> bool:
@@ -75,7 +85,7 @@ class PeerMonitor:
         return bool(self.stored) and self.recorders <= self.stored
 
     def watch(self, publisher: EventPublisher, t_ns: int) -> None:
-        """Reads events and presence; publishes who joins, and who is lost without an end event.
+        """Reads events and presence, and publishes the joins and losses of members.
 
         Args:
             publisher: publishes this site's events.
@@ -92,15 +102,25 @@ class PeerMonitor:
     def _update_presence(
         self, member: str, boot: str, publisher: EventPublisher, t_ns: int, *, alive: bool
     ) -> None:
+        """Applies the appearance or disappearance of a member's token.
+
+        Args:
+            member: name of the member.
+            boot: its boot, as in the token.
+            publisher: publishes this site's events.
+            t_ns: the present time, ns since the epoch.
+            alive: True if the token has appeared.
+        """
         is_member = str(self.boots.get(member)) == boot
         is_recorder = member == topics.RECORDER
         is_site = member in self._events
         if is_recorder:
-            (self.recorders.add if alive else self.recorders.discard)(boot)
-            if alive and not is_member:  # a recorder joins late, or replaces one that died
-                publisher.publish("back", "a recorder has come", about=member, t_ns=t_ns)
+            _set_membership(self.recorders, boot, alive)
+            # a recorder joins late, or replaces a recorder that died
+            if alive and not is_member:
+                publisher.publish("back", "a recorder has joined", about=member, t_ns=t_ns)
         elif is_site:
-            (self._alive.add if alive else self._alive.discard)((member, boot))
+            _set_membership(self._alive, (member, boot), alive)
         if self.boots.get(member) in self._ended:
             return
         if is_member and alive:
@@ -112,12 +132,18 @@ class PeerMonitor:
                 self.departed[member] = (t_ns, sentence)
 
     def mark_present(self, member: str, t_ns: int) -> None:
-        """Marks a site that is heard as present, if its token was lost some time ago.
+        """Marks a site as present whose messages arrive, if its token was lost some time ago.
 
         A site whose end event was received stays departed.
+
+        Args:
+            member: name of the site.
+            t_ns: the present time, ns since the epoch.
         """
-        since_ns, _ = self.departed.get(member, (t_ns, ""))
-        if t_ns - since_ns > RETURN_NS and self.boots.get(member) not in self._ended:
+        if member not in self.departed or self.boots.get(member) in self._ended:
+            return
+        since_ns, _ = self.departed[member]
+        if t_ns - since_ns > RETURN_NS:
             del self.departed[member]
 
     def _read_peer_events(
@@ -125,11 +151,11 @@ class PeerMonitor:
     ) -> Iterator[Event]:
         """Reads a peer's events, and yields the join events of new boots.
 
-        If the peer has admitted several boots of this site, the last one counts: the earlier
-        ones died while they joined.
+        If the peer has admitted several boots of this site, the last boot counts: the earlier
+        boots died while they joined.
         """
-        own_boot = publisher.info.boot
-        admitted_boot = own_boot
+        local_boot = publisher.info.boot
+        admitted_boot = local_boot
         for event in read_messages(inbox, Event):
             if event.kind == "coming" and self._admits:
                 yield event
@@ -145,16 +171,20 @@ class PeerMonitor:
                 if event.about and self._admits:
                     self.departed[event.member] = t_ns, event.text
                     publisher.publish(
-                        "left", event.text, about=event.member, t_ns=t_ns, ticks=event.ticks
+                        "left",
+                        event.text,
+                        about=event.member,
+                        t_ns=t_ns,
+                        ticks=event.ticks,
                     )
             elif event.kind == "admit" and event.about == self._site:
-                admitted_boot = event.boots.get(self._site, own_boot)
-        if admitted_boot != own_boot and self.boots.get(self._site) == own_boot:
-            self.ended_by = f"another start of {self._site} has taken its place"
+                admitted_boot = event.boots.get(self._site, local_boot)
+        if admitted_boot != local_boot and self.boots.get(self._site) == local_boot:
+            self.ended_by = f"another start of {self._site} has replaced this site"
             self.ended_member = self._site
 
     def _decide_on_join(self, publisher: EventPublisher, event: Event, t_ns: int) -> None:
-        """Admits a new boot of a site, or refuses it while the previous one is alive."""
+        """Admits a new boot of a site, or refuses the boot while the previous boot is alive."""
         member = event.member
         previous_boot = self.boots.get(member)
         is_repeated = self._first_ticks.get(event.boot) == event.ticks
@@ -164,10 +194,7 @@ class PeerMonitor:
         if is_replaced and (member, str(previous_boot)) in self._alive:
             if event.boot not in self._refused:
                 self._refused.add(event.boot)
-                text = (
-                    f"{member} is there already; "
-                    "another start of it must wait until that is gone"
-                )
+                text = f"{member} is present already; a new start must wait until it is gone"
                 self._publish_decision("refused", text, publisher, event=event, t_ns=t_ns)
             return
         self.boots = {**self.boots, member: event.boot}
@@ -181,6 +208,15 @@ class PeerMonitor:
     def _publish_decision(
         self, kind: str, text: str, publisher: EventPublisher, event: Event, t_ns: int
     ) -> None:
+        """Publishes the decision on a join event.
+
+        Args:
+            kind: "admit" or "refused".
+            text: the decision as a sentence.
+            publisher: publishes this site's events.
+            event: the join event.
+            t_ns: the present time, ns since the epoch.
+        """
         publisher.publish(
             kind,
             text,
@@ -202,3 +238,11 @@ class PeerMonitor:
             if event.kind == "stored" and event.about == self._site and event.ticks >= ticks:
                 self.stored.add(str(event.boot))
         return len(self.stored) > before
+
+
+def _set_membership(members: set[T], member: T, is_present: bool) -> None:
+    """Adds a member to a set, or removes the member from the set."""
+    if is_present:
+        members.add(member)
+    else:
+        members.discard(member)

@@ -337,7 +337,7 @@ def test_a_frozen_start_ends_when_another_has_its_place(tmp_path: Path) -> None:
     log = session.run()
     assert len(log.starts["m"]) == 1
     frozen, _, again = (end for _, end in session.told)
-    assert "another start of m has taken its place" in str(frozen)
+    assert "another start of m has replaced this site" in str(frozen)
     assert again == 0
     assert log["m"].mode[-1] == "run"
     assert verify(log).differing == 0
