@@ -354,7 +354,7 @@ def test_nothing_is_replaced_unasked_and_the_file_itself_never(tmp_path: Path) -
     (tmp_path / "run.mcap").write_bytes(b"precious")
     with pytest.raises(UsageError, match=r"run\.mcap: exists"):
         recover(torn)
-    with pytest.raises(UsageError, match="is the file itself"):
+    with pytest.raises(UsageError, match="is the source file"):
         recover(torn, torn, force=True)
     assert (tmp_path / "run.mcap").read_bytes() == b"precious"
     recover(torn, force=True)
