@@ -233,7 +233,10 @@ def _find_resting_rows(modes: NDArray[Any], tick: Ints, rate_hz: int) -> Bools:
 
 
 def _fill_tick_grid(
-    scenario: Scenario, part: SiteLog, rows: Ints, last: int | None = None
+    scenario: Scenario,
+    part: SiteLog,
+    rows: Ints,
+    last: int | None = None,
 ) -> AlignedRecords:
     """Returns a site's records on every tick; missing records are interpolated.
 

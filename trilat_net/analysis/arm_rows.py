@@ -122,7 +122,13 @@ class PlacedArm:
         G_1 = theta[3] * self.g_m_s2 * np.cos(q_1) + G_2
         return np.array([G_1, G_2])
 
-    def required_torque(self, theta: Numbers, qd: Numbers, v: Numbers, a: Numbers) -> Numbers:
+    def required_torque(
+        self,
+        theta: Numbers,
+        qd: Numbers,
+        v: Numbers,
+        a: Numbers,
+    ) -> Numbers:
         """Returns M(q) a + C(q, qd) v + G(q), shape (2, ...), N m: Y theta of Eq. (12)."""
         M = self.inertia_matrix(theta)
         C = self.coriolis_matrix(theta, qd)
@@ -238,13 +244,27 @@ class PlanarArmRows(NamedTuple):
         product = multiply_columns(M, x.T)
         return product.T
 
-    def law_torque(self, theta_hat: Array, q: Array, qd: Array, v: Array, a: Array) -> Array:
+    def law_torque(
+        self,
+        theta_hat: Array,
+        q: Array,
+        qd: Array,
+        v: Array,
+        a: Array,
+    ) -> Array:
         """Returns Y(q, qd, v, a) theta_hat, shape (K, 2), N m; theta_hat has shape (K, 5)."""
         arm = self.place(q)
         torque = arm.required_torque(theta_hat.T, qd.T, v.T, a.T)
         return torque.T
 
-    def gradient(self, q: Array, qd: Array, v: Array, a: Array, r: Array) -> Array:
+    def gradient(
+        self,
+        q: Array,
+        qd: Array,
+        v: Array,
+        a: Array,
+        r: Array,
+    ) -> Array:
         """Returns Y'r of r = qd - v, shape (K, 5)."""
         arm = self.place(q)
         Y = arm.regressor_matrix(qd.T, v.T, a.T)
@@ -310,7 +330,13 @@ def _put_torques(
     last = theta.shape[0] - 1
     for k in range(q.shape[0]):
         place_joints(chain, q[k])
-        propagate_motion(chain=chain, gravity=gravity, qd=qd[k], v=v[k], a=a[k])
+        propagate_motion(
+            chain=chain,
+            gravity=gravity,
+            qd=qd[k],
+            v=v[k],
+            a=a[k],
+        )
         parameters = theta[min(k, last)]
         inverse_dynamics(
             chain=chain,
@@ -334,7 +360,13 @@ def _put_gradients(
     """Writes Y'r of every row, r = qd - v, shape (K, 10 n)."""
     for k in range(q.shape[0]):
         place_joints(chain, q[k])
-        propagate_motion(chain=chain, gravity=gravity, qd=qd[k], v=v[k], a=a[k])
+        propagate_motion(
+            chain=chain,
+            gravity=gravity,
+            qd=qd[k],
+            v=v[k],
+            a=a[k],
+        )
         parameter_gradient(chain, gradient[k])
 
 
@@ -448,7 +480,14 @@ class ChainArmRows(NamedTuple):
             a=x,
         )
 
-    def law_torque(self, theta_hat: Array, q: Array, qd: Array, v: Array, a: Array) -> Array:
+    def law_torque(
+        self,
+        theta_hat: Array,
+        q: Array,
+        qd: Array,
+        v: Array,
+        a: Array,
+    ) -> Array:
         """Returns Y(q, qd, v, a) theta_hat + armature a + friction(v), shape (K, n), N m.
 
         theta_hat has shape (K, 10 n), or (1, 10 n) for all rows.
@@ -467,7 +506,14 @@ class ChainArmRows(NamedTuple):
         )
         return torque
 
-    def gradient(self, q: Array, qd: Array, v: Array, a: Array, r: Array) -> Array:  # noqa: ARG002
+    def gradient(
+        self,
+        q: Array,
+        qd: Array,
+        v: Array,
+        a: Array,
+        r: Array,  # noqa: ARG002 - as of the planar arm
+    ) -> Array:
         """Returns Y'r of r = qd - v, shape (K, 10 n)."""
         gradient = np.zeros((len(q), len(self.theta)))
         q, qd, v, a = map(np.ascontiguousarray, (q, qd, v, a))

@@ -234,7 +234,10 @@ def drop_finished_ramps(
 
 
 def evaluate_ramps(
-    start: Array, ramps: Sequence[DominanceRamp], t_s: Array, h_s: float
+    start: Array,
+    ramps: Sequence[DominanceRamp],
+    t_s: Array,
+    h_s: float,
 ) -> DominanceHistory:
     """Returns the dominance factors over time.
 

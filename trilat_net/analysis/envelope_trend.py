@@ -100,7 +100,11 @@ class EnvelopeFit(NamedTuple):
 
 
 def fit_envelopes(
-    t_s: Array, values: Array, floor: float = FLOOR_RAD, *, falls_first: bool = False
+    t_s: Array,
+    values: Array,
+    floor: float = FLOOR_RAD,
+    *,
+    falls_first: bool = False,
 ) -> list[EnvelopeFit]:
     """Returns the trends of several envelopes, as the module's docstring defines them.
 
@@ -142,7 +146,12 @@ def fit_envelopes(
     return fits
 
 
-def _find_window_maxima(t_s: Array, values: Array, windows: int, floor: float) -> Array | None:
+def _find_window_maxima(
+    t_s: Array,
+    values: Array,
+    windows: int,
+    floor: float,
+) -> Array | None:
     """Returns the maxima of equal windows of the second half, shape (windows, C).
 
     Returns None if some window has fewer than two points.
@@ -205,7 +214,13 @@ def _fit_maxima(maxima: Array, window_s: float, log_floor: float) -> list[Envelo
     return fits
 
 
-def _classify_trend(change: float, bound: float, steps: Array, *, dead: bool) -> EnvelopeTrend:
+def _classify_trend(
+    change: float,
+    bound: float,
+    steps: Array,
+    *,
+    dead: bool,
+) -> EnvelopeTrend:
     """Returns the trend of an envelope.
 
     Args:

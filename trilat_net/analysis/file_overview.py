@@ -150,7 +150,11 @@ class FileInventory:
     def _describe_channel(self, topic: str) -> JsonObject:
         """Returns the facts of a channel, without its gaps."""
         unknown = ChannelInfo(
-            topic=topic, encoding="", schema="", schema_encoding="", metadata={}
+            topic=topic,
+            encoding="",
+            schema="",
+            schema_encoding="",
+            metadata={},
         )
         channel = self._channel_infos.get(topic, unknown)
         log_ns = np.frombuffer(self._messages[topic].log_ns, dtype=np.uint64)

@@ -193,7 +193,12 @@ def _transpose(matrices: Array) -> Array:
     return matrices.transpose(0, 2, 1)
 
 
-def build_following(arm: ArmRows, q: Array, qd: Array, Lambda: Array) -> Following:
+def build_following(
+    arm: ArmRows,
+    q: Array,
+    qd: Array,
+    Lambda: Array,
+) -> Following:
     """Returns the maps of a site over rows of its joint motion.
 
     Args:

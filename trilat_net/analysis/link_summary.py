@@ -75,7 +75,12 @@ class PredictedDelivery(NamedTuple):
         return np.where(self.lost, LOST, ticks)
 
 
-def predict_delivery(log: Log, peer: str, site: str, count: int) -> PredictedDelivery:
+def predict_delivery(
+    log: Log,
+    peer: str,
+    site: str,
+    count: int,
+) -> PredictedDelivery:
     """Returns the predicted delivery of the first `count` samples of the link peer -> site.
 
     Raises:
@@ -176,7 +181,12 @@ def count_sent(log: Log, peer: str, newest: int) -> int:
     return min(max(newest + 1, recorded_ticks, *end_ticks), log.scenario.ticks(peer))
 
 
-def mark_judged_samples(log: Log, site: str, stamp_ns: Ints, arrivals: Arrivals) -> Bools:
+def mark_judged_samples(
+    log: Log,
+    site: str,
+    stamp_ns: Ints,
+    arrivals: Arrivals,
+) -> Bools:
     """Returns the samples of which it is known whether they arrived, shape (M,).
 
     These are the samples that arrived, those older than the newest arrival, and those older
@@ -445,7 +455,12 @@ def bin_ages(age_ns: Ints) -> AgeHistogram | None:
 
 
 def _summarise_link(
-    log: Log, states: list[StatedModel], peer: str, site: str, sent: int, arrivals: Arrivals
+    log: Log,
+    states: list[StatedModel],
+    peer: str,
+    site: str,
+    sent: int,
+    arrivals: Arrivals,
 ) -> LinkSummary:
     """Returns the summary of the link peer -> site.
 
@@ -486,7 +501,11 @@ def _summarise_link(
     one_way_us = None
     if len(part):
         counts = _count_samples(
-            part=part, used=used, delivery=delivery, arrivals=arrivals, judged=judged
+            part=part,
+            used=used,
+            delivery=delivery,
+            arrivals=arrivals,
+            judged=judged,
         )
         if log.driver == "live" and part.record(0).v >= ONE_WAY_SCHEMA_VERSION:
             one_way_us = compute_statistics(arrivals.delay_us)
@@ -508,7 +527,11 @@ def _summarise_link(
 
 
 def _count_samples(
-    part: SiteLog, used: Ints, delivery: PredictedDelivery, arrivals: Arrivals, judged: int
+    part: SiteLog,
+    used: Ints,
+    delivery: PredictedDelivery,
+    arrivals: Arrivals,
+    judged: int,
 ) -> SampleCounts:
     """Returns the sample counts of a link.
 

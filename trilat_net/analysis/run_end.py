@@ -217,7 +217,13 @@ NO_BUCKETS = np.zeros((0, 3))
 """The buckets of a site without records."""
 
 
-def reduce_to_buckets(bucket: Ints, e: Array, qd: Array, q: Array, into: Array) -> Array:
+def reduce_to_buckets(
+    bucket: Ints,
+    e: Array,
+    qd: Array,
+    q: Array,
+    into: Array,
+) -> Array:
     """Returns buckets with further records of a site added.
 
     In task space e has as many columns as the task. Missing columns of e, qd or q are zero.
@@ -391,7 +397,10 @@ def _choose_judged_part(t_s: Array, acted_s: float) -> tuple[int, bool]:
 
 
 def _find_worst_joint(
-    scenario: Scenario, t_s: Array, columns: Sequence[Array], sites: Sequence[Array]
+    scenario: Scenario,
+    t_s: Array,
+    columns: Sequence[Array],
+    sites: Sequence[Array],
 ) -> RunEnd:
     """Returns the end of the joint with the worst behaviour, and of these the fastest.
 
@@ -453,7 +462,12 @@ def _find_worst_joint(
     )
 
 
-def _judge_joint(scenario: Scenario, end: RunEnd, motion: Array, t_s: Array) -> EndBehaviour:
+def _judge_joint(
+    scenario: Scenario,
+    end: RunEnd,
+    motion: Array,
+    t_s: Array,
+) -> EndBehaviour:
     """Returns the behaviour of a joint.
 
     Args:
@@ -593,7 +607,12 @@ def _classify_joint(
 
 
 def _refine_by_motion(
-    behaviour: EndBehaviour, q: Array, speed: Array, t_s: Array, *, still: bool
+    behaviour: EndBehaviour,
+    q: Array,
+    speed: Array,
+    t_s: Array,
+    *,
+    still: bool,
 ) -> EndBehaviour:
     """Returns the behaviour of a joint, refined by the direction of its motion.
 
@@ -662,7 +681,10 @@ def find_coupled_sites(scenario: Scenario) -> list[list[int]]:
 
 
 def _find_disagreement(
-    scenario: Scenario, trace: RunTrace, t_s: Array, columns: Sequence[Array]
+    scenario: Scenario,
+    trace: RunTrace,
+    t_s: Array,
+    columns: Sequence[Array],
 ) -> Iterable[str]:
     """Yields a sentence for each group of coupled sites that end far apart without being held.
 
@@ -713,7 +735,10 @@ def _compares_sites_by_error(scenario: Scenario, sites: Iterable[str]) -> bool:
 
 
 def _find_held_sites(
-    scenario: Scenario, trace: RunTrace, joint: int, end_s: float
+    scenario: Scenario,
+    trace: RunTrace,
+    joint: int,
+    end_s: float,
 ) -> NDArray[np.bool_]:
     """Returns the sites at which a joint is held at the end, by the stiffness of a source.
 

@@ -216,7 +216,12 @@ def extreme_rows(values: Array, buckets: int) -> Ints:
     return np.unique(np.concatenate(keep))
 
 
-def decimate(tick: Ints, t_s: Array, values: Array, buckets: int) -> DecimatedTrace:
+def decimate(
+    tick: Ints,
+    t_s: Array,
+    values: Array,
+    buckets: int,
+) -> DecimatedTrace:
     """Returns a trace of at most 2 C + 3 points per bucket, C being the number of columns.
 
     One bucket per pixel is enough.

@@ -97,7 +97,10 @@ def compute_target_motion(source: TorqueSource, t_s: Array) -> tuple[Array, Arra
 
 
 def compute_spring_effort(
-    source: TorqueSource, t_s: Array, position: Array, speed: Array
+    source: TorqueSource,
+    t_s: Array,
+    position: Array,
+    speed: Array,
 ) -> Array:
     """Returns K (target - position) + B (target velocity - speed), shape (K, n).
 
@@ -121,7 +124,11 @@ def _map_to_joints(J: Array, force: Array) -> Array:
 
 
 def compute_source_torque(
-    source: TorqueSource, t_s: Array, q: Array, qd: Array, end_effector: EndEffectorRows
+    source: TorqueSource,
+    t_s: Array,
+    q: Array,
+    qd: Array,
+    end_effector: EndEffectorRows,
 ) -> Array:
     """Returns the torque of a source that depends on the state, ON the arm, (K, n), N m.
 
@@ -164,7 +171,11 @@ def compute_source_torque(
 
 
 def compute_live_torque(
-    source: TorqueSource, hand: Array, q: Array, qd: Array, end_effector: EndEffectorRows
+    source: TorqueSource,
+    hand: Array,
+    q: Array,
+    qd: Array,
+    end_effector: EndEffectorRows,
 ) -> Array:
     """Returns the torque of a live hand ON the arm, shape (K, n), N m.
 
@@ -455,7 +466,10 @@ def find_wall_energies(log: Log) -> list[WallEnergy]:
 
 
 def _find_generated_energy(
-    wall: TorqueSource, records: AlignedRecords, end_effector: EndEffectorRows, force: Array
+    wall: TorqueSource,
+    records: AlignedRecords,
+    end_effector: EndEffectorRows,
+    force: Array,
 ) -> float:
     """Returns the largest rise of the wall's work plus its spring's energy, in J.
 
@@ -478,7 +492,12 @@ def _find_generated_energy(
     return float((supplied - least_so_far).max())
 
 
-def _find_arm_damping(spec: SiteSpec, wall: TorqueSource, J: Array, t_s: Array) -> float:
+def _find_arm_damping(
+    spec: SiteSpec,
+    wall: TorqueSource,
+    J: Array,
+    t_s: Array,
+) -> float:
     """Returns the arm's own least damping along a wall's normal n in contact, in N s/m.
 
     The damping is 1 / (n'J D^-1 J'n), with D the damping of joints that acts continuously.

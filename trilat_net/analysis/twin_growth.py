@@ -264,7 +264,11 @@ class TwinVerdict(NamedTuple):
 
 
 def judge_end_by_twins(
-    end: RunEnd, twins: TwinGrowth, *, settles: bool | None, rises: bool
+    end: RunEnd,
+    twins: TwinGrowth,
+    *,
+    settles: bool | None,
+    rises: bool,
 ) -> TwinVerdict:
     """Returns the judgement of a run by its end and by its twins.
 
@@ -320,7 +324,11 @@ def judge_end_by_twins(
 
 
 def measure_twins(
-    log: Log, end: RunEnd, count: int = TWINS, *, own_laws: bool = False
+    log: Log,
+    end: RunEnd,
+    count: int = TWINS,
+    *,
+    own_laws: bool = False,
 ) -> TwinGrowth:
     """Returns the growth of small pushes in a run.
 
@@ -341,7 +349,10 @@ def measure_twins(
 
 
 def measure_virtual_twins(
-    scenario: Scenario, end: RunEnd, duration_s: float, count: int
+    scenario: Scenario,
+    end: RunEnd,
+    duration_s: float,
+    count: int,
 ) -> TwinGrowth:
     """Returns the growth of small pushes in a run in virtual time, without a log.
 
@@ -359,7 +370,10 @@ def measure_virtual_twins(
 
 
 def judge_twins(
-    scenario: Scenario, twins: Twins, counts_from_s: float, quiet_from_s: float
+    scenario: Scenario,
+    twins: Twins,
+    counts_from_s: float,
+    quiet_from_s: float,
 ) -> TwinGrowth:
     """Returns the growth of the pushes of a run's twins.
 
@@ -436,7 +450,12 @@ def _measure_leg(last: Array, scale: Array, largest: Array) -> Array:
         scale: logarithm of their scale, shape (K,).
         largest: logarithm of the largest difference of a joint, shape (K,).
     """
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore", under="ignore"):
+    with np.errstate(
+        divide="ignore",
+        invalid="ignore",
+        over="ignore",
+        under="ignore",
+    ):
         peak = np.max(largest, where=np.isfinite(largest), initial=-np.inf)
         d = last * np.exp(scale - peak)[:, np.newaxis]
         d_rate = np.gradient(d, 1.0 / BUCKETS_PER_S, axis=0)
@@ -526,7 +545,10 @@ def _exp(logarithm: float) -> float:
 
 
 def _find_departures(
-    twins: Twins, amplitudes: Sequence[Array], joints: Sequence[int], quiet: slice
+    twins: Twins,
+    amplitudes: Sequence[Array],
+    joints: Sequence[int],
+    quiet: slice,
 ) -> Iterator[RestDeparture]:
     """Yields the times in which the run departs from a rest, and its twins from the run.
 

@@ -407,7 +407,10 @@ def count_zero_roots(pencil: Pencil) -> tuple[int, int]:
 
 
 def refine_roots(
-    pencil: Pencil, candidates: Complex, names: Sequence[str], wanted: int
+    pencil: Pencil,
+    candidates: Complex,
+    names: Sequence[str],
+    wanted: int,
 ) -> tuple[list[CharacteristicRoot], int]:
     """Returns the rightmost `wanted` roots near some guesses, and the count of failures.
 

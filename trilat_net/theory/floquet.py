@@ -745,7 +745,10 @@ def _estimate_deviation(span: _SpanMap, mode: Array, span_s: float) -> float:
 
 
 def _describe_modes(
-    s: Complex, tracks: Sequence[Array], loop: CoupledTicks, rates_hz: Sequence[int]
+    s: Complex,
+    tracks: Sequence[Array],
+    loop: CoupledTicks,
+    rates_hz: Sequence[int],
 ) -> list[CharacteristicRoot]:
     """Returns the roots of modes, with their frequencies and their fastest joints.
 

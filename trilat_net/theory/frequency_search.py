@@ -231,7 +231,10 @@ def _find_steps_at_minima(curve_and_rounding: Array) -> NDArray[np.bool_]:
 
 
 def _find_bands_below(
-    curve: FrequencyCurve, w_rad_s: Array, values: Array, level: float
+    curve: FrequencyCurve,
+    w_rad_s: Array,
+    values: Array,
+    level: float,
 ) -> tuple[FrequencyBand, ...]:
     """Returns the bands in which a curve is below a level; bisection finds all edges together.
 

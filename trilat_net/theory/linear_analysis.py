@@ -307,7 +307,11 @@ _ROOTS = 2
 
 
 def certify_run(
-    log: Log, *, min_coverage: float = MIN_COVERAGE, own_laws: bool = False, twins: int = TWINS
+    log: Log,
+    *,
+    min_coverage: float = MIN_COVERAGE,
+    own_laws: bool = False,
+    twins: int = TWINS,
 ) -> Certificate:
     """Returns the certificate of a log, with the roots of the loop at the end of the run.
 

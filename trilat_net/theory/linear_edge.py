@@ -219,7 +219,11 @@ class _GrowthRate:
     """
 
     def __init__(
-        self, scenario: Scenario, key: str, rest: Equilibrium | None, sampled: bool | None
+        self,
+        scenario: Scenario,
+        key: str,
+        rest: Equilibrium | None,
+        sampled: bool | None,
     ) -> None:
         self.takes_integers = key.rpartition(".")[2] in _INTEGER_KEYS
         self._scenario = scenario
@@ -324,7 +328,10 @@ def compute_growth_column(
 
 
 def find_root_crossings(
-    scenario: Scenario, key: str, low: float, high: float
+    scenario: Scenario,
+    key: str,
+    low: float,
+    high: float,
 ) -> tuple[tuple[float, ...], str]:
     """Returns the values of a key at which the rightmost root crosses the axis, and a remark.
 

@@ -101,7 +101,11 @@ class OperatingConditions(NamedTuple):
         for n, law in enumerate(self.laws):
             M = inertia[n] if inertia else np.eye(self.sites[n].layout.joints)
             situation = LinearSituation(
-                site=n, names=self.names, laws=self.laws, alpha=self.alpha, inertia=M
+                site=n,
+                names=self.names,
+                laws=self.laws,
+                alpha=self.alpha,
+                inertia=M,
             )
             forms.append(law.linear_form(situation))
         return forms
@@ -320,7 +324,10 @@ def _find_final_link(scenario: Scenario, name: str, notes: list[str]) -> LinkBas
 
 
 def compute_effective_delay(
-    scenario: Scenario, peer: str, site: str, link: LinkBase
+    scenario: Scenario,
+    peer: str,
+    site: str,
+    link: LinkBase,
 ) -> EffectiveDelay:
     """Returns the age of a peer's samples at the ticks of a site that use them.
 

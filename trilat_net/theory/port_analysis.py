@@ -397,7 +397,10 @@ def _check_two_ports(
 
 
 def _check_llewellyn(
-    Y: port_response.PortResponse, keep: list[int], clamped: list[int], w_rad_s: Array
+    Y: port_response.PortResponse,
+    keep: list[int],
+    clamped: list[int],
+    w_rad_s: Array,
 ) -> frequency_search.Minima:
     """Returns Llewellyn's parameter of two ports, with other ports clamped."""
     return frequency_search.find_minima(

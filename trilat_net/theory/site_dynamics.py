@@ -54,7 +54,13 @@ class ArgumentLayout:
         arguments: length of the whole argument.
     """
 
-    def __init__(self, joints: int, parameters: int, shared: int = 0, peers: int = 0) -> None:
+    def __init__(
+        self,
+        joints: int,
+        parameters: int,
+        shared: int = 0,
+        peers: int = 0,
+    ) -> None:
         self.joints = joints
         self.parameters = parameters
         self.shared = shared
@@ -246,7 +252,10 @@ def _as_columns(values: object, like: Numbers) -> Numbers:
 
 
 def _evaluate_known_gravity_law(
-    site: SiteSetup, arm: PlacedArm | PlacedChain, following: Following, x: Numbers
+    site: SiteSetup,
+    arm: PlacedArm | PlacedChain,
+    following: Following,
+    x: Numbers,
 ) -> Numbers:
     """Returns the torque of a law with known gravity, shape (n, ...), N m.
 
@@ -270,7 +279,10 @@ def _evaluate_known_gravity_law(
 
 
 def _evaluate_adaptive_law(
-    site: SiteSetup, arm: PlacedArm | PlacedChain, following: Following, x: Numbers
+    site: SiteSetup,
+    arm: PlacedArm | PlacedChain,
+    following: Following,
+    x: Numbers,
 ) -> tuple[Numbers, Numbers]:
     """Returns the torque of an adaptive law, N m, and the rate of its estimate.
 
@@ -332,7 +344,11 @@ def _is_at_bound(site: SiteSetup, estimate: Numbers, rate: Numbers) -> Numbers:
 
 
 def _sum_actors(
-    site: SiteSetup, arm: PlacedArm | PlacedChain, x: Numbers, *, sampled: bool
+    site: SiteSetup,
+    arm: PlacedArm | PlacedChain,
+    x: Numbers,
+    *,
+    sampled: bool,
 ) -> Numbers:
     """Returns the sum of the torques of the continuous or the sampled actors.
 
@@ -356,7 +372,10 @@ def _sum_actors(
 
 
 def _evaluate_actor(
-    arm: PlacedArm | PlacedChain, actor: TorqueSource, q: Numbers, qd: Numbers
+    arm: PlacedArm | PlacedChain,
+    actor: TorqueSource,
+    q: Numbers,
+    qd: Numbers,
 ) -> Numbers:
     """Returns the torque of one actor in force, shape (n, ...), N m.
 

@@ -149,7 +149,13 @@ class PlacedChain:
             offset_m = multiply_columns(R_base, p)
             place_m = place_m + offset_m
             R_base = _multiply(R_base, R)
-            link = PlacedLink(X=X, S=S, J=J, R_base=R_base, place_m=place_m)
+            link = PlacedLink(
+                X=X,
+                S=S,
+                J=J,
+                R_base=R_base,
+                place_m=place_m,
+            )
             self._links.append(link)
 
     def _get_per_joint(self, name: str) -> Numbers:
@@ -190,7 +196,13 @@ class PlacedChain:
             blocks.append(block)
         return np.concatenate(blocks, axis=1)
 
-    def required_torque(self, theta: Numbers, qd: Numbers, v: Numbers, a: Numbers) -> Numbers:
+    def required_torque(
+        self,
+        theta: Numbers,
+        qd: Numbers,
+        v: Numbers,
+        a: Numbers,
+    ) -> Numbers:
         """Returns M(q) a + C(q, qd) v + G(q) + friction(v), shape (n, ...), N m.
 
         M includes the inertia of the drives.
@@ -549,14 +561,25 @@ class Following(NamedTuple):
 
 
 def follow_joints(
-    Lambda: Numbers, q: Numbers, qd: Numbers, q_des: Numbers, qd_des: Numbers
+    Lambda: Numbers,
+    q: Numbers,
+    qd: Numbers,
+    q_des: Numbers,
+    qd_des: Numbers,
 ) -> Following:
     """Returns how a site follows joint by joint, Eq. (9), (10): v = -Lambda (q - q_des)."""
     e = q - q_des
     ed = qd - qd_des
     v = -Lambda * e
     a = -Lambda * ed
-    return Following(x=q, xd=qd, e=e, ed=ed, v=v, a=a)
+    return Following(
+        x=q,
+        xd=qd,
+        e=e,
+        ed=ed,
+        v=v,
+        a=a,
+    )
 
 
 def share_pose(task: TaskSetup, arm: PlacedChain) -> Numbers:
@@ -621,7 +644,17 @@ def follow_in_task(
         posture=(psi, psi_d),
         error=(Lambda * e, Lambda * ed),
     )
-    return Following(x=x, xd=xd, e=e, ed=ed, v=v, a=a, J=J, A=A, least=least)
+    return Following(
+        x=x,
+        xd=xd,
+        e=e,
+        ed=ed,
+        v=v,
+        a=a,
+        J=J,
+        A=A,
+        least=least,
+    )
 
 
 def _subtract_poses(x: Numbers, x_des: Numbers) -> Numbers:

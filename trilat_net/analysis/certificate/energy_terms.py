@@ -231,7 +231,13 @@ class SiteMotion:
         records = self.records
         return self.control_torque(rows, records.e[rows], records.ed[rows], self.r[rows])
 
-    def control_torque(self, rows: Ints, e: Array, ed: Array, r: Array) -> Array:
+    def control_torque(
+        self,
+        rows: Ints,
+        e: Array,
+        ed: Array,
+        r: Array,
+    ) -> Array:
         """Returns tau of Eq. (13) without its limit, with the given errors, shape (K, n), N m.
 
         Args:
@@ -429,7 +435,10 @@ class Increment(NamedTuple):
 
 
 def _trapezoid(
-    site: SiteMotion, left: Array, right: Array, jump: Array | None = None
+    site: SiteMotion,
+    left: Array,
+    right: Array,
+    jump: Array | None = None,
 ) -> Increment:
     """Returns the trapezoid rule over powers at both ends of every period, and a jump."""
     half_s = 0.5 * site.records.h_s
@@ -709,7 +718,11 @@ def singular_pose_work(site: SiteMotion) -> Increment:
 
 
 def _singular_pose_power(
-    site: SiteMotion, rows: slice, e: Array, qd_des: Array, r: Array
+    site: SiteMotion,
+    rows: slice,
+    e: Array,
+    qd_des: Array,
+    r: Array,
 ) -> Array:
     """Returns the power of the damping near singular poses at one end of every period, W."""
     records = site.records

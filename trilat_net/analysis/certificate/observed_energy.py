@@ -229,7 +229,12 @@ def _add_parts(energy: Array) -> Array:
     return total
 
 
-def _read_law_records(log: Log, site: str, law: Any, count: int) -> LawRecords:
+def _read_law_records(
+    log: Log,
+    site: str,
+    law: Any,
+    count: int,
+) -> LawRecords:
     """Returns the first `count` records of a site in the form that a law expects."""
     part = log[site]
     sent = {key: values[:count] for key, values in part.sent.items()}
@@ -245,7 +250,12 @@ def _read_law_records(log: Log, site: str, law: Any, count: int) -> LawRecords:
     )
 
 
-def _read_law_memory(log: Log, site: str, law: Any, count: int) -> dict[str, Array]:
+def _read_law_memory(
+    log: Log,
+    site: str,
+    law: Any,
+    count: int,
+) -> dict[str, Array]:
     """Returns the attributes that a law remembers, over the first `count` records."""
     part = log[site]
     rule = log.scenario.sites[site].on_stale.rule
@@ -260,7 +270,11 @@ def _read_law_memory(log: Log, site: str, law: Any, count: int) -> dict[str, Arr
 
 
 def _read_peer_records(
-    log: Log, site: str, peer: str, sent: Mapping[str, Array], count: int
+    log: Log,
+    site: str,
+    peer: str,
+    sent: Mapping[str, Array],
+    count: int,
 ) -> PeerRecords:
     """Returns what a site's law received from a peer, and what it sent to that peer alone.
 

@@ -73,7 +73,12 @@ class FrequencyResponse(NamedTuple):
 
 
 def estimate_responses(
-    drive: Array, put_in: Array, came_out: Array, usable: Bools, rate_hz: int, least: float
+    drive: Array,
+    put_in: Array,
+    came_out: Array,
+    usable: Bools,
+    rate_hz: int,
+    least: float,
 ) -> list[FrequencyResponse]:
     """Returns the ratio of an output to an input at every driven line, the strongest first.
 
@@ -125,7 +130,10 @@ def _find_segments(usable: Bools, length: int) -> list[int]:
 
 
 def _estimate_at_line(
-    frequency_hz: float, D: Complex, X: Complex, Y: Complex
+    frequency_hz: float,
+    D: Complex,
+    X: Complex,
+    Y: Complex,
 ) -> FrequencyResponse:
     """Returns the ratio of Y to X at one line, from the segments' spectra there.
 

@@ -48,7 +48,13 @@ def metric(value: float | None, why: str = _NOT_FINITE) -> Metric:
     return Metric(float(value))
 
 
-def unavailable(group: str, why: str, *, of: str = "", applies: bool = True) -> MetricValues:
+def unavailable(
+    group: str,
+    why: str,
+    *,
+    of: str = "",
+    applies: bool = True,
+) -> MetricValues:
     """Returns the quantities of a group, all without a number.
 
     Args:

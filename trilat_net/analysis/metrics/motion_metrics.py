@@ -338,7 +338,10 @@ def read_all_estimates(view: RunView) -> dict[str, ParameterEstimates]:
 
 
 def _estimate_base_parameters(
-    arm: ArmRows, learnt: Bools, theta: list[float] | None, theta_hat: Array
+    arm: ArmRows,
+    learnt: Bools,
+    theta: list[float] | None,
+    theta_hat: Array,
 ) -> BaseEstimates:
     """Returns the estimates of a chain in base parameters.
 
@@ -417,7 +420,10 @@ def measure_parameter_error(view: RunView, site: str) -> MetricValues:
 
 
 def _compute_parameter_energy(
-    arm: ArmRows, learnt: Bools, Gamma: Array, errors: Array
+    arm: ArmRows,
+    learnt: Bools,
+    Gamma: Array,
+    errors: Array,
 ) -> list[float | None]:
     """Returns the part of V of parameter errors, in J, for each row.
 

@@ -330,7 +330,10 @@ def measure_force_sharing(view: RunView, _run: str) -> MetricValues:
 
 
 def _weigh_load(
-    window: StaticWindow, joint: int, torque: dict[str, float], weights: Array | str
+    window: StaticWindow,
+    joint: int,
+    torque: dict[str, float],
+    weights: Array | str,
 ) -> JointLoad:
     """Returns a loaded joint with the weights of its torques.
 
