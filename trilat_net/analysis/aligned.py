@@ -328,7 +328,8 @@ class PeerTrajectory:
         sums = squared_rate[1:] + squared_rate[:-1]
         steps = 0.5 * records.h_s * sums
         start = np.zeros((1, squared_rate.shape[1]))
-        self._squares: Array = np.vstack([start, np.cumsum(steps, axis=0)])
+        running_sums = np.cumsum(steps, axis=0)
+        self._squares: Array = np.vstack([start, running_sums])
 
     def evaluate(self, t_s: Array) -> PeerMotion:
         """Returns the site's motion at some times; on its ticks this equals its records.
@@ -346,7 +347,8 @@ class PeerTrajectory:
         is_at_tick = np.abs(position - nearest) < _TICK_TOLERANCE
         position = np.where(is_at_tick, nearest, position)
         last_period = len(records.known) - 2
-        row = np.clip(np.floor(position), 0, last_period).astype(np.int64)
+        period = np.floor(position)
+        row = np.clip(period, 0, last_period).astype(np.int64)
         x = np.clip(position - row, 0.0, 1.0)[:, np.newaxis]
         qa = records.shared[row]
         qb = records.shared[row + 1].copy()

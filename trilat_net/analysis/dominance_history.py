@@ -210,7 +210,9 @@ def list_scripted_ramps(scenario: Scenario, site: str) -> tuple[Array, list[Domi
 
 
 def drop_finished_ramps(
-    start: Array, ramps: Sequence[DominanceRamp], from_s: float
+    start: Array,
+    ramps: Sequence[DominanceRamp],
+    from_s: float,
 ) -> tuple[Array, list[DominanceRamp]]:
     """Returns a start and ramps that have the same history from a time on.
 

@@ -125,7 +125,10 @@ class FileInventory:
         )
 
     def channels(
-        self, session: str, rates_hz: Mapping[str, int], absences: Absences
+        self,
+        session: str,
+        rates_hz: Mapping[str, int],
+        absences: Absences,
     ) -> dict[str, JsonObject]:
         """Returns the facts of every channel by topic.
 
@@ -396,7 +399,9 @@ _LATENESS_PERCENTILES = {"p50": 50.0, "p99": 99.0, "p99_9": 99.9, "max": 100.0}
 
 
 def compute_percentiles(
-    values: ArrayLike, shares: Mapping[str, float] = PERCENTILES, unit: float = 1.0
+    values: ArrayLike,
+    shares: Mapping[str, float] = PERCENTILES,
+    unit: float = 1.0,
 ) -> dict[str, float] | None:
     """Returns percentiles by name; None without values.
 

@@ -86,7 +86,8 @@ def predict_delivery(
     Raises:
         LogError: a record names a change that is not valid.
     """
-    setup = next(link for link in log.scenario.setup(site).links if link.peer == peer)
+    links = log.scenario.setup(site).links
+    setup = next(link for link in links if link.peer == peer)
     peer_index = log[site].peers.index(peer)
     commands = [command for batch in log.commands(site).values() for command in batch]
     ordered_models = [
@@ -419,7 +420,9 @@ def compute_statistics(values: ArrayLike) -> ValueStatistics | None:
     array = np.asarray(values, dtype=np.float64)
     if not array.size:
         return None
-    p50, p95, p99, low, high = np.percentile(array, (50.0, 95.0, 99.0, 0.0, 100.0)).tolist()
+    shares = (50.0, 95.0, 99.0, 0.0, 100.0)
+    percentiles = np.percentile(array, shares)
+    p50, p95, p99, low, high = percentiles.tolist()
     return ValueStatistics(
         mean=float(array.mean()),
         deviation=float(array.std()),

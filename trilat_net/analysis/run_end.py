@@ -318,7 +318,8 @@ def classify_run_end(scenario: Scenario, trace: RunTrace) -> RunEnd:
     sites = _split_buckets(scenario, trace)
     # the last interval may be incomplete
     count = max(min(map(len, sites)) - 1, 0)
-    recorded = np.all([site[:count, 0, 0] >= 0.0 for site in sites], axis=0)
+    recorded_by_site = [site[:count, 0, 0] >= 0.0 for site in sites]
+    recorded = np.all(recorded_by_site, axis=0)
     rows = np.flatnonzero(recorded)
     span_s = count / BUCKETS_PER_S
     all_t_s = rows / BUCKETS_PER_S
@@ -334,7 +335,10 @@ def classify_run_end(scenario: Scenario, trace: RunTrace) -> RunEnd:
     columns = [site[judged_rows] for site in sites]
 
     worst = _find_worst_joint(scenario, t_s, columns, sites)
-    missing = [site for site, data in zip(scenario.names, sites, strict=True) if not len(data)]
+    missing = []
+    for name, data in zip(scenario.names, sites, strict=True):
+        if not len(data):
+            missing.append(name)
     end = worst._replace(
         missing_sites=tuple(missing),
         counts_from_s=float(t_s[0]) if len(t_s) else 0.0,
@@ -384,9 +388,12 @@ def _choose_judged_part(t_s: Array, acted_s: float) -> tuple[int, bool]:
         Row at which the part starts.
         True if the action falls in the judged half.
     """
-    if not len(t_s) or acted_s <= 0.5 * (t_s[0] + t_s[-1]):
+    if not len(t_s):
         return 0, False
     end_s = t_s[-1]
+    middle_s = 0.5 * (t_s[0] + end_s)
+    if acted_s <= middle_s:
+        return 0, False
     run_s = end_s - t_s[0]
     least_s = max(LEAST_JUDGED_S, LEAST_JUDGED_SHARE * run_s)
     if end_s - acted_s < least_s:
@@ -491,7 +498,13 @@ def _judge_joint(
         still=is_still,
         rests=rests,
     )
-    return _refine_by_motion(behaviour, motion[:, 2], motion[:, 1], t_s, still=is_still)
+    return _refine_by_motion(
+        behaviour,
+        q=motion[:, 2],
+        speed=motion[:, 1],
+        t_s=t_s,
+        still=is_still,
+    )
 
 
 def _find_fed_joints(joints: Sequence[RunEnd], owners: Ints, group: Sequence[int]) -> list[int]:

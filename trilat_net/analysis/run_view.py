@@ -1,4 +1,4 @@
-"""Provides one view of a recorded run, from which all metrics are computed.
+"""One view of a recorded run, from which all metrics are computed.
 
 The view holds the aligned records of the sites, the torques by source, the dominance factors,
 the links and the walls.
@@ -33,9 +33,9 @@ class SiteRun(NamedTuple):
     """A site of a recorded run.
 
     Attributes:
-        records: its aligned records.
-        torque: torque ON its arm, by source.
-        dominance: its dominance factors for its peers.
+        records: aligned records of the site.
+        torque: torque ON the site's arm, by source.
+        dominance: dominance factors of the site for its peers.
     """
 
     records: AlignedRecords
@@ -68,14 +68,14 @@ class RunView:
     @cached_property
     def sites(self) -> dict[str, SiteRun]:
         """The sites with records."""
-        return {
-            site: SiteRun(
-                records,
-                attribute_torque(records, self.scenario),
-                trace_dominance(self.log, site, records.t_s),
+        runs = {}
+        for site, records in align_records(self.log).items():
+            runs[site] = SiteRun(
+                records=records,
+                torque=attribute_torque(records, self.scenario),
+                dominance=trace_dominance(self.log, site, records.t_s),
             )
-            for site, records in align_records(self.log).items()
-        }
+        return runs
 
     @cached_property
     def shared(self) -> dict[str, SiteRun]:
@@ -84,7 +84,10 @@ class RunView:
         In task space, poses of end effectors take the place of joint angles, and forces take
         the place of torques.
         """
-        return {site: _view_shared(self.scenario, run) for site, run in self.sites.items()}
+        shared = {}
+        for site, run in self.sites.items():
+            shared[site] = _view_shared(self.scenario, run)
+        return shared
 
     @cached_property
     def absent(self) -> list[str]:
@@ -136,7 +139,8 @@ def _view_shared(scenario: Scenario, run: SiteRun) -> SiteRun:
         return run
     script = torque.script
     if script is not None:
-        script = script @ (following.inverse[0] @ following.J[0]).T
+        force_by_torque = following.inverse[0] @ following.J[0]
+        script = script @ force_by_torque.T
     forces = torque._replace(
         operator_now=following.project_torque(torque.operator_now),
         operator_held=following.project_torque(torque.operator_held),
@@ -147,8 +151,12 @@ def _view_shared(scenario: Scenario, run: SiteRun) -> SiteRun:
     x = records.x
     if x.shape[1] == POSE:
         # metrics compare poses of different times, so rotation vectors must not change branch
-        x = np.hstack([x[:, :POSITION], compute_continuous_vectors(x[:, POSITION:])])
+        position = x[:, :POSITION]
+        rotation_vectors = compute_continuous_vectors(x[:, POSITION:])
+        x = np.hstack([position, rotation_vectors])
     shared_records = records._replace(
-        q=axes * x, qd=axes * records.xd, tau_x=axes * records.wrench
+        q=axes * x,
+        qd=axes * records.xd,
+        tau_x=axes * records.wrench,
     )
     return SiteRun(shared_records, forces, run.dominance)

@@ -121,7 +121,9 @@ def list_changes(log: Log) -> list[AppliedChange]:
 
 
 def list_stated_models(
-    log: Log, link: str, changed: Sequence[AppliedChange]
+    log: Log,
+    link: str,
+    changed: Sequence[AppliedChange],
 ) -> list[StatedModel]:
     """Returns the models of a link: the one at the start, and one after every change.
 
@@ -141,7 +143,8 @@ def list_stated_models(
 def recorded_end_s(log: Log) -> float:
     """Returns the end of a run in s: that of the last record's period, or the planned end."""
     parts = [log[site] for site in log.sites]
-    ends_s = [float(part.t_s[-1]) + 1.0 / part.rate_hz for part in parts if len(part)]
+    recorded = [part for part in parts if len(part)]
+    ends_s = [float(part.t_s[-1]) + 1.0 / part.rate_hz for part in recorded]
     return max(ends_s, default=log.scenario.duration_s)
 
 

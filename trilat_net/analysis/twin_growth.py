@@ -456,7 +456,8 @@ def _measure_leg(last: Array, scale: Array, largest: Array) -> Array:
         over="ignore",
         under="ignore",
     ):
-        peak = np.max(largest, where=np.isfinite(largest), initial=-np.inf)
+        is_finite = np.isfinite(largest)
+        peak = np.max(largest, where=is_finite, initial=-np.inf)
         d = last * np.exp(scale - peak)[:, np.newaxis]
         d_rate = np.gradient(d, 1.0 / BUCKETS_PER_S, axis=0)
         # weighting by the local size lets all times count alike for the frequency
@@ -747,7 +748,9 @@ def _parse_sizes(text: str) -> list[float]:
 
 
 def _find_linear_sizes(
-    scenario: Scenario, growth: TwinGrowth, sizes: Sequence[float]
+    scenario: Scenario,
+    growth: TwinGrowth,
+    sizes: Sequence[float],
 ) -> LinearSizes:
     """Returns the sizes of a push up to which its effect is proportional to its size.
 

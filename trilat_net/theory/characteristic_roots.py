@@ -130,7 +130,9 @@ class Pencil(NamedTuple):
     @property
     def rate_matrix(self) -> Array:
         """E as a matrix, the coefficient of s, shape (n, n)."""
-        return np.eye(len(self.A)) if self.E is None else np.diag(self.E)
+        if self.E is None:
+            return np.eye(len(self.A))
+        return np.diag(self.E)
 
     def evaluate(self, s: complex) -> tuple[Complex, Complex]:
         """Returns Delta(s) and its derivative by s, shape (n, n) each."""
@@ -181,7 +183,8 @@ states, each of which has a root at zero.
 def extract_moving_part(pencil: Pencil, names: Sequence[str]) -> MovingPart:
     """Returns the part of a loop without constant states and without states of no effect."""
     # entry (i, j): effect of state j on the rate of state i
-    effects = np.abs(pencil.A) + np.abs(pencil.Ad).sum(axis=0)
+    delayed_effects = np.abs(pencil.Ad).sum(axis=0)
+    effects = np.abs(pencil.A) + delayed_effects
     kept = list(range(len(names)))
     while True:
         inner = effects[np.ix_(kept, kept)]
@@ -290,7 +293,9 @@ class Spectrum(NamedTuple):
 
 
 def _solve_for_root(
-    pencil: Pencil, guess: complex, names: Sequence[str]
+    pencil: Pencil,
+    guess: complex,
+    names: Sequence[str],
 ) -> CharacteristicRoot | None:
     """Returns the root to which Newton's method converges from a guess; None without one.
 
@@ -331,7 +336,7 @@ def _compute_newton_step(pencil: Pencil, s: complex) -> complex | None:
     """Returns the smallest mu of Delta(s) v = mu Delta'(s) v; None if there is none."""
     delta, derivative = pencil.evaluate(s)
     # far to the left, exp(-s T) overflows
-    if not (np.isfinite(delta).all() and np.isfinite(derivative).all()):
+    if not np.isfinite(delta).all() or not np.isfinite(derivative).all():
         return None
     try:
         if pencil.E is None:

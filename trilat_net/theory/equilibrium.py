@@ -156,7 +156,9 @@ def _limit_step(step: Array) -> float:
 
 
 def _compute_gauss_newton_step(
-    conditions: OperatingConditions, rest: Equilibrium, residual: Array
+    conditions: OperatingConditions,
+    rest: Equilibrium,
+    residual: Array,
 ) -> Array:
     """Returns the least-squares step of the loop's states, of least norm, shape (states,).
 
@@ -177,7 +179,9 @@ def _compute_gauss_newton_step(
 
 
 def _shift_equilibrium(
-    conditions: OperatingConditions, rest: Equilibrium, step: Array
+    conditions: OperatingConditions,
+    rest: Equilibrium,
+    step: Array,
 ) -> Equilibrium:
     """Returns an equilibrium shifted by a step of the loop's states; velocities are ignored."""
     masks = linear_loop.mask_loop_states(conditions)
@@ -239,7 +243,8 @@ def predict_from_start(conditions: OperatingConditions, scenario: Scenario) -> E
     first_guess = start
     if layout.chain and not layout.task:
         mean_pose = q.mean(axis=0)
-        first_guess = start._replace(q=np.tile(mean_pose, (len(q), 1)))
+        same_poses = np.tile(mean_pose, (len(q), 1))
+        first_guess = start._replace(q=same_poses)
     rest = find_nearest_equilibrium(conditions, first_guess)
     if conditions.has_forms:
         return rest._replace(how="the start poses")
@@ -257,7 +262,9 @@ def predict_from_start(conditions: OperatingConditions, scenario: Scenario) -> E
 
 
 def _compute_deviation(
-    conditions: OperatingConditions, start: Equilibrium, rest: Equilibrium
+    conditions: OperatingConditions,
+    start: Equilibrium,
+    rest: Equilibrium,
 ) -> Array:
     """Returns the deviation of a start at rest from an equilibrium, shape (states,)."""
     q_deviation = start.q - rest.q
@@ -267,7 +274,8 @@ def _compute_deviation(
         layout = lay_out_arguments(site)
         q = q_deviation[n, : layout.joints]
         estimate = estimate_deviation[n, : layout.parameters]
-        states.append(np.concatenate([q, np.zeros(layout.joints), estimate]))
+        velocities = np.zeros(layout.joints)
+        states.append(np.concatenate([q, velocities, estimate]))
     return _select_loop_states(conditions, states)
 
 
@@ -390,7 +398,9 @@ def _complete_estimates(
 
 
 def _iterate_memories(
-    conditions: OperatingConditions, rest: Equilibrium, ticks: int
+    conditions: OperatingConditions,
+    rest: Equilibrium,
+    ticks: int,
 ) -> Equilibrium:
     """Returns a pose with the memories of imported laws after some ticks in this pose."""
     theta_hat = rest.theta_hat.copy()

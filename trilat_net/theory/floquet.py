@@ -390,7 +390,9 @@ class _SpanPart(NamedTuple):
 
 
 def _plan_parts(
-    ticks: Sequence[int], used: Mapping[tuple[int, int], IntArray], count: int
+    ticks: Sequence[int],
+    used: Mapping[tuple[int, int], IntArray],
+    count: int,
 ) -> list[_SpanPart]:
     """Returns an order of all ticks of a span, in parts.
 
@@ -518,7 +520,11 @@ class _SpanMap:
         return tracks
 
     def apply(
-        self, V: Array, *, divided: bool = True, sizes: list[Array] | None = None
+        self,
+        V: Array,
+        *,
+        divided: bool = True,
+        sizes: list[Array] | None = None,
     ) -> tuple[Array, list[Array]]:
         """Returns columns after the span, and the track of each site.
 
@@ -582,7 +588,9 @@ def _split_into(V: Array, blocks: Sequence[Array]) -> None:
 
 
 def _find_multipliers(
-    span: _SpanMap, n: int, wanted: int
+    span: _SpanMap,
+    n: int,
+    wanted: int,
 ) -> tuple[Complex, Complex, NDArray[np.bool_]]:
     """Returns the largest multipliers of a span map, by the block Arnoldi method.
 
@@ -765,8 +773,12 @@ def _describe_modes(
     count = len(s)
     roots: list[CharacteristicRoot] = []
     # 2 pi / T
-    turn = 2.0 * np.pi * rates_hz[0] / (len(tracks[0]) - 1)
-    first_states = [track[0, :, :count] + 1j * track[0, :, count:] for track in tracks]
+    ticks = len(tracks[0]) - 1
+    turn = 2.0 * np.pi * rates_hz[0] / ticks
+    first_states = []
+    for track in tracks:
+        first = track[0]
+        first_states.append(first[:, :count] + 1j * first[:, count:])
     amplitudes = np.abs(np.concatenate(first_states))
     velocities = []
     for state, name in enumerate(loop.names):

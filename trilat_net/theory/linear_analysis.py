@@ -470,7 +470,8 @@ def _choose_end_state(scenario: Scenario, site_logs: Sequence[SiteLog]) -> tuple
         padded = []
         for site_log in site_logs:
             missing_joints = joints - site_log.q.shape[1]
-            padded.append(np.pad(site_log.q[rows], ((0, 0), (0, missing_joints))))
+            padding = ((0, 0), (0, missing_joints))
+            padded.append(np.pad(site_log.q[rows], padding))
         q = np.stack(padded, axis=1)
         deepest = find_deepest_contact(scenario, q)
         if deepest is not None:

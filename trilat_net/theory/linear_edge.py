@@ -48,7 +48,10 @@ ASSUMED_EQUILIBRIUM_REMARK = (
 
 
 def find_rightmost_root(
-    conditions: OperatingConditions, rest: Equilibrium, *, sampled: bool
+    conditions: OperatingConditions,
+    rest: Equilibrium,
+    *,
+    sampled: bool,
 ) -> CharacteristicRoot | None:
     """Returns the rightmost root about an equilibrium; None if all roots are zero.
 
@@ -78,7 +81,8 @@ def find_deepest_contact(scenario: Scenario, q: Array) -> int | None:
         for wall in site.actors:
             if wall.kind is TorqueKind.WALL and wall.sampled:
                 tip = place_arm(site, joint_angles).end_effector_position()
-                wall_depth_m = (np.array(wall.a) - tip.T) @ np.array(wall.b)
+                from_surface = np.array(wall.a) - tip.T
+                wall_depth_m = from_surface @ np.array(wall.b)
                 depth_m = np.maximum(depth_m, wall_depth_m)
     deepest = int(depth_m.argmax())
     return deepest if depth_m[deepest] > 0.0 else None
@@ -290,7 +294,9 @@ class GrowthColumn(NamedTuple):
 
 
 def compute_growth_column(
-    scenarios: Sequence[Scenario], key: str, values: Sequence[float]
+    scenarios: Sequence[Scenario],
+    key: str,
+    values: Sequence[float],
 ) -> GrowthColumn:
     """Returns the growth rates of scenarios that differ in one key only.
 

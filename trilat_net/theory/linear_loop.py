@@ -180,7 +180,9 @@ def differentiate_references(
 
 
 def compute_couplings(
-    conditions: OperatingConditions, rest: Equilibrium, sites: list[SiteJacobian]
+    conditions: OperatingConditions,
+    rest: Equilibrium,
+    sites: list[SiteJacobian],
 ) -> dict[tuple[int, int], Array]:
     """Returns the effect of site j's output on site i's inputs, by (i, j).
 
@@ -222,7 +224,10 @@ def mask_loop_states(conditions: OperatingConditions) -> list[NDArray[np.bool_]]
 
 
 def differentiate_rates(
-    conditions: OperatingConditions, rest: Equilibrium, *, all_estimates: bool = False
+    conditions: OperatingConditions,
+    rest: Equilibrium,
+    *,
+    all_estimates: bool = False,
 ) -> list[SiteJacobian]:
     """Returns the derivatives of each site's rates at an equilibrium, without its peers.
 
@@ -333,7 +338,10 @@ def _list_blocks(lengths: Sequence[int]) -> list[slice]:
 
 
 def linearise_loop(
-    conditions: OperatingConditions, rest: Equilibrium, *, all_estimates: bool = False
+    conditions: OperatingConditions,
+    rest: Equilibrium,
+    *,
+    all_estimates: bool = False,
 ) -> LinearLoop:
     """Returns the loop linearised at an equilibrium, under given conditions.
 
@@ -401,7 +409,9 @@ def _name_states(
 
 
 def _name_ports(
-    conditions: OperatingConditions, sites: Sequence[SiteJacobian], kind: str
+    conditions: OperatingConditions,
+    sites: Sequence[SiteJacobian],
+    kind: str,
 ) -> tuple[str, ...]:
     """Returns the names of a quantity of all joints, as "m1.tau1" for the kind "tau"."""
     names = []
@@ -420,7 +430,9 @@ def _sort_terms(terms: dict[float, tuple[Array, Array]]) -> tuple[DelayedTerm, .
 
 
 def add_law_forms(
-    conditions: OperatingConditions, sites: Sequence[SiteJacobian], loop: LinearLoop
+    conditions: OperatingConditions,
+    sites: Sequence[SiteJacobian],
+    loop: LinearLoop,
 ) -> LinearLoop:
     """Returns a loop with the states and the sent signals that laws add (`LinearForm`).
 
@@ -466,7 +478,8 @@ def add_law_forms(
                     B[signal] = B[acceleration]
             undelayed_A[signal, signal] -= np.eye(len(sites[i].rates.qdd))
     A, B = terms.pop(0.0)
-    new_columns = np.zeros((len(loop.C), state_count - loop.C.shape[1]))
+    outputs, old_states = loop.C.shape
+    new_columns = np.zeros((outputs, state_count - old_states))
     return loop._replace(
         names=tuple(names),
         A=A,
@@ -482,7 +495,9 @@ _StateBlocks = dict[tuple[int, BlockKey], slice]
 
 
 def _index_form_states(
-    conditions: OperatingConditions, forms: Sequence[LinearForm | None], loop: LinearLoop
+    conditions: OperatingConditions,
+    forms: Sequence[LinearForm | None],
+    loop: LinearLoop,
 ) -> tuple[_StateBlocks, list[str]]:
     """Returns the state blocks of all laws' signals, and the names of all states."""
     blocks: _StateBlocks = {}

@@ -117,12 +117,14 @@ class OperatingConditions(NamedTuple):
         Site i uses them if its dominance factor is not zero, or if its law is imported: such a
         law reads the samples of every peer.
         """
-        is_imported = np.array(
-            [isinstance(site.law_factory, NumericLaw) for site in self.sites]
-        )
-        is_other = ~np.eye(len(self.alpha), dtype=bool)
-        coupled = (self.alpha != 0.0) | (is_imported[:, np.newaxis] & is_other)
-        return [(int(i), int(j)) for i, j in zip(*np.nonzero(coupled), strict=True)]
+        pairs = []
+        for i, site in enumerate(self.sites):
+            is_imported = isinstance(site.law_factory, NumericLaw)
+            for j, share in enumerate(self.alpha[i].tolist()):
+                reads_all = is_imported and j != i
+                if share != 0.0 or reads_all:
+                    pairs.append((i, j))
+        return pairs
 
     @property
     def has_forms(self) -> bool:
@@ -149,13 +151,13 @@ class OperatingConditions(NamedTuple):
             return True
         if self.sites[0].scheme is Scheme.DIGITAL:
             return True
-        return any(actor.sampled for site in self.sites for actor in site.actors)
+        actors = [actor for site in self.sites for actor in site.actors]
+        return any(actor.sampled for actor in actors)
 
     def evaluate_rates(self, arguments: Sequence[Array]) -> list[SiteRates]:
         """Returns the rates of every site at its own arguments, see `evaluate_site_rates`."""
-        return [
-            evaluate_site_rates(site, x) for site, x in zip(self.sites, arguments, strict=True)
-        ]
+        pairs = zip(self.sites, arguments, strict=True)
+        return [evaluate_site_rates(site, x) for site, x in pairs]
 
 
 def derive_operating_conditions(
@@ -223,11 +225,8 @@ def _describe_laws(scenario: Scenario) -> list[str]:
     laws = scenario.controls
     codes = [law.code if isinstance(law, ImportedLaw) else "" for law in laws]
     for code in filter(None, dict.fromkeys(codes)):
-        sites = [
-            name
-            for name, law_code in zip(scenario.names, codes, strict=True)
-            if law_code == code
-        ]
+        pairs = zip(scenario.names, codes, strict=True)
+        sites = [name for name, law_code in pairs if law_code == code]
         notes.append(
             f"{code} of {', '.join(sites)} is differentiated numerically, "
             "and so is its memory: by central differences"
@@ -238,9 +237,8 @@ def _describe_laws(scenario: Scenario) -> list[str]:
 
 def is_constant_link(link: LinkBase) -> bool:
     """True if a link delays every sample by the same time and loses none."""
-    return (
-        link.to_core_model().kind == DelayKind.CONSTANT and not link.loss and not link.measured
-    )
+    has_constant_model = link.to_core_model().kind == DelayKind.CONSTANT
+    return has_constant_model and not link.loss and not link.measured
 
 
 def _build_imported_law(scenario: Scenario, site: SiteSetup, alpha: Array) -> SiteSetup:
@@ -363,11 +361,17 @@ def compute_effective_delay(
     tick_ns = np.arange(first, len(used)) * NS_PER_S // site_hz
     sample_ns = used[first:] * NS_PER_S // peer_hz
     ages_s = (tick_ns - sample_ns) * 1e-9
-    return EffectiveDelay(float(ages_s.mean()), float(ages_s.min()), float(ages_s.max()))
+    return EffectiveDelay(
+        mean_s=float(ages_s.mean()),
+        least_s=float(ages_s.min()),
+        most_s=float(ages_s.max()),
+    )
 
 
 def _find_final_dominance(
-    scenario: Scenario, sites: tuple[SiteSetup, ...], notes: list[str]
+    scenario: Scenario,
+    sites: tuple[SiteSetup, ...],
+    notes: list[str],
 ) -> Array:
     """Returns the dominance matrix at the end of the run, shape (N, N); adds to `notes`."""
     alpha = scenario.alpha.copy()
@@ -379,8 +383,10 @@ def _find_final_dominance(
                 continue
             progress = 1.0
             if ramp.end_ns > end_ns:
-                progress = (end_ns - ramp.start_ns) / (ramp.end_ns - ramp.start_ns)
-            alpha[i, peers] += progress * (np.array(ramp.alpha) - alpha[i, peers])
+                elapsed_ns = end_ns - ramp.start_ns
+                progress = elapsed_ns / (ramp.end_ns - ramp.start_ns)
+            change = np.array(ramp.alpha) - alpha[i, peers]
+            alpha[i, peers] += progress * change
             notes.append(
                 f"the dominance factors of {site.name} change during the run: "
                 "their values at the end are used"

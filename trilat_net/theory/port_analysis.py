@@ -286,7 +286,9 @@ def _are_estimates_true(conditions: OperatingConditions, rest: Equilibrium) -> b
 
 
 def _check_absolute_stability(
-    loop: LinearLoop, Y: port_response.PortResponse, w_rad_s: Array
+    loop: LinearLoop,
+    Y: port_response.PortResponse,
+    w_rad_s: Array,
 ) -> frequency_search.Minima:
     """Returns the margin of absolute stability over frequency, with the best weights."""
     owners = _find_owners(loop)
@@ -329,7 +331,9 @@ def _locate_hands(
             continue
         q = site_q[np.newaxis, : site.layout.joints]
         ports = port_response.find_site_ports(loop, site.name)
-        J = build_arm_rows(scenario, site.name).place_end_effector(q, np.zeros_like(q)).J[0]
+        arm = build_arm_rows(scenario, site.name)
+        end_effector = arm.place_end_effector(q, np.zeros_like(q))
+        J = end_effector.J[0]
         if any(len(hand.B) != len(J) for hand in hands):
             raise UsageError(
                 f"{site.name}: its end effector moves along {count_nouns(len(J), 'axis')}, "
@@ -355,7 +359,9 @@ def _find_owners(loop: LinearLoop) -> NDArray[np.int64]:
 
 
 def _check_proof(
-    conditions: OperatingConditions, loop: LinearLoop, w_rad_s: Array
+    conditions: OperatingConditions,
+    loop: LinearLoop,
+    w_rad_s: Array,
 ) -> Passivity | None:
     """Returns passivity with respect to r under the proof's weights; None: no proof."""
     output = build_proof_output(conditions, loop)
@@ -371,7 +377,9 @@ def _check_proof(
 
 
 def _check_two_ports(
-    loop: LinearLoop, Y: port_response.PortResponse, w_rad_s: Array
+    loop: LinearLoop,
+    Y: port_response.PortResponse,
+    w_rad_s: Array,
 ) -> tuple[TwoPort, ...]:
     """Returns Llewellyn's criterion for each joint that both sites of a pair have.
 
@@ -502,7 +510,9 @@ def name_ports(conditions: OperatingConditions) -> dict[int, str]:
 
 
 def move_ports_to_end_effectors(
-    conditions: OperatingConditions, rest: Equilibrium, loop: LinearLoop
+    conditions: OperatingConditions,
+    rest: Equilibrium,
+    loop: LinearLoop,
 ) -> LinearLoop:
     """Returns a loop with ports at the end effectors; in joint space the same loop.
 

@@ -207,7 +207,9 @@ def find_lacking_damping(Y: Complex, w_rad_s: Array) -> float:
 
 
 def check_passivity(
-    response: PortResponse, w_rad_s: Array, weights: Array | None = None
+    response: PortResponse,
+    w_rad_s: Array,
+    weights: Array | None = None,
 ) -> Passivity:
     """Returns the passivity at some ports, on a frequency grid that is refined at minima.
 
@@ -363,7 +365,8 @@ def find_best_weights(Y: Complex, owner: NDArray[np.int64]) -> BestWeights:
         centre[active] += step / (free + 1.0)
         ellipsoids[active] = _shrink_ellipsoids(ellipsoids[active], step)
     # the first site's weight is 1
-    log_weights = np.concatenate([np.zeros((count, 1)), best], axis=1)
+    first_site = np.zeros((count, 1))
+    log_weights = np.concatenate([first_site, best], axis=1)
     return BestWeights(margin, np.exp(log_weights))
 
 
@@ -399,7 +402,9 @@ def _scale_sites(Y: Complex, owner: NDArray[np.int64]) -> Complex:
 
 
 def _evaluate_margin(
-    Y: Complex, log_weights: Array, owner: NDArray[np.int64]
+    Y: Complex,
+    log_weights: Array,
+    owner: NDArray[np.int64],
 ) -> tuple[Array, Array]:
     """Returns the least eigenvalue under weights, and its gradient by their logarithms.
 

@@ -108,7 +108,9 @@ class PoleAtZero(NamedTuple):
 
 
 def evaluate_transfer(
-    loop: LinearLoop, s: Complex, output: LoopOutput | None = None
+    loop: LinearLoop,
+    s: Complex,
+    output: LoopOutput | None = None,
 ) -> Complex:
     """Returns the transfer function from torques to an output, shape (F, p, m).
 
@@ -121,9 +123,12 @@ def evaluate_transfer(
             admittance Y(s), rad/s per N m.
     """
     output = LoopOutput(loop.C) if output is None else output
-    shape = (len(s), len(output.C), loop.B.shape[1])
-    response = np.zeros(shape, np.complex128)
-    E = np.eye(len(loop.A)) if loop.E is None else np.diag(loop.E)
+    outputs = len(output.C)
+    inputs = loop.B.shape[1]
+    response = np.zeros((len(s), outputs, inputs), np.complex128)
+    E = np.eye(len(loop.A))
+    if loop.E is not None:
+        E = np.diag(loop.E)
     for first in range(0, len(s), _BATCH):
         end = first + _BATCH
         batch = s[first:end]
@@ -302,6 +307,7 @@ def clamp_site(loop: LinearLoop, site: str) -> LinearLoop:
         kept_A = total.A[np.ix_(kept, kept)]
         kept_terms.append(DelayedTerm(delay_s, kept_A, total.B[kept]))
     undelayed, *delayed = kept_terms
+    active_terms = [term for term in delayed if term.A.any() or term.B.any()]
     return LinearLoop(
         names=tuple(loop.names[n] for n in kept),
         inputs=tuple(loop.inputs[n] for n in other_ports),
@@ -309,7 +315,7 @@ def clamp_site(loop: LinearLoop, site: str) -> LinearLoop:
         A=undelayed.A,
         B=undelayed.B,
         C=loop.C[np.ix_(other_ports, kept)],
-        delayed=tuple(term for term in delayed if term.A.any() or term.B.any()),
+        delayed=tuple(active_terms),
         E=None if loop.E is None else loop.E[kept],
     )
 

@@ -79,7 +79,8 @@ def _cross_motion(V: Numbers) -> Numbers:
 
     The matrix of V x* for forces is minus its transpose.
     """
-    matrix = np.zeros((6, 6, *V.shape[1:]), V.dtype)
+    columns = V.shape[1:]
+    matrix = np.zeros((6, 6, *columns), V.dtype)
     rotation = build_cross_matrix(V[3:])
     matrix[:3, :3] = rotation
     matrix[3:, 3:] = rotation
@@ -347,7 +348,8 @@ def _transform_velocities(R: Numbers, p: Numbers) -> Numbers:
     """
     R_transposed = _transpose(R)
     lever = _multiply(R_transposed, build_cross_matrix(p))
-    X = np.zeros((6, 6, *p.shape[1:]), np.result_type(R, p))
+    columns = p.shape[1:]
+    X = np.zeros((6, 6, *columns), np.result_type(R, p))
     X[:3, :3] = R_transposed
     X[3:, 3:] = R_transposed
     X[:3, 3:] = -lever
@@ -409,8 +411,10 @@ def rotation_from_vector(vector: Numbers) -> Numbers:
     # sin(x) / x and (1 - cos(x)) / x^2
     sine_series = 1.0 - square / 6.0 * (1.0 - square / 20.0 * (1.0 - square / 42.0))
     cosine_series = 0.5 - square / 24.0 * (1.0 - square / 30.0 * (1.0 - square / 56.0))
-    sine_factor = np.where(is_small, sine_series, np.sin(angle) / angle)
-    cosine_factor = np.where(is_small, cosine_series, (1.0 - np.cos(angle)) / angle**2)
+    sine_quotient = np.sin(angle) / angle
+    cosine_quotient = (1.0 - np.cos(angle)) / angle**2
+    sine_factor = np.where(is_small, sine_series, sine_quotient)
+    cosine_factor = np.where(is_small, cosine_series, cosine_quotient)
     K = build_cross_matrix(vector)
     K_squared = _multiply(K, K)
     identity = _add_axes(np.eye(3), (3, 3), vector.ndim - 1)
@@ -473,7 +477,8 @@ def _find_quaternion(R: Numbers) -> Numbers:
             [z, xz, yz, 1.0 - xx - yy + zz],
         ]
     )
-    sizes = np.array([products[n, n].real for n in range(4)])
+    diagonal = [products[n, n].real for n in range(4)]
+    sizes = np.array(diagonal)
     largest = sizes.argmax(axis=0)
     row = largest[np.newaxis, np.newaxis]
     quaternion = np.take_along_axis(products, row, axis=0)[0]
@@ -634,7 +639,8 @@ def follow_in_task(
     J_rate = axis_rows * full_J_rate
     A, least = _damp(task, J)
 
-    posture = _add_axes(np.array(task.posture or site.q0), (-1,), column_axes)
+    preferred = np.array(task.posture or site.q0)
+    posture = _add_axes(preferred, (-1,), column_axes)
     psi = -task.posture_rate * (q - posture)
     psi_d = -task.posture_rate * qd
     v, a = find_task_reference(
@@ -696,7 +702,8 @@ def _damp(task: TaskSetup, J: Numbers) -> tuple[Numbers, float]:
     if not least.min() > SINGULAR:
         return A + np.nan, 0.0
 
-    inverse_trace = np.trace(np.linalg.inv(matrices), axis1=-2, axis2=-1)
+    inverses = np.linalg.inv(matrices)
+    inverse_trace = np.trace(inverses, axis1=-2, axis2=-1)
     bound = 1.0 / inverse_trace
     limit = task.singular_value**2
     damping = np.where(bound.real < limit, limit - bound, 0.0)

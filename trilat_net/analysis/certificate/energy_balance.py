@@ -114,7 +114,10 @@ class SiteEnergy:
     @property
     def begin_s(self) -> float:
         """The first tick at which V_i follows from records, in s; infinite if there is none."""
-        known = [view.delayed.known & view.now.known for view in self.followed.values()]
+        known = []
+        for view in self.followed.values():
+            is_known = view.delayed.known & view.now.known
+            known.append(is_known)
         known_rows = np.flatnonzero(np.logical_and.reduce(known))
         if not len(known_rows):
             return np.inf
@@ -422,8 +425,10 @@ def _weigh_site(energy: SiteEnergy, left: Array, right: Array) -> dict[tuple[str
     for name, increment in energy.work.items():
         weighted["work", name] = weigh(increment)
     V = energy.parts.total
-    ramp_work = (right - start) * 0.5 * (V[:-1] + V[1:])
-    step_work = (after_step - right) * V[1:]
+    V_start = V[:-1]
+    V_end = V[1:]
+    ramp_work = (right - start) * 0.5 * (V_start + V_end)
+    step_work = (after_step - right) * V_end
     weight_work = _accumulate(ramp_work + step_work)
     weighted["work", "shares"] = weighted["work", "shares"] + weight_work
     weighted["sampling", ""] = weigh(energy.sampling)
@@ -440,7 +445,10 @@ def _resample(times: Array, t_s: Array, values: Array) -> Array:
 
 
 def _trace_weights(
-    energies: Mapping[str, SiteEnergy], records: AlignedRecords, *, paper_weights: bool
+    energies: Mapping[str, SiteEnergy],
+    records: AlignedRecords,
+    *,
+    paper_weights: bool,
 ) -> tuple[Array, Array]:
     """Returns the weights beta of all N sites, on the tick grid of one site's records.
 
@@ -478,7 +486,9 @@ def _trace_weights(
 
 
 def _interpolate_dominance(
-    energies: Mapping[str, SiteEnergy], t_s: Array, ahead_s: float = 0.0
+    energies: Mapping[str, SiteEnergy],
+    t_s: Array,
+    ahead_s: float = 0.0,
 ) -> Array:
     """Returns the dominance matrix of a group of sites over time, shape (T, N, N).
 

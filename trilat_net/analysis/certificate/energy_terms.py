@@ -90,7 +90,8 @@ class SiteConstants(NamedTuple):
         """Kd as the weights of V use it, shape (m,): NaN along axes that are not followed."""
         if not self.axes:
             return self.Kd
-        return np.where(np.array(self.axes) == 0.0, np.nan, self.Kd)
+        is_free = np.array(self.axes) == 0.0
+        return np.where(is_free, np.nan, self.Kd)
 
     def robust_torque(self, r: Array) -> Array:
         """Returns the robust torque that opposes r in addition to Kp r, shape (K, n), N m."""
@@ -228,8 +229,12 @@ class SiteMotion:
 
     def law_torque(self, rows: Ints) -> Array:
         """Returns tau of Eq. (13) without its limit, in some rows, shape (K, n), N m."""
-        records = self.records
-        return self.control_torque(rows, records.e[rows], records.ed[rows], self.r[rows])
+        return self.control_torque(
+            rows,
+            e=self.records.e[rows],
+            ed=self.records.ed[rows],
+            r=self.r[rows],
+        )
 
     def control_torque(
         self,
@@ -624,8 +629,10 @@ def dominance_change_work(site: SiteMotion) -> Increment:
         stored_at_end = 0.5 * integral_at_end @ c.Kd
         alpha_rate = dominance.rate[:-1, j]
         followed_rate = np.where(ends.following, alpha_rate, 0.0)
-        ramp_left = (qd_left * c.Kd * view.delayed.q[:-1]).sum(axis=1)
-        ramp_right = (qd_right * c.Kd * view.delayed_end.q).sum(axis=1)
+        q_left = view.delayed.q[:-1]
+        q_right = view.delayed_end.q
+        ramp_left = (qd_left * c.Kd * q_left).sum(axis=1)
+        ramp_right = (qd_right * c.Kd * q_right).sum(axis=1)
         left = left + alpha_rate * stored[:-1]
         left = left + followed_rate * ramp_left
         right = right + alpha_rate * stored_at_end
@@ -857,7 +864,8 @@ def _evaluate_before_jump(site: SiteMotion) -> tuple[Array, Array]:
     has_rate_limit = np.any(np.isfinite(c.tau_rate))
     is_rate_limited = site.limited.any(axis=1) & has_rate_limit
     is_bound = site.rests | is_rate_limited
-    tau[periods] = np.where(is_bound[rows, np.newaxis], tau[periods], limited_torque)
+    keeps_torque = is_bound[rows, np.newaxis]
+    tau[periods] = np.where(keeps_torque, tau[periods], limited_torque)
     return tau, Yr
 
 

@@ -4,13 +4,13 @@ A law may declare the energies that prove its passivity: those of its lines to p
 observers and of its tanks. This module recomputes what the arms exchanged with the laws, and
 checks the declared energies against that.
 
-    line from peer j to site i: what j's law put in, less what i's law took out;
+    line from peer j to site i: energy that j's law sent, less energy that i's law received;
     arm's port: sum over ticks of u_k' (q_{k+1} - q_k), u_k the torque that was held.
 
 Invariant:
     - The declared energies are believed only as far as they agree with the records.
     - Lines and stores are never below zero, and the energy that a law dissipated never falls;
-      otherwise the verdict names the place.
+      otherwise the verdict names the line, the store or the site.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -176,11 +176,11 @@ def observe_energies(log: Log, *, own_laws: bool = False) -> ObservedEnergy | No
         text = f"{unjudged}: the law of {', '.join(silent)} declares none"
         return ObservedEnergy(unjudged, text)
     parts = {site: log[site] for site in log.sites}
-    incomplete = [
-        site
-        for site, part in parts.items()
-        if not len(part) or part.missing or part.tick[0]  # records are missing before tick[0]
-    ]
+    incomplete = []
+    for site, part in parts.items():
+        # a first tick above 0 means that records before it are missing
+        if not len(part) or part.missing or part.tick[0]:
+            incomplete.append(site)
     if incomplete:
         text = f"{unjudged}: records of {', '.join(incomplete)} are missing"
         return ObservedEnergy(unjudged, text)
@@ -192,13 +192,14 @@ def _read_books(log: Log, site: str, law: Any) -> _SiteBooks:
     """Returns the energies of a site's law, declared and recomputed from the records."""
     part = log[site]
     setup = log.scenario.setup(site)
-    # the record that says `diverged` has no law of its own
+    # no law computed a record with the mode "diverged"
     count = len(part) - int(part.mode[-1] == "diverged")
     records = _read_law_records(log, site, law, count)
     declared: LawEnergies = law.energies(records)
     limit_nm = np.array(setup.tau_limit_nm)
     digital = setup.scheme is Scheme.DIGITAL
-    arm_gave = -sum_work(hold_torque(records.tau, limit_nm, digital=digital), records.q)
+    held_torque = hold_torque(records.tau, limit_nm, digital=digital)
+    arm_gave = -sum_work(held_torque, records.q)
     if setup.theta_known:
         # holding the arm against gravity is no work of the law
         potential = build_arm_rows(log.scenario, site).potential_energy(records.q)
@@ -260,13 +261,17 @@ def _read_law_memory(
     part = log[site]
     rule = log.scenario.sites[site].on_stale.rule
     life_length = part.layout.count_life_memory(len(part.peers), degrades=rule.degrades)
-    # the law's memory follows that of the session's life, or that of the reference
-    first = life_length if rule.action is StaleAction.GLIDE else part.layout.shared + 1
+    # the law's memory follows the memory of the session's life, or of the reference
+    first = part.layout.shared + 1
+    if rule.action is StaleAction.GLIDE:
+        first = life_length
     attributes = getattr(law, "remembers", ())
     lengths = [np.size(getattr(law, attribute)) for attribute in attributes]
     memory = part.memory(first, sum(lengths))[:count]
-    parts = np.split(memory, np.cumsum(lengths, dtype=np.int64)[:-1], axis=1)
-    return dict(zip(attributes, parts, strict=False))  # without attributes, one empty part
+    ends = np.cumsum(lengths, dtype=np.int64)
+    parts = np.split(memory, ends[:-1], axis=1)
+    # without attributes there is one empty part
+    return dict(zip(attributes, parts, strict=False))
 
 
 def _read_peer_records(
@@ -276,24 +281,25 @@ def _read_peer_records(
     sent: Mapping[str, Array],
     count: int,
 ) -> PeerRecords:
-    """Returns what a site's law received from a peer, and what it sent to that peer alone.
+    """Returns the values that a site's law received from a peer, and sent to this peer alone.
 
     A key such as `wave[s]` is a value for site s alone.
     """
     tick = log[site].used[peer][:count]
-    peer_sent = {
-        key.removesuffix(f"[{site}]"): values for key, values in log[peer].sent.items()
-    }
-    received = {
-        key: np.where(tick[:, None] >= 0, values[np.maximum(tick, 0)], 0.0)
-        for key, values in peer_sent.items()
-        if "[" not in key
-    }
-    sent_to_peer = {
-        key.partition("[")[0]: values
-        for key, values in sent.items()
-        if key.endswith(f"[{peer}]")
-    }
+    has_sample = tick[:, np.newaxis] >= 0
+    row = np.maximum(tick, 0)
+    received = {}
+    for key, values in log[peer].sent.items():
+        name = key.removesuffix(f"[{site}]")
+        # a value for another site
+        if "[" in name:
+            continue
+        received[name] = np.where(has_sample, values[row], 0.0)
+    sent_to_peer = {}
+    for key, values in sent.items():
+        if key.endswith(f"[{peer}]"):
+            name = key.partition("[")[0]
+            sent_to_peer[name] = values
     return PeerRecords(tick, received, sent_to_peer)
 
 
@@ -306,10 +312,12 @@ def _find_curves(log: Log, books: Mapping[str, _SiteBooks]) -> Iterator[EnergyCu
             energies.append(("store", "", declared.store))
         for j, peer in enumerate(log[site].peers):
             peer_books = books[peer]
-            peer_gave = peer_books.declared.gave[log[peer].peers.index(site)]
-            # what the peer had given by each tick of this site
-            row = np.searchsorted(peer_books.t_s, site_books.t_s + 1e-9, side="right") - 1
-            energies.append(("line", peer, peer_gave[row] - declared.took[j]))
+            index_at_peer = log[peer].peers.index(site)
+            sent_j = peer_books.declared.gave[index_at_peer]
+            # the peer's last tick at each tick of this site
+            after = np.searchsorted(peer_books.t_s, site_books.t_s + 1e-9, side="right")
+            line_j = sent_j[after - 1] - declared.took[j]
+            energies.append(("line", peer, line_j))
             if declared.observed:
                 energies.append(("known", peer, declared.observed[j]))
         for kind, peer, energy in energies:
@@ -337,20 +345,24 @@ def _judge_books(log: Log, books: Mapping[str, _SiteBooks]) -> ObservedEnergy:
     least = []
     for curve in curves:
         row = int(curve.least_j.argmin())
-        least.append(LeastEnergy(curve.name, float(curve.least_j[row]), float(curve.t_s[row])))
+        minimum = LeastEnergy(
+            name=curve.name,
+            amount_j=float(curve.least_j[row]),
+            at_s=float(curve.t_s[row]),
+        )
+        least.append(minimum)
     largest_j = max(float(curve.energy_j.max()) for curve in curves)
     for site, site_books in books.items():
         port = site_books.port
-        curves.append(
-            EnergyCurve(
-                kind="given",
-                site=site,
-                peer="",
-                t_s=site_books.t_s,
-                energy_j=port,
-                least_j=port,
-            )
+        curve = EnergyCurve(
+            kind="given",
+            site=site,
+            peer="",
+            t_s=site_books.t_s,
+            energy_j=port,
+            least_j=port,
         )
+        curves.append(curve)
     ports_j = [float(np.abs(site_books.port).max()) for site_books in books.values()]
     scale_j = max(largest_j, *ports_j)
     premises = _check_books(log, books, scale_j)
@@ -380,6 +392,7 @@ def _judge_books(log: Log, books: Mapping[str, _SiteBooks]) -> ObservedEnergy:
 
 
 def _largest_residual_j(site_books: _SiteBooks) -> float:
+    """Returns the largest error in the books of a law, in J."""
     return float(np.abs(site_books.residual).max())
 
 

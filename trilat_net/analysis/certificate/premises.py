@@ -528,7 +528,9 @@ def find_absent_spans(log: Log) -> list[AbsentSpan]:
     for site in log.sites:
         part = log[site]
         for first, last in log.absences.get(site, ()):
-            absent.append(AbsentSpan(site, first / part.rate_hz, (last + 1) / part.rate_hz))
+            start_s = first / part.rate_hz
+            end_s = (last + 1) / part.rate_hz
+            absent.append(AbsentSpan(site, start_s, end_s))
         last_s = (part.last_tick + 1) / part.rate_hz
         kinds = {event.kind for event in log.events if event.about == site}
         if last_s < end_s - LEAST_ABSENCE_S and kinds & {"left", "lost"}:

@@ -298,7 +298,10 @@ class Certificate(Result):
 
 
 def certify(
-    log: Log, *, min_coverage: float = MIN_COVERAGE, own_laws: bool = False
+    log: Log,
+    *,
+    min_coverage: float = MIN_COVERAGE,
+    own_laws: bool = False,
 ) -> Certificate:
     """Returns the certificate of a log, which may be torn, short or empty.
 

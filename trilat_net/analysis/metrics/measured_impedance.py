@@ -41,8 +41,9 @@ _OVERLAP_FACTOR = 1.06
 MIN_DRIVE_TORQUE_NM = 0.05
 """Least amplitude of a torque that drives, N m."""
 _DRIVEN_SHARE = 0.55
-"""Share of the strongest drive above which a line is driven: a Hann window leaks 0.5 into the
-next line.
+"""Share of the strongest drive above which a line counts as driven.
+
+A Hann window leaks 0.5 of a line into the next line.
 """
 STILL_SCRIPT_NM_S = 1e-6
 """A script that changes by less than this per second stands still, N m/s."""
@@ -114,7 +115,13 @@ def estimate_responses(
     responses = []
     for line in (strongest, *driven[driven != strongest].tolist()):
         frequency_hz = (line + _LOWEST_LINE) / SEGMENT_S
-        responses.append(_estimate_at_line(frequency_hz, D[:, line], X[:, line], Y[:, line]))
+        response = _estimate_at_line(
+            frequency_hz=frequency_hz,
+            D=D[:, line],
+            X=X[:, line],
+            Y=Y[:, line],
+        )
+        responses.append(response)
     return responses
 
 
@@ -144,7 +151,9 @@ def _estimate_at_line(
         Y: the output in every segment, shape (S,).
     """
     power = np.abs(D) ** 2
-    segments = float(power.sum() ** 2 / (power**2).sum()) / _OVERLAP_FACTOR
+    square_of_sum = power.sum() ** 2
+    sum_of_squares = (power**2).sum()
+    segments = float(square_of_sum / sum_of_squares) / _OVERLAP_FACTOR
     if segments < MIN_SEGMENTS:
         reason = (
             f"undecided: {segments:.1f} stretches of {SEGMENT_S:g} s drive "
@@ -160,11 +169,18 @@ def _estimate_at_line(
             f"{MIN_COHERENCE:g} is needed"
         )
         return FrequencyResponse(
-            frequency_hz, coherence=coherence, segments=segments, why=reason
+            frequency_hz=frequency_hz,
+            coherence=coherence,
+            segments=segments,
+            why=reason,
         )
-    H = np.vdot(D, Y) / np.vdot(D, X)
-    noise = (1.0 / input_coherence - 1.0) + (1.0 / output_coherence - 1.0)
-    error = math.sqrt(max(0.0, noise) / (2.0 * segments))
+    S_dx = np.vdot(D, X)
+    S_dy = np.vdot(D, Y)
+    H = S_dy / S_dx
+    input_noise = 1.0 / input_coherence - 1.0
+    output_noise = 1.0 / output_coherence - 1.0
+    noise = max(0.0, input_noise + output_noise)
+    error = math.sqrt(noise / (2.0 * segments))
     return FrequencyResponse(
         frequency_hz=frequency_hz,
         gain=float(abs(H)),
@@ -177,17 +193,21 @@ def _estimate_at_line(
 
 def _compute_coherence(D: Complex, X: Complex) -> float:
     """Returns the coherence |S_dx|^2 / (S_dd S_xx) of two signals; 0 if one vanishes."""
-    power = float(np.vdot(D, D).real * np.vdot(X, X).real)
+    S_dd = np.vdot(D, D).real
+    S_xx = np.vdot(X, X).real
+    S_dx = np.vdot(D, X)
+    power = float(S_dd * S_xx)
     if not power > 0.0:
         return 0.0
-    return min(1.0, float(abs(np.vdot(D, X)) ** 2) / power)
+    common_power = float(abs(S_dx) ** 2)
+    return min(1.0, common_power / power)
 
 
 def _compute_spectra(signal: Array, starts: list[int], length: int) -> Complex:
     """Returns the spectral lines of every segment under a Hann window, shape (S, L).
 
-    They are scaled so that the square of a line is the mean square of its sinusoid. No trend is
-    removed, because that would distort slow sinusoids too.
+    The lines are scaled so that the square of a line is the mean square of its sinusoid. No
+    trend is removed, because this would distort slow sinusoids too.
 
     Args:
         signal: the signal, shape (K,).
@@ -195,7 +215,9 @@ def _compute_spectra(signal: Array, starts: list[int], length: int) -> Complex:
         length: rows of a segment.
     """
     segments = np.stack([signal[start : start + length] for start in starts])
-    window = 0.5 - 0.5 * np.cos(2.0 * np.pi * (np.arange(length) + 0.5) / length)
+    middles = np.arange(length) + 0.5
+    angles = 2.0 * np.pi * middles / length
+    window = 0.5 - 0.5 * np.cos(angles)
     highest = min(int(HIGHEST_HZ * SEGMENT_S), length // 2 - 1)
     scale = math.sqrt(2.0) / window.sum()
     spectra = np.fft.rfft(segments * window, axis=1)
@@ -246,7 +268,9 @@ def estimate_impedances(view: RunView) -> list[ImpedanceEstimate]:
 
 
 def _estimate_joints(
-    runs: Mapping[str, SiteRun], site: str, environment: str
+    runs: Mapping[str, SiteRun],
+    site: str,
+    environment: str,
 ) -> Iterator[ImpedanceEstimate]:
     """Yields the impedance of every joint of a site, or its reflection of an environment.
 
@@ -296,7 +320,10 @@ def _estimate_joints(
 
 
 def _find_still_rows(
-    runs: Mapping[str, SiteRun], reference_site: str, *, alone: bool
+    runs: Mapping[str, SiteRun],
+    reference_site: str,
+    *,
+    alone: bool,
 ) -> Bools | None:
     """Returns the ticks of a site at which no operator moves, shape (K,).
 
@@ -318,7 +345,7 @@ def _find_still_rows(
             return None
         if len(script) > 1:
             rows, _ = find_latest_rows(run.records, t_s)
-            slopes = np.abs(np.gradient(script, axis=0)).max(axis=1)
-            rate_nm_s = slopes * run.records.rate_hz
+            slopes = np.abs(np.gradient(script, axis=0))
+            rate_nm_s = slopes.max(axis=1) * run.records.rate_hz
             still &= rate_nm_s[rows] < STILL_SCRIPT_NM_S
     return still

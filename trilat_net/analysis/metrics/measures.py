@@ -115,7 +115,9 @@ def rms(values: ArrayLike) -> float:
     array = np.asarray(values, dtype=np.float64)
     if not array.size:
         return math.nan
-    return float(np.sqrt(np.einsum("kj,kj->j", array, array) / len(array)).max())
+    square_sums = np.einsum("kj,kj->j", array, array)
+    root_mean_squares = np.sqrt(square_sums / len(array))
+    return float(root_mean_squares.max())
 
 
 def peak(values: ArrayLike) -> float:

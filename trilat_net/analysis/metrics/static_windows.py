@@ -126,7 +126,9 @@ def _find_resting_rows(run: SiteRun) -> Bools:
 
 
 def _average_window(
-    runs: Mapping[str, SiteRun], rows: Mapping[str, Ints], t_s: Array
+    runs: Mapping[str, SiteRun],
+    rows: Mapping[str, Ints],
+    t_s: Array,
 ) -> StaticWindow:
     """Returns a static window with the means over its rows.
 

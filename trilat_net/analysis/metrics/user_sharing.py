@@ -229,7 +229,9 @@ def _measure_disagreement(runs: list[SiteRun]) -> MetricValues:
 
 
 def _measure_takeover_s(
-    change_s: float, h_s: float, ramp_spans_s: list[tuple[float, float]]
+    change_s: float,
+    h_s: float,
+    ramp_spans_s: list[tuple[float, float]],
 ) -> float:
     """Returns the time from the start of a ramp to the change of the leader that it caused.
 
