@@ -1,18 +1,22 @@
-"""The bridge between a running session and the graph of ROS 2.
+"""Connect a running session with ROS 2 programs, in both directions.
 
-The bridge publishes the records of the sites as standard messages, and offers the orders of the
-session as services. In the other direction, a topic of ROS can hold an arm like a person's
-hand, change the dominance factors, or be the robot that is a site's external arm.
+A session consists of sites, processes that each run one arm. The bridge publishes the states of
+the sites as standard ROS messages, and offers the orders to stop and enable arms as ROS
+services. In the other direction, a ROS topic can
+
+- command an arm, like an operator who holds it,
+- set the weights with which a site follows its peers,
+- or be the robot that is the external arm of a site.
 
 Invariant:
-    - ROS is never part of a control loop. A message of ROS enters the session only as the goal
-      of a hand, which the site limits, fades and records, or as a measurement of an external
-      arm. A log is therefore verified without ROS.
-    - A topic with two publishers moves nothing.
-    - A target that falls silent for 200 ms releases the arm.
-    - A robot without a valid torque receives its safe command, again and again.
-    - No message of ROS ends the bridge. A message that cannot be used is refused and counted by
-      reason, and the first refusal of each reason is printed.
+    - ROS is never part of a control loop. A ROS message enters a session only as the goal of an
+      operator, which the site limits and records, or as a measurement of an external arm. A log
+      can therefore be verified without ROS.
+    - A topic on which two programs publish moves nothing.
+    - If no target arrives for 200 ms, the arm is released.
+    - A robot without a valid torque receives its safe command repeatedly.
+    - No ROS message ends the bridge. A message that cannot be used is refused and counted by
+      the reason. The first refusal for each reason is printed.
 """
 
 import math
@@ -43,13 +47,13 @@ from .ros2_topics import RELIABLE, BridgeEnds, SiteTopics
 from .running_session import RunningSession, open_hand
 
 POLL_NS = 1_000_000
-"""Smallest time between two polls of the session's messages, in ns."""
+"""Shortest time between two polls for messages of the session, in ns."""
 POLLS_PER_RECORD = 5.0
-"""How many polls there are in the time between two published records."""
+"""Number of polls in the time between two published records."""
 LOOK_PERIOD_NS = 200_000_000
 """Time between two checks of the connection to the router, in ns."""
 SILENCE_NS = 200_000_000
-"""Time after which a target that is not repeated releases the arm, in ns."""
+"""Time without a target after which an arm is released, in ns."""
 SENDER_TIMEOUT_NS = NS_PER_S
 """Time for which a publisher counts as present after its last message, in ns."""
 SAFE_PERIOD_NS = 10_000_000
@@ -57,13 +61,20 @@ SAFE_PERIOD_NS = 10_000_000
 DRIVE_PERIOD_S = 0.001
 """Time between two checks for a new torque, in s."""
 REQUEST_PERIOD_S = 0.05
-"""Time between two checks for newly requested shares, in s."""
+"""Time between two checks for new weights, in s."""
 TRIGGER = "std_srvs/srv/Trigger"
-"""Type of the services: a request without content."""
+"""Type of the services, whose requests have no content."""
 
 
 class SingleSender:
-    """Accepts the messages of a topic only while the topic has a single publisher."""
+    """Check that only one program publishes on a topic.
+
+    Two programs that command the same arm would move it back and forth. Both are refused until
+    one of them has been silent for `SENDER_TIMEOUT_NS`.
+
+    Args:
+        clock: Clock of this process.
+    """
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
@@ -73,16 +84,16 @@ class SingleSender:
         self._conflict_ns = self._received_ns
 
     def admit(self, publisher: bytes) -> int:
-        """Accepts a message of a publisher.
+        """Accepts a message of a publisher, or refuses it if another publisher is present.
 
         Args:
-            publisher: the publisher's identity in the graph of ROS.
+            publisher: Identity of the publisher in its message, see `Attachment.gid`.
 
         Returns:
             The time since the previous message, in ns.
 
         Raises:
-            ValueError: two publishers send.
+            ValueError: Two programs publish.
         """
         now_ns = self._clock.monotonic_ns()
         silent_ns = now_ns - self._received_ns
@@ -99,13 +110,20 @@ class SingleSender:
 
 
 class TargetTopic:
-    """A topic of ROS that holds an arm: `target_pose`, `target_joint` or `target_wrench`.
+    """Subscription to a ROS topic on which another program commands an arm.
+
+    The topic is `target_pose`, `target_joint` or `target_wrench`. Each message is converted to
+    a target, which is sent to the site of the arm. For the site, the ROS program is the
+    operator who holds the arm.
 
     Args:
-        hand: the hand at the arm.
-        read: returns the goal in a message; raises ValueError.
-        apply: sends a goal to the site as the command of the hand.
-        clock: the clock of this process.
+        hand: Connection to the site, in the role of the operator.
+        read: Function that converts a message to a target. It raises ValueError if it cannot.
+        apply: Function that sends a target to the site.
+        clock: Clock of this process.
+
+    Attributes:
+        hand: Connection to the site.
     """
 
     def __init__(
@@ -125,11 +143,16 @@ class TargetTopic:
         self._received_ns: int | None = None
 
     def receive(self, data: bytes, attachment: Attachment) -> None:
-        """Applies the target of a message; called in a thread of Zenoh.
+        """Sends the target in a message to the site. It is called in a thread of Zenoh.
+
+        Args:
+            data: The encoded message.
+            attachment: Attachment of the message, which identifies the publisher.
 
         Raises:
-            ValueError: the message cannot be read, or there are two publishers.
-            TrilatError: the hand refuses the goal.
+            ValueError: The message cannot be read, or two programs publish. In the second case,
+                the arm is released.
+            TrilatError: The target is refused.
         """
         with self._lock:
             try:
@@ -142,7 +165,7 @@ class TargetTopic:
             self._received_ns = self._clock.monotonic_ns()
 
     def watch(self) -> None:
-        """Releases the arm if nobody has repeated the target for `SILENCE_NS`."""
+        """Releases the arm if no target has arrived for `SILENCE_NS`."""
         with self._lock:
             if self._received_ns is None:
                 return
@@ -151,22 +174,24 @@ class TargetTopic:
                 self._release_hand()
 
     def _release_hand(self) -> None:
-        """Releases the arm if the topic holds it."""
+        """Releases the arm if the topic commands it at present."""
         if self._received_ns is not None:
             self._received_ns = None
             self.hand.release()
 
 
 class DominanceTopic:
-    """A topic of ROS that sets a site's shares of its peers, `set_dominance`.
+    """Subscription to a ROS topic that sets the weights with which a site follows its peers.
 
-    A newer message replaces an older one that has not been sent to the site yet. Messages that
-    repeat the last request are ignored, unless no message has arrived for a second.
+    The topic is `set_dominance`. Requests to the site wait for its reply and are therefore sent
+    by a thread of their own. If several messages arrive meanwhile, only the newest is used.
+    Messages that repeat the last request are ignored, unless no message has arrived for a
+    second.
 
     Args:
-        peers: the peers, in the order of a message's numbers.
-        change: requests shares from the site, and waits until the site accepts them.
-        clock: the clock of this process.
+        peers: Names of the peers, in the order of the numbers in a message.
+        change: Function that requests weights from the site, and waits for its reply.
+        clock: Clock of this process.
     """
 
     def __init__(
@@ -179,10 +204,14 @@ class DominanceTopic:
         self._sent_request: dict[str, float] | None = None
 
     def receive(self, data: bytes, attachment: Attachment) -> None:
-        """Stores the shares of a message; called in a thread of Zenoh.
+        """Stores the weights in a message. It is called in a thread of Zenoh.
+
+        Args:
+            data: The encoded message.
+            attachment: Attachment of the message, which identifies the publisher.
 
         Raises:
-            ValueError: the message cannot be read, or there are two publishers.
+            ValueError: The message cannot be read, or two programs publish.
         """
         shares = _check_finite(cdr.read_float_array(data))
         if len(shares) != len(self._peers):
@@ -194,10 +223,10 @@ class DominanceTopic:
         self._requested = dict(zip(self._peers, shares, strict=True))
 
     def send_request(self) -> None:
-        """Requests the stored shares from the site, if they are new.
+        """Requests the stored weights from the site, if they are new.
 
         Raises:
-            TrilatError: the site refuses the shares.
+            TrilatError: The site refuses the weights.
         """
         requested = self._requested
         if requested is not None and requested != self._sent_request:
@@ -206,24 +235,25 @@ class DominanceTopic:
 
 
 class RobotArm:
-    """A robot of ROS that is the external arm of a site.
+    """A ROS robot that is the external arm of a site.
 
-    The site receives the robot's joint states, and the robot receives the site's torque, as
-    with `ArmClient`. If the arm must brake, the robot's controller receives its safe command
-    repeatedly.
+    The joint states of the robot are sent to the site, and the torque of the site is sent to
+    the controller of the robot, as a driver with `ArmClient` does. While the arm must brake,
+    the controller receives its safe command repeatedly.
 
     Args:
-        make_client: returns a client of the site's present boot.
-        joints: the names by which the robot may call each joint, in the scenario's order.
-        robot: the settings of the robot.
-        commands: the publisher of the robot's commands.
-        clock: the clock of this process.
+        make_client: Function that connects to the present start of the site.
+        joints: Names by which the robot may call each joint, in the order of the scenario.
+        robot: Settings of the robot.
+        commands: Publisher of the commands to the controller.
+        clock: Clock of this process.
 
     Attributes:
-        armed: False as long as the robot must receive safe commands only.
+        armed: False while the robot must receive only safe commands. The bridge sets it to True
+            once the scenario is known.
 
     Raises:
-        UsageError: the settings do not have one number for each joint.
+        UsageError: The settings do not have one entry for each joint.
     """
 
     def __init__(
@@ -251,17 +281,23 @@ class RobotArm:
         self._safe_ns = clock.monotonic_ns() - SAFE_PERIOD_NS
 
     def receive(self, data: bytes, attachment: Attachment) -> None:
-        """Sends the joint states of a message to the site; called in a thread of Zenoh.
+        """Sends the joint states in a message to the site. It is called in a thread of Zenoh.
 
-        A message that contains none of the joints is that of another robot, and is ignored.
+        A message with none of the joints belongs to another robot and is ignored.
+
+        Args:
+            data: The encoded message.
+            attachment: Attachment of the message, which identifies the publisher.
 
         Raises:
-            ValueError: the message cannot be read, or there are two publishers.
+            ValueError: The message cannot be read, or two programs publish.
         """
         state = cdr.read_joint_state(data)
         known_names = {name for names in self._joints for name in names}
-        if state.names and known_names.isdisjoint(state.names):
+        is_other_robot = bool(state.names) and known_names.isdisjoint(state.names)
+        if is_other_robot:
             return
+
         indices = find_joint_indices(self._joints, state)
         if len(state.velocity) != len(state.position):
             positions = count_nouns(len(state.position), "position")
@@ -279,13 +315,15 @@ class RobotArm:
         if self._client.over:
             with self._lock:
                 self._client = self._make_client()
+
         record = self._client.record
-        # The torque is that of `record`, or of a newer record.
-        torque = self._client.torque()
+        torque = self._client.torque()  # that of `record`, or of a newer record
         if record is None or torque is None or not self._may_apply(torque):
-            if self._clock.monotonic_ns() - self._safe_ns >= SAFE_PERIOD_NS:
+            waited_ns = self._clock.monotonic_ns() - self._safe_ns
+            if waited_ns >= SAFE_PERIOD_NS:
                 self.send_safe_command()
             return
+
         tick = (record.boot, record.tick)
         if tick != self._published_tick:
             self._published_tick = tick
@@ -293,7 +331,7 @@ class RobotArm:
             self._commands.put(self._pack(*ordered_torque))
 
     def _may_apply(self, torque: Sequence[float]) -> bool:
-        """Returns True if the robot is armed and the torque has a number for each joint."""
+        """Returns True if the robot is armed, and the torque has one number for each joint."""
         return self.armed and len(torque) == len(self._joint_order)
 
     def send_safe_command(self) -> None:
@@ -305,15 +343,18 @@ class RobotArm:
 def _order_joints(
     joints: Sequence[Sequence[str]], controller: Sequence[str], safe_command: Sequence[float]
 ) -> list[int]:
-    """Returns the index in the scenario of each joint of a robot's controller.
+    """Finds the joint of the scenario to which each joint of the controller corresponds.
 
     Args:
-        joints: the names that each joint may have, in the scenario's order.
-        controller: the names of the joints, in the controller's order.
-        safe_command: the command to the controller while the arm brakes.
+        joints: Names that each joint may have, in the order of the scenario.
+        controller: Names of the joints, in the order of the controller.
+        safe_command: Command to the controller while the arm brakes.
+
+    Returns:
+        For each joint of the controller, its index in the scenario.
 
     Raises:
-        UsageError: the controller or the safe command does not have one entry for each joint.
+        UsageError: The controller or the safe command does not have one entry for each joint.
     """
     count = len(joints)
     joint_order: list[int] = []
@@ -321,6 +362,7 @@ def _order_joints(
         for index, names in enumerate(joints):
             if controller_name in names:
                 joint_order.append(index)
+    # Each joint occurs exactly once if the sorted indices are 0, 1, ... count - 1.
     is_complete = sorted(joint_order) == list(range(count)) and len(controller) == count
     is_safe_valid = len(safe_command) == count and all(map(math.isfinite, safe_command))
     if not is_complete or not is_safe_valid:
@@ -330,19 +372,23 @@ def _order_joints(
 
 
 def find_joint_indices(joints: Sequence[Sequence[str]], state: cdr.RosJoints) -> list[int]:
-    """Returns the index of each joint in a message.
+    """Finds the position of each joint in a message.
 
     Args:
-        joints: the names that each joint may have.
-        state: the message.
+        joints: Names that each joint may have.
+        state: The message.
+
+    Returns:
+        For each joint, its index in the message.
 
     Raises:
-        ValueError: a joint is missing, or appears twice.
+        ValueError: A joint is missing or appears twice.
     """
     if len(state.names) != len(state.position):
         name_count = count_nouns(len(state.names), "name")
         position_count = count_nouns(len(state.position), "position")
         raise ValueError(f"has {name_count} and {position_count}")
+
     missing = [names[0] for names in joints if set(names).isdisjoint(state.names)]
     if missing:
         present = ", ".join(state.names[:9]) or "no names"
@@ -351,6 +397,7 @@ def find_joint_indices(joints: Sequence[Sequence[str]], state: cdr.RosJoints) ->
         for name in names:
             if state.names.count(name) > 1:
                 raise ValueError(f"has {name} twice")
+
     indices: list[int] = []
     for names in joints:
         present_name = next(name for name in names if name in state.names)
@@ -359,14 +406,17 @@ def find_joint_indices(joints: Sequence[Sequence[str]], state: cdr.RosJoints) ->
 
 
 def read_joint_target(joints: Sequence[Sequence[str]], data: bytes) -> list[float]:
-    """Returns the angles in a `JointState`, in rad and in the order of an arm's joints.
+    """Reads target angles from a `JointState` message.
 
     Args:
-        joints: the names that each joint may have, in the arm's order.
-        data: the message.
+        joints: Names that each joint may have, in the order of the arm.
+        data: The encoded message.
+
+    Returns:
+        The angles in rad, in the order of the arm's joints.
 
     Raises:
-        ValueError: the message cannot be read, or lacks a joint.
+        ValueError: The message cannot be read, or lacks a joint.
     """
     state = cdr.read_joint_state(data)
     indices = find_joint_indices(joints, state)
@@ -374,24 +424,31 @@ def read_joint_target(joints: Sequence[Sequence[str]], data: bytes) -> list[floa
 
 
 def _check_finite(numbers: Sequence[float]) -> list[float]:
-    """Returns the numbers; raises ValueError if a number is not finite."""
+    """Returns the numbers as a list.
+
+    Raises:
+        ValueError: A number is not finite.
+    """
     if not all(map(math.isfinite, numbers)):
         raise ValueError("has a number that is not finite")
     return list(numbers)
 
 
 def read_vector_target(frame: str, axes: int, count: int, data: bytes) -> list[float]:
-    """Returns the position in a `PoseStamped`, in m, or the force in a `WrenchStamped`, in N.
+    """Reads the position in a `PoseStamped` message, or the force in a `WrenchStamped`.
 
     Args:
-        frame: the frame in which the arm expects the vector.
-        axes: the number of coordinates to return.
-        count: how many numbers the message has: 7 in a pose, 6 in a wrench.
-        data: the message.
+        frame: Frame in which the arm expects the vector.
+        axes: Number of coordinates to return.
+        count: Number of numbers in the message: 7 in a pose, 6 in a wrench.
+        data: The encoded message.
+
+    Returns:
+        The position in m, or the force in N.
 
     Raises:
-        ValueError: the message cannot be read, is in another frame, or has a number that is
-            not finite.
+        ValueError: The message cannot be read, is in another frame, or contains a number that
+            is not finite.
     """
     message_frame, numbers = cdr.read_frame_vectors(data, count)
     if message_frame not in ("", frame):
@@ -400,16 +457,19 @@ def read_vector_target(frame: str, axes: int, count: int, data: bytes) -> list[f
 
 
 class Bridge:
-    """The bridge of a running session; its topics and services exist from its creation on.
+    """The bridge of one running session.
+
+    When the object is created, its topics and services exist. `run` then publishes what happens
+    in the session.
 
     Args:
-        ends: the graph and the session.
-        scenario: the scenario of the session.
-        epoch_unix_ns: the session's epoch in Unix time, in ns.
+        ends: Connections to ROS and to the session.
+        scenario: Scenario of the session.
+        epoch_unix_ns: Start of the session in Unix time, in ns.
 
     Attributes:
-        targets: the topics that hold an arm, by name.
-        dominance: the topics that set the shares of a site, by name.
+        targets: Topics that command an arm, by name.
+        dominance: Topics that set the weights of a site, by name.
     """
 
     def __init__(self, ends: BridgeEnds, scenario: Scenario, epoch_unix_ns: int) -> None:
@@ -451,7 +511,7 @@ class Bridge:
         serve_orders(graph, running, scenario.names)
 
     def _subscribe_dominance(self, site: str, running: RunningSession) -> None:
-        """Receives the topic that sets the shares of a site."""
+        """Subscribes to the topic that sets the weights of a site."""
         ends = self._ends
         # The changes before the bridge was started determine the site's present shares.
         for event in list_past_events(ends.bus, ends.clock, ends.session, site):
@@ -463,7 +523,7 @@ class Bridge:
         ends.graph.subscribe(topic, cdr.FLOAT64_ARRAY, dominance.receive)
 
     def _subscribe_target(self, site: str) -> None:
-        """Receives the topic that holds the arm of a site."""
+        """Subscribes to the topic that commands the arm of a site."""
         ends = self._ends
         hand = open_hand(
             bus=ends.bus,
@@ -483,12 +543,12 @@ class Bridge:
     def run(
         self, rate_hz: float, stopped: Callable[[], bool], say: Callable[[str], None]
     ) -> bool:
-        """Publishes the session until it ends or `stopped` returns True.
+        """Publishes the session until it ends.
 
         Args:
-            rate_hz: the rate at which the newest records are published, in 1/s.
-            stopped: returns True to end the call.
-            say: prints a line for the user.
+            rate_hz: Rate at which the newest records are published, in 1/s.
+            stopped: Function that returns True to end the call.
+            say: Function that prints a line for the user.
 
         Returns:
             True if another session has begun under the same name.
@@ -505,6 +565,7 @@ class Bridge:
                 return True
             for target in self.targets.values():
                 target.watch()
+
             now_ns = clock.monotonic_ns()
             if now_ns - checked_ns > LOOK_PERIOD_NS:
                 checked_ns = now_ns
@@ -516,16 +577,17 @@ class Bridge:
             if now_ns - diagnosed_ns > NS_PER_S:
                 diagnosed_ns = now_ns
                 self._publish_diagnostics()
+
             wake_ns = max(wake_ns + poll_ns, now_ns)
             clock.sleep_until(wake_ns)
         return False
 
     def _have_sites_left(self) -> bool:
-        """Returns True if sites were present and none is present any more."""
+        """Returns True if sites were present, and none is present any more."""
         return self._has_seen_site and not self._present
 
     def _publish_messages(self, rate_hz: float) -> bool:
-        """Publishes the messages that have arrived from the session.
+        """Publishes the records, events and statistics that have arrived from the session.
 
         Returns:
             True if another session has begun under the same name.
@@ -533,6 +595,7 @@ class Bridge:
         for record in read_records(self._records):
             if record.site in self._sites:
                 self._sites[record.site].publish(record, rate_hz)
+
         has_new_epoch = False
         for event in read_messages(self._events, Event):
             if event.kind == "epoch" and event.epoch_unix_ns != self._epoch_unix_ns:
@@ -542,6 +605,7 @@ class Bridge:
             stamp_ns = self._ends.clock.unix_ns()
             for name, data in pack_event(event, stamp_ns):
                 self._lines[name].put(data)
+
         for stats in read_messages(self._links, LinkStats):
             if stats.site in self._sites:
                 self._sites[stats.site].publish_statistics(stats)
@@ -555,7 +619,7 @@ class Bridge:
         return has_new_epoch
 
     def _publish_diagnostics(self) -> None:
-        """Publishes the diagnostics of all sites, if somebody listens."""
+        """Publishes the diagnostics of all sites, if a ROS program subscribes to them."""
         if not self._diagnostics.has_subscribers:
             return
         newest = [site_topics.newest for site_topics in self._sites.values()]
@@ -567,17 +631,20 @@ class Bridge:
 def describe_target(
     scenario: Scenario, site: str, hand: Hand, frame: str
 ) -> tuple[str, str, Callable[[bytes], Sequence[float]], Callable[..., int]]:
-    """Returns the topic that commands the live hand of a site, and how its messages are used.
+    """Determines the topic that commands the arm of a site, and how its messages are used.
+
+    The type of the topic depends on whether the scenario's operator moves the end effector,
+    moves the joints, or applies forces.
 
     Args:
-        scenario: the scenario of the session.
-        site: the site, which has an open live hand.
-        hand: the hand.
-        frame: the frame of the positions and forces in the messages.
+        scenario: Scenario of the session.
+        site: Name of the site, which must have a live operator.
+        hand: Connection to the site, in the role of the operator.
+        frame: Frame of the positions and forces in the messages.
 
     Returns:
-        The topic's name and type, a function that reads the goal in a message, and the method
-        of the hand that sends the goal.
+        Name and type of the topic, a function that converts a message to a target, and a
+        function that sends the target to the site.
     """
     live = scenario.sites[site].find_live_hand(is_open=True)
     assert live is not None
@@ -594,16 +661,22 @@ def describe_target(
 
 
 def list_joint_names(scenario: Scenario, site: str) -> list[tuple[str, ...]]:
-    """Returns the names of each joint of a site: in topics, and in the scenario."""
+    """Lists for each joint its name in ROS topics and its name in the scenario."""
     topic_names = Ros2SiteChannels(scenario, site).joints
     pairs = zip(topic_names, scenario.arms[site].joint_names, strict=True)
     return [tuple(dict.fromkeys(pair)) for pair in pairs]
 
 
 def serve_orders(graph: Ros2Graph, running: RunningSession, sites: Sequence[str]) -> None:
-    """Offers the orders of a session as services.
+    """Offers the orders of a session as ROS services.
 
-    Their names are `/<session>/stop`, `/<session>/<site>/stop` and so on.
+    Their names are `/<session>/stop` for all sites, `/<session>/<site>/stop` for one site, and
+    the same for the other orders.
+
+    Args:
+        graph: Connection to the ROS programs.
+        running: The session.
+        sites: Names of its sites.
     """
 
     def serve(order: Callable[..., list[str]], *site: str) -> None:
@@ -619,7 +692,15 @@ def serve_orders(graph: Ros2Graph, running: RunningSession, sites: Sequence[str]
 
 
 def _send_order(order: Callable[..., list[str]], *sites: str) -> bytes:
-    """Sends an order to sites, and returns the response of the service with their replies."""
+    """Sends an order to sites, and returns the response of the service.
+
+    Args:
+        order: Method of `RunningSession` that sends the order.
+        *sites: Names of the sites. All sites if there is none.
+
+    Returns:
+        The encoded response, with the replies of the sites or the error.
+    """
     try:
         replies = order(*sites)
     except TrilatError as error:
@@ -631,7 +712,13 @@ def _send_order(order: Callable[..., list[str]], *sites: str) -> bytes:
 def _repeat_in_thread(
     period_s: float, act: Callable[[], None], finish: Callable[[], None] = lambda: None
 ) -> Iterator[None]:
-    """Calls `act` every `period_s` in a thread, and `finish` after the thread has ended."""
+    """Calls a function regularly in a thread, as a context manager.
+
+    Args:
+        period_s: Time between two calls, in s.
+        act: The function.
+        finish: Function that is called once after the thread has ended.
+    """
     is_over = threading.Event()
 
     def repeat() -> None:
@@ -657,22 +744,22 @@ def serve_ros2(
     say: Callable[[str], None],
     timeout_s: float,
 ) -> None:
-    """Publishes a session in the graph of ROS 2 until it ends or `stopped` returns True.
+    """Runs the bridge of a session, for the command `trilat ros2`.
 
     The function waits for a router of ROS and for the session. If another session begins under
-    the same name, the function connects to the graph again and publishes that session.
+    the same name, the function connects to ROS again and continues with that session.
 
     Args:
-        running: the session.
-        open_graph: connects to the graph of ROS 2.
-        rate_hz: the rate at which records are published, in 1/s.
-        table: the names of the topics, and the robots.
-        stopped: returns True to end the call.
-        say: prints a line for the user.
-        timeout_s: longest wait for the first site or its router, in s.
+        running: The session.
+        open_graph: Function that connects to the ROS programs.
+        rate_hz: Rate at which records are published, in 1/s.
+        table: Names of the topics, and settings of the robots.
+        stopped: Function that returns True to end the call.
+        say: Function that prints a line for the user.
+        timeout_s: Longest wait for the first site or its router, in s.
 
     Raises:
-        UsageError: there is no router, or the settings of a robot do not fit the session.
+        UsageError: There is no router, or the settings of a robot do not fit the session.
     """
     clock = SystemClock()
     with running.reach(BRIDGE, timeout_s) as bus:
@@ -697,15 +784,16 @@ def serve_ros2(
 def publish_session(
     ends: BridgeEnds, rate_hz: float, stopped: Callable[[], bool], say: Callable[[str], None]
 ) -> bool:
-    """Waits for a session, and publishes it until it ends or `stopped` returns True.
+    """Waits for a session, and bridges it until it ends.
 
-    The robots are connected before the session begins, because it begins only with their arms.
+    Robots are connected before the session begins, because the session begins only when their
+    arms send measurements.
 
     Args:
-        ends: the graph and the session.
-        rate_hz: the rate at which records are published, in 1/s.
-        stopped: returns True to end the call.
-        say: prints a line for the user.
+        ends: Connections to ROS and to the session.
+        rate_hz: Rate at which records are published, in 1/s.
+        stopped: Function that returns True to end the call.
+        say: Function that prints a line for the user.
 
     Returns:
         True if another session has begun under the same name.
@@ -717,6 +805,7 @@ def publish_session(
             # replies.
             if robot.joints:
                 robots[site] = stack.enter_context(open_robot(ends, site, robot))
+
         say(f"waiting for session {ends.session!r} to begin")
         info = await_site(ends, stopped, running=False)
         if info is None:
@@ -730,9 +819,11 @@ def publish_session(
                 robot_context = open_robot(ends, site, robot, names)
                 robots[site] = stack.enter_context(robot_context)
             robots[site].armed = True
+
         running_info = await_site(ends, stopped, running=True)
         if running_info is None:
             return False
+
         bridge = Bridge(ends, scenario, running_info.epoch_unix_ns)
         for target in bridge.targets.values():
             stack.enter_context(target.hand)
@@ -746,12 +837,12 @@ def publish_session(
 
 
 def _describe_inputs(ends: BridgeEnds, bridge: Bridge, robots: Iterable[str]) -> str:
-    """Returns the topics that the bridge receives, as the end of a line for the user.
+    """Describes the topics that the bridge receives, as the end of a line for the user.
 
     Args:
-        ends: the graph and the session.
-        bridge: the bridge of the session.
-        robots: the sites whose arm is a robot of ROS.
+        ends: Connections to ROS and to the session.
+        bridge: The bridge of the session.
+        robots: Names of the sites whose arm is a ROS robot.
     """
     inputs = [f"; /{topic} holds an arm" for topic in bridge.targets]
     for site in robots:
@@ -764,16 +855,20 @@ def _describe_inputs(ends: BridgeEnds, bridge: Bridge, robots: Iterable[str]) ->
 def open_robot(
     ends: BridgeEnds, site: str, robot: RobotTable, joints: Sequence[Sequence[str]] = ()
 ) -> Iterator[RobotArm]:
-    """Yields the robot of a site; states and commands are exchanged until the context ends.
+    """Connects the ROS robot of a site, as a context manager.
 
-    At the end, the robot receives its safe command.
+    Inside the `with` block, joint states and torques are exchanged. At its end, the robot
+    receives its safe command.
 
     Args:
-        ends: the graph and the session.
-        site: the site whose arm is the robot.
-        robot: the settings of the robot.
-        joints: the names that each joint may have, in the scenario's order; by default the
-            names in `robot`.
+        ends: Connections to ROS and to the session.
+        site: Name of the site whose arm is the robot.
+        robot: Settings of the robot.
+        joints: Names that each joint may have, in the order of the scenario. Empty uses the
+            names in the settings.
+
+    Yields:
+        The robot.
     """
     commands_topic = ends.topic(site, "robot_commands")
     states_topic = ends.topic(site, "robot_states")
@@ -791,10 +886,10 @@ def open_robot(
 
 
 def refuse_other_robots(table: TopicTable, scenario: Scenario) -> None:
-    """Checks that each robot of the table belongs to a site with an external arm.
+    """Checks that each robot in the settings belongs to a site with an external arm.
 
     Raises:
-        UsageError: a robot belongs to another site.
+        UsageError: A robot belongs to another site.
     """
     for site, robot in table.robots.items():
         has_settings = robot != RobotTable() or site not in scenario.names
@@ -806,12 +901,16 @@ def refuse_other_robots(table: TopicTable, scenario: Scenario) -> None:
 
 
 def await_site(ends: BridgeEnds, stopped: Callable[[], bool], *, running: bool) -> Info | None:
-    """Waits for the reply of a site; returns None if `stopped` returns True first.
+    """Waits until a site of the session replies.
 
     Args:
-        ends: the graph and the session.
-        stopped: returns True to end the wait.
-        running: whether to wait for a site that runs.
+        ends: Connections to ROS and to the session.
+        stopped: Function that returns True to end the wait.
+        running: True to wait until a site runs. False accepts a site that still waits for
+            others.
+
+    Returns:
+        The identity of the site. None if `stopped` returned True.
     """
     replies = find_members(ends.bus, ends.clock, ends.session, stopped=stopped, timeout_s=None)
     for info in replies:
