@@ -1,10 +1,15 @@
-"""Presence of the other members during a run: joins, departures and ends.
+"""Follow during a run which other members of the session join, leave and end.
+
+A member is a process that takes part in the session: a site or a recorder. Each start of a
+process has a boot, a random number that distinguishes it from earlier and later starts. A site
+learns about the others in two ways: from the liveliness tokens that appear and disappear with a
+process, and from the events that a process publishes.
 
 Invariant:
-    - Messages of a site count only if they come from the boot with which the session began.
-      Under the rule `glide`, boots that were admitted later count as well.
-    - A new boot of a site is admitted once the token of the previous boot is gone, or the end
-      event of the previous boot was received.
+    - Only the boots with which the session started count as members. If the scenario allows
+      sites to come back (rule `glide`), boots that were admitted later count as well.
+    - Another boot of a site is admitted only after the previous one has disappeared or has
+      published its end. Two processes never act as the same site.
     - A recorder may join at any time.
 """
 
@@ -19,35 +24,37 @@ from trilat_net.net.messages import Event
 T = TypeVar("T")
 
 RETURN_NS = 1_000_000_000
-"""Time after the loss of a site's token from which a message of the site proves its presence.
+"""Time after the loss of a site's token after which samples alone show its return, in ns.
 
-After a reconnection the new token of the site may be reported late.
+After a reconnection, samples may arrive before the new liveliness token.
 """
 _INBOX_CAPACITY = 256
 """Number of events of a member that wait at most."""
 
 
 class PeerMonitor:
-    """The other members of a session, as one site sees them.
+    """The other members of a session, from the view of one site.
+
+    The site calls `watch` ten times a second, and reads the attributes.
 
     Args:
-        bus: the bus of the site.
-        session: the session's name.
-        site: the name of this site.
-        peers: the names of its peers.
-        admits: True if sites may leave and rejoin.
+        bus: Network connection of the site.
+        session: Name of the session.
+        site: Name of the site.
+        peers: Names of its peers, the sites whose samples it receives.
+        admits: True if sites may leave and come back.
 
     Attributes:
-        boots: the boots of the session's members, by name.
-        recorders: boots of the recorders that are present.
-        stored: boots of the recorders that have stored all messages of this site.
-        ended_by: text of the event with which a member ended the run for all; "" before such
-            an event.
-        ended_member: the name of that member.
-        departed: time of departure, ns since the epoch, and a sentence, by the name of a site
-            that has left.
-        admitted: join events of admitted sites that the loop has not applied yet.
-        changed: True once a peer has published a change.
+        boots: Boot of each member of the session, by name.
+        recorders: Boots of the recorders that are present.
+        stored: Boots of the recorders that have stored all messages of this site.
+        ended_by: Sentence of the event with which a member ended the run for all. Empty if
+            there is none.
+        ended_member: Name of that member.
+        departed: Sites that have left, by name: the time in ns since the epoch, and a sentence.
+        admitted: Events with which sites announced their join, and that the site must still
+            apply.
+        changed: True once a peer has published a change of its settings.
     """
 
     def __init__(
@@ -81,15 +88,15 @@ class PeerMonitor:
 
     @property
     def all_stored(self) -> bool:
-        """True if a recorder has stored everything, and no present recorder lacks anything."""
+        """True if at least one recorder, and each that is present, has stored everything."""
         return bool(self.stored) and self.recorders <= self.stored
 
     def watch(self, publisher: EventPublisher, t_ns: int) -> None:
-        """Reads events and presence, and publishes the joins and losses of members.
+        """Receives events and changes of presence, and publishes who joins and who is lost.
 
         Args:
-            publisher: publishes this site's events.
-            t_ns: the present time, ns since the epoch.
+            publisher: Publishes the events of this site.
+            t_ns: Present time, in ns since the epoch.
         """
         joining: list[Event] = []
         for inbox in self._events.values():
@@ -102,13 +109,13 @@ class PeerMonitor:
     def _update_presence(
         self, member: str, boot: str, publisher: EventPublisher, t_ns: int, *, alive: bool
     ) -> None:
-        """Applies the appearance or disappearance of a member's token.
+        """Applies the news that the token of a member has appeared or disappeared.
 
         Args:
-            member: name of the member.
-            boot: its boot, as in the token.
-            publisher: publishes this site's events.
-            t_ns: the present time, ns since the epoch.
+            member: Name of the member.
+            boot: Boot of the member, as text.
+            publisher: Publishes the events of this site.
+            t_ns: Present time, in ns since the epoch.
             alive: True if the token has appeared.
         """
         is_member = str(self.boots.get(member)) == boot
@@ -132,13 +139,14 @@ class PeerMonitor:
                 self.departed[member] = (t_ns, sentence)
 
     def mark_present(self, member: str, t_ns: int) -> None:
-        """Marks a site as present whose messages arrive, if its token was lost some time ago.
+        """Marks a site as present because its samples arrive, although its token was lost.
 
-        A site whose end event was received stays departed.
+        A site whose end event was received stays departed. A site that has just departed does
+        so as well: its last samples may still arrive.
 
         Args:
-            member: name of the site.
-            t_ns: the present time, ns since the epoch.
+            member: Name of the site.
+            t_ns: Present time, in ns since the epoch.
         """
         if member not in self.departed or self.boots.get(member) in self._ended:
             return
@@ -149,10 +157,19 @@ class PeerMonitor:
     def _read_peer_events(
         self, inbox: Inbox, publisher: EventPublisher, t_ns: int
     ) -> Iterator[Event]:
-        """Reads a peer's events, and yields the join events of new boots.
+        """Receives the events of one peer, and applies those that concern this site.
 
-        If the peer has admitted several boots of this site, the last boot counts: the earlier
-        boots died while they joined.
+        If the peer has admitted another start of this site, this process has been replaced and
+        must end. If it has admitted several starts, the last one counts: the earlier ones died
+        while they joined.
+
+        Args:
+            inbox: Queue of the events of the peer.
+            publisher: Publishes the events of this site.
+            t_ns: Present time, in ns since the epoch.
+
+        Yields:
+            The events with which new starts of the peer request to join.
         """
         local_boot = publisher.info.boot
         admitted_boot = local_boot
@@ -184,19 +201,28 @@ class PeerMonitor:
             self.ended_member = self._site
 
     def _decide_on_join(self, publisher: EventPublisher, event: Event, t_ns: int) -> None:
-        """Admits a new boot of a site, or refuses the boot while the previous boot is alive."""
+        """Admits a new start of a site, or refuses it while the previous one is still alive.
+
+        Args:
+            publisher: Publishes the events of this site.
+            event: Event with which the new start requests to join.
+            t_ns: Present time, in ns since the epoch.
+        """
         member = event.member
         previous_boot = self.boots.get(member)
         is_repeated = self._first_ticks.get(event.boot) == event.ticks
         if event.boots.get(member) != event.boot or is_repeated:
             return
+
         is_replaced = previous_boot not in (event.boot, *self._ended)
-        if is_replaced and (member, str(previous_boot)) in self._alive:
+        is_previous_alive = (member, str(previous_boot)) in self._alive
+        if is_replaced and is_previous_alive:
             if event.boot not in self._refused:
                 self._refused.add(event.boot)
                 text = f"{member} is present already; a new start must wait until it is gone"
                 self._publish_decision("refused", text, publisher, event=event, t_ns=t_ns)
             return
+
         self.boots = {**self.boots, member: event.boot}
         self.departed.pop(member, None)
         self.admitted.append(event)
@@ -208,15 +234,7 @@ class PeerMonitor:
     def _publish_decision(
         self, kind: str, text: str, publisher: EventPublisher, event: Event, t_ns: int
     ) -> None:
-        """Publishes the decision on a join event.
-
-        Args:
-            kind: "admit" or "refused".
-            text: the decision as a sentence.
-            publisher: publishes this site's events.
-            event: the join event.
-            t_ns: the present time, ns since the epoch.
-        """
+        """Publishes that this site admits or refuses a new start of another site."""
         publisher.publish(
             kind,
             text,
@@ -228,10 +246,13 @@ class PeerMonitor:
         )
 
     def read_stored(self, ticks: int) -> bool:
-        """Reads the recorders' events; returns True if a recorder has just stored all messages.
+        """Receives the recorders' events that they have stored all messages of this site.
 
         Args:
-            ticks: the number of ticks of this site.
+            ticks: Number of ticks of this site.
+
+        Returns:
+            True if another recorder has just stored everything.
         """
         before = len(self.stored)
         for event in read_messages(self._recorder_events, Event):

@@ -1,13 +1,17 @@
-"""The bus: the protocol of a member's network connection, and the rings of waiting messages.
+"""Define the interface of a member's network connection, and the queues of waiting messages.
 
-`zenoh_bus` implements the protocol over Eclipse Zenoh.
+A member is a process that takes part in a session. Its network connection, the bus, publishes
+messages under keys, receives the messages of other members, and sends and answers queries.
+`zenoh_bus` implements the interface over Eclipse Zenoh. Tests implement it within one process.
 
 Invariant:
-    - For an arriving message, a site's bus thread does no more than stamp and decode the
-      message, and append it or send a short reply. The decoding function raises nothing.
-    - Messages wait in bounded rings until the loop polls them. On overflow the oldest message
-      is dropped; the receiver notices the gap by the numbers of the messages.
-    - Only the recorder uses callbacks (`Bus.tap`).
+    - When a message arrives, the network thread of a site only reads the time, decodes the
+      message and appends it to a queue, or sends a short reply. The control loop therefore
+      loses little time to network threads. The decoding function must not raise an error.
+    - Messages wait in queues of limited length until the control loop polls them. If a queue is
+      full, the oldest message is dropped. The receiver notices the gap because messages are
+      numbered.
+    - Only the recorder receives messages by a callback (`Bus.tap`).
 """
 
 import re
@@ -17,55 +21,69 @@ from functools import lru_cache
 from typing import Generic, Protocol, TypeVar
 
 RING_CAPACITY = 16_384
-"""Capacity of a ring in messages: sixteen seconds of one peer at 1 kHz."""
+"""Number of messages that a queue holds: those of one peer in sixteen seconds at 1 kHz."""
 
 T = TypeVar("T")
 Polled = TypeVar("Polled", covariant=True)
 
 
 class PolledRing(Protocol[Polled]):
-    """A bounded ring of entries that have arrived."""
+    """A queue of limited length, for entries that have arrived."""
 
     def poll(self) -> Polled | None:
-        """Returns the oldest entry, or None; never waits."""
+        """Removes the oldest entry and returns it, or None if the queue is empty.
+
+        It never waits.
+        """
 
 
 Inbox = PolledRing[tuple[str, bytes]]
-"""Messages: (key, payload)."""
+"""Queue of messages: the key and the payload of each message."""
 PresenceInbox = PolledRing[tuple[str, bool]]
-"""Liveliness changes: (key, True if the token is alive now)."""
+"""Queue of changes of presence: the key of a token, and True if the token has appeared."""
 StampedInbox = PolledRing[tuple[Polled, int]]
-"""Messages with their arrival times: (decoded message, ns)."""
+"""Queue of decoded messages, each with its time of arrival in ns."""
 
 
 class Query(Protocol):
-    """A query that waits for a reply."""
+    """A query that has arrived and waits for a reply."""
 
     @property
     def payload(self) -> bytes:
-        """The payload of the query; b"" if the query has no payload."""
+        """Payload of the query. Empty if there is none."""
 
     def reply(self, payload: bytes) -> None:
-        """Replies to the query."""
+        """Sends the reply to the query."""
 
 
 QueryInbox = PolledRing[Query]
+"""Queue of queries that have arrived."""
 
 
 class Bus(Protocol):
-    """Network connection of one member."""
+    """Network connection of one member.
+
+    Keys that are passed for receiving may contain wildcards: `*` for one part of a key, `**`
+    for any number of parts.
+    """
 
     def publisher(self, key: str, *, patient: bool = False) -> Callable[[bytes], None]:
         """Returns a function that publishes payloads under a key.
 
         Args:
-            key: the key.
-            patient: False to drop a payload rather than wait for room. True to wait for room,
-                for at most some seconds: for senders without ticks that must lose nothing.
+            key: The key.
+            patient: False if a payload is dropped when the network is too slow. True if the
+                function waits instead, for some seconds at most. That is for senders without a
+                control loop that must not lose messages.
         """
 
     def inbox(self, key: str, capacity: int = RING_CAPACITY) -> Inbox:
-        """Returns a ring of the messages that other members publish under a key expression."""
+        """Returns a queue of the messages that other members publish under a key.
+
+        Args:
+            key: The key.
+            capacity: Number of messages that the queue holds.
+        """
 
     def stamped_inbox(
         self,
@@ -74,47 +92,69 @@ class Bus(Protocol):
         read: Callable[[bytes], T],
         capacity: int = RING_CAPACITY,
     ) -> StampedInbox[T]:
-        """Returns a ring whose messages are stamped and decoded on arrival, in a bus thread.
+        """Returns a queue whose messages are decoded on arrival, with their times of arrival.
 
         Args:
-            key: key expression of the messages.
-            now_ns: clock that stamps the arrivals.
-            read: decodes a payload, and raises nothing; `bytes` keeps the payload as it is.
-            capacity: number of messages that the ring holds.
+            key: The key.
+            now_ns: Function that reads the local clock, in ns.
+            read: Function that decodes a payload, in a network thread. It must not raise an
+                error. `bytes` leaves the payload as it is.
+            capacity: Number of messages that the queue holds.
         """
 
     def tap(self, key: str, callback: Callable[[str, bytes], None]) -> None:
-        """Calls `callback(key, payload)` for every arriving message, in a thread of the bus."""
+        """Calls `callback(key, payload)` for every message under a key, in a network thread."""
 
     def query_inbox(self, key: str) -> QueryInbox:
-        """Returns a ring of the queries that other members send under a key."""
+        """Returns a queue of the queries that other members send under a key."""
 
     def respond(self, key: str, answer: Callable[[bytes], bytes | None]) -> None:
-        """Replies to queries under a key at once, in a thread of the bus.
+        """Replies to the queries under a key at once, in a network thread.
 
         Args:
-            key: the key.
-            answer: returns the reply to a payload, or None for no reply. The function must be
-                short, because messages wait meanwhile, and must raise nothing.
+            key: The key.
+            answer: Function that returns the payload of the reply to a payload, or None for no
+                reply. It must be fast, because messages wait meanwhile, and must not raise an
+                error.
         """
 
     def query(self, key: str, payload: bytes = b"") -> Inbox:
-        """Queries all members under a key expression, and returns the ring of their replies."""
+        """Sends a query to all members that serve a matching key.
+
+        Args:
+            key: The key.
+            payload: Payload of the query.
+
+        Returns:
+            A queue for the replies.
+        """
 
     def announce(self, key: str) -> None:
-        """Declares a liveliness token, which disappears together with this member."""
+        """Declares a liveliness token, which shows other members that this member is present.
+
+        The token disappears when the connection is closed or lost.
+
+        Args:
+            key: Key of the token.
+        """
 
     def presence(self, key: str) -> PresenceInbox:
-        """Returns a ring of the tokens that appear and disappear; present tokens come first."""
+        """Returns a queue of the tokens that appear and disappear under a key.
+
+        The first entries are the tokens that exist already.
+
+        Args:
+            key: The key.
+        """
 
     def close(self) -> None:
-        """Closes the connection; repeated calls have no effect."""
+        """Closes the connection. Calling it again has no effect."""
 
 
 @lru_cache(256)
 def _compile_expression(expression: str) -> re.Pattern[str]:
-    """Returns the regular expression of a key expression, for keys behind a slash."""
-    pattern = ""
+    """Converts a key with wildcards to a regular expression, see `matches_key`."""
+    patterns = []
     for chunk in expression.split("/"):
         if chunk == "**":
             pattern += "(?:/[^/]+)*"
@@ -127,44 +167,48 @@ def _compile_expression(expression: str) -> re.Pattern[str]:
 
 
 def matches_key(expression: str, key: str) -> bool:
-    """Returns True if a key expression matches a key.
+    """Returns True if a key with wildcards matches a key, by the rules of Zenoh.
 
-    In an expression, `*` stands for one chunk, `**` for any number of chunks, and `$*` for any
-    part of a chunk.
+    Keys consist of parts between slashes. The wildcard `*` stands for one part, `**` for any
+    number of parts, and `$*` for any characters within a part.
+
+    Args:
+        expression: Key with wildcards.
+        key: Key without wildcards.
     """
     return _compile_expression(expression).fullmatch("/" + key) is not None
 
 
 class BoundedRing(Generic[T]):
-    """A bounded ring, which drops its oldest entry on overflow.
+    """A queue of limited length, which drops its oldest entry if it is full.
 
     One thread may call `put` while another thread calls `poll`.
 
     Args:
-        capacity: largest number of entries.
+        capacity: Number of entries that the queue holds.
     """
 
     def __init__(self, capacity: int = RING_CAPACITY) -> None:
         self._entries: deque[T] = deque(maxlen=capacity)
 
     def put(self, entry: T) -> None:
-        """Adds the newest entry."""
+        """Adds an entry. If the queue is full, the oldest entry is dropped."""
         self._entries.append(entry)
 
     def poll(self) -> T | None:
-        """See `PolledRing`."""
+        """Removes the oldest entry and returns it, or None if the queue is empty."""
         return self._entries.popleft() if self._entries else None
 
 
 class StampingRing(BoundedRing[tuple[T, int]]):
-    """The `StampedInbox` of every bus.
+    """A queue of messages that are decoded on arrival, with their times of arrival.
 
     One thread may call `receive` while another thread calls `poll`.
 
     Args:
-        now_ns: clock that stamps the arrivals.
-        read: decodes a payload, and raises nothing.
-        capacity: largest number of entries.
+        now_ns: Function that reads the local clock, in ns.
+        read: Function that decodes a payload. It must not raise an error.
+        capacity: Number of messages that the queue holds.
     """
 
     def __init__(
@@ -175,6 +219,6 @@ class StampingRing(BoundedRing[tuple[T, int]]):
         self._read = read
 
     def receive(self, payload: bytes) -> None:
-        """Stamps an arriving message, decodes it and appends it."""
+        """Adds a message. The time is read before the message is decoded."""
         now_ns = self._now_ns()
         self._entries.append((self._read(payload), now_ns))

@@ -1,18 +1,21 @@
-"""The keys of a session's members, which `trilat keys new` creates.
+"""Create, renew and read the keys with which the members of a session prove their identity.
 
-A private authority signs one certificate per member. Every member loads the keys in its own
-folder; the authority has a separate folder.
+A member is a process that takes part in a session, such as a site or a recorder. `trilat keys
+new` creates a private certificate authority for the session, which signs one certificate per
+member. Every member loads the keys in its own folder. The authority has a separate folder,
+which should be stored safely. Zenoh encrypts all connections with these keys (TLS or QUIC with
+certificates of both ends).
 
-Keys end a day before their certificate: afterwards no member can start with the keys, but
-`trilat stop` can still connect. Every connection of Zenoh, and every reconnection, needs a
-valid certificate.
+The keys end one day earlier than their certificate. During this day, no member can start with
+the keys, but `trilat stop` can still connect and stop the arms. Zenoh needs a valid certificate
+for each new connection, and each time a connection is opened again.
 
 Invariant:
-    - A certificate ends after some days.
-    - A member's folder holds its private key, its certificate, the certificate of the
-      authority, and the list of members, from which the access rules follow.
-    - No other user can read the private key, or write any file of the folder.
-    - Either all keys of a session are created, or no key.
+    - Every certificate ends after some days.
+    - The folder of a member contains its private key, its certificate, the certificate of the
+      authority, and the list of all members. The access rules of Zenoh follow from this list.
+    - No other user of the machine can read the private key or change a file in the folder.
+    - Either the keys of all members are created, or no keys.
 """
 
 import datetime
@@ -42,33 +45,40 @@ from ..files import (
 from .zenoh_config import MOST_SESSIONS, PROTOCOLS, make_access_rules
 
 AUTHORITY = "authority.pem"
+"""Name of the file with the certificate of the authority."""
 CERTIFICATE = "certificate.pem"
+"""Name of the file with the certificate of the member."""
 PRIVATE_KEY = "private.key"
+"""Name of the file with the private key of the member."""
 MEMBERS = "members.json"
+"""Name of the file with the list of all members and the end of the keys."""
 _AUTHORITY_FOLDER = "authority"
+"""Name of the folder of the authority."""
 HERE = ("localhost", "127.0.0.1", "::1")
-"""Names of the local machine, which every certificate contains."""
+"""Names and addresses of the local machine, which every certificate contains."""
 STOPPING_TIME = datetime.timedelta(days=1)
-"""Time after the end of the keys during which they can still stop arms."""
+"""Time after the end of the keys for which they can still be used to stop arms."""
 _CLOCK_TOLERANCE = datetime.timedelta(hours=1)
-"""Tolerated difference between the clocks of two machines."""
+"""Difference between the clocks of two machines that is tolerated."""
 MOST_KEY_BYTES = 65_536
 """Largest number of bytes that are read from a key file."""
 _RENEWAL = "renew it with trilat keys renew, or make new keys for all with trilat keys new"
+"""Advice to the user for keys that have ended."""
 _DATE = "%Y-%m-%d %H:%M UTC"
+"""Format of dates in messages to the user."""
 MOST_DAYS = 3_650
 """Longest validity of keys, in days."""
 MOST_LETTERS = 64
-"""Longest name of a member: X.509 limits common names to 64 characters."""
+"""Longest name of a member. X.509 limits common names to 64 characters."""
 
 
 class MemberKeys(NamedTuple):
-    """The keys of one member.
+    """The keys of one member, ready for a network connection.
 
     Attributes:
-        member: name of the member.
-        members: names of all members.
-        ends: end of the keys, in UTC; the certificate is valid for `STOPPING_TIME` longer.
+        member: Name of the member.
+        members: Names of all members.
+        ends: End of the keys, in UTC. The certificate is valid for `STOPPING_TIME` longer.
         settings: Zenoh settings that use the keys, see `make_zenoh_config`.
     """
 
@@ -81,23 +91,24 @@ class MemberKeys(NamedTuple):
 def create_keys(
     folder: str | Path, members: Sequence[str], hosts: Sequence[str] = (), days: int = 30
 ) -> list[Path]:
-    """Creates an authority and a folder of keys for each member, like `trilat keys new`.
+    """Creates an authority and a folder of keys for each member, as `trilat keys new` does.
 
     >>> [folder.name for folder in tn.create_keys("keys", ["m", "s", "recorder"])]
     ['m', 's', 'recorder']
 
     Args:
-        folder: the folder to create; it must be empty if it exists.
-        members: the sites, and those of `recorder`, `operator` and `router` that take part.
-        hosts: names and addresses at which members listen, in addition to `HERE`.
-        days: validity of the keys, in days.
+        folder: Folder to create. If it exists, it must be empty.
+        members: Names of the sites, and `recorder`, `operator` and `router` if they take part.
+        hosts: Names and addresses at which members listen, in addition to those of the local
+            machine.
+        days: Validity of the keys, in days.
 
     Returns:
         The folders of the members.
 
     Raises:
-        UsageError: a name is not valid, or the folder is not empty or cannot be created.
-        LogRefused: the disk refused a write; no files are left.
+        UsageError: A name is not valid, or the folder is not empty or cannot be created.
+        LogRefused: The disk refused to write. No files are left.
     """
     folder = Path(folder)
     faults = [_find_name_fault(members), *map(_find_host_fault, hosts)]
@@ -118,7 +129,7 @@ def create_keys(
 
 
 def _find_name_fault(members: Sequence[Any]) -> str:
-    """Returns why members cannot have these names; "" if they can."""
+    """Returns why members cannot have these names. Empty if they can."""
     for name in members:
         has_valid_letters = isinstance(name, str) and re.fullmatch("[A-Za-z0-9_-]+", name)
         if not has_valid_letters or len(name) > MOST_LETTERS or name == _AUTHORITY_FOLDER:
@@ -133,9 +144,9 @@ def _find_name_fault(members: Sequence[Any]) -> str:
 
 
 def _find_host_fault(host: str) -> str:
-    """Returns why a certificate cannot name a host; "" if it can.
+    """Returns why a certificate cannot contain a host name. Empty if it can.
 
-    Addresses and patterns that stand for several hosts are refused.
+    Names with a port and patterns that stand for several hosts are refused.
     """
     label = "(?!-)[A-Za-z0-9_-]{1,63}(?<!-)"
     try:
@@ -151,26 +162,26 @@ def _find_host_fault(host: str) -> str:
 
 
 def renew_keys(folder: str | Path, members: Sequence[str] = (), days: int = 30) -> list[Path]:
-    """Renews the certificates of members in place, like `trilat keys renew`.
+    """Renews the certificates of members in place, as `trilat keys renew` does.
 
-    Private keys, hosts and the lists of members stay as they are.
+    Private keys, host names and the lists of members are not changed.
 
     >>> folders = tn.create_keys("lab-keys", ["m", "s"], days=1)
     >>> [folder.name for folder in tn.renew_keys("lab-keys", days=30)]
     ['m', 's']
 
     Args:
-        folder: the folder that `create_keys` created, with its folder `authority`.
-        members: members whose certificates are renewed; if empty, all members that have a
+        folder: Folder that `create_keys` created, including its folder `authority`.
+        members: Members whose certificates are renewed. If empty, all members that have a
             folder.
-        days: validity of the keys from now on, in days.
+        days: Validity of the keys from now on, in days.
 
     Returns:
         The renewed folders.
 
     Raises:
-        UsageError: the authority, a member's folder or a file in it is missing or damaged.
-        LogRefused: the disk refused a write.
+        UsageError: The authority, the folder of a member or a file in it is missing or damaged.
+        LogRefused: The disk refused to write.
     """
     folder = Path(folder)
     if not 0 <= days <= MOST_DAYS:
@@ -219,7 +230,21 @@ def renew_keys(folder: str | Path, members: Sequence[str] = (), days: int = 30) 
 def _renew_member(
     folder: Path, authority: x509.Certificate, authority_key: Any, ends: datetime.datetime
 ) -> tuple[x509.Certificate, str]:
-    """Returns a member's new certificate and the new content of its list of members."""
+    """Signs a new certificate for the existing private key of a member.
+
+    Args:
+        folder: Folder of the member.
+        authority: Previous certificate of the authority, which must have signed the previous
+            certificate of the member.
+        authority_key: Private key of the authority.
+        ends: End of the keys.
+
+    Returns:
+        The new certificate, and the new content of the list of members.
+
+    Raises:
+        UsageError: A file is damaged, or the authority has not signed the previous certificate.
+    """
     try:
         old = x509.load_pem_x509_certificate(_read_trusted(folder / CERTIFICATE))
         old.verify_directly_issued_by(authority)
@@ -244,7 +269,14 @@ def _renew_member(
 def _write_all_keys(
     folder: Path, members: Sequence[str], hosts: Sequence[str], days: int
 ) -> None:
-    """Creates the folders of the authority and of all members inside `folder`."""
+    """Creates the folders of the authority and of all members.
+
+    Args:
+        folder: Folder in which they are created.
+        members: Names of the members.
+        hosts: Names and addresses at which members listen.
+        days: Validity of the keys, in days.
+    """
     ends = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=days)
     authority_key = ec.generate_private_key(ec.SECP256R1())
     authority = _sign_authority(authority_key, ends)
@@ -272,7 +304,7 @@ def _format_member_list(member: str, members: Sequence[str], ends: datetime.date
 def _sign_authority(
     key: ec.EllipticCurvePrivateKey, ends: datetime.datetime
 ) -> x509.Certificate:
-    """Returns the self-signed certificate of the authority."""
+    """Returns the certificate of the authority, which it signs itself."""
     constraints = x509.BasicConstraints(ca=True, path_length=0)
     builder = _start_certificate(_ISSUER, key.public_key(), ends)
     return builder.add_extension(constraints, critical=True).sign(key, hashes.SHA256())
@@ -285,7 +317,15 @@ def _sign_member(
     authority_key: ec.EllipticCurvePrivateKey,
     ends: datetime.datetime,
 ) -> x509.Certificate:
-    """Returns the certificate for a member's public key, signed by the key of the authority."""
+    """Returns a certificate for the public key of a member, signed by the authority.
+
+    Args:
+        subject: Name of the member.
+        public_key: Public key of the member.
+        names: Host names and addresses at which the member may listen.
+        authority_key: Private key of the authority.
+        ends: End of the keys.
+    """
     uses = x509.ExtendedKeyUsage(
         [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
     )
@@ -296,16 +336,18 @@ def _sign_member(
 
 
 def _make_subject(common_name: str) -> x509.Name:
+    """Returns a name in the form of a certificate."""
     return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common_name)])
 
 
 _ISSUER = _make_subject("trilat-net authority")
+"""Name of the authority in the certificates."""
 
 
 def _start_certificate(
     subject: x509.Name, public_key: Any, ends: datetime.datetime
 ) -> x509.CertificateBuilder:
-    """Returns a certificate of the authority that is not signed yet."""
+    """Returns the fields that all certificates of a session have in common, unsigned."""
     return (
         x509.CertificateBuilder()
         .subject_name(subject)
@@ -318,11 +360,16 @@ def _start_certificate(
 
 
 def _encode(certificate: x509.Certificate) -> bytes:
+    """Returns a certificate in PEM format."""
     return certificate.public_bytes(serialization.Encoding.PEM)
 
 
 def _make_alternative_names(hosts: Sequence[str]) -> x509.SubjectAlternativeName:
-    """Returns the hosts of a certificate: `HERE` and `hosts`, each as address or as name."""
+    """Returns the host names and addresses that a certificate contains.
+
+    Args:
+        hosts: Names and addresses in addition to those of the local machine.
+    """
     names: list[x509.GeneralName] = []
     for host in dict.fromkeys((*HERE, *hosts)):
         try:
@@ -338,7 +385,15 @@ def _write_folder(
     certificate: x509.Certificate,
     key: ec.EllipticCurvePrivateKey,
 ) -> None:
-    """Creates the folder of a member, or of the authority if both certificates are the same."""
+    """Creates the folder of a member, or that of the authority.
+
+    Args:
+        folder: The folder.
+        authority: Certificate of the authority.
+        certificate: Certificate of the member. For the authority's own folder it is the same
+            object as `authority`, and is written only once.
+        key: Private key that belongs to the certificate.
+    """
     folder.mkdir(mode=0o700, parents=True)
     _write_new_file(folder / AUTHORITY, authority.public_bytes(serialization.Encoding.PEM))
     if certificate is not authority:
@@ -354,14 +409,18 @@ def _write_folder(
 
 
 def _write_new_file(path: Path, content: bytes) -> None:
-    """Writes a file that only its owner can read; the file must not exist."""
+    """Writes a file that only its owner can read. The file must not exist."""
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     with os.fdopen(descriptor, "wb") as file:
         file.write(content)
 
 
 def _read_trusted(path: Path) -> bytes:
-    """Returns the content of a key file; raises UsageError if other users can change it."""
+    """Reads a key file, after a check that no other user can change it.
+
+    Raises:
+        UsageError: Another user can change the file.
+    """
     with open_regular(path) as stream:
         _check_permissions(path, os.fstat(stream.fileno()))
         content: bytes = stream.read(MOST_KEY_BYTES)
@@ -369,10 +428,17 @@ def _read_trusted(path: Path) -> bytes:
 
 
 def _check_permissions(path: Path, status: os.stat_result) -> None:
-    """Raises UsageError if another user can change a file or folder.
+    """Checks that no other user can change a file or folder.
 
-    In a shared folder with the sticky bit, users cannot change the files of others. On Windows
-    the permission bits do not tell who can write, so there is no check.
+    In a folder with the sticky bit, users cannot change the files of others, so that it may be
+    shared. On Windows, permission bits do not tell who can write, and nothing is checked.
+
+    Args:
+        path: The file or folder.
+        status: Its permissions.
+
+    Raises:
+        UsageError: Another user can change it.
     """
     if sys.platform == "win32":
         return
@@ -388,18 +454,21 @@ def _check_permissions(path: Path, status: os.stat_result) -> None:
 
 
 def read_member_keys(folder: str | Path, *, stops: bool = False) -> MemberKeys:
-    """Reads and checks the keys in a member's folder, like `trilat keys info`.
+    """Reads and checks the keys in the folder of a member, as `trilat keys info` does.
 
     >>> tn.read_member_keys(tn.create_keys("lab-keys", ["m", "s"])[0]).member
     'm'
 
     Args:
-        folder: the folder of one member.
-        stops: True if the keys only serve to stop arms: then keys that have ended are accepted
-            while their certificate is valid.
+        folder: Folder of one member.
+        stops: True if the keys are only used to stop arms. Keys that have ended are then
+            accepted as long as their certificate is valid.
+
+    Returns:
+        The keys.
 
     Raises:
-        UsageError: a file is missing or damaged, the keys have ended, or the files do not
+        UsageError: A file is missing or damaged, the keys have ended, or the files do not
             belong together.
     """
     folder = Path(folder)
@@ -457,7 +526,16 @@ def _find_key_fault(
     key: Any,
     ends: datetime.datetime,
 ) -> str:
-    """Returns the first fault of a member's keys; "" if the keys are valid."""
+    """Returns the first fault of the keys of a member. Empty if the keys are valid.
+
+    Args:
+        folder: Folder of the member.
+        member: Name of the member, from its list of members.
+        members: Names of all members.
+        certificate: Certificate of the member.
+        key: Private key of the member.
+        ends: Time until which the keys can be used.
+    """
     common_name = ", ".join(
         name.rfc4514_string().removeprefix("CN=") for name in certificate.subject.rdns
     )
@@ -494,7 +572,7 @@ def _find_key_fault(
 
 
 def _make_settings(folder: Path, members: Sequence[str]) -> dict[str, Any]:
-    """Returns the Zenoh settings of a member whose keys are in `folder`."""
+    """Returns the Zenoh settings of a member that uses the keys in a folder."""
     tls = {
         "root_ca_certificate": str(folder / AUTHORITY),
         "enable_mtls": True,

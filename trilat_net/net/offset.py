@@ -1,32 +1,35 @@
-"""Estimation of the offset and drift of another clock, and the slewed offset in use.
+"""Estimate the offset and drift between two clocks from the time stamps of messages.
 
-The estimate uses time stamps of messages that crossed a network. A message is never received
-before it was sent. With
+A message cannot be received before it was sent. With
 
     offset = other clock - local clock,
 
-every message therefore limits the offset at one instant of the local clock:
+each message therefore limits the offset at one time of the local clock:
 
-    ceiling (local side sent):     offset <= other reading on receipt - local reading on sending
-    floor   (local side received): offset >= other reading on sending - local reading on receipt
+    ceiling (sent locally):     offset <= other time of receipt - local time of sending
+    floor   (received locally): offset >= other time of sending - local time of receipt
 
-The stamps t1 (local sending), t2 (other receiving), t3 (other sending) and t4 (local receiving)
-of one exchange give the ceiling t2 - t1 and the floor t3 - t4. Their mean is the classical
-estimate of the offset, their difference the round trip, and half of that the error bound.
+In an exchange with the stamps t1 (local sending), t2 (other receipt), t3 (other sending) and t4
+(local receipt), the ceiling is t2 - t1 and the floor is t3 - t4. Their mean is the classical
+estimate of the offset, as in NTP. Their difference is the round trip time, and half of it is
+the error bound.
 
-Each window keeps its lowest ceiling and its highest floor. These may come from different
-exchanges, so the bound is half the shortest way out plus half the shortest way back. Over the
-windows the offset is modelled as a straight line. The lines below all ceilings and above all
-floors are admissible, and their spread at present is the bound.
+The time stamps are divided into windows. Of each window, only the lowest ceiling and the
+highest floor are kept. They may come from different exchanges, so that the error bound is half
+of the shortest delay in one direction plus half of the shortest delay in the other. Over the
+windows, the offset is modelled as a straight line. All lines below every ceiling and above
+every floor are admissible, and the range of their values at present is the range of the offset.
 
-Assumptions: two clocks drift apart by less than DRIFT_LIMIT, and along a line to within WANDER
-over the windows that are kept.
+Assumptions: the clocks drift apart by less than DRIFT_LIMIT, and their drift deviates from its
+mean by less than WANDER over the stored windows.
 
 Invariant:
-    - The stamps prove every bound, for any delays, however unequal the two directions are.
-    - The offset in use never steps: it is continuous and piecewise linear. It reaches each new
-      estimate within SLEW_NS and then follows the estimate's drift.
-    - The bound of the offset in use covers the estimate's interval also during the slew.
+    - The time stamps prove each bound, however long the delays are, and however different they
+      are in the two directions.
+    - The offset in use (`SlewedOffset`) never steps. It is continuous and piecewise linear. It
+      reaches each new estimate within SLEW_NS, and then follows the drift of the estimate.
+    - The bound of the offset in use includes the range of the estimate also while the offset
+      moves towards the estimate.
 """
 
 import math
@@ -39,26 +42,28 @@ from ..core.ticks import NS_PER_S
 from ..core.vectors import Array
 
 WINDOWS_KEPT = 60
+"""Number of windows whose limits are stored."""
 DRIFT_LIMIT = 500_000.0
-"""Largest drift of one clock against another, ns/s."""
+"""Largest drift between two clocks, in ns/s."""
 WANDER = 1_000.0
-"""Largest deviation of the drift from its mean over the windows kept, ns/s."""
+"""Largest deviation of the drift from its mean over the stored windows, in ns/s."""
 _NOISE_NS = 3_000.0
-"""Excess over the tightest limit at which the weight of a limit falls to a quarter, in ns."""
+"""Distance from the tightest limit at which the weight of a limit falls to a quarter, in ns."""
 _PRIOR_DRIFT = 100_000.0
-"""Standard deviation of the drift's prior around 0, ns/s.
+"""Standard deviation of the drift that is expected before any measurement, in ns/s.
 
-The prior decides only while the windows span less than a second.
+It matters only while the windows span less than a second.
 """
 _WEIGHTING_ROUNDS = 3
+"""Number of rounds of the reweighted least squares. Three are enough in practice."""
 
 
 class OffsetLimit(NamedTuple):
     """Upper limit (ceiling) or lower limit (floor) of an offset.
 
     Attributes:
-        local_ns: the instant of the local clock for which the limit holds.
-        offset_ns: the limit, in ns.
+        local_ns: Time on the local clock for which the limit holds, in ns.
+        offset_ns: The limit, in ns.
     """
 
     local_ns: int
@@ -66,14 +71,14 @@ class OffsetLimit(NamedTuple):
 
 
 class OffsetEstimate(NamedTuple):
-    """Estimate of the offset and drift of another clock against the local clock.
+    """Estimate of the offset and the drift of another clock relative to the local clock.
 
     Attributes:
-        local_ns: the instant of the local clock for which the estimate holds.
-        offset_ns: the other clock minus the local clock at that instant.
-        drift: growth of the offset, ns/s.
-        low_ns, high_ns: limits of the offset at that instant.
-        drift_low, drift_high: limits of the drift, ns/s.
+        local_ns: Time on the local clock for which the estimate holds, in ns.
+        offset_ns: The other clock minus the local clock at that time, in ns.
+        drift: Growth of the offset, in ns/s.
+        low_ns, high_ns: Limits of the offset at that time, in ns.
+        drift_low, drift_high: Limits of the drift, in ns/s.
     """
 
     local_ns: int
@@ -85,27 +90,32 @@ class OffsetEstimate(NamedTuple):
     drift_high: float
 
     def extrapolate_ns(self, local_ns: int) -> int:
-        """Returns the estimated offset at another instant of the local clock, in ns."""
+        """Returns the estimated offset at another time of the local clock, in ns."""
         return self.offset_ns + round((local_ns - self.local_ns) * self.drift / NS_PER_S)
 
     def widen(self, *limits: OffsetLimit | None) -> "OffsetEstimate":
-        """Returns the estimate with its interval widened to include contradicting limits."""
+        """Returns the estimate with wider limits, which include limits that contradict it.
+
+        Args:
+            *limits: Ceilings and floors. None is ignored.
+        """
         offsets = [limit.offset_ns for limit in limits if limit is not None]
         low_ns = min([self.low_ns, *offsets])
         high_ns = max([self.high_ns, *offsets])
         return self._replace(low_ns=low_ns, high_ns=high_ns)
 
     def error_bound_ns(self, local_ns: int, offset_ns: int) -> int:
-        """Returns the largest possible error of a value of the offset, in ns.
+        """Returns the largest possible error of a value that is used for the offset, in ns.
 
         Args:
-            local_ns: instant of the local clock.
-            offset_ns: value that is used for the offset at that instant.
+            local_ns: Time on the local clock, in ns.
+            offset_ns: Value that is used for the offset at that time, in ns.
         """
         passed_s = (local_ns - self.local_ns) / NS_PER_S
-        is_later = passed_s >= 0.0
-        upper_drift = self.drift_high if is_later else self.drift_low
-        lower_drift = self.drift_low if is_later else self.drift_high
+        upper_drift = self.drift_high
+        lower_drift = self.drift_low
+        if passed_s < 0.0:  # before the estimate, a smaller drift gives a larger offset
+            upper_drift, lower_drift = lower_drift, upper_drift
         error_above = self.high_ns - offset_ns + passed_s * upper_drift
         error_below = offset_ns - self.low_ns - passed_s * lower_drift
         return max(0, math.ceil(max(error_above, error_below)))
@@ -114,7 +124,7 @@ class OffsetEstimate(NamedTuple):
 def exact_offset(offset_ns: int) -> OffsetEstimate:
     """Returns the estimate of a constant offset that is known exactly.
 
-    Two readings of one clock have such an offset.
+    Such an offset exists between two readings of the same clock.
     """
     return OffsetEstimate(
         local_ns=0,
@@ -128,17 +138,17 @@ def exact_offset(offset_ns: int) -> OffsetEstimate:
 
 
 def format_offset(offset_ns: int, bound_ns: int) -> str:
-    """Returns an offset and its error bound as text."""
+    """Formats an offset and its error bound for the user."""
     return f"offset {offset_ns / 1e9:.6f} s +- {-(-bound_ns // 1000)} us"
 
 
 class OffsetEstimator:
-    """Estimator of another clock's offset from the ceilings and floors of the latest windows.
+    """Estimates the offset of another clock from the limits of the latest windows.
 
     Attributes:
-        broken: number of times at which the limits contradicted each other, so that the older
-            limits were dropped. Then a clock has stepped, or was slewed by more than
-            DRIFT_LIMIT.
+        broken: Number of times that the limits contradicted each other. The older half of them
+            was then discarded. Such a contradiction shows that a clock has stepped, or has
+            drifted by more than DRIFT_LIMIT.
     """
 
     def __init__(self) -> None:
@@ -147,17 +157,28 @@ class OffsetEstimator:
         self._floors: deque[OffsetLimit] = deque(maxlen=WINDOWS_KEPT)
 
     def add(self, ceiling: OffsetLimit | None, floor: OffsetLimit | None) -> None:
-        """Adds the limits of one window; None if no message arrived in that direction."""
+        """Adds the limits of one window.
+
+        Args:
+            ceiling: Lowest ceiling of the window. None if no sample was acknowledged.
+            floor: Highest floor of the window. None if no message arrived.
+        """
         if ceiling is not None:
             self._ceilings.append(ceiling)
         if floor is not None:
             self._floors.append(floor)
 
     def estimate(self, now_ns: int) -> OffsetEstimate | None:
-        """Returns the estimate for the present, or None if a direction has no limit yet.
+        """Estimates the offset at present.
+
+        If the stored limits contradict each other, older ones are discarded until the rest
+        agree.
 
         Args:
-            now_ns: present reading of the local clock, not before the end of any window.
+            now_ns: Present time on the local clock, in ns. No window may end later.
+
+        Returns:
+            The estimate. None if there is no limit in one of the directions.
         """
         while self._ceilings and self._floors:
             lines = _AdmissibleLines(self._ceilings, self._floors, now_ns)
@@ -174,12 +195,18 @@ class OffsetEstimator:
 class _AdmissibleLines:
     """All straight lines below every ceiling and above every floor.
 
-    Times are in s from the present, offsets in ns from the offset of the latest ceiling. The
-    small numbers keep the precision that differences of 64-bit instants would lose.
+    Times are in s relative to the present, and offsets in ns relative to the latest ceiling.
+    These small numbers keep the precision that floating-point numbers would lose for 64-bit
+    times.
+
+    Args:
+        ceilings: Lowest ceiling of each window.
+        floors: Highest floor of each window.
+        now_ns: Present time on the local clock, in ns.
 
     Attributes:
         exist: True if there is an admissible line.
-        steepest, flattest: limits of the admissible slopes, ns/s.
+        steepest, flattest: Largest and smallest slope of an admissible line, in ns/s.
     """
 
     def __init__(
@@ -205,14 +232,17 @@ class _AdmissibleLines:
         self.exist = bool(simultaneous_gap >= 0.0 and self.flattest <= self.steepest)
 
     def _read_columns(self, limits: deque[OffsetLimit]) -> tuple[Array, Array]:
-        """Returns the times (s from now) and the offsets (ns from the base) of limits."""
-        times_ns = [min(0, limit.local_ns - self._now_ns) for limit in limits]
-        offsets_ns = [limit.offset_ns - self._base_ns for limit in limits]
-        times_s = np.array(times_ns, dtype=np.float64) / NS_PER_S
-        return times_s, np.array(offsets_ns, dtype=np.float64)
+        """Returns the times of limits in s relative to the present, and their offsets in ns."""
+        times_ns = np.array(
+            [min(0, limit.local_ns - self._now_ns) for limit in limits], dtype=np.float64
+        )
+        offsets_ns = np.array(
+            [limit.offset_ns - self._base_ns for limit in limits], dtype=np.float64
+        )
+        return times_ns / NS_PER_S, offsets_ns
 
     def estimate(self) -> OffsetEstimate:
-        """Returns the line in the middle, with the spread of all admissible lines now."""
+        """Returns the middle line as the estimate, with the range of all lines as limits."""
         slope = min(max(self._estimate_slope(), self.flattest), self.steepest)
         lowest_ceiling = np.min(self._relaxed_ceilings - slope * self._ceiling_times_s)
         highest_floor = np.max(self._relaxed_floors - slope * self._floor_times_s)
@@ -232,11 +262,15 @@ class _AdmissibleLines:
         )
 
     def _estimate_slope(self) -> float:
-        """Returns the drift: weighted least squares of one slope for ceilings and floors, ns/s.
+        """Estimates the drift by weighted least squares, as one slope for ceilings and floors.
 
-        A window of slow messages has little information, so the weight of a limit falls with
-        its distance from the tightest limit. The distance depends on the slope, so each round
-        computes new weights (iteratively reweighted least squares).
+        A limit from a slow message contains little information. Therefore the weight of a limit
+        falls with its distance from the tightest limit. This distance depends on the slope, so
+        that the weights are computed again in each round (iteratively reweighted least
+        squares).
+
+        Returns:
+            The drift, in ns/s.
         """
         sides = (
             (self._ceiling_times_s, self._ceilings, 1.0),
@@ -265,15 +299,15 @@ SLEW_NS = 1_000_000_000
 
 
 class _SlewSegment:
-    """The offset in use from one instant on: a slew to an estimate, then along the estimate.
+    """Part of the offset in use: it moves to an estimate within SLEW_NS, and then follows it.
 
     Args:
-        start_ns: instant of the local clock at which the slew begins.
-        offset_ns: offset in use at that instant.
-        estimate: the estimate to reach within SLEW_NS.
+        start_ns: Time on the local clock at which the part begins, in ns.
+        offset_ns: Offset in use at that time, in ns.
+        estimate: The estimate.
 
     Attributes:
-        bound_ns: largest error of the offset in use during the slew.
+        bound_ns: Largest error of the offset in use until it has reached the estimate, in ns.
     """
 
     def __init__(self, start_ns: int, offset_ns: int, estimate: OffsetEstimate) -> None:
@@ -289,13 +323,13 @@ class _SlewSegment:
         self.bound_ns = max(start_bound_ns, joined_bound_ns)
 
     def evaluate_ns(self, local_ns: int) -> int:
-        """Returns the offset in use at an instant of the local clock, in ns."""
+        """Returns the offset in use at a time of the local clock, in ns."""
         passed_ns = local_ns - self._joined_ns
         rate = self._approach_rate if passed_ns < 0 else self._drift_per_ns
         return self._joined_offset_ns + int(passed_ns * rate)
 
     def error_bound_ns(self, local_ns: int) -> int:
-        """Returns the largest possible error of the offset in use at an instant, in ns."""
+        """Returns the largest possible error of the offset in use at a time, in ns."""
         if self.start_ns <= local_ns <= self._joined_ns:
             return self.bound_ns
         return self.estimate.error_bound_ns(local_ns, self.evaluate_ns(local_ns))
@@ -304,8 +338,11 @@ class _SlewSegment:
 class SlewedOffset:
     """The offset in use over time: the other clock minus the local clock, without steps.
 
+    Delays are computed with this offset and not with the latest estimate, because an estimate
+    may differ from the previous one by a step.
+
     Args:
-        estimate: the first estimate, which the offset equals at first.
+        estimate: First estimate, which is used at once.
     """
 
     def __init__(self, estimate: OffsetEstimate) -> None:
@@ -315,36 +352,42 @@ class SlewedOffset:
 
     @property
     def estimate(self) -> OffsetEstimate:
-        """The estimate to which the offset slews."""
+        """Estimate to which the offset moves."""
         return self._segment.estimate
 
     @property
     def bound_ns(self) -> int:
-        """Largest error of the offset during SLEW_NS from the last `slew_to`; then it grows."""
+        """Largest error of the offset until it has reached the estimate, in ns.
+
+        Later the error grows.
+        """
         return self._segment.bound_ns
 
     def slew_to(self, local_ns: int, estimate: OffsetEstimate) -> None:
-        """Starts to slew to a new estimate at an instant of the local clock."""
+        """Starts to move to a new estimate.
+
+        Args:
+            local_ns: Time on the local clock at which the move starts, in ns.
+            estimate: The estimate.
+        """
         segment = _SlewSegment(local_ns, self.evaluate_ns(local_ns), estimate)
         self._previous_segment = self._segment
         self._segment = segment
 
     def evaluate_ns(self, local_ns: int) -> int:
-        """Returns the offset in use at an instant of the local clock, in ns.
+        """Returns the offset in use at a time of the local clock, in ns.
 
-        The instant must not precede the last call but one of `slew_to`.
+        The time must not be earlier than the start of the previous move.
         """
         return self._select_segment(local_ns).evaluate_ns(local_ns)
 
     def error_bound_ns(self, local_ns: int) -> int:
-        """Returns the largest possible error of the offset in use at an instant, in ns.
+        """Returns the largest possible error of the offset in use at a time, in ns.
 
-        The instant must not precede the last call but one of `slew_to`.
+        The time must not be earlier than the start of the previous move.
         """
         return self._select_segment(local_ns).error_bound_ns(local_ns)
 
     def _select_segment(self, local_ns: int) -> _SlewSegment:
-        """Returns the segment that holds at an instant of the local clock."""
-        if local_ns >= self._segment.start_ns:
-            return self._segment
-        return self._previous_segment
+        """Returns the part of the offset in use to which a time belongs."""
+        return self._segment if local_ns >= self._segment.start_ns else self._previous_segment

@@ -1,25 +1,30 @@
-"""The Zenoh configuration of a session member, its access rules, and checks of a user's file.
+"""Compose the Zenoh configuration of a member, and check the Zenoh file of a user.
+
+A member is a process that takes part in a session. Its Zenoh settings differ from Zenoh's
+defaults in three points that matter for a control loop at 1 kHz:
+
+- The transmission queue holds 16 batches instead of 2. A loop that was late sends the messages
+  of several ticks in one burst.
+- A publisher does not wait for room in the queue (the default is 1 ms), because the loop must
+  not wait. Receivers count the messages that are dropped.
+- The option `express`, which sends each message separately, stays off. Bursts of thousands of
+  small messages fit into the queue only in batches.
+
+With keys, Zenoh's access control limits what each kind of member may do: which messages it may
+publish, receive, query and answer. A router forwards the messages of others, and is therefore
+permitted to do everything. The size of messages is limited as well, but not their rate: a rate
+limit of Zenoh would drop messages of a burst.
 
 Invariant:
-    - Endpoints are explicit, without multicast, gossip or shared memory, so that two sessions
-      on one host never connect by accident.
-    - No setting of a user's file is overruled silently: a setting is accepted, or refused with
-      its key, its value and the required value. A setting that the session sets itself is
-      accepted if its value is the session's.
-    - A refusal of a file lists all settings that contradict a session.
-    - Access is denied by default, at every member and at routers.
-    - A member publishes under its own name only: its links show a certificate, and the name in
-      the certificate is the name in its keys.
-
-Three defaults of Zenoh do not suit a 1 kHz loop: a transmission queue of 2 batches (16 here,
-for bursts of catch-up ticks), a publisher that waits 1 ms for room (0 here: the loop never
-waits and the receiver counts drops), and `express`, which sends each message separately.
-`express` stays off because only with batching do bursts of thousands of small messages fit.
-
-The rules of Zenoh's access control say which messages a member may publish, receive, query and
-reply to. A router forwards the messages of others and is trusted with all of them. The rules
-limit sizes but not rates: a rate limit of Zenoh would thin out bursts, and bursts carry the
-samples of catch-up ticks and the events of a single tick.
+    - Members connect only to endpoints that are named explicitly. Multicast, gossip and shared
+      memory are off. Two sessions on one machine therefore never connect by accident.
+    - No setting in a user's file is overruled silently. It is accepted, or refused with its
+      key, its value and the required value. If the session itself sets a key, the file may
+      contain the same value.
+    - If a file is refused, the message lists all settings that contradict a session.
+    - With keys, everything that is not permitted is denied, at every member and at routers.
+    - With keys, a member can publish only under its own name, because its connections show a
+      certificate with that name.
 """
 
 import difflib
@@ -35,24 +40,29 @@ from ..files import open_regular
 from . import topics
 
 LEASE_MS = 5_000
-"""Lease of a connection, in ms: a shorter stall loses no connection and thus no message.
+"""Time without a sign of life after which Zenoh closes a connection, in ms.
 
-A killed peer is noticed at once by its closed connection, a silent peer by the age of its
-samples.
+A member may be suspended for a shorter time without losing the connection and messages. A
+member that is killed is noticed at once, because its connection is closed, and a silent member
+is noticed by the age of its samples.
 """
 
 BATCHES = 16
+"""Number of batches that a transmission queue holds."""
 BATCH_BYTES = 65_535
+"""Size of a batch, in bytes."""
 MOST_PUT_BYTES = 262_144
-MOST_QUERY_BYTES = 65_536
-"""Largest messages that a link accepts, in bytes.
+"""Largest published message that is accepted, in bytes.
 
-A put holds ten records of the longest arms, a query holds a command.
+It holds ten records of the longest arms.
 """
+MOST_QUERY_BYTES = 65_536
+"""Largest query that is accepted, in bytes."""
 
 ZenohMode = Literal["peer", "client", "router"]
+"""Whether a process connects to other members, connects to a router, or is a router."""
 Endpoint = str | Mapping[str, Any]
-"""A locator, as in "tcp/127.0.0.1:7447", or a group of locators in the form of Zenoh."""
+"""An address such as "tcp/127.0.0.1:7447", or a group of addresses in Zenoh's format."""
 
 QUEUES = [
     "control",
@@ -64,21 +74,30 @@ QUEUES = [
     "data_low",
     "background",
 ]
-"""Zenoh's transmission queues of a link, by priority."""
+"""Names of Zenoh's transmission queues of a connection, by priority."""
 
 CONNECT_TIMEOUT_MS = {"router": -1, "peer": -1, "client": 0}
-"""Zenoh's `connect/timeout_ms` by mode: -1 retries without limit, 0 does not retry.
+"""Zenoh's setting `connect/timeout_ms` by mode: -1 retries without limit, 0 does not retry.
 
-A client cannot open its session without its router; `open_bus` retries until the router runs.
+A client cannot open its session without its router. `open_bus` tries again until the router
+runs.
 """
 CONNECT_EXIT_ON_FAILURE = {"router": False, "peer": False, "client": True}
+"""Zenoh's setting `connect/exit_on_failure` by mode."""
 LISTEN_TIMEOUT_MS = {"router": 0, "peer": 0, "client": 0}
-"""Zenoh's `listen/timeout_ms` by mode: the defaults, which a session does not change."""
+"""Zenoh's setting `listen/timeout_ms` by mode. These are the defaults of Zenoh."""
 LISTEN_EXIT_ON_FAILURE = {"router": True, "peer": True, "client": True}
+"""Zenoh's setting `listen/exit_on_failure` by mode. These are the defaults of Zenoh."""
 
 
 def limit_sizes(name: str, messages: list[str], size: int) -> dict[str, Any]:
-    """Returns the Zenoh filter by which a member drops incoming messages over `size` bytes."""
+    """Returns a Zenoh filter that drops incoming messages above a size.
+
+    Args:
+        name: Name of the filter.
+        messages: Kinds of messages that it concerns.
+        size: Largest permitted size, in bytes.
+    """
     return {
         "id": name,
         "flows": ["ingress"],
@@ -92,6 +111,7 @@ SIZE_LIMITS = [
     limit_sizes("puts", ["put", "delete"], MOST_PUT_BYTES),
     limit_sizes("queries", ["query"], MOST_QUERY_BYTES),
 ]
+"""Size limits of every member, with and without keys."""
 
 
 def make_zenoh_config(
@@ -100,13 +120,14 @@ def make_zenoh_config(
     mode: ZenohMode = "peer",
     user_settings: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Returns the Zenoh configuration of a session member.
+    """Returns the complete Zenoh configuration of a member.
 
     Args:
-        listen: endpoints at which the member listens.
-        connect: endpoints to which the member connects.
-        mode: the member's mode in Zenoh.
-        user_settings: the `settings` of a `ZenohFile`, which take precedence.
+        listen: Endpoints at which the member listens.
+        connect: Endpoints to which the member connects.
+        mode: Mode of the member.
+        user_settings: Settings that take precedence, from a user's file (`ZenohFile.settings`)
+            or from keys.
     """
     retry = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5}
     session_settings: dict[str, Any] = {
@@ -141,7 +162,10 @@ def make_zenoh_config(
 
 
 def merge_settings(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the nested settings of `base`, replaced by `overrides` key by key."""
+    """Merges two nested dictionaries of settings.
+
+    Values of `overrides` replace those of `base`.
+    """
     merged = dict(base)
     for key, value in overrides.items():
         base_value = merged.get(key)
@@ -153,23 +177,31 @@ def merge_settings(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dic
 
 
 _Requirement = tuple[Callable[[Any], bool], str]
-"""A requirement of a key in a user's file: a predicate of the value, and a text for errors."""
+"""Requirement for a value: a function that checks the value, and a text for errors.
+"""
 
 
 def _require_value(required: object, text: str) -> _Requirement:
-    """Returns the requirement of a fixed value, including its type: 0 is not False."""
+    """Returns the requirement that a value and its type equal `required`: 0 is not False.
+
+    Args:
+        required: The required value.
+        text: Text for errors.
+    """
     return (lambda value: value == required and isinstance(value, type(required)), text)
 
 
 def _require_minimum(minimum: int, text: str) -> _Requirement:
-    """Returns the requirement of an integer that is `minimum` or more."""
+    """Returns the requirement that a value is an integer of at least `minimum`."""
     return (lambda value: isinstance(value, int) and value >= minimum, text)
 
 
 def _require_session_value(session_values: Mapping[str, Any]) -> _Requirement:
-    """Returns the requirement of a key that a session sets itself, by the mode of the member.
+    """Returns the requirement for a key that the session sets itself, depending on the mode.
 
-    The predicate takes the values of a file by mode, see `_expand_mode`.
+    Args:
+        session_values: Values that the session sets, by mode. The checked value is a dictionary
+            by mode as well, see `_expand_mode`.
     """
 
     def equals_session_value(mode: str, value: Any) -> bool:
@@ -231,23 +263,24 @@ REQUIREMENTS: Mapping[str, _Requirement] = {
         "left out: a session sets it",
     ),
 }
-"""Requirements of a session by the path of the key in Zenoh's configuration."""
+"""Requirements of a session, by the path of the key in Zenoh's configuration."""
 
 _FILE_KEYS = r"transport/(link/tls/\w+_(certificate|private_key)|auth/usrpwd/dictionary_file)"
-"""Keys that name files, which are opened here once to report unreadable files early.
+"""Pattern of the keys whose values are names of files.
 
-Zenoh opens the files of a connecting member late, and then retries for ever.
+These files are opened during the check, to report unreadable files early. Zenoh opens them only
+when it connects, and then tries again for ever.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class ZenohFile:
-    """A user's Zenoh configuration after its check.
+    """Content of a user's Zenoh file that has passed the check.
 
     Attributes:
-        source: name of the file, for error texts.
-        mode: mode in Zenoh; "" if the file has no mode.
-        settings: all settings except mode and endpoints.
+        source: Name of the file, for error messages.
+        mode: Mode in the file. Empty if the file has none.
+        settings: All settings except the mode and the endpoints.
     """
 
     source: str
@@ -258,7 +291,15 @@ class ZenohFile:
     def endpoints(
         self, side: Literal["listen", "connect"], mode: ZenohMode
     ) -> list[Endpoint] | None:
-        """Returns the endpoints of one side for a mode; None if the file has no endpoints."""
+        """Returns the endpoints that the file names.
+
+        Args:
+            side: "listen" or "connect".
+            mode: Mode of the member, as the file may name other endpoints for each mode.
+
+        Returns:
+            The endpoints. None if the file names none.
+        """
         endpoints = self._endpoints.get(side)
         # A dictionary is either a group of locators or a table by mode.
         if isinstance(endpoints, dict) and "locators" not in endpoints:
@@ -271,16 +312,20 @@ class ZenohFile:
 def check_zenoh_file(
     source: str, stated: object, refusal: Callable[[Mapping[str, Any]], str]
 ) -> ZenohFile:
-    """Checks the content of a user's Zenoh configuration file.
+    """Checks the content of a user's Zenoh file.
 
     Args:
-        source: name of the file, for error texts.
-        stated: parsed content of the file.
-        refusal: returns Zenoh's reason for refusing some settings; "" if Zenoh accepts them.
+        source: Name of the file, for error messages.
+        stated: Parsed content of the file.
+        refusal: Function that returns Zenoh's reason for refusing settings, or an empty text if
+            Zenoh accepts them.
+
+    Returns:
+        The content.
 
     Raises:
-        UsageError: the file is not a Zenoh configuration, or contradicts requirements of a
-            session; the message lists all keys that do so.
+        UsageError: The file is not a Zenoh configuration, or contradicts the requirements of a
+            session. The message lists all keys that do so.
     """
     if not isinstance(stated, dict):
         raise UsageError(f"{source}: a Zenoh configuration is one object in braces")
@@ -304,7 +349,7 @@ def check_zenoh_file(
 
 
 def _list_problems(source: str, problems: Sequence[str]) -> str:
-    """Returns the problems of a file in one line."""
+    """Returns the message about the problems of a file, in one line."""
     if len(problems) == 1:
         return f"{source}: {problems[0]}"
     count = count_nouns(len(problems), "setting")
@@ -312,7 +357,11 @@ def _list_problems(source: str, problems: Sequence[str]) -> str:
 
 
 def _find_problems(settings: Mapping[str, Any]) -> Iterator[str]:
-    """Yields a text for each setting that contradicts a requirement, beginning with its key."""
+    """Checks each setting against the requirements of a session.
+
+    Yields:
+        A text for each problem, which begins with the key.
+    """
     for key, value in _iterate_leaves(settings, ()):
         compared = _expand_mode(settings, value) if key in _SET_BY_MODE else value
         if key in REQUIREMENTS:
@@ -336,19 +385,25 @@ _SET_BY_MODE = (
     "listen/timeout_ms",
     "listen/exit_on_failure",
 )
-"""Keys that a session sets itself, by the mode of the member."""
+"""Keys that a session sets itself, depending on the mode of the member."""
 
 
 def _expand_mode(settings: Mapping[str, Any], value: Any) -> Any:
     """Returns the value of a key as a dictionary by mode.
 
-    A single value applies to the file's mode, or to peers if the file has no mode.
+    A value that is not a dictionary applies to the mode in the file, or to peers if the file
+    has no mode.
     """
     return value if isinstance(value, dict) else {settings.get("mode", "peer"): value}
 
 
 def _drop_key(settings: dict[str, Any], path: str) -> None:
-    """Removes a key from nested settings, if present; `path` separates the levels by "/"."""
+    """Removes a key from nested settings if it is present.
+
+    Args:
+        settings: The settings. They are changed in place.
+        path: Keys of the levels, separated by "/".
+    """
     *folders, last = path.split("/")
     for folder in folders:
         settings = settings.get(folder, {})
@@ -367,11 +422,13 @@ def _remove_nulls(settings: Mapping[str, Any]) -> dict[str, Any]:
 def _iterate_leaves(
     settings: Mapping[str, Any], path: tuple[str, ...]
 ) -> Iterator[tuple[str, Any]]:
-    """Yields path and value of each leaf of nested settings, and of each required key.
+    """Yields the path and the value of each setting in nested settings.
+
+    If there is a requirement for a group of settings, the group is yielded as a whole.
 
     Args:
-        settings: the settings below `path`.
-        path: keys of the levels above.
+        settings: Settings below `path`.
+        path: Keys of the levels above.
     """
     for key, value in settings.items():
         key_path = (*path, key)
@@ -387,9 +444,16 @@ def _find_refused_keys(
     refusal: Callable[[Mapping[str, Any]], str],
     path: tuple[str, ...],
 ) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Yields path and reason of each setting that Zenoh refuses, even without the others.
+    """Finds the settings that Zenoh refuses, by checking each setting alone.
 
-    If Zenoh refuses a group of settings, the deepest refused keys are yielded.
+    Args:
+        settings: Settings below `path`.
+        refusal: Function that returns Zenoh's reason for refusing settings, or an empty text.
+        path: Keys of the levels above.
+
+    Yields:
+        The path and the reason of each refused setting. If a group of settings is refused,
+        these are the refused settings within the group.
     """
     for key, value in settings.items():
         key_path = (*path, key)
@@ -406,7 +470,12 @@ def _find_refused_keys(
 
 
 def _suggest_key(path: Sequence[str], reason: str) -> str:
-    """Returns Zenoh's reason, or for an unknown key a suggestion of similar keys."""
+    """Returns the reason why a key is refused, with a suggestion for an unknown key.
+
+    Args:
+        path: Path of the key.
+        reason: Reason of Zenoh.
+    """
     match = re.match(r"unknown field `([^`]*)`, expected (?:one of )?(.*)", reason)
     if match is None or not path or match[1] != path[-1]:
         return reason
@@ -423,22 +492,27 @@ OPERATOR = "operator"
 ROUTER = "router"
 BRIDGE = "bridge"
 PROTOCOLS = ("tls", "quic")
+"""Protocols that are permitted with keys."""
 
 MOST_REPLY_BYTES = 8_388_608
-"""Largest reply that a link accepts, in bytes: a reply with records that are sent again."""
+"""Largest reply that is accepted, in bytes: a reply with records that are sent again."""
 MOST_SESSIONS = 64
+"""Largest number of connections of a member with keys."""
 
 
 class _Role(NamedTuple):
     """The channels that a kind of member may use.
 
+    A channel is a kind of messages, see `topics`.
+
     Attributes:
-        receives: channels that the member receives from all members.
-        queries: channels that the member queries at all members.
-        publishes: channels that the member publishes under its own name.
-        replies: channels on which the member replies to queries under its own name.
-        receives_addressed: channels that the member receives under its own name.
-        publishes_to: channels that the member publishes under the name of the addressed member.
+        hears: Channels that the member receives from all members.
+        asks: Channels on which the member queries all members.
+        publishes: Channels that the member publishes under its own name.
+        answers: Channels on which the member answers queries to its own name.
+        hears_addressed: Channels that the member receives under its own name.
+        addresses: Channels that the member publishes under the name of the member that shall
+            receive them.
     """
 
     receives: tuple[str, ...]
@@ -463,6 +537,7 @@ SITE_ROLE = _Role(
     queries=(topics.INFO, topics.PING, topics.STOP),
     receives_addressed=(topics.STATE, topics.MEASURED, topics.HAND, topics.ENABLE),
 )
+"""Role of a site."""
 ROLES = {
     RECORDER: _Role(
         publishes=(topics.EVENT, topics.STATS),
@@ -488,14 +563,14 @@ ROLES = {
         publishes_to=(topics.HAND, topics.MEASURED),
     ),
 }
-"""Roles of the members that are not sites, by name of the member."""
+"""Roles of the members that are not sites, by their names."""
 
 
 def make_access_rules(members: Sequence[str]) -> dict[str, Any]:
-    """Returns the Zenoh settings that restrict members to their roles.
+    """Returns the Zenoh settings that permit each member only what its role needs.
 
     Args:
-        members: names of all members, with or without `ROUTER`.
+        members: Names of all members. Those that are not names of special roles are sites.
     """
     rules: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []
@@ -538,10 +613,19 @@ _ALL_MESSAGES = (
     "declare_queryable",
     *_LIVELINESS,
 )
+"""All kinds of messages, which a router may forward."""
 
 
 def _derive_rules(member: str, role: _Role) -> Iterator[dict[str, Any]]:
-    """Yields the rules of a role: messages from the member (ingress) and to it (egress)."""
+    """Derives the access rules of a member from its role.
+
+    Zenoh checks the rules at the other end of a connection: "ingress" concerns messages that
+    arrive from the member, "egress" messages that are sent to it.
+
+    Args:
+        member: Name of the member.
+        role: Role of the member.
+    """
 
     def keys(owner: str, channels: Sequence[str]) -> list[str]:
         """Returns the keys of a member's channels in any session; "*" is any member."""
@@ -568,4 +652,5 @@ def _derive_rules(member: str, role: _Role) -> Iterator[dict[str, Any]]:
 
 
 def _make_rule(flows: list[str], messages: Sequence[str], keys: list[str]) -> dict[str, Any]:
+    """Returns a rule that permits messages in some directions under some keys."""
     return {"flows": flows, "messages": list(messages), "key_exprs": keys}
