@@ -1,19 +1,21 @@
-"""A device in a person's hand, such as a haptic device, that leads the arm of a site.
+"""Move an arm with an input device, and render the reaction force of the arm on the device.
 
-A person presses a button of the device, the clutch, and moves the device: the target of the arm
-moves by the same steps. The device renders the reaction force of the arm to the person.
+The person presses a button of the device, the clutch, and moves the device. The target of the
+arm then moves by the same step, rotated and scaled as the scenario says. The force that the arm
+exerts is rendered on the device.
 
 Invariant:
     - Only changes of the device's position move the target, and only while the clutch is
-      pressed. A state that is not finite, a jump, and a device that reconnects move nothing.
-    - The target stays within the arm's reach, however often the clutch is pressed. A motion of
-      the device out of this reach is lost; a motion back into the reach acts at once.
-    - After a release, or after a silence of the device, the arm is held again only when the
-      clutch is pressed again.
+      pressed. A state that is not finite, a jump, and a device that connects again move
+      nothing.
+    - The target stays within the reach of the arm, however often the clutch is pressed. A
+      motion of the device out of the reach is lost, and a motion back takes effect at once.
+    - After a release, also after one because the device was silent, the arm is held again only
+      when the clutch is pressed again.
     - The rendered force is that of the newest record, rotated, scaled and limited as the
-      scenario says. It is zero while the clutch is open or the record is old.
-    - The states of the device are the only heartbeat of the hand. If the loop hangs, the hand
-      is silent and the site releases the arm.
+      scenario says. It is zero while the clutch is not pressed, and if the record is old.
+    - Only the states of the device show the site that this program is alive. If the program
+      hangs, the site releases the arm.
 """
 
 import math
@@ -33,34 +35,32 @@ from .devices import Device, DeviceState, Vector
 RETRY_NS = 1_000_000_000
 """Time between two attempts to connect to the device, in ns."""
 MIN_STATE_GAP_S = 0.005
-"""Smallest time between two states by which a jump is judged, in s.
+"""Shortest time between two states that is assumed when a jump is detected, in s.
 
-The operating system may deliver several states at once.
+The operating system may deliver states late, and several at once.
 """
 MAX_STATE_GAP_S = 0.05
-"""Largest time between two states by which a jump is judged, in s.
-
-The operating system may deliver states late.
-"""
+"""Longest time between two states that is assumed when a jump is detected, in s."""
 TRIPS_KEPT = 60_000
-"""Number of round-trip times that are kept."""
+"""Number of round trips that are kept for statistics."""
 
 
 class DeviceHand:
-    """A device that leads the arm of a live hand.
+    """Operator of an arm that follows an input device.
 
     Args:
-        hand: the connection to the site.
-        device: the device.
-        settings: how the device leads the arm, and how it renders force.
-        clock: the clock of this machine.
-        reach: the region that the target may not leave.
+        hand: Connection to the site, in the role of the operator.
+        device: The device.
+        settings: How the device moves the arm, and how force is rendered.
+        clock: Clock of this machine.
+        reach: Region that the target must not leave.
 
     Attributes:
-        states: the number of states that were read.
-        jumps: the number of states that moved nothing because they jumped.
-        unreadable: the number of states that moved nothing because they were not finite.
-        trips_ns: the times from a position of the device to the force caused by it, in ns.
+        states: Number of states that were read.
+        jumps: Number of states that moved nothing because they were jumps.
+        unreadable: Number of states that moved nothing because they were not finite.
+        trips_ns: Times from a position of the device until the force that it caused was
+            rendered, in ns.
     """
 
     def __init__(
@@ -102,9 +102,12 @@ class DeviceHand:
         self._sent.clear()
 
     def serve(self) -> None:
-        """Reads a state, moves the target by it, and renders a force.
+        """Reads a state of the device, moves the target, and renders a force.
 
         The call takes one period of the device.
+
+        Raises:
+            OSError: The device is silent or gone.
         """
         state = self._device.read()
         now_ns = self._clock.monotonic_ns()
@@ -126,7 +129,12 @@ class DeviceHand:
         self._measure_trips()
 
     def _follow(self, state: DeviceState, now_ns: int) -> None:
-        """Applies the buttons of a state, and moves the target if the clutch is pressed."""
+        """Applies the buttons of a state, and moves the target if the clutch is pressed.
+
+        Args:
+            state: State of the device, with finite numbers.
+            now_ns: Present time on the local clock, in ns.
+        """
         settings = self._settings
         previous_m = self._position_m
         elapsed_s = (now_ns - self._received_ns) * 1e-9
@@ -148,7 +156,14 @@ class DeviceHand:
             self._move_target(step_m, elapsed_s)
 
     def _move_target(self, step_m: list[float], elapsed_s: float) -> None:
-        """Moves the target by a step of the device, unless the step is a jump."""
+        """Moves the target by a step of the device, unless the step is a jump.
+
+        A step is a jump if it is longer than the speed limit of the scenario allows.
+
+        Args:
+            step_m: Change of the device's position, in m.
+            elapsed_s: Time since the previous state, in s.
+        """
         settings = self._settings
         gap_s = min(max(elapsed_s, MIN_STATE_GAP_S), MAX_STATE_GAP_S)
         if math.hypot(*step_m) > settings.jump_m_s * gap_s:
@@ -160,11 +175,17 @@ class DeviceHand:
         self._target = list(self._reach.find_nearest(target))
 
     def _compute_force(self) -> Vector:
-        """Returns the reaction force of the arm in the coordinates of the device, in N.
+        """Computes the force to render, the reaction force of the arm in device coordinates.
 
-        The force fades in when the clutch closes.
+        The force grows from zero within `GRIP_NS` after the clutch was pressed. It is zero if
+        the clutch is not pressed, the newest record is old, or this operator does not hold the
+        arm.
+
+        Returns:
+            The force, in N.
         """
-        if not (self._closed_ns and self._hand.fresh and self._hand.holds):
+        is_held = self._closed_ns and self._hand.fresh and self._hand.holds
+        if not is_held:
             return 0.0, 0.0, 0.0
         settings = self._settings
         closed_ns = self._clock.monotonic_ns() - self._closed_ns
@@ -176,7 +197,11 @@ class DeviceHand:
         return x, y, z
 
     def _measure_trips(self) -> None:
-        """Measures the round-trip times of the targets that the newest record has used."""
+        """Measures the time from a position of the device to the force that it has caused.
+
+        Each position was sent with a number. The newest record states which number the site
+        follows.
+        """
         used_number = self._hand.number
         now_ns = self._clock.monotonic_ns()
         while self._sent:
@@ -187,7 +212,7 @@ class DeviceHand:
             self.trips_ns.append(now_ns - sent_ns)
 
     def describe(self) -> str:
-        """Returns a line with the numbers of states and the round-trip times."""
+        """Returns a line for the user with the numbers of states and the round trip times."""
         states = count_nouns(self.states, "state")
         jumps = count_nouns(self.jumps, "jump")
         counts = f"{states} of the device, dropped {jumps}, {self.unreadable} unreadable"
@@ -197,14 +222,14 @@ class DeviceHand:
         return f"{counts}; from its place to the force of it p50 {p50:.1f} ms, p99 {p99:.1f} ms"
 
     def run(self, stopped: Callable[[], bool], say: Callable[[str], None]) -> None:
-        """Leads the arm until the session ends or `stopped` returns True.
+        """Moves the arm with the device until the session ends.
 
-        After each loss of the device, the hand connects to it again. Each loss and each return
-        is printed.
+        If the connection to the device is lost, the arm is released, and the device is tried
+        again until it is back.
 
         Args:
-            stopped: returns True to end the call.
-            say: prints a line for the user.
+            stopped: Function that returns True to end the call.
+            say: Function that prints a line for the user.
         """
         is_present: bool | None = None
         while not (stopped() or self._hand.over):

@@ -1,13 +1,12 @@
-"""Devices in a person's hand, which are read for their motion and may render a force.
+"""Define the interface of input devices, with which a person moves an arm and feels its force.
 
-Each device has a file in this folder with a class that implements `Device`. To add a device,
-add its file: no list of devices needs a change.
+Each device is a class in a file of its own in this folder. `open_device` finds the class by the
+name of the file, so that a further device needs no entry in any list.
 
 Invariant:
-    - The class of a device has the name of the file, without underscores.
-    - All devices use the coordinates of the person who holds them: x to the right, y ahead, z
-      up. The units are m, m/s and N.
-    - Buttons are named "a", "b", "c" in their order.
+    - All devices use the coordinates of the person who holds them: x to the right, y ahead and
+      z up. The units are m, m/s and N.
+    - The buttons are named "a", "b", "c" in their order.
 """
 
 from collections.abc import Mapping
@@ -18,18 +17,19 @@ from typing import ClassVar, NamedTuple, Protocol, Self
 from trilat_net.errors import UsageError
 
 Vector = tuple[float, float, float]
+"""Three coordinates: x to the right, y ahead, z up."""
 
 
 class DeviceState(NamedTuple):
-    """The measured state of a device.
+    """Measured state of a device.
 
     >>> tn.DeviceState((0.0, -0.12, 0.15), (0.0, 0.0, 0.0), {"a": True}).buttons["a"]
     True
 
     Attributes:
-        position_m: the position, in m, in a frame with any origin: only changes are used.
-        velocity_m_s: the velocity, in m/s.
-        buttons: whether each button is pressed, by name.
+        position_m: Position in m. The origin is arbitrary, because only changes are used.
+        velocity_m_s: Velocity in m/s.
+        buttons: For each button by its name, True if it is pressed.
     """
 
     position_m: Vector
@@ -38,9 +38,10 @@ class DeviceState(NamedTuple):
 
 
 class Device(Protocol):
-    """A device that is read `rate_hz` times a second.
+    """Interface of an input device, which is read `rate_hz` times a second.
 
-    A device is a context manager, which is entered again after each loss of the connection.
+    A device is a context manager. If the connection to the device is lost, the `with` block is
+    left and entered again.
 
     >>> tn.session("play").lead("m1", MyDevice())  # doctest: +SKIP
     """
@@ -48,27 +49,27 @@ class Device(Protocol):
     rate_hz: ClassVar[int]
 
     def __enter__(self) -> Self:
-        """Connects to the device; raises OSError if the device is not present."""
+        """Connects to the device. Raises OSError if the device is not present."""
 
     def __exit__(self, *_: object) -> None:
-        """Ends the device's force, and closes the connection."""
+        """Ends the force of the device, and closes the connection."""
 
     def read(self) -> DeviceState:
-        """Returns the newest state; raises OSError if the device is silent or gone."""
+        """Returns the newest state. Raises OSError if the device is silent or gone."""
 
     def render(self, force_n: Vector) -> None:
-        """Renders a force in N to the person who holds the device."""
+        """Applies a force to the person who holds the device, in N."""
 
 
 def open_device(text: str) -> Device:
-    """Returns the device that a text such as "spacemouse" names.
+    """Creates the device that the option --device names.
 
     Args:
-        text: the name of the device and, after "=", its address, as in
-            "haply_inverse3=ws://127.0.0.1:10001".
+        text: Name of the device, optionally followed by "=" and its address, as in "spacemouse"
+            or "haply_inverse3=ws://127.0.0.1:10001".
 
     Raises:
-        UsageError: there is no such device.
+        UsageError: There is no such device.
     """
     name, _, address = text.partition("=")
     known = sorted(module_info.name for module_info in iter_modules(__path__))

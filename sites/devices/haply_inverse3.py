@@ -1,12 +1,13 @@
-"""The haptic device Inverse3 of Haply, by the JSON messages of the maker's service.
+"""Use an Inverse3 of Haply as an input device, through the service of its maker.
 
-The service replies to each message with one state, so this program sets the rate.
+The service runs on the same machine and exchanges JSON messages over a WebSocket. It replies to
+each message with one state, so that this program determines the rate.
 
 Invariant:
-    - This program answers each state with one message, which contains a force. At rest the
-      force is zero; the message keeps the connection alive.
-    - A message that cannot be parsed becomes a state whose position is not finite, which moves
-      nothing.
+    - Each state is answered with one message that contains a force, even if the force is zero.
+      This keeps the exchange going.
+    - If a message cannot be parsed, it becomes a state with a position that is not finite. Such
+      a state moves nothing.
 """
 
 import math
@@ -23,8 +24,12 @@ from trilat_net.net.host_names import check_hosts
 from . import DeviceState, Vector
 
 SILENCE_S = 0.15
-"""Silence after which the connection is ended, in s: before the site releases a silent hand."""
+"""Silence of the service after which the connection is closed, in s.
+
+It is shorter than the silence after which the site releases the arm.
+"""
 _NO_POSITION = (math.nan, math.nan, math.nan)
+"""Position of a state that could not be parsed."""
 _PARSE_ERRORS = (
     LookupError,
     TypeError,
@@ -33,22 +38,24 @@ _PARSE_ERRORS = (
     OverflowError,
     msgspec.MsgspecError,
 )
+"""Errors that a message with an unexpected content may cause."""
 _CONNECT_OPTIONS: dict[str, Any] = {
     "compression": None,
     "proxy": None,
     "ping_interval": None,
     "close_timeout": 0.2,
 }
+"""Options of the WebSocket for short delays."""
 
 
 class HaplyInverse3:
-    """An Inverse3 of Haply with its wireless grip, by the maker's service (version 3).
+    """An Inverse3 of Haply with its wireless grip, through version 3 of the maker's service.
 
     >>> tn.lead("play", "m1", tn.HaplyInverse3("ws://127.0.0.1:10001"))  # doctest: +SKIP
 
     Args:
-        address: the address of the service. "#values" at its end sends forces under the key
-            `values`, as older versions of the service expect, instead of `vector`.
+        address: Address of the service. If it ends with "#values", forces are sent under the
+            key `values` instead of `vector`, as older versions of the service expect.
     """
 
     rate_hz: ClassVar[int] = 1000
@@ -86,7 +93,12 @@ class HaplyInverse3:
         self._open.close()
 
     def read(self) -> DeviceState:
-        """Returns the next state that the service sends."""
+        """Waits for the next state from the service, and returns it.
+
+        Raises:
+            ConnectionError: The service has no device, or has closed the connection.
+            TimeoutError: The service is silent.
+        """
         assert self._socket is not None, "the context has been entered"
         try:
             message = msgspec.json.decode(self._socket.recv(SILENCE_S))
@@ -103,8 +115,11 @@ class HaplyInverse3:
     def _parse_state(self, message: Any) -> DeviceState:
         """Returns the state of the first Inverse3 in a message, with the buttons of all grips.
 
+        Args:
+            message: Decoded message of the service.
+
         Raises:
-            ConnectionError: the service has no Inverse3.
+            ConnectionError: The service has no Inverse3.
         """
         if not message.get("inverse3"):
             raise ConnectionError(f"the service at {self._address} has no Inverse3")
@@ -122,7 +137,10 @@ class HaplyInverse3:
         )
 
     def render(self, force_n: Vector) -> None:
-        """Sends a force in N; the message also requests the next state."""
+        """Sends a force in N to the device. The message also requests the next state.
+
+        Nothing is sent before the first state, which contains the identity of the device.
+        """
         if self._socket is None or not self._id:
             return
         force = {self._force_key: dict(zip("xyz", force_n, strict=True))}
@@ -138,5 +156,5 @@ class HaplyInverse3:
 
 
 def _parse_vector(point: dict[str, float]) -> Vector:
-    """Returns the coordinates of a point in a message."""
+    """Returns a point of the service as a vector."""
     return float(point["x"]), float(point["y"]), float(point["z"])

@@ -1,12 +1,12 @@
-"""The SpaceMouse of 3Dconnexion, by the reports of Linux' hidraw.
+"""Read a SpaceMouse of 3Dconnexion on Linux, from its hidraw file.
 
-The device has a cap that a person pushes and turns, and that springs back. The deflection of
-the cap stands for a velocity, from which this module integrates a position.
+A SpaceMouse does not move. The deflection of its cap is interpreted as a velocity, which is
+integrated to a position.
 
 Invariant:
-    - A cap that reports nothing for `STILL_NS` is at rest, because a deflected cap reports all
-      the time.
-    - No web page needs to be open, unlike with WebHID.
+    - A cap that has reported nothing for `STILL_NS` is at rest, because a deflected cap reports
+      continuously.
+    - No web page needs to be open, unlike with a connection through a browser (WebHID).
 """
 
 import os
@@ -19,20 +19,25 @@ from trilat_net.net.clock import Clock, SystemClock
 from . import DeviceState, Vector
 
 STILL_NS = 100_000_000
-"""Time without a report after which the cap is at rest, in ns."""
+"""Time without a report after which the cap counts as not deflected, in ns."""
 SPEED_M_S = 0.2 / 350.0
-"""Velocity for each count of an axis, in m/s; a fully deflected cap reports 350 counts."""
+"""Velocity per count of an axis, in m/s. A fully deflected cap reports 350 counts."""
 _MAKER_IDS = (":0000256F:", ":0000046D:0000C62")
-"""Parts of the identities of SpaceMice: of 3Dconnexion, and of Logitech, the earlier maker."""
+"""USB identifiers of a SpaceMouse in a uevent file: 3Dconnexion, and earlier Logitech."""
 _MOTION_REPORT = 1
+"""Number of the reports that contain the deflection of the cap."""
 _BUTTON_REPORT = 3
+"""Number of the reports that contain the buttons."""
 
 
 def find_spacemouse(devices: Path = Path("/sys/class/hidraw")) -> str:
-    """Returns the path of the first SpaceMouse.
+    """Returns the file of the first SpaceMouse that is connected, such as "/dev/hidraw3".
+
+    Args:
+        devices: Folder in which Linux lists the hidraw devices.
 
     Raises:
-        FileNotFoundError: no SpaceMouse is connected.
+        FileNotFoundError: No SpaceMouse is connected.
     """
     for uevent in sorted(devices.glob("*/device/uevent")):
         identity = uevent.read_text(encoding="utf-8")
@@ -42,13 +47,13 @@ def find_spacemouse(devices: Path = Path("/sys/class/hidraw")) -> str:
 
 
 class SpaceMouse:
-    """A SpaceMouse; its first two buttons are "a" and "b", and it renders no force.
+    """A SpaceMouse as an input device. Its first two buttons are "a" and "b". It has no force.
 
     >>> tn.session("play").lead("m1", tn.SpaceMouse("/dev/hidraw3"))  # doctest: +SKIP
 
     Args:
-        address: the path of the device; by default the first SpaceMouse.
-        clock: the clock of this machine.
+        address: File of the device. Empty uses the first SpaceMouse that is connected.
+        clock: Clock of this machine. None creates one.
     """
 
     rate_hz: ClassVar[int] = 125
@@ -92,10 +97,18 @@ class SpaceMouse:
         return DeviceState(self._position_m, self._velocity_m_s, buttons)
 
     def _read_report(self, now_ns: int) -> bool:
-        """Reads a report and stores its contents; returns False if there is no report.
+        """Reads one report, if there is one, and stores the deflections or buttons in it.
+
+        Report 1 contains the deflections, and report 3 the buttons. Other reports are ignored.
+
+        Args:
+            now_ns: Present time, in ns.
+
+        Returns:
+            False if there was no report.
 
         Raises:
-            ConnectionError: the device is not connected any more.
+            ConnectionError: The device is gone.
         """
         try:
             report = os.read(self._file, 64)
@@ -106,6 +119,7 @@ class SpaceMouse:
         kind = report[0]
         if kind == _MOTION_REPORT and len(report) >= 7:
             # The device counts towards the right, towards the person, and down.
+            # The axes of the device point to the right, towards the person, and down.
             right, near, down = struct.unpack_from("<3h", report, 1)
             self._velocity_m_s = (SPEED_M_S * right, -SPEED_M_S * near, -SPEED_M_S * down)
             self._reported_ns = now_ns
@@ -114,4 +128,4 @@ class SpaceMouse:
         return True
 
     def render(self, force_n: Vector) -> None:
-        """Does nothing: a SpaceMouse has no motors."""
+        """Does nothing, because a SpaceMouse has no motors."""
