@@ -189,9 +189,8 @@ class SessionDisplay:
     @property
     def due(self) -> bool:
         """True if it is time for the next update."""
-        return self._clock.monotonic_ns() - self._updated_ns >= (
-            TABLE_NS if self._live else LINES_NS
-        )
+        period_ns = TABLE_NS if self._live else LINES_NS
+        return self._clock.monotonic_ns() - self._updated_ns >= period_ns
 
     def say(self, text: str) -> None:
         """Prints a line above the table."""
@@ -208,7 +207,7 @@ class SessionDisplay:
             alarms: Name of the site and the alarm, for each alarm that is present.
         """
         self._updated_ns = self._clock.monotonic_ns()
-        if self._live is None:
+        if self._live is None:  # the output is not a terminal
             alarm_lines = [f"*** {name} {alarm}" for name, alarm in alarms]
             title_lines = [title] if title != self._title else []
             self._title = title
@@ -216,6 +215,7 @@ class SessionDisplay:
             for line in [*title_lines, *alarm_lines, *row_lines]:
                 self.say(line)
             return
+
         table = Table(title=escape(title), title_justify="left")
         for head in HEADS:
             table.add_column(head, justify="right" if head in NUMBERS else "left")

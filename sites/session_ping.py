@@ -112,8 +112,10 @@ class SessionPing:
         now_ns = self._clock.monotonic_ns()
         if self._first_ns is None:
             return now_ns - begun_ns > timeout_ns
+
         elapsed_ns = now_ns - self._first_ns
-        limit_ns = GATHERING_NS + self._trips_per_member * PING_PACE_NS + PATIENCE_NS
+        pings_ns = self._trips_per_member * PING_PACE_NS
+        limit_ns = GATHERING_NS + pings_ns + PATIENCE_NS
         is_complete = self.pinger.knows_clocks(self._boots) or elapsed_ns > limit_ns
         return elapsed_ns > GATHERING_NS and is_complete
 
@@ -269,6 +271,7 @@ def ping_topic(
     Raises:
         RunFailed: Nobody has published on the topic.
     """
+    # Number and delay of each message, and the type of the messages, by publisher.
     samples: dict[bytes, list[tuple[int, int]]] = {}
     types: dict[bytes, str] = {}
 
@@ -287,7 +290,9 @@ def ping_topic(
             f"nobody published on /{topic} in {lasted_s:.3g} s: "
             "see ros2 topic list, and --domain"
         )
+
     publishers = []
+    # The lists are copied, because messages still arrive.
     for gid, publisher_samples in list(samples.items()):
         # DDS calls a type "std_msgs::msg::dds_::Bool_" that ROS calls "std_msgs/msg/Bool".
         kind = types[gid].replace("::dds_::", "/").replace("::", "/").removesuffix("_")

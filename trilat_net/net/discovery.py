@@ -138,6 +138,7 @@ def connect_to_session(
             )
             return None if bus is None else stack.enter_context(closing(bus))
 
+        # A recorder does not use the known sites: it must announce itself to the first site.
         if connection.connect is None and recorder_boot is None:
             connection = replace(connection, connect=find_known_endpoints(session, connection))
         if connection.connect is None:
@@ -221,8 +222,8 @@ def send_change(
     except WireError as error:
         raise SessionError(f"the reply of {site} cannot be read: {error}") from None
     if request.order == "stop" and not reply.accepted and request.source is not UNSET:
-        # A site of an older program does not know the field `source`, and refuses the whole
-        # request. The arm of that site must stop, too.
+        # A site with an older version of this program does not know the field `source`, and
+        # refuses the whole request. Its arm must stop as well.
         return send_change(
             bus=bus,
             clock=clock,

@@ -210,6 +210,7 @@ def stop_at_once(arguments: Sequence[str]) -> int | list[str]:
     _print(f"stopping {arms} of session {session} ...")
     try:
         known_sites = find_known_sites(session) if is_simple else []
+        # One connection has one mode: sites with another mode are left to the search.
         known_sites = [known for known in known_sites if known.mode == known_sites[0].mode]
         if not known_sites:
             return list(arguments)
@@ -221,6 +222,8 @@ def stop_at_once(arguments: Sequence[str]) -> int | list[str]:
             return UsageError.exit_code
         if _order_stop(known_sites, sites, options["--keys"]):
             return 0
+
+        # The search continues at the endpoints of the known sites.
         way = "--router" if known_sites[0].mode == "client" else "--connect"
         remaining = list(arguments)
         for endpoint in list_endpoints(known_sites):
@@ -287,6 +290,7 @@ def _order_stop(known_sites: Sequence[KnownSite], sites: Sequence[str], keys: st
 
         key_settings = read_member_keys(Path(keys), stops=True).settings
         settings = merge_settings(key_settings, AT_ONCE)
+
     remaining = set(sites or known_sites[0].sites)
     starts_by_name = Counter(known.site for known in known_sites)
     session = known_sites[0].session

@@ -304,6 +304,7 @@ class LinkTimingMonitor:
         length_ns = FIRST_WINDOW_NS if self._windows < FIRST_WINDOWS else WINDOW_NS
         if now_ns - self._window_start_ns < length_ns:
             return None
+
         self._window_start_ns = now_ns
         self._windows += 1
         contradictions_before = estimator.broken
@@ -454,6 +455,9 @@ class SiteTiming:
         if bound_ns is None:
             monitor.admit(clock)
             return []
+
+        # The offset is the time at which the peer's first tick is due on its clock, minus the
+        # time at which the same tick of this site is due on this clock.
         k = t_ns * self._rate_hz // NS_PER_S
         due_ns = self.schedule.due_ns(k)
         offset_ns = epoch_ns + k * NS_PER_S // self._rate_hz - due_ns
@@ -507,7 +511,9 @@ class SiteTiming:
         notices = self._update_next_estimate(k, now_ns, due_ns)
         for index, monitor in enumerate(self.monitors):
             notices += self._find_faults(index, k, now_ns)
-            if monitor.peer.name == self._leader_name and not monitor.peer.is_own:
+            is_leader = monitor.peer.name == self._leader_name
+            if is_leader and not monitor.peer.is_own:
+                # Time since the epoch on the leader's clock when the tick is due here.
                 leader_ns = due_ns + monitor.offset.evaluate_ns(due_ns) - monitor.peer.epoch_ns
                 error_ns = leader_ns - k * NS_PER_S // self._rate_hz
                 self.schedule.adjust_rate(k, error_ns, monitor.offset.estimate.drift)
@@ -540,9 +546,11 @@ class SiteTiming:
             notices.append(_describe_fault(monitor))
             monitor.worst_ns = 0
             monitor.contradicted = False
-        # The state is reported when it changes. `is_acknowledged` is None, which equals neither
-        # True nor False, while the state of the peer is not known.
-        if monitor.is_unacknowledged is monitor.is_acknowledged(now_ns):
+
+        # The reported state is the opposite of the present one, unless the state has changed.
+        is_acknowledged = monitor.is_acknowledged(now_ns)  # None if it is not known
+        has_changed = is_acknowledged is monitor.is_unacknowledged
+        if has_changed:
             monitor.is_unacknowledged = not monitor.is_unacknowledged
             notices.append(_describe_acknowledgement(monitor, k))
         return notices
@@ -682,7 +690,9 @@ class LoopStats:
             k: The tick.
             skipped: Number of ticks that were skipped before it.
         """
-        return k % self._ticks_per_stats <= skipped
+        # Number of ticks since the last tick at which statistics were due.
+        ticks_since_due = k % self._ticks_per_stats
+        return ticks_since_due <= skipped
 
     def pop_stats(
         self, output: TickRecord, measured: Mapping[str, Any] | None = None

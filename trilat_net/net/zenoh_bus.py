@@ -162,15 +162,17 @@ def open_zenoh(
         UsageError: An endpoint is malformed, or the session cannot listen there.
         RouterSilent: The session is a client, and no router answers.
     """
-    # Logs nothing unless the environment has RUST_LOG.
+    # Zenoh logs only if the environment variable RUST_LOG is set.
     zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]
     config = json.dumps(make_zenoh_config(listen, connect, mode, settings))
     try:
         return zenoh.open(zenoh.Config.from_json5(config))
     except zenoh.ZError as error:
-        if mode == "client" and "Unable to connect" in str(error):
+        # Zenoh has one class of errors. They can be distinguished only by their texts.
+        message = str(error)
+        if mode == "client" and "Unable to connect" in message:
             raise RouterSilent(silent.format(_endpoint_texts(connect))) from None
-        if "in use" in str(error) or "AddrInUse" in str(error):
+        if "in use" in message or "AddrInUse" in message:
             raise UsageError(
                 f"cannot listen at {_endpoint_texts(listen)}: the port is in use; "
                 "end the program that uses it, or choose another port with "
