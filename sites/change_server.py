@@ -123,8 +123,7 @@ class ChangeServer:
                 if change is not None:
                     changes.append(change)
                     has_order = has_order or bool(request.order)
-                names_source = isinstance(request.source, str)
-                if names_source and changes:
+                if isinstance(request.source, str) and changes:
                     self.sources[changes[-1].text] = request.source
                 reply = ChangeReply(member=self._site, accepted=True, text=text, tick=tick)
             except (WireError, ScenarioError) as error:

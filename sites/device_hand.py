@@ -111,9 +111,11 @@ class DeviceHand:
         """
         state = self._device.read()
         now_ns = self._clock.monotonic_ns()
-        # The device was silent, or this process was suspended.
+        # If the device was silent, or this process was suspended, the site may have released
+        # the arm already.
         if now_ns - self._received_ns > SILENCE_NS:
             self.release()
+
         self.states += 1
         if all(map(math.isfinite, (*state.position_m, *state.velocity_m_s))):
             self._follow(state, now_ns)
@@ -122,7 +124,8 @@ class DeviceHand:
         if self._target:
             number = self._hand.move(*self._target)
             self._sent.append((number, now_ns))
-        # By the end of the period, the site may have replied.
+
+        # The force is read at the end of the period, when the site may have replied already.
         self._due_ns = max(self._due_ns + self._period_ns, now_ns)
         self._clock.sleep_until(self._due_ns)
         self._device.render(self._compute_force())

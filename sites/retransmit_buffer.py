@@ -145,6 +145,7 @@ class RetransmitBuffer:
         self._queries = queries
         records = min(KEPT_S * site.rate_hz, RECORDS_KEPT)
         statistics = KEPT_S * STATS_PER_SECOND
+        # A record of an arm with more than two joints contains more numbers.
         record_bytes = RECORD_BYTES + FLOAT_BYTES * (site.layout.floats - Layout().floats)
         self.channels = {
             topics.STATE: ChannelBuffer(records, max(records * record_bytes, EVENTS_BYTES)),

@@ -198,9 +198,10 @@ def join_session(parts: SiteParts, give_up_ns: int) -> "RunningSite | None":
         sites=scenario.names,
         late=LateSites(scenario.sites_may_return, options.without, parts.site.rate_hz),
     )
-    membership = joining.membership
     pinger = joining.pinger
-    parts.say(f"waiting for {', '.join(membership.list_missing()) or 'the epoch'}")
+    missing = ", ".join(joining.membership.list_missing())
+    parts.say(f"waiting for {missing or 'the epoch'}")
+
     first_tick = 0
     while not parts.interrupt.is_requested():
         epoch = joining.poll()
@@ -316,22 +317,21 @@ class RunningSite:
         epoch = self._epoch
         scenario = parts.scenario
         peers = []
-        for peer in parts.site.peers:
-            boot = epoch.boots.get(peer, NO_BOOT)
-            peers.append(
-                PeerClock(
-                    name=peer,
-                    epoch_ns=epoch.epochs.get(peer, epoch.mono_ns),
-                    index_at_peer=scenario.peers(peer).index(parts.name),
-                    estimate=pinger.estimate(boot),
-                    estimator=pinger.estimator(boot),
-                )
-            )
         local_names = {parts.name}
-        for peer in peers:
-            is_present = peer.name in epoch.boots
+        for name in parts.site.peers:
+            boot = epoch.boots.get(name, NO_BOOT)
+            peer = PeerClock(
+                name=name,
+                epoch_ns=epoch.epochs.get(name, epoch.mono_ns),
+                index_at_peer=scenario.peers(name).index(parts.name),
+                estimate=pinger.estimate(boot),
+                estimator=pinger.estimator(boot),
+            )
+            peers.append(peer)
+            is_present = name in epoch.boots
             if peer.is_own and is_present:
-                local_names.add(peer.name)
+                local_names.add(name)
+
         self._local_sites = [name for name in scenario.names if name in local_names]
         turn = self._local_sites.index(parts.name)
         rate_hz = max(scenario.sites[name].rate_hz for name in self._local_sites)
@@ -610,11 +610,13 @@ class RunningSite:
         now_ns = self._parts.clock.monotonic_ns()
         if coming is None or t_ns < self._rejoined_ns + NS_PER_S:
             return
+
         is_ignored = False
         for meter in self._timing.monitors:
-            if meter.is_receiving(now_ns) and meter.is_acknowledged(now_ns) is None:
+            # None means that the peer has never acknowledged a sample of this site.
+            has_never_acknowledged = meter.is_acknowledged(now_ns) is None
+            if meter.is_receiving(now_ns) and has_never_acknowledged:
                 is_ignored = True
-                break
         if is_ignored:
             self._rejoined_ns = t_ns
             fields = {**asdict(coming), "t_ns": t_ns, "n": self._publisher.published}

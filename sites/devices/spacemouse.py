@@ -118,7 +118,6 @@ class SpaceMouse:
             raise ConnectionError("the SpaceMouse is gone")
         kind = report[0]
         if kind == _MOTION_REPORT and len(report) >= 7:
-            # The device counts towards the right, towards the person, and down.
             # The axes of the device point to the right, towards the person, and down.
             right, near, down = struct.unpack_from("<3h", report, 1)
             self._velocity_m_s = (SPEED_M_S * right, -SPEED_M_S * near, -SPEED_M_S * down)

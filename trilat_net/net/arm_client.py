@@ -354,16 +354,16 @@ class ArmClient(OutsideClient):
 
         # `mem` begins with the position that the arm holds. The next number is the time at
         # which the fault or stop began. The reason of a stop follows after as many numbers
-        # again.
+        # again. In records without these numbers, the slices are empty.
         shared = len(record.q_des)
         begun_ns = record.mem[shared : shared + 1]
-        reason = record.mem[2 * shared + 1 : 2 * shared + 2]
-        is_released = record.mode == "stopped" and reason == [LifeReason.RELEASED]
+        stop_reason = record.mem[2 * shared + 1 : 2 * shared + 2]
+        is_released = record.mode == "stopped" and stop_reason == [LifeReason.RELEASED]
         if record.mode != "fault" and not is_released:
             return tuple(record.tau)
-        if begun_ns and record.t_ns - begun_ns[0] < BRAKE_NS:
-            return tuple(record.tau)
-        return None
+
+        is_coming_to_rest = begun_ns and record.t_ns - begun_ns[0] < BRAKE_NS
+        return tuple(record.tau) if is_coming_to_rest else None
 
 
 def make_hand_sender(bus: Bus, clock: Clock, session: str, site: str) -> SiteSender:

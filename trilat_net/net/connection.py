@@ -262,7 +262,7 @@ def secure_connection(
         return connection
     for address in addresses:
         _check_encrypted_endpoint(address)
-    _check_settings_without_keys(connection.settings)
+    _refuse_settings_of_keys(connection.settings)
     return replace(
         connection,
         settings=merge_settings(keys.settings, connection.settings),
@@ -290,18 +290,25 @@ def _check_encrypted_endpoint(address: str) -> None:
         )
 
 
-def _check_settings_without_keys(settings: Mapping[str, Any]) -> None:
-    """Refuses Zenoh settings of a user that the keys determine as well.
+def _refuse_settings_of_keys(settings: Mapping[str, Any]) -> None:
+    """Refuses Zenoh settings of a user's file that the keys determine as well.
+
+    Args:
+        settings: Settings of the file.
 
     Raises:
-        UsageError: A setting is refused.
+        UsageError: The file contains such a setting.
     """
-    for name in sorted(set(settings) & {"access_control", "low_pass_filter", "adminspace"}):
-        raise UsageError(f"--zenoh-config: {name}: comes from --keys; give it in one place")
+    set_by_keys = {"access_control", "low_pass_filter", "adminspace"}
+    link_set_by_keys = {"tls", "protocols"}
     link_settings = settings.get("transport", {}).get("link", {})
-    for name in sorted(set(link_settings) & {"tls", "protocols"}):
+    conflicts = sorted(set(settings) & set_by_keys)
+    conflicts += [
+        f"transport/link/{name}" for name in sorted(set(link_settings) & link_set_by_keys)
+    ]
+    if conflicts:
         raise UsageError(
-            f"--zenoh-config: transport/link/{name}: comes from --keys; give it in one place"
+            f"--zenoh-config: {conflicts[0]}: comes from --keys; give it in one place"
         )
 
 
@@ -458,9 +465,12 @@ def _join_options(
         raise UsageError(
             f"{file.source}: listen/endpoints: given by --listen too; give them in one place"
         )
-    listening = file_listen if listen is None else listen
-    if listening is None:
-        listening = listen_else
+
+    listening: Sequence[Endpoint] = listen_else
+    if listen is not None:
+        listening = listen
+    elif file_listen is not None:
+        listening = file_listen
     connected = _merge_endpoints(connect, file, mode, connect_else)
     return Connection(listening, connected, mode, file.settings)
 

@@ -269,8 +269,8 @@ class Membership:
         self._late = late
         self._presence = bus.presence(topics.presence_key(session, "*"))
         self._query = MemberQuery(bus, clock, session)
-        self._refused_boots: set[int] = set()
-        self._recorder_boots: set[str] = set()
+        self._refused_boots: set[int] = set()  # members whose refusal was published
+        self._recorder_boots: set[str] = set()  # recorders that are present
 
     @property
     def local_info(self) -> Info:
