@@ -96,9 +96,9 @@ class WatchedCode:
         self._usage = usage
         self._period_ns = NS_PER_S // rate_hz
         self._overtime_ns = 0
-        self._total_ns = 0
+        self._total_ns = 0  # duration of all calls
         self._calls = 0
-        self._same_call_checks = 0
+        self._same_call_checks = 0  # checks in a row that have seen the same call
         self._running_tick = -1  # the tick of the running call
         self._first_tick = -1
         self._checked_count = -1  # the number of finished calls at the last check

@@ -209,7 +209,7 @@ class RemoteHand(HandPlayer):
         self._publish = publish
         self._dropped = dropped
         self._clock = clock
-        self._asked_tick = -1
+        self._asked_tick = -1  # tick of the newest view that was sent
         self._source = hand_site.source
 
     def track(self, site: Site, k: int) -> list[float]:

@@ -123,11 +123,13 @@ class PeerMonitor:
         is_site = member in self._events
         if is_recorder:
             _set_membership(self.recorders, boot, alive)
-            # a recorder joins late, or replaces a recorder that died
+            # A recorder joins late, or replaces a recorder that died.
             if alive and not is_member:
                 publisher.publish("back", "a recorder has joined", about=member, t_ns=t_ns)
         elif is_site:
             _set_membership(self._alive, (member, boot), alive)
+
+        # The departure of a member that has published its end was reported already.
         if self.boots.get(member) in self._ended:
             return
         if is_member and alive:
@@ -211,7 +213,8 @@ class PeerMonitor:
         member = event.member
         previous_boot = self.boots.get(member)
         is_repeated = self._first_ticks.get(event.boot) == event.ticks
-        if event.boots.get(member) != event.boot or is_repeated:
+        is_consistent = event.boots.get(member) == event.boot
+        if not is_consistent or is_repeated:
             return
 
         is_replaced = previous_boot not in (event.boot, *self._ended)

@@ -156,14 +156,14 @@ def _compile_expression(expression: str) -> re.Pattern[str]:
     """Converts a key with wildcards to a regular expression, see `matches_key`."""
     patterns = []
     for chunk in expression.split("/"):
+        literals = map(re.escape, chunk.split("$*"))
         if chunk == "**":
-            pattern += "(?:/[^/]+)*"
+            patterns.append("(?:/[^/]+)*")
         elif chunk == "*":
-            pattern += "/[^/]+"
+            patterns.append("/[^/]+")
         else:
-            literals = map(re.escape, chunk.split("$*"))
-            pattern += "/" + "[^/]*".join(literals)
-    return re.compile(pattern)
+            patterns.append("/" + "[^/]*".join(literals))
+    return re.compile("".join(patterns))
 
 
 def matches_key(expression: str, key: str) -> bool:

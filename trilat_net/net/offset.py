@@ -222,12 +222,9 @@ class _AdmissibleLines:
         intervals_s = self._ceiling_times_s[:, None] - self._floor_times_s[None, :]
         gaps = self._relaxed_ceilings[:, None] - self._relaxed_floors[None, :]
         slopes = np.divide(gaps, intervals_s, out=np.zeros_like(gaps), where=intervals_s != 0.0)
-        # A ceiling after a floor limits the slope from above, a ceiling before a floor limits
-        # the slope from below.
-        steepest = np.min(slopes, where=intervals_s > 0.0, initial=DRIFT_LIMIT)
-        flattest = np.max(slopes, where=intervals_s < 0.0, initial=-DRIFT_LIMIT)
-        self.steepest = float(steepest)
-        self.flattest = float(flattest)
+        # A ceiling after a floor limits the slope from above, a ceiling before one from below.
+        self.steepest = float(np.min(slopes, where=intervals_s > 0.0, initial=DRIFT_LIMIT))
+        self.flattest = float(np.max(slopes, where=intervals_s < 0.0, initial=-DRIFT_LIMIT))
         simultaneous_gap = np.min(gaps, where=intervals_s == 0.0, initial=0.0)
         self.exist = bool(simultaneous_gap >= 0.0 and self.flattest <= self.steepest)
 
@@ -244,6 +241,7 @@ class _AdmissibleLines:
     def estimate(self) -> OffsetEstimate:
         """Returns the middle line as the estimate, with the range of all lines as limits."""
         slope = min(max(self._estimate_slope(), self.flattest), self.steepest)
+        # Values at present of the lines with this slope that touch the limits.
         lowest_ceiling = np.min(self._relaxed_ceilings - slope * self._ceiling_times_s)
         highest_floor = np.max(self._relaxed_floors - slope * self._floor_times_s)
         middle = 0.5 * (lowest_ceiling + highest_floor)
@@ -264,30 +262,38 @@ class _AdmissibleLines:
     def _estimate_slope(self) -> float:
         """Estimates the drift by weighted least squares, as one slope for ceilings and floors.
 
-        A limit from a slow message contains little information. Therefore the weight of a limit
-        falls with its distance from the tightest limit. This distance depends on the slope, so
-        that the weights are computed again in each round (iteratively reweighted least
-        squares).
+        The ceilings and the floors have different levels but the same slope,
+
+            slope = sum w (t - t_mean) offset / (sum w (t - t_mean)^2 + 1 / prior^2),
+
+        where both sums extend over all ceilings and floors, w is the weight of a limit, t is
+        its time, t_mean is the weighted mean time of its group, and prior is the standard
+        deviation of the drift before any measurement.
+
+        A limit from a slow message contains little information. Therefore its weight falls with
+        its distance from the tightest limit of the group. This distance depends on the slope,
+        so that the weights are computed again in each round (iteratively reweighted least
+        squares). In the first round all weights are equal.
 
         Returns:
             The drift, in ns/s.
         """
-        sides = (
+        slope = 0.0
+        prior_weight = _PRIOR_DRIFT**-2
+        # The sign is 1 if the tightest limit of the group is the lowest, -1 if the highest.
+        groups = (
             (self._ceiling_times_s, self._ceilings, 1.0),
             (self._floor_times_s, self._floors, -1.0),
         )
-        slope = 0.0
-        prior_weight = _PRIOR_DRIFT**-2
         for round_index in range(_WEIGHTING_ROUNDS):
             numerator = 0.0
             denominator = prior_weight
-            for times, values, sign in sides:
-                distance = sign * (values - slope * times)
-                # In the first round the slope is unknown, so that all weights are equal.
-                excess = distance - distance.min() if round_index else np.zeros_like(distance)
+            for times, values, sign in groups:
+                level = sign * (values - slope * times)
+                excess = (level - level.min()) if round_index else np.zeros_like(level)
                 weights = (excess + _NOISE_NS) ** -2.0
-                mean_time = (weights * times).sum() / weights.sum()
-                from_mean = times - mean_time
+                total_weight = weights.sum()
+                from_mean = times - (weights * times).sum() / total_weight
                 numerator += float((weights * from_mean * values).sum())
                 denominator += float((weights * from_mean**2).sum())
             slope = numerator / denominator
@@ -317,10 +323,11 @@ class _SlewSegment:
         self._joined_offset_ns = estimate.extrapolate_ns(self._joined_ns)
         self._approach_rate = (self._joined_offset_ns - offset_ns) / SLEW_NS
         self._drift_per_ns = estimate.drift / NS_PER_S
-        # The bound is convex over the slew, so the largest bound is at one of the two ends.
-        start_bound_ns = estimate.error_bound_ns(start_ns, offset_ns)
-        joined_bound_ns = estimate.error_bound_ns(self._joined_ns, self._joined_offset_ns)
-        self.bound_ns = max(start_bound_ns, joined_bound_ns)
+        # The bound is convex over the slew, so it is largest at one of the two ends.
+        self.bound_ns = max(
+            estimate.error_bound_ns(start_ns, offset_ns),
+            estimate.error_bound_ns(self._joined_ns, self._joined_offset_ns),
+        )
 
     def evaluate_ns(self, local_ns: int) -> int:
         """Returns the offset in use at a time of the local clock, in ns."""

@@ -83,6 +83,7 @@ def _list_vector_lengths(kind: type[msgspec.Struct], layout: Layout) -> dict[str
         layout: Numbers of joints, peers and parameters of the site that sends the message.
     """
     if kind is State:
+        # Vectors that the layout does not mention must be absent.
         return dict.fromkeys(STATE_VECTORS, 0) | layout.lengths()
     if kind is PeerSample:
         return dict.fromkeys(("q", "qd", "tau_x"), layout.shared) | {"ch": layout.sent}
@@ -257,7 +258,7 @@ def split_states(block: bytes) -> Iterator[bytes]:
     unpacker = msgpack.Unpacker(max_buffer_size=MAX_BYTES)
     unpacker.feed(block)
     start = 0
-    while start < len(block) or not block:
+    while start < len(block) or not block:  # an empty block fails in the first round
         try:
             unpacker.skip()
         except (msgpack.UnpackException, ValueError) as error:
