@@ -156,7 +156,7 @@ class _Texts(HTMLParser):
         self.feed(page)
         self.words = self._text.split()
 
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+    def handle_starttag(self, tag: str, _attrs: list[tuple[str, str | None]]) -> None:
         self._text += "" if tag == "span" else " "  # a span may stand within a word
 
     def handle_data(self, data: str) -> None:
