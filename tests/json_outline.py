@@ -11,7 +11,7 @@ from typing import Any
 
 import trilat_net as tn
 from tests.sites.visits import ping_publishers, ping_sites
-from tests.studies.experiment.experiments import write_protocol
+from tests.studies.experiment.experiments import answer_form, write_hurried_pair, write_protocol
 from trilat_net.results import Result
 
 PAGE = Path(__file__).parents[1] / "docs" / "json.md"
@@ -81,6 +81,20 @@ SINES = [
     )
 ]
 HAND = {"kind": "tip_spring", "stiffness_n_m": [220.0, 150.0], "damping_n_s_m": [12.0, 9.0]}
+
+
+def _analyse_hurried_pair(folder: Path) -> Result:
+    """The analysis of a pair that ran into the time limit, and left questions without an answer."""
+    hurried = folder / "hurried"
+    hurried.mkdir()
+    experiment = tn.run_experiment(write_hurried_pair(hurried), hurried / "out", jobs=1)
+    for n, (number, who) in enumerate([(2, "P1"), (2, "P2"), (4, "P1"), (4, "P2")]):
+        answer_form(
+            experiment, f"q{n}", number, who, "tlx", [10.0, None, 30.0, 40.0, 50.0, 60.0]
+        )
+    return tn.analyse_experiment(experiment.folder)
+
+
 OF_PEOPLE: dict[str, Callable[[Path], list[Result]]] = {
     "identify hand": lambda _: [
         tn.identify_hand(
@@ -93,10 +107,13 @@ OF_PEOPLE: dict[str, Callable[[Path], list[Result]]] = {
     "experiment run": lambda folder: [
         tn.run_experiment(write_protocol(folder), folder / "experiment", jobs=1)
     ],
-    "experiment analyse": lambda folder: [
-        tn.analyse_experiment(folder / "experiment", exclude=left)
-        for left in ({}, {"P2": "left"})
-    ],
+    "experiment analyse": lambda folder: (
+        [
+            tn.analyse_experiment(folder / "experiment", exclude=left)
+            for left in ({}, {"P2": "left"})
+        ]
+        + [_analyse_hurried_pair(folder)]
+    ),
     "experiment power": lambda _: [
         tn.compute_experiment_power(0.5, people) for people in (None, 20)
     ],

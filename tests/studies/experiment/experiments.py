@@ -1,6 +1,10 @@
 """A short experiment of synthetic participants, as a protocol."""
 
 from pathlib import Path
+from typing import Any
+
+from trilat_net.studies.experiment.experiment_run import Experiment, Note
+from trilat_net.studies.experiment.questionnaires import find_form
 
 TEXT = """
 name = "short"
@@ -50,3 +54,25 @@ def write_protocol(
     text = text.replace("{ m1 = 0.7, m2 = 0.3 }", f"{{ m1 = {first}, m2 = {1.0 - first:.1f} }}")
     file.write_text(text, encoding="utf-8")
     return file
+
+
+def write_hurried_pair(folder: Path) -> Path:
+    """Writes the protocol of a pair whose time is short for the second condition, with questionnaires."""
+    file = write_protocol(
+        folder, '["m1", "m2"]', REACH.replace("timeout_s = 6.0", "timeout_s = 1.2")
+    )
+    forms = 'questionnaires = [{ name = "tlx" }, { name = "agency", after = "experiment" }]\n'
+    file.write_text(
+        file.read_text(encoding="utf-8").replace("[set]", f"{forms}[set]"), encoding="utf-8"
+    )
+    return file
+
+
+def answer_form(
+    experiment: Experiment, cell: str, number: int, who: str, form: str, values: list[Any]
+) -> None:
+    """Adds the answers of a participant to a questionnaire; None is a question without an answer."""
+    items = [item for item in experiment.plan.protocol.questionnaires if item.name == form]
+    answers = find_form(items[0]).read(values)
+    with experiment.open_notes() as notes:
+        notes.add(Note(cell, "questionnaire", who, number, 0.0, form, answers))

@@ -4,7 +4,6 @@ import csv
 import json
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,10 +11,9 @@ import pytest
 import trilat_net as tn
 from tests.json_outline import is_documented
 from trilat_net.errors import UsageError
-from trilat_net.studies.experiment.experiment_run import Experiment, Note, begin_experiment
-from trilat_net.studies.experiment.questionnaires import find_form
+from trilat_net.studies.experiment.experiment_run import begin_experiment
 
-from .experiments import REACH, write_protocol
+from .experiments import REACH, answer_form, write_hurried_pair, write_protocol
 
 
 @pytest.fixture(scope="module")
@@ -102,13 +100,7 @@ def test_users_within_pairs_have_a_mixed_model(tmp_path: Path) -> None:
 def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One pair of synthetic participants whose time is short for the second condition."""
     where = tmp_path_factory.mktemp("pair")
-    file = write_protocol(
-        where, '["m1", "m2"]', REACH.replace("timeout_s = 6.0", "timeout_s = 1.2")
-    )
-    forms = 'questionnaires = [{ name = "tlx" }, { name = "agency", after = "experiment" }]\n'
-    file.write_text(
-        file.read_text(encoding="utf-8").replace("[set]", f"{forms}[set]"), encoding="utf-8"
-    )
+    file = write_hurried_pair(where)
     return tn.run_experiment(file, where / "out", jobs=1).folder
 
 
@@ -151,15 +143,6 @@ def test_measure_of_one_value_is_shown(folder: Path) -> None:
     assert "succeeded, mean over participants" in found.summary()
 
 
-def answer(
-    experiment: Experiment, cell: str, number: int, who: str, form: str, values: list[Any]
-) -> None:
-    items = [one for one in experiment.plan.protocol.questionnaires if one.name == form]
-    answers = find_form(items[0]).read(values)
-    with experiment.open_notes() as notes:
-        notes.add(Note(cell, "questionnaire", who, number, 0.0, form, answers))
-
-
 def test_missing_answers_are_counted_and_not_averaged(pair: Path, tmp_path: Path) -> None:
     copy = tmp_path / "copy"
     shutil.copytree(pair, copy)
@@ -168,8 +151,8 @@ def test_missing_answers_are_counted_and_not_averaged(pair: Path, tmp_path: Path
     for n, (number, who, values) in enumerate(
         [(2, "P1", full), (2, "P2", lacking), (4, "P1", lacking), (4, "P2", lacking)]
     ):
-        answer(experiment, f"q{n}", number, who, "tlx", values)
-    answer(experiment, "after", 4, "P1", "agency", [None, 1.0, 2.0, 3.0])
+        answer_form(experiment, f"q{n}", number, who, "tlx", values)
+    answer_form(experiment, "after", 4, "P1", "agency", [None, 1.0, 2.0, 3.0])
     found = tn.analyse_experiment(copy, tmp_path / "there")
     (mean,) = found.means["tlx"]  # the other condition has no whole questionnaire
     assert (mean.condition, mean.mean, mean.missing) == ("near", 35.0, 1)
