@@ -11,7 +11,12 @@ from typing import Any
 
 import trilat_net as tn
 from tests.sites.visits import ping_publishers, ping_sites
-from tests.studies.experiment.experiments import answer_form, write_hurried_pair, write_protocol
+from tests.studies.experiment.experiments import (
+    REACH,
+    answer_form,
+    write_hurried_pair,
+    write_protocol,
+)
 from trilat_net.results import Result
 
 PAGE = Path(__file__).parents[1] / "docs" / "json.md"
@@ -95,6 +100,14 @@ def _analyse_hurried_pair(folder: Path) -> Result:
     return tn.analyse_experiment(experiment.folder)
 
 
+def _analyse_hurried_users(folder: Path) -> Result:
+    """The analysis of users of whom some ran into the time limit in one of two conditions."""
+    hurried = folder / "users"
+    hurried.mkdir()
+    file = write_protocol(hurried, task=REACH.replace("timeout_s = 6.0", "timeout_s = 2.6"))
+    return tn.analyse_experiment(tn.run_experiment(file, hurried / "out", jobs=1).folder)
+
+
 OF_PEOPLE: dict[str, Callable[[Path], list[Result]]] = {
     "identify hand": lambda _: [
         tn.identify_hand(
@@ -112,7 +125,7 @@ OF_PEOPLE: dict[str, Callable[[Path], list[Result]]] = {
             tn.analyse_experiment(folder / "experiment", exclude=left)
             for left in ({}, {"P2": "left"})
         ]
-        + [_analyse_hurried_pair(folder)]
+        + [_analyse_hurried_pair(folder), _analyse_hurried_users(folder)]
     ),
     "experiment power": lambda _: [
         tn.compute_experiment_power(0.5, people) for people in (None, 20)
