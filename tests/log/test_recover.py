@@ -382,7 +382,7 @@ def test_where_there_is_nothing_to_save_no_file_is_made(content: bytes, tmp_path
         (
             lambda data: data[:-60],
             0,
-            ["run.mcap: made of run.mcap.active, which was not finished", "nothing"],
+            ["run.mcap: recovered from run.mcap.active, which was not finished", "nothing"],
         ),
         (lambda data: data[: len(data) // 2], 3, ["cut off", "lost"]),
         (lambda _: b"junk", 1, []),

@@ -156,7 +156,7 @@ def test_a_clock_is_told_as_it_stood_at_the_end():
     (line,) = format_clock_lines(clocked())
     assert line == (
         "clock of m1 seen by m2: +3000.100 ms at the end, known to 60 us (p50 130, max 200), "
-        "drift +50.00 ppm, 2 samples came before they were sent: a clock has stepped"
+        "drift +50.00 ppm, 2 samples arrived before they were sent: a clock has stepped"
     )
 
 

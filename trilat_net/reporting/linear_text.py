@@ -1,7 +1,7 @@
 """Text of a linear analysis for the terminal.
 
-The text has the equilibrium, the delays in use, a table of the rightmost roots, the verdict,
-the delay margin, the ports, and the edges of stability over a scenario key.
+The text consists of the equilibrium, the delays in use, a table of the rightmost roots, the
+verdict, the delay margin, the ports, and the edges of stability over a scenario key.
 
 Invariant:
     - Every number has its unit.
@@ -152,43 +152,26 @@ def describe_linear_verdict(analysis: LinearAnalysis) -> str:
     return f"{analysis.verdict}: {slowest} goes as {growth}"
 
 
-_SHOWN_BANDS = 3
+_MAX_BANDS = 3
 """Largest number of listed frequency bands."""
-_JOINTS_BY_LINE = 2
-"""Largest number of joints for which every failing two-port has a line of its own."""
+_MAX_SEPARATE_JOINTS = 2
+"""Largest number of joints for which every failing two-port has a separate line."""
 WEIGHTS_ALIKE = 1e-9
 """Largest difference of weights that count as equal."""
 
 
 def describe_ports(ports: PortAnalysis) -> list[str]:
-    """Returns the lines on passivity, absolute stability and transparency of the ports."""
-    low, high = ports.band_hz
-    conditions = f"operators and environments off, {low:g}-{high:g} Hz"
-    grid = "(a grid refined at minima: evidence, no proof)"
-    lines = [f"Ports of {', '.join(ports.sites)}, {conditions} {grid}"]
-    if ports.resolved_hz < high:
-        beyond = f"above {ports.resolved_hz:.3g} Hz"
-        lines.append(f"  {beyond} the grid does not follow the phase of the longest delay")
+    """Returns the lines on passivity, absolute stability and transparency of the ports.
+
+    If the loop is unstable without operators, or with a site clamped, the lines end there.
+    """
+    lines = _describe_conditions(ports)
     if ports.verdict == "unstable":
-        return [
-            *lines,
-            "  the loop without operators is unstable: not passive, and without an impedance",
-        ]
-    if ports.pole.order:
-        kind = "as of free masses" if ports.pole.passive else "which no passive network has"
-        lines.append(f"  at zero frequency Y has a pole of order {ports.pole.order}, {kind}")
-    unit = ports.impedance_unit()
-    kind = ports.kind
-    whole = _describe_passivity(ports.velocity, unit, kind)
-    lines.append(f"  operators passive in {ports.speed}, coupled or not: {whole}")
-    for joint, passivity in ports.joints.items():
-        alone = _describe_passivity(passivity, ports.impedance_unit(joint), kind)
-        lines.append(f"    {ports.name_port(joint)} alone: {alone}")
-    if ports.proof is not None:
-        proof = _describe_proof(ports, ports.proof)
         lines.append(
-            f"  operators passive in r = {ports.speed} + Lambda e, the proof's premise: {proof}"
+            "  the loop without operators is unstable: not passive, and without an impedance"
         )
+        return lines
+    lines += _describe_port_passivity(ports)
     absolute = _describe_absolute_stability(ports)
     lines.append(f"  a passive operator in {ports.speed} per site, best weights: {absolute}")
     lines += [f"    Llewellyn, {text}" for text in _describe_two_ports(ports)]
@@ -200,12 +183,43 @@ def describe_ports(ports: PortAnalysis) -> list[str]:
         lines.append(f"  the measured operators at the masters, any at each: {result}")
     if ports.clamped_verdict == "unstable":
         clamped = ports.transparency[0].other_site
-        return [
-            *lines,
-            f"  with {clamped} clamped the loop is unstable: it has no steady impedance",
-        ]
+        lines.append(
+            f"  with {clamped} clamped the loop is unstable: it has no steady impedance"
+        )
+        return lines
     for transparency in ports.transparency:
         lines.append(f"  {_describe_transparency(ports, transparency)}")
+    return lines
+
+
+def _describe_conditions(ports: PortAnalysis) -> list[str]:
+    """Returns the lines on the analysed ports and on the grid of frequencies."""
+    low_hz, high_hz = ports.band_hz
+    conditions = f"operators and environments off, {low_hz:g}-{high_hz:g} Hz"
+    grid = "(a grid refined at minima: evidence, no proof)"
+    lines = [f"Ports of {', '.join(ports.sites)}, {conditions} {grid}"]
+    if ports.resolved_hz < high_hz:
+        beyond = f"above {ports.resolved_hz:.3g} Hz"
+        lines.append(f"  {beyond} the grid does not follow the phase of the longest delay")
+    return lines
+
+
+def _describe_port_passivity(ports: PortAnalysis) -> list[str]:
+    """Returns the lines on the passivity of all ports, of each joint, and of the proof's r."""
+    lines = []
+    if ports.pole.order:
+        kind = "as of free masses" if ports.pole.passive else "which no passive network has"
+        lines.append(f"  at zero frequency Y has a pole of order {ports.pole.order}, {kind}")
+    all_ports = _describe_passivity(ports.velocity, ports.impedance_unit(), ports.kind)
+    lines.append(f"  operators passive in {ports.speed}, coupled or not: {all_ports}")
+    for joint, passivity in ports.joints.items():
+        unit = ports.impedance_unit(joint)
+        port = _describe_passivity(passivity, unit, ports.kind)
+        lines.append(f"    {ports.name_port(joint)} alone: {port}")
+    if ports.proof is not None:
+        premise = f"r = {ports.speed} + Lambda e, the proof's premise"
+        proof = _describe_proof(ports, ports.proof)
+        lines.append(f"  operators passive in {premise}: {proof}")
     return lines
 
 
@@ -213,11 +227,11 @@ def _describe_proof(ports: PortAnalysis, proof: Passivity) -> str:
     beta = ", ".join(f"{weight:.3g}" for weight in ports.beta)
     text = f"{_describe_passivity(proof)}; sites weighted {beta}"
     if np.ptp(ports.beta) > WEIGHTS_ALIKE:
-        text += ", which is nothing for operators coupled to one another"
+        text += ", which says nothing about operators coupled to each other"
     if proof.passive or ports.estimates_true:
         return text
     return (
-        f"{text}; estimates here are not true, and the proof counts the energy that they store"
+        f"{text}; the estimates are not true, and the proof counts the energy that they store"
     )
 
 
@@ -244,10 +258,10 @@ def _describe_passivity(passivity: Passivity, unit: str = "", kind: str = "") ->
 
 
 def _list_bands(bands: tuple[FrequencyBand, ...]) -> str:
-    shown = [f"{band.from_hz:.3g}-{band.to_hz:.3g}" for band in bands[:_SHOWN_BANDS]]
-    text = f"at {', '.join(shown)} Hz"
-    if len(bands) > _SHOWN_BANDS:
-        text += f" and {count_nouns(len(bands) - _SHOWN_BANDS, 'range')} more"
+    ranges = [f"{band.from_hz:.3g}-{band.to_hz:.3g}" for band in bands[:_MAX_BANDS]]
+    text = f"at {', '.join(ranges)} Hz"
+    if len(bands) > _MAX_BANDS:
+        text += f" and {count_nouns(len(bands) - _MAX_BANDS, 'range')} more"
     return text
 
 
@@ -266,7 +280,7 @@ def _describe_two_ports(ports: PortAnalysis) -> list[str]:
     # for arms of many joints, the failing two-ports of a pair of sites share a line
     groups: dict[tuple[object, ...], list[TwoPort]] = {}
     for two_port in failing:
-        joint = two_port.joint if len(ports.joints) <= _JOINTS_BY_LINE else ""
+        joint = two_port.joint if len(ports.joints) <= _MAX_SEPARATE_JOINTS else ""
         groups.setdefault((two_port.sites, two_port.clamped, joint), []).append(two_port)
     lines = [_describe_failing(ports, group) for group in groups.values()]
     holding = len(ports.two_ports) - len(failing)

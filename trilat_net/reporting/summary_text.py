@@ -16,11 +16,12 @@ from typing import Any
 
 from ..analysis import link_summary
 from ..analysis.metrics.log_metrics import LogMetrics
+from ..analysis.metrics.measured_impedance import FrequencyResponse
 from ..analysis.metrics.measures import Metric, Quantity, quantities
 from ..analysis.timeline import StatedModel, find_mode_intervals, list_alarms, list_changes
 from ..errors import count_nouns
 from ..execution.log_checks import LogCheckReport
-from ..execution.rerun import Rerun
+from ..execution.rerun import LinkEffect, Rerun, SiteEffect
 from ..execution.rerun_execution import describe_rerun_changes
 from ..log.log_reader import Log
 from ..log.recover import Recovery
@@ -35,8 +36,8 @@ MOST_LINE_CHARACTERS = 400
 """Largest length of a message of a user law or an external arm."""
 OUTSIDE_EVENT_KINDS = ("failed", "law", "arm")
 """Kinds of the events about user laws and external arms."""
-_MAX_PLACES = 10
-"""Largest number of listed places of a failed check; the JSON has all."""
+_MAX_LOCATIONS = 10
+"""Largest number of listed locations of a failed check; the JSON has all."""
 _MAX_LOSSES = 10
 """Largest number of listed losses of a recovery; the JSON has all."""
 _NO_NUMBER = "–"
@@ -48,16 +49,8 @@ _MAX_FREQUENCIES = 16
 def compose_log(log: Log) -> Iterator[Block]:
     """Yields the session, a table with a row per site, and the lines of `format_run_lines`."""
     yield log.headline()
-    rows = [
-        [
-            row["site"],
-            f"{row['rate_hz']}",
-            f"{row['records']}",
-            f"{row['missing']}",
-            f"{row['last_s']}",
-        ]
-        for row in log.to_rows()
-    ]
+    keys = ("site", "rate_hz", "records", "missing", "last_s")
+    rows = [[str(row[key]) for key in keys] for row in log.to_rows()]
     yield TextTable(("site", "rate Hz", "records", "missing", "until s"), rows, align="lr")
     yield from format_run_lines(log)
 
@@ -69,7 +62,7 @@ def format_run_lines(log: Log) -> list[str]:
         LogError: a record names a change that does not exist.
     """
     return [
-        *_first([f"*** {alarm}" for alarm in list_alarms(log)]),
+        *_limit_lines([f"*** {alarm}" for alarm in list_alarms(log)]),
         *format_outside_lines(log),
         *format_link_lines(log),
         *format_change_lines(log),
@@ -85,7 +78,7 @@ def format_outside_lines(log: Log) -> list[str]:
         if event.kind in OUTSIDE_EVENT_KINDS:
             text = event.text[:MOST_LINE_CHARACTERS]
             lines.append("".join(letter if letter.isprintable() else " " for letter in text))
-    return _first(lines)
+    return _limit_lines(lines)
 
 
 def format_link_lines(log: Log) -> list[str]:
@@ -98,15 +91,15 @@ def format_link_lines(log: Log) -> list[str]:
         origin = "" if measured else "stated "
         parts = [f"link {use.name}: {origin}{format_stated_models(use.stated)}"]
         if use.one_way_us is not None and measured:
-            parts.append(f"one way {_ms(use.one_way_us, 1e-3)}")
+            parts.append(f"one way {_format_spread(use.one_way_us, 1e-3)}")
         if use.age_ms is None:
             parts.append("no sample in use")
         else:
-            parts.append(f"effective {_ms(use.age_ms)}")
+            parts.append(f"effective {_format_spread(use.age_ms)}")
         if use.counts is not None:
-            parts.append(_losses(use, use.counts))
+            parts.append(_describe_losses(use, use.counts))
         lines.append("; ".join(parts))
-    return _first(lines)
+    return _limit_lines(lines)
 
 
 def format_change_lines(log: Log) -> list[str]:
@@ -116,7 +109,7 @@ def format_change_lines(log: Log) -> list[str]:
         tick = changed.taken_at_tick
         origin = "by the scenario" if tick is None else f"applied at tick {tick}"
         lines.append(f"change: {changed.sentence} ({origin})")
-    return _first(lines)
+    return _limit_lines(lines)
 
 
 def format_mode_lines(log: Log) -> list[str]:
@@ -144,7 +137,7 @@ def format_clock_lines(log: Log) -> list[str]:
             use = link_summary.summarise_clock(log, peer, site)
             if use is not None and not use.shared:
                 lines.append(f"clock of {peer} seen by {site}: {format_clock(use)}")
-    return _first(lines)
+    return _limit_lines(lines)
 
 
 def format_stated_models(states: Sequence[StatedModel]) -> str:
@@ -165,24 +158,30 @@ def format_clock(use: link_summary.ClockSummary) -> str:
     if use.drift_ppm is not None:
         parts.append(f"drift {use.drift_ppm:+.2f} ppm")
     if use.faults:
-        early = "sample came before it was sent", "samples came before they were sent"
-        parts.append(f"{count_nouns(use.faults, *early)}: a clock has stepped")
+        early = count_nouns(
+            use.faults,
+            singular="sample arrived before it was sent",
+            plural="samples arrived before they were sent",
+        )
+        parts.append(f"{early}: a clock has stepped")
     return ", ".join(parts)
 
 
-def _ms(spread: link_summary.ValueStatistics, factor: float = 1.0) -> str:
-    mean = _number(factor * spread.mean)
-    deviation = _number(factor * spread.deviation)
-    p99 = _number(factor * spread.p99)
-    largest = _number(factor * spread.max)
+def _format_spread(spread: link_summary.ValueStatistics, unit_ms: float = 1.0) -> str:
+    """Returns statistics of times, whose unit is `unit_ms`, in ms."""
+    mean = _format_number(unit_ms * spread.mean)
+    deviation = _format_number(unit_ms * spread.deviation)
+    p99 = _format_number(unit_ms * spread.p99)
+    largest = _format_number(unit_ms * spread.max)
     return f"{mean} +- {deviation} ms (p99 {p99}, max {largest})"
 
 
-def _number(value: float) -> str:
+def _format_number(value: float) -> str:
     return f"{value:.0f}" if abs(value) >= 100.0 else f"{value:.3g}"
 
 
-def _losses(use: link_summary.LinkSummary, counts: link_summary.SampleCounts) -> str:
+def _describe_losses(use: link_summary.LinkSummary, counts: link_summary.SampleCounts) -> str:
+    """Returns the numbers of samples of a link that were not used, with their shares."""
     losses = {
         "missing on the way": counts.missing,
         "lost": counts.lost,
@@ -197,11 +196,12 @@ def _losses(use: link_summary.LinkSummary, counts: link_summary.SampleCounts) ->
             parts.append(f"{name} {count} ({100 * count / judged:.3g} %)")
     # shorter bursts would be shown as "1 in a row"
     if use.burst is not None and use.burst > 1.005:
-        parts.append(f"{_number(use.burst)} in a row")
+        parts.append(f"{_format_number(use.burst)} in a row")
     return ", ".join(parts) or "nothing lost"
 
 
-def _first(lines: list[str]) -> list[str]:
+def _limit_lines(lines: list[str]) -> list[str]:
+    """Returns at most `MOST_LINES` lines, and a line that counts the others."""
     more = len(lines) - MOST_LINES
     if more <= 0:
         return lines
@@ -217,25 +217,26 @@ def compose_verification(report: LogCheckReport) -> Iterator[Block]:
 
 
 def compose_log_check(report: LogCheckResult) -> Iterator[Block]:
-    """Yields a line per check, and the places where the check failed."""
+    """Yields a line per check, and the locations at which the check failed."""
     for finding in report.findings:
         mark = MARKS["ok" if finding.passed else "FAIL"]
         yield MarkedText(mark, f"{finding.check:<9}  {finding.text}")
-        # a single place that the text of the check names is not repeated
+        # a single location that the text of the check names is not repeated
         if finding.wrong == 1 and str(finding.places[0]) in finding.text:
             continue
-        for place in finding.places[:_MAX_PLACES]:
-            file = f"{place.file}: " if len(report.files) > 1 and place.file else ""
-            yield f"       {file}{place}"
-        if finding.wrong > _MAX_PLACES:
-            more = finding.wrong - _MAX_PLACES
+        for location in finding.places[:_MAX_LOCATIONS]:
+            names_file = len(report.files) > 1 and location.file
+            file = f"{location.file}: " if names_file else ""
+            yield f"       {file}{location}"
+        if finding.wrong > _MAX_LOCATIONS:
+            more = finding.wrong - _MAX_LOCATIONS
             yield f"       and {more} more; --json names {len(finding.places)}"
 
 
 def compose_recovery(recovery: Recovery) -> Iterator[Block]:
     """Yields the recovered file, and a table of the recovered and the lost records."""
     state = "was finished" if recovery.finished else "was not finished"
-    yield f"{recovery.output}: made of {recovery.path}, which {state}"
+    yield f"{recovery.output}: recovered from {recovery.path}, which {state}"
     rows = []
     record_counts = recovery.coverage.judged
     if record_counts:
@@ -265,60 +266,62 @@ def compose_rerun(rerun: Rerun) -> Iterator[Block]:
     changes = describe_rerun_changes(request)
     for line in changes or ["nothing is changed: this is the experiment of the log"]:
         yield f"  {line}"
-    headers = (
-        "ticks",
-        "identical",
-        "rms e rad",
-        "here",
-        "max e rad",
-        "here",
-        "max tau N m",
-        "here",
-    )
     rows = []
     for effect in rerun.sites.values():
         cells = []
         for pair in (effect.error_rms_rad, effect.error_max_rad, effect.torque_max_nm):
             cells += ["", ""] if pair is None else [f"{value:#.3g}" for value in pair]
         rows.append([effect.site, str(effect.executed), str(effect.identical), *cells])
-    yield TextTable(("site", *headers), rows, align="lr")
-    yield from _describe_effects(rerun)
+    headers = (
+        "site",
+        "ticks",
+        "identical",
+        "rms e rad",
+        "rerun",
+        "max e rad",
+        "rerun",
+        "max tau N m",
+        "rerun",
+    )
+    yield TextTable(headers, rows, align="lr")
+    for effect in rerun.sites.values():
+        rate_hz = request.scenario.sites[effect.site].rate_hz
+        for line in _describe_site_effect(effect, rate_hz):
+            yield f"{effect.site}: {line}"
+    for link in rerun.links.values():
+        if link.differs:
+            yield _describe_link_effect(link)
     yield from (f"note: {note}" for note in rerun.notes)
 
 
-def _describe_effects(rerun: Rerun) -> list[str]:
+def _describe_site_effect(effect: SiteEffect, rate_hz: int) -> list[str]:
+    """Returns lines on the differences between the rerun of a site and the log."""
     lines = []
-    for effect in rerun.sites.values():
-        if effect.q_max_rad:
-            most = effect.q_max_rad
-            at_s = effect.q_max_at_s
-            rms = effect.q_rms_rad
-            largest = f"q is up to {most:.3g} rad off the log, at {at_s:.3f} s"
-            lines.append(f"{effect.site}: {largest}; {rms:.3g} rad rms")
-        if effect.first is not None:
-            first = effect.first
-            at_s = first.tick / rerun.request.scenario.sites[effect.site].rate_hz
-            logged, computed = _values(first.logged, first.computed)
-            when = f"tick {first.tick} ({at_s:.3f} s)"
-            change = f"{first.field} was {logged}, is {computed}"
-            lines.append(f"{effect.site}: the first difference is at {when}: {change}")
-        if effect.diverged_at_s is not None:
-            lines.append(
-                f"{effect.site}: diverged at {effect.diverged_at_s:.3f} s and ends there"
-            )
-    for link in rerun.links.values():
-        if not link.differs:
-            continue
-        before, after = (
-            f"{mean:.4g} ms old on average, {largest:.4g} ms at most"
-            for mean, largest in zip(link.age_mean_ms, link.age_max_ms, strict=True)
-        )
-        lines.append(f"link {link.link}: samples in use were {before}; are {after}")
+    if effect.q_max_rad:
+        largest = f"{effect.q_max_rad:.3g} rad off the log, at {effect.q_max_at_s:.3f} s"
+        lines.append(f"q is up to {largest}; {effect.q_rms_rad:.3g} rad rms")
+    first = effect.first
+    if first is not None:
+        logged, computed = _format_difference(first.logged, first.computed)
+        when = f"tick {first.tick} ({first.tick / rate_hz:.3f} s)"
+        change = f"{first.field} was {logged}, is {computed}"
+        lines.append(f"the first difference is at {when}: {change}")
+    if effect.diverged_at_s is not None:
+        lines.append(f"diverged at {effect.diverged_at_s:.3f} s and ends there")
     return lines
 
 
-def _values(before: object, after: object) -> tuple[str, str]:
-    """Returns two different values as texts that differ: in full if six digits are the same."""
+def _describe_link_effect(link: LinkEffect) -> str:
+    """Returns the ages of the samples in use on a link, in the log and in the rerun."""
+    mean_ms = link.age_mean_ms
+    max_ms = link.age_max_ms
+    before = f"{mean_ms.before:.4g} ms old on average, {max_ms.before:.4g} ms at most"
+    after = f"{mean_ms.after:.4g} ms old on average, {max_ms.after:.4g} ms at most"
+    return f"link {link.link}: samples in use were {before}; are {after}"
+
+
+def _format_difference(before: object, after: object) -> tuple[str, str]:
+    """Returns two different values as texts that differ: in full if six digits are equal."""
     short_before = f"{before:.6g}" if isinstance(before, float) else str(before)
     short_after = f"{after:.6g}" if isinstance(after, float) else str(after)
     if short_before == short_after:
@@ -338,7 +341,7 @@ def compose_ping(report: Result) -> Iterator[Block]:
     members = facts["members"]
     links = facts["links"]
     state = "runs" if any(member["running"] for member in members) else "waits for its members"
-    clock_note = "a clock is the one there minus the one here"
+    clock_note = "clock: the member's minus that of this machine"
     yield f"session {facts['session']} {state}; times in us; {clock_note}"
     rows = []
     for member in members:
@@ -346,7 +349,9 @@ def compose_ping(report: Result) -> Iterator[Block]:
         times_us = [rtt.get("min"), rtt.get("p50"), rtt.get("p99"), member.get("jitter_us")]
         times = ["" if time_us is None else f"{time_us:.0f}" for time_us in times_us]
         answers = str(member["answers"])
-        rows.append([member["member"], member["host"], answers, *times, _clock(member)])
+        rows.append(
+            [member["member"], member["host"], answers, *times, _describe_clock(member)]
+        )
     headers = ("member", "host", "answers", "rtt min", "p50", "p99", "jitter", "clock")
     yield TextTable(headers, rows, align="llrrrrrl")
     if links:
@@ -354,9 +359,9 @@ def compose_ping(report: Result) -> Iterator[Block]:
         rows = []
         for link in links:
             delays_us = [link["delay_us"], link["delay_max_us"], link["rtt_us"]]
-            shown = ["none" if delay_us < 0 else str(delay_us) for delay_us in delays_us]
+            delays = ["none" if delay_us < 0 else str(delay_us) for delay_us in delays_us]
             offset = [f"{link['offset_us'] / 1e6:.6f}", str(link["bound_us"])]
-            rows.append([link["from"], link["to"], *shown, *offset])
+            rows.append([link["from"], link["to"], *delays, *offset])
         heads = ("from", "to", "delay p50", "max", "rtt min", "offset s", "+- us")
         yield TextTable(heads, rows, align="llr")
 
@@ -368,8 +373,8 @@ _BARS = " ▁▂▃▄▅▆▇█"
 def compose_topic_delays(report: Result) -> Iterator[Block]:
     """Yields a row per publisher, with a histogram from its least to its largest delay."""
     facts = report.to_dict()
-    lasted = f"{facts['lasted_s']:.3g} s"
-    yield f"/{facts['topic']}, {lasted}; times in us, from sending to arrival here"
+    duration = f"{facts['lasted_s']:.3g} s"
+    yield f"/{facts['topic']}, {duration}; times in us, from sending to arrival"
     rows = []
     least = 0.0
     for publisher in facts["publishers"]:
@@ -401,11 +406,12 @@ def compose_topic_delays(report: Result) -> Iterator[Block]:
     )
     yield TextTable(headers, rows, align="llrrrrrrrl")
     if least < 0.0:
-        yield "delays below 0: the clock there is ahead of the one here"
-    yield "between two machines these contain the offset of their clocks"
+        yield "delays below 0: the publisher's clock is ahead of the clock of this machine"
+    yield "between two machines, delays contain the offset of the clocks"
 
 
-def _clock(member: dict[str, Any]) -> str:
+def _describe_clock(member: dict[str, Any]) -> str:
+    """Returns the offset of a member's clock, in s, and its bound, in us."""
     if member["same_clock"]:
         return "the same clock"
     if "offset_ns" not in member:
@@ -418,27 +424,30 @@ def compose_benchmark(benchmark: Result) -> Iterator[Block]:
     facts = benchmark.to_dict()
     needs = facts["needs"]
     name = facts["scenario"]
-    yield "one way is half a round trip, the far end's handling with it; times in us"
+    yield "one way is half a round trip with the handling at the far end; times in us"
     rows = []
     for row in facts["rows"]:
         times = row["one_way_us"] or {}
-        shown = [f"{times[key]:.0f}" if key in times else "" for key in ("p50", "p99", "max")]
+        delays = [f"{times[key]:.0f}" if key in times else "" for key in ("p50", "p99", "max")]
         same_size = row["bytes"] == needs["sample_bytes"]
         same_rate = row["rate_hz"] == needs["rate_hz"]
         scenario = name if same_size and same_rate else ""
         counts = [row["bytes"], f"{row['rate_hz']:g}", row["sent"], row["lost"]]
-        rows.append([row["transport"], *map(str, counts), *shown, scenario])
-    headers = ("transport", "bytes", "rate", "sent", "lost", "p50", "p99", "max", "is that of")
+        rows.append([row["transport"], *map(str, counts), *delays, scenario])
+    headers = ("transport", "bytes", "rate", "sent", "lost", "p50", "p99", "max", "as in")
     yield TextTable(headers, rows, align="lrrrrrrrl", units=("", "", "Hz"))
     yield f"{name}: {needs['words']}"
     for transport in facts["transports"]:
         mark = MARKS["ok" if transport["good"] else "fail"]
-        yield MarkedText(mark, f"{transport['transport']}: {_judgement(transport, needs)}")
+        yield MarkedText(
+            mark, f"{transport['transport']}: {_judge_transport(transport, needs)}"
+        )
 
 
-def _judgement(transport: dict[str, Any], needs: dict[str, Any]) -> str:
+def _judge_transport(transport: dict[str, Any], needs: dict[str, Any]) -> str:
+    """Returns a sentence on the delay of a transport against the needs of a scenario."""
     if transport["p99_ms"] is None:
-        return "nothing came back"
+        return "no message returned"
     parts = [f"p99 {transport['p99_ms']:.3g} ms"]
     if needs["held_ms"]:
         relation = "hides in" if transport["hidden"] else "exceeds"
@@ -459,26 +468,28 @@ def _judgement(transport: dict[str, Any], needs: dict[str, Any]) -> str:
 def compose_metrics(metrics: LogMetrics) -> Iterator[Block]:
     """Yields the tables of metrics, statics and impedances, then reasons of missing numbers.
 
-    Metrics have a table per group of quantities and kind of place: run, site, link or wall.
+    There is a table per group of quantities and kind of subject: run, site, link or wall.
     """
     reasons: dict[str, list[str]] = {}
-    by_table = groupby(quantities(), key=lambda quantity: (quantity.group, quantity.of))
-    for (group, _), members in by_table:
+    tables = groupby(quantities(), key=lambda quantity: (quantity.group, quantity.of))
+    for (group, _), members in tables:
         yield from _compose_group(group, list(members), metrics, reasons)
-    yield from _compose_statics(metrics)
+    yield from _compose_sharing(metrics)
+    yield from _compose_stiffness(metrics)
     yield from _compose_impedance(metrics)
     for reason, missing in reasons.items():
         yield _explain_missing(sanitize(", ".join(missing)), reason)
 
 
 def _explain_missing(subject: str, reason: str) -> MarkedText:
+    """Returns a line on the reason why numbers are missing, behind the mark of their cells."""
     return MarkedText(f"[bold]{_NO_NUMBER}[/bold]", f"{subject}: {sanitize(reason)}")
 
 
 def _compose_group(
     group: str, members: Sequence[Quantity], metrics: LogMetrics, reasons: dict[str, list[str]]
 ) -> Iterator[Block]:
-    """Yields a table with a row per quantity and a column per place, for those that apply.
+    """Yields a table with a row per quantity and a column per subject, for those that apply.
 
     Args:
         group: the heading of the table.
@@ -488,105 +499,138 @@ def _compose_group(
     """
     values = {quantity: metrics.values_of(quantity) for quantity in members}
     applicable = {
-        quantity: by_place
-        for quantity, by_place in values.items()
-        if any(metric.applies for metric in by_place.values())
+        quantity: by_subject
+        for quantity, by_subject in values.items()
+        if any(metric.applies for metric in by_subject.values())
     }
-    places = [
-        place
-        for place in next(iter(values.values()))
-        if any(by_place[place].applies for by_place in applicable.values())
+    subjects = [
+        subject
+        for subject in next(iter(values.values()))
+        if any(by_subject[subject].applies for by_subject in applicable.values())
     ]
-    if not places:
+    if not subjects:
         return
     rows = []
-    for quantity, by_place in applicable.items():
-        numbers = [_write_metric(by_place[place]) for place in places]
+    for quantity, by_subject in applicable.items():
+        numbers = [_format_metric(by_subject[subject]) for subject in subjects]
         rows.append([quantity.name, quantity.unit, *numbers])
-    yield from _tabulate([group, "", *places], rows, text_columns=2)
-    for quantity, by_place in applicable.items():
-        for place in places:
-            metric = by_place[place]
+    yield from _tabulate([group, "", *subjects], rows, text_columns=2)
+    for quantity, by_subject in applicable.items():
+        for subject in subjects:
+            metric = by_subject[subject]
             if metric.value is None and metric.applies:
-                name = f"{quantity.name} of {place}" if place else quantity.name
+                name = f"{quantity.name} of {subject}" if subject else quantity.name
                 reasons.setdefault(metric.why, []).append(name)
 
 
-def _compose_statics(metrics: LogMetrics) -> Iterator[Block]:
-    if metrics.sharing_ratios:
-        joint, nm = ("axis", metrics.unit("N m", 1)) if metrics.axes else ("joint", "N m")
-        heads = ("at rest", joint, "ON the arm of", nm, "felt at", nm, "expected", "off")
-        rows = []
-        for pair in metrics.sharing_ratios:
-            pushed = f"{pair.pushed}{' (wall)' if pair.by_wall else ''}"
-            row = [
-                f"{pair.from_s:.1f} - {pair.to_s:.1f} s",
-                metrics.label(pair.joint),
-                pushed,
-                _write_value(pair.pushed_nm),
-                pair.holds,
-                _write_value(pair.felt_nm),
-                _write_metric(pair.expected_nm),
-                _NO_NUMBER if pair.off is None else f"{100.0 * pair.off:.3g} %",
-            ]
-            rows.append(row)
-        yield from _tabulate(heads, rows, text_columns=1)
-        for reason in dict.fromkeys(pair.expected_nm.why for pair in metrics.sharing_ratios):
-            if reason:
-                yield _explain_missing("nothing is expected", reason)
-    if metrics.stiffness:
-        rows = []
-        for felt in metrics.stiffness:
-            stiffness = _NO_NUMBER
-            if felt.stiffness_nm_rad is not None:
-                stiffness = _write_value(felt.stiffness_nm_rad)
-            row = [
-                f"{felt.from_s:.1f} to {felt.to_s:.1f} s",
-                metrics.label(felt.joint),
-                felt.site,
-                _write_value(felt.torque_nm),
-                _write_value(felt.angle_rad),
-                stiffness,
-            ]
-            rows.append(row)
-        nm = metrics.unit("N m", 1)
-        rad = metrics.unit("rad", 1)
-        ratio = metrics.unit("N m/rad", 1)
-        joint = "axis" if metrics.axes else "joint"
-        felt_heads = ("stiffness felt", joint, "by", f"{nm} more", f"{rad} further", ratio)
-        yield from _tabulate(felt_heads, rows, text_columns=1)
+def _compose_sharing(metrics: LogMetrics) -> Iterator[Block]:
+    """Yields a table of the forces that a site at rest feels while another site is pushed."""
+    if not metrics.sharing_ratios:
+        return
+    joint_header = "joint"
+    unit = "N m"
+    if metrics.axes:
+        joint_header = "axis"
+        unit = metrics.unit("N m", 1)
+    rows = []
+    for pair in metrics.sharing_ratios:
+        wall_note = " (wall)" if pair.by_wall else ""
+        deviation = _NO_NUMBER if pair.off is None else f"{100.0 * pair.off:.3g} %"
+        row = [
+            f"{pair.from_s:.1f} - {pair.to_s:.1f} s",
+            metrics.label(pair.joint),
+            f"{pair.pushed}{wall_note}",
+            _format_value(pair.pushed_nm),
+            pair.holds,
+            _format_value(pair.felt_nm),
+            _format_metric(pair.expected_nm),
+            deviation,
+        ]
+        rows.append(row)
+    headers = (
+        "at rest",
+        joint_header,
+        "ON the arm of",
+        unit,
+        "felt at",
+        unit,
+        "expected",
+        "deviation",
+    )
+    yield from _tabulate(headers, rows, text_columns=1)
+    reasons = dict.fromkeys(pair.expected_nm.why for pair in metrics.sharing_ratios)
+    for reason in reasons:
+        if reason:
+            yield _explain_missing("nothing is expected", reason)
+
+
+def _compose_stiffness(metrics: LogMetrics) -> Iterator[Block]:
+    """Yields a table of the stiffness that sites felt, if it was measured."""
+    if not metrics.stiffness:
+        return
+    rows = []
+    for felt in metrics.stiffness:
+        stiffness = _NO_NUMBER
+        if felt.stiffness_nm_rad is not None:
+            stiffness = _format_value(felt.stiffness_nm_rad)
+        row = [
+            f"{felt.from_s:.1f} to {felt.to_s:.1f} s",
+            metrics.label(felt.joint),
+            felt.site,
+            _format_value(felt.torque_nm),
+            _format_value(felt.angle_rad),
+            stiffness,
+        ]
+        rows.append(row)
+    headers = (
+        "stiffness felt",
+        "axis" if metrics.axes else "joint",
+        "by",
+        f"{metrics.unit('N m', 1)} more",
+        f"{metrics.unit('rad', 1)} further",
+        metrics.unit("N m/rad", 1),
+    )
+    yield from _tabulate(headers, rows, text_columns=1)
 
 
 def _compose_impedance(metrics: LogMetrics) -> Iterator[Block]:
+    """Yields a table of the impedance felt, with a row per frequency, if it was measured."""
     if not metrics.responses:
         return
     rows = []
     for response in metrics.responses:
-        axis = f"{'along' if metrics.axes else 'joint'} {metrics.label(response.joint)}"
+        direction = "along" if metrics.axes else "joint"
         source = f" of {response.of}" if response.of else ""
+        axis = f"{direction} {metrics.label(response.joint)}"
         title = f"{response.kind}{source} at {response.at}, {axis}"
         unit = metrics.unit(response.unit, response.joint)
-        # rounded up: at most _MAX_FREQUENCIES ratios are listed
-        step = -(-len(response.spectrum) // _MAX_FREQUENCIES) or 1
-        ratios = response.spectrum[::step] if len(response.spectrum) > 1 else [response.ratio]
+        ratios: Sequence[FrequencyResponse] = [response.ratio]
+        if len(response.spectrum) > 1:
+            # rounded up: at most _MAX_FREQUENCIES ratios are listed
+            step = -(-len(response.spectrum) // _MAX_FREQUENCIES)
+            ratios = response.spectrum[::step]
         for index, ratio in enumerate(ratios):
-            head = ["" if index else title, unit]
-            if ratio.gain is None:
-                rows.append([*head, "", "", "", "", ratio.why])
-                continue
-            numbers = (ratio.frequency_hz, ratio.gain, ratio.phase_rad, ratio.coherence)
-            cells = [_write_value(value or 0.0) for value in numbers]
-            error = _NO_NUMBER if ratio.error is None else f"{100.0 * ratio.error:.1g} %"
-            rows.append([*head, *cells, f"+- {error}"])
-    heads = ["felt over frequency", "", "Hz", "gain", "phase rad", "coherence", ""]
-    yield from _tabulate(heads, rows, text_columns=2)
+            shown_title = title if index == 0 else ""
+            rows.append([shown_title, unit, *_list_response_cells(ratio)])
+    headers = ["felt over frequency", "", "Hz", "gain", "phase rad", "coherence", ""]
+    yield from _tabulate(headers, rows, text_columns=2)
 
 
-def _write_metric(metric: Metric) -> str:
-    return _NO_NUMBER if metric.value is None else _write_value(metric.value)
+def _list_response_cells(ratio: FrequencyResponse) -> list[str]:
+    """Returns frequency, gain, phase, coherence and error; or the reason why there are none."""
+    if ratio.gain is None:
+        return ["", "", "", "", ratio.why]
+    numbers = (ratio.frequency_hz, ratio.gain, ratio.phase_rad, ratio.coherence)
+    cells = [_format_value(number or 0.0) for number in numbers]
+    error = _NO_NUMBER if ratio.error is None else f"{100.0 * ratio.error:.1g} %"
+    return [*cells, f"+- {error}"]
 
 
-def _write_value(value: float) -> str:
+def _format_metric(metric: Metric) -> str:
+    return _NO_NUMBER if metric.value is None else _format_value(metric.value)
+
+
+def _format_value(value: float) -> str:
     is_whole = value == int(value) and abs(value) < 1e6
     return f"{value:.0f}" if is_whole else f"{value:.4g}"
 
