@@ -247,7 +247,8 @@ def _compute_rest(balance: EnergyBalance) -> Array:
     gained = sum(balance.work.values())
     lost = sum(balance.dissipation.values())
     explained = gained - lost + balance.sampling - balance.transfer
-    return balance.V - balance.V[0] - explained
+    rest: Array = balance.V - balance.V[0] - explained
+    return rest
 
 
 def _describe_v(balance: EnergyBalance, index: int) -> tuple[str, float]:

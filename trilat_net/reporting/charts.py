@@ -216,8 +216,8 @@ class ChartBuilder:
         rate_hz = self._log.scenario.sites[site].rate_hz
         table = ColumnTable(rate_hz=rate_hz, tick=_encode(tick, "<i4"), columns=columns)
         self._tables.append(table)
-        is_finite = np.isfinite(values)
-        self._has_values.append(is_finite.any(axis=0).tolist())
+        has_values: list[bool] = np.isfinite(values).any(axis=0).tolist()
+        self._has_values.append(has_values)
         return len(self._tables) - 1
 
     def _add_decimated(self, site: str, tick: Ints, t_s: Array, values: Values) -> int:
