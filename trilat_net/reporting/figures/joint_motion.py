@@ -407,7 +407,7 @@ def _draw_link_estimates(log: Log, form: FigureSize) -> Figure:
     rows = len(longest.theta) // columns
     with style.time_figure(log, form, 0.8 + 0.74 * rows) as plot:
         grid = style.add_panels(plot.figure, rows, columns, sharex=True)
-        panels: list[Axes] = list(grid.flat)
+        panels: list[Axes] = [*grid.flat]
         for index, (axes, parameter) in enumerate(zip(panels, longest.parameters, strict=True)):
             name, unit = parameter
             link, _, symbol = name.rpartition(".")

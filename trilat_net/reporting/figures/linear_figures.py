@@ -88,7 +88,8 @@ def draw_port_impedance(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> 
 
         # the last row can have fewer joints than columns
         joints_in_last_row = len(joints) - columns * (len(rows) - 1)
-        for axes in grid[-2:, joints_in_last_row:].flat:
+        unused: list[Axes] = [*grid[-2:, joints_in_last_row:].flat]
+        for axes in unused:
             axes.set_visible(False)
         style.add_legend(figure, _list_impedance_entries(ports))
     return figure

@@ -159,7 +159,8 @@ def _add_panels(figure: Figure, log: Log, form: FigureSize) -> list[Axes]:
     """Returns the four panels with labels: two rows of two, or one below another if narrow."""
     rows = 4 if form.narrow else 2
     columns = len(_PANELS) // rows
-    panels = list(style.add_panels(figure, rows, columns, sharex=True).flat)
+    grid = style.add_panels(figure, rows, columns, sharex=True)
+    panels: list[Axes] = [*grid.flat]
     for panel, axes in zip(_PANELS, panels, strict=True):
         name = panel.name.replace(" ", "\n") if form.narrow else panel.name
         axes.set_ylabel(f"{name} ({panel.find_unit(log)})")
