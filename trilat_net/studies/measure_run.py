@@ -415,7 +415,8 @@ class SiteStats:
         """The torque of operator and environment at the last record, shape (n,), N m."""
         if not self._tail:
             return np.zeros(1)
-        return self._tail[-1].tau_x[-1]
+        last_tau_x: Array = self._tail[-1].tau_x[-1]
+        return last_tau_x
 
 
 class LinkAge(msgspec.Struct, frozen=True):
