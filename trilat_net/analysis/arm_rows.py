@@ -445,10 +445,13 @@ class ChainArmRows(NamedTuple):
 
     @property
     def _rows(self) -> RowArray:
+        """The joints in the form that the core's functions expect."""
         return build_chain(self.chain.joints, MAX_JOINTS)
 
     def _column(self, name: str) -> Array:
-        return np.array([getattr(joint, name) for joint in self.chain.joints])
+        """Returns an attribute of all joints, shape (n,)."""
+        values = [getattr(joint, name) for joint in self.chain.joints]
+        return np.array(values)
 
     def _replace_in_joints(self, **values: Any) -> "ChainArmRows":
         """Returns the same chain with some values of every joint replaced."""
@@ -493,15 +496,14 @@ class ChainArmRows(NamedTuple):
         theta_hat has shape (K, 10 n), or (1, 10 n) for all rows.
         """
         torque = np.zeros_like(q)
-        theta_hat, q, qd, v, a = map(np.ascontiguousarray, (theta_hat, q, qd, v, a))
         _put_torques(
             chain=self._rows,
-            theta=theta_hat,
+            theta=np.ascontiguousarray(theta_hat),
             gravity=np.array(self.chain.gravity_m_s2),
-            q=q,
-            qd=qd,
-            v=v,
-            a=a,
+            q=np.ascontiguousarray(q),
+            qd=np.ascontiguousarray(qd),
+            v=np.ascontiguousarray(v),
+            a=np.ascontiguousarray(a),
             torque=torque,
         )
         return torque
@@ -516,14 +518,13 @@ class ChainArmRows(NamedTuple):
     ) -> Array:
         """Returns Y'r of r = qd - v, shape (K, 10 n)."""
         gradient = np.zeros((len(q), len(self.theta)))
-        q, qd, v, a = map(np.ascontiguousarray, (q, qd, v, a))
         _put_gradients(
             chain=self._rows,
             gravity=np.array(self.chain.gravity_m_s2),
-            q=q,
-            qd=qd,
-            v=v,
-            a=a,
+            q=np.ascontiguousarray(q),
+            qd=np.ascontiguousarray(qd),
+            v=np.ascontiguousarray(v),
+            a=np.ascontiguousarray(a),
             gradient=gradient,
         )
         return gradient
@@ -704,7 +705,9 @@ def _chain_positions_m(chain: ChainSetup, q: Array) -> Array:
     """Returns the positions of base, joints and end effector of a chain, (K, n + 2, 3), m."""
     joints = build_chain(chain.joints)
     tip_m = np.array(chain.tip_m)
-    points = np.zeros((len(q), len(joints) + 2, 3))
+    # base, joints and end effector
+    points_per_pose = len(joints) + 2
+    points = np.zeros((len(q), points_per_pose, 3))
     for pose, angles in zip(points, q, strict=True):
         place_joints(joints, np.ascontiguousarray(angles))
         pose[-1] = place_end_effector(joints, tip_m)
@@ -824,7 +827,10 @@ def find_pseudo_inertias(theta: Array) -> Array:
     mass = links[:, 0]
     moment = links[:, 1:4]
     xx, xy, yy, xz, yz, zz = links[:, 4:].T
-    inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    row_x = [xx, xy, xz]
+    row_y = [xy, yy, yz]
+    row_z = [xz, yz, zz]
+    inertia = np.array([row_x, row_y, row_z])
     inertia_of_link = inertia.transpose(2, 0, 1)
     half_trace = 0.5 * (xx + yy + zz)
     S = half_trace[:, np.newaxis, np.newaxis] * np.eye(3) - inertia_of_link

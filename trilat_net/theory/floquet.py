@@ -419,8 +419,8 @@ def _plan_parts(
         stops = [-(-total * n // count) for total in ticks]
         while done != stops:
             for i, stop in enumerate(stops):
-                limits = [computable[i, j][done[j]] for j in peers[i]]
-                until = min([stop, *limits])
+                known_until = [computable[i, j][done[j]] for j in peers[i]]
+                until = min([stop, *known_until])
                 first = done[i]
                 if until > first:
                     runs.append(_TickRun(i, first, until - first))
@@ -658,7 +658,8 @@ def _order_multipliers(mu: Complex, wanted: int) -> NDArray[np.int64]:
     is_smaller = moduli[1:] < (1.0 - _SAME_ROOT) * moduli[:-1]
     rank = np.cumsum(np.append(0, is_smaller))
     is_large = moduli > _SMALLEST * moduli[0]
-    return order[(rank < wanted) & is_large]
+    selected: NDArray[np.int64] = order[(rank < wanted) & is_large]
+    return selected
 
 
 def compute_sampled_spectrum(

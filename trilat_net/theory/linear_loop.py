@@ -171,9 +171,12 @@ def differentiate_references(
         if not has_orientation:
             continue
         for j in {i, *followed}:
-            columns = [pose[:, np.newaxis] + np.zeros(len(pose)) for pose in poses]
-            step = 1j * site_dynamics.COMPLEX_STEP * np.eye(len(poses[j]))
-            columns[j] = columns[j] + step
+            columns = []
+            for pose in poses:
+                zeros = np.zeros(len(pose))
+                columns.append(pose[:, np.newaxis] + zeros)
+            unit_steps = np.eye(len(poses[j]))
+            columns[j] = columns[j] + 1j * site_dynamics.COMPLEX_STEP * unit_steps
             reference = evaluate_reference(shares, columns[i], columns)
             derivatives[i, j] = reference.imag / site_dynamics.COMPLEX_STEP
     return derivatives

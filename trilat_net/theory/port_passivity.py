@@ -154,8 +154,8 @@ def check_against_hands(
         return least
 
     def find_tolerance(w: Array) -> Array:
-        impedance = np.linalg.inv(response(w))
-        return EIGENVALUE_ROUNDING * _find_frobenius_norm(impedance)
+        Z: Complex = np.linalg.inv(response(w)).astype(np.complex128)
+        return EIGENVALUE_ROUNDING * _find_frobenius_norm(Z)
 
     return find_minima(find_least, w_rad_s, tolerance=find_tolerance)
 
@@ -382,7 +382,8 @@ def _shrink_ellipsoids(ellipsoids: Array, step: Array) -> Array:
         return ellipsoids / 4.0
     outer = step[:, :, np.newaxis] * step[:, np.newaxis, :]
     flattened = ellipsoids - 2.0 / (n + 1.0) * outer
-    return n**2 / (n**2 - 1.0) * flattened
+    shrunk: Array = n**2 / (n**2 - 1.0) * flattened
+    return shrunk
 
 
 def _scale_sites(Y: Complex, owner: NDArray[np.int64]) -> Complex:

@@ -304,7 +304,11 @@ class EnergyBalance:
     @property
     def _work_from_outside(self) -> dict[str, Array]:
         """External work by source (hands, walls, stops)."""
-        return {name: self.work[name] for name in EXTERNAL_SOURCES if name in self.work}
+        sources = {}
+        for name in EXTERNAL_SOURCES:
+            if name in self.work:
+                sources[name] = self.work[name]
+        return sources
 
     @property
     def external_work(self) -> Array:
@@ -438,8 +442,7 @@ def _weigh_site(energy: SiteEnergy, left: Array, right: Array) -> dict[tuple[str
 
 def _resample(times: Array, t_s: Array, values: Array) -> Array:
     """Returns values at `t_s` interpolated at `times`; unchanged if the times are equal."""
-    has_same_times = len(t_s) == len(times) and t_s[0] == times[0]
-    if has_same_times:
+    if len(t_s) == len(times) and t_s[0] == times[0]:
         return values
     return np.interp(times, t_s, values)
 

@@ -118,8 +118,9 @@ def derive_site_constants(scenario: Scenario, site: str) -> SiteConstants:
     spec = scenario.sites[site]
     arm = build_arm_rows(scenario, site)
     gains = scenario.gains(site)
-    names = ("Lambda", "Kp", "Kd", "Gamma", "low", "high", "rho", "width", "friction")
-    gain_arrays = {name: np.array(getattr(gains, name)) for name in names}
+    gain_arrays = {}
+    for name in ("Lambda", "Kp", "Kd", "Gamma", "low", "high", "rho", "width", "friction"):
+        gain_arrays[name] = np.array(getattr(gains, name))
     axes: tuple[float, ...] = ()
     if arm.task is not None:
         axes = arm.task.axes
@@ -225,7 +226,9 @@ class SiteMotion:
         """Y'r with which the scheme advances the estimate over a period, shape (K - 1, P)."""
         if self.scheme is Scheme.DIGITAL:
             return self.Yr[:-1]
-        return 0.5 * (self.Yr[:-1] + self.Yr[1:])
+        Yr_left = self.Yr[:-1]
+        Yr_right = self.Yr[1:]
+        return 0.5 * (Yr_left + Yr_right)
 
     def law_torque(self, rows: Ints) -> Array:
         """Returns tau of Eq. (13) without its limit, in some rows, shape (K, n), N m."""
@@ -404,7 +407,8 @@ def evaluate_functional(site: SiteMotion) -> FunctionalParts:
     stiffness = c.Lambda * c.Kd
     e_K_e = (stiffness * records.e**2).sum(axis=1)
     delay_terms = []
-    for alpha, view in zip(site.dominance.alpha.T, site.peers.values(), strict=True):
+    for j, view in enumerate(site.peers.values()):
+        alpha = site.dominance.alpha[:, j]
         delay_terms.append(alpha * _energy_in_transit(c, view))
     return FunctionalParts(
         kinetic=0.5 * r_M_r,
@@ -494,7 +498,8 @@ def compute_dissipation(site: SiteMotion) -> dict[str, Increment]:
         return power
 
     def friction_power(r: Array, qd: Array) -> Array:
-        torque = c.arm.friction(qd) - c.arm.friction(qd - r)
+        friction = c.arm.friction(qd)
+        torque = friction - c.arm.friction(qd - r)
         power: Array = (r * torque).sum(axis=1)
         return power
 
@@ -529,9 +534,11 @@ def compute_transfer(site: SiteMotion, axes: Array) -> Increment:
     left = site_power[:-1]
     right = site_power[1:]
     for j, view in enumerate(site.peers.values()):
+        alpha_left = dominance.alpha[:-1, j]
+        alpha_right = dominance.before[:, j]
         peer_power = 0.5 * _weighted_square(c, view.now.qd)
-        left = left - dominance.alpha[:-1, j] * peer_power[:-1]
-        right = right - dominance.before[:, j] * peer_power[1:]
+        left = left - alpha_left * peer_power[:-1]
+        right = right - alpha_right * peer_power[1:]
     return _trapezoid(site, left, right)
 
 
@@ -676,10 +683,12 @@ def torque_limit_work(site: SiteMotion) -> Increment:
     """Returns the work int r' (tau - tau of Eq. (13)) of limits and rests on the torque."""
     records = site.records
     power = np.zeros(len(records.known))
-    rows = np.flatnonzero(site.limited.any(axis=1) | site.rests)
+    is_limited = site.limited.any(axis=1)
+    rows = np.flatnonzero(is_limited | site.rests)
     if len(rows):
         difference = records.tau[rows] - site.law_torque(rows)
-        power[rows] = (site.r[rows] * difference).sum(axis=1)
+        r = site.r[rows]
+        power[rows] = (r * difference).sum(axis=1)
     return _trapezoid(site, power[:-1], power[1:])
 
 
@@ -809,7 +818,8 @@ def compute_sampling_work(site: SiteMotion) -> Increment:
     c = site.constants
     ends = site.ends
     digital = site.scheme is Scheme.DIGITAL
-    u = hold_torque(records.tau, c.tau_limit, digital=digital)[:-1]
+    held = hold_torque(records.tau, c.tau_limit, digital=digital)
+    u = held[:-1]
     tau_right, Yr_right = _evaluate_before_jump(site)
 
     mean_tau = 0.5 * (records.tau[:-1] + tau_right)
@@ -886,7 +896,8 @@ def _energy_of_jump(site: SiteMotion, de: Array) -> Array:
     ends = site.ends
     if not de.any():
         return np.zeros(len(de))
-    momentum = c.arm.multiply_inertia(site.records.q[1:], ends.r_middle)
+    q_next = site.records.q[1:]
+    momentum = c.arm.multiply_inertia(q_next, ends.r_middle)
     dr = site.following.compute_jump_of_r(slice(1, None), de)
     potential_change = c.Kd * ends.e_middle * c.Lambda * de
     change: Array = (momentum * dr).sum(axis=1)

@@ -206,7 +206,9 @@ def _read_books(log: Log, site: str, law: Any) -> _SiteBooks:
         arm_gave += declared.gravity * (potential - potential[0])
     arm_gave *= declared.weight
     port = arm_gave if declared.port is None else declared.port
-    stored = np.zeros(count) if declared.store is None else _add_parts(declared.store)
+    stored = np.zeros(count)
+    if declared.store is not None:
+        stored = _add_parts(declared.store)
     received = sum(map(_add_parts, declared.took))
     sent = sum(map(_add_parts, declared.gave))
     dissipated = port + (received - sent) - stored
@@ -226,7 +228,8 @@ def _read_books(log: Log, site: str, law: Any) -> _SiteBooks:
 
 def _add_parts(energy: Array) -> Array:
     """Returns the sum of an energy's parts, shape (K,)."""
-    total: Array = energy.reshape(len(energy), -1).sum(axis=1)
+    parts = energy.reshape(len(energy), -1)
+    total: Array = parts.sum(axis=1)
     return total
 
 
@@ -321,13 +324,14 @@ def _find_curves(log: Log, books: Mapping[str, _SiteBooks]) -> Iterator[EnergyCu
             if declared.observed:
                 energies.append(("known", peer, declared.observed[j]))
         for kind, peer, energy in energies:
+            parts = energy.reshape(len(energy), -1)
             yield EnergyCurve(
                 kind=kind,
                 site=site,
                 peer=peer,
                 t_s=site_books.t_s,
                 energy_j=_add_parts(energy),
-                least_j=energy.reshape(len(energy), -1).min(axis=1),
+                least_j=parts.min(axis=1),
             )
         yield EnergyCurve(
             kind="taken",

@@ -102,7 +102,8 @@ class RecordWindow:
             self._columns[name] = slice(width, end)
             width = end
         self._floats = np.zeros((capacity, width))
-        self._used = np.full((capacity, len(self.peers)), -1, dtype=np.int64)
+        shape = (capacity, len(self.peers))
+        self._used = np.full(shape, -1, dtype=np.int64)
         self._known = np.zeros(capacity, dtype=np.bool_)
         self._follows = np.zeros(capacity, dtype=np.bool_)
         self._rests = np.zeros(capacity, dtype=np.bool_)

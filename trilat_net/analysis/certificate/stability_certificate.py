@@ -365,7 +365,11 @@ def _judge_site_balances(run: FunctionalFacts, _: Sequence[Premise]) -> Stabilit
     if not wrong:
         return None
     external = run.log.scenario.external
-    simulated = [site for site in wrong if not {*external} & {site, *energies[site].followed}]
+    simulated = []
+    for site in wrong:
+        involved = {site, *energies[site].followed}
+        if involved.isdisjoint(external):
+            simulated.append(site)
     site = max(simulated or wrong, key=error_j.__getitem__)
     energy = energies[site]
     exceeds = np.abs(energy.unexplained) > compute_bound_j(site)
@@ -387,7 +391,8 @@ def _judge_torques(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdi
     for site, energy in run.energies.items():
         records = energy.motion.records
         error_nm = energy_terms.measure_torque_error(energy.motion)
-        wrong = error_nm > TORQUE_TOLERANCE * (1.0 + np.abs(records.tau).max(axis=1))
+        largest_nm = np.abs(records.tau).max(axis=1)
+        wrong = error_nm > TORQUE_TOLERANCE * (1.0 + largest_nm)
         if wrong.any():
             from_s = records.t_s[int(np.argmax(wrong))]
             text = (
@@ -486,13 +491,14 @@ def _find_largest_rise(balance: EnergyBalance, tolerance: float) -> FunctionalRi
             work_by_source[name if is_link else f"the {name}"] = work
     work_by_source["sampling"] = balance.sampling
     work_by_source["what beta does not cancel"] = -balance.transfer
-    causes = {name: float(work[last] - work[first]) for name, work in work_by_source.items()}
-    largest_first = sorted(causes.items(), key=lambda cause: -cause[1])
-    notable = {
-        name: amount
-        for name, amount in largest_first
-        if amount > NOTABLE_CAUSE_SHARE * rise[last]
-    }
+    causes = {}
+    for name, work in work_by_source.items():
+        causes[name] = float(work[last] - work[first])
+    least_amount = NOTABLE_CAUSE_SHARE * rise[last]
+    notable = {}
+    for name in sorted(causes, key=lambda name: -causes[name]):
+        if causes[name] > least_amount:
+            notable[name] = causes[name]
     return FunctionalRise(
         from_s=float(balance.t_s[first]),
         at_s=float(balance.t_s[last]),

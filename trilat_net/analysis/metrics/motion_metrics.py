@@ -112,7 +112,9 @@ def measure_spread(view: RunView, _run: str) -> MetricValues:
         return unavailable(SPREAD, f"no records of {', '.join(view.absent)}")
     sites = [run.records for run in view.sites.values()]
     rows, known = find_common_rows(sites)
-    poses_by_site = [records.shared[row] for records, row in zip(sites, rows, strict=True)]
+    poses_by_site = []
+    for records, row in zip(sites, rows, strict=True):
+        poses_by_site.append(records.shared[row])
     if not known.any():
         return unavailable(SPREAD, "no instant of which every site has a record")
     poses = np.stack(poses_by_site)[:, known]
@@ -154,10 +156,10 @@ def measure_following(view: RunView, link: str) -> MetricValues:
     master = view.sites[peer].records
     slave = view.sites[site].records
     used = slave.used[peer]
-    row = used - master.first
-    inside = (used >= 0) & (row >= 0) & (row < len(master.known))
-    row = np.clip(row, 0, len(master.known) - 1)
-    known = slave.known & inside & master.known[row]
+    master_row = used - master.first
+    row = np.clip(master_row, 0, len(master.known) - 1)
+    is_recorded = (used >= 0) & (row == master_row)
+    known = slave.known & is_recorded & master.known[row]
     if not known.any():
         return unavailable(FOLLOWING, f"no record of {site} uses a recorded sample of {peer}")
     master_pose = master.shared[row]
@@ -192,10 +194,14 @@ def measure_effort(view: RunView, site: str) -> MetricValues:
     tau = part.tau
     limit_nm = view.log.scenario.sites[site].limits.tau_limit_nm
     at_limit = np.any(np.abs(tau) >= limit_nm, axis=1)
-    changes = np.diff(tau, axis=0)[np.diff(part.tick) == 1]
-    chatter = float(np.abs(changes).mean(axis=0).max()) if len(changes) else None
+    is_successive = np.diff(part.tick) == 1
+    changes = np.abs(np.diff(tau, axis=0)[is_successive])
+    chatter = None
+    if len(changes):
+        chatter = float(changes.mean(axis=0).max())
+    sum_of_squares = float(np.einsum("kj,kj->", tau, tau))
     return {
-        "effort_nm2_s": metric(float(np.einsum("kj,kj->", tau, tau)) / part.rate_hz),
+        "effort_nm2_s": metric(sum_of_squares / part.rate_hz),
         "rms_tau_nm": metric(rms(tau)),
         "peak_tau_nm": metric(peak(tau)),
         "saturated_share": metric(float(at_limit.mean())),
@@ -232,7 +238,8 @@ def measure_wall_contact(view: RunView, name: str) -> MetricValues:
     end_effector = run.torque.end_effector
     force = wall_force(wall, t_s, end_effector)
     touches = force > 0.0
-    was_free = np.concatenate([[False], ~touches[:-1] & known[:-1]])
+    is_known_free = known & ~touches
+    was_free = np.concatenate([[False], is_known_free[:-1]])
     is_hit = touches & was_free
     depth = wall_depth(wall, end_effector)[known]
     metrics = {
@@ -352,8 +359,12 @@ def _estimate_base_parameters(
         theta_hat: estimates in every record, shape (K, P).
     """
     base = find_base_parameters(arm, learnt)
-    first, last = (base.combination @ theta_hat[[0, -1]].T).T.tolist()
-    true_base = None if theta is None else (base.combination @ np.array(theta)).tolist()
+    first_and_last = theta_hat[[0, -1]]
+    estimates = base.combination @ first_and_last.T
+    first, last = estimates.T.tolist()
+    true_base = None
+    if theta is not None:
+        true_base = (base.combination @ np.array(theta)).tolist()
     return BaseEstimates(
         parameter=base.kept.tolist(),
         theta=true_base,
@@ -377,8 +388,8 @@ def _estimate_base_parameters(
 def measure_parameter_error(view: RunView, site: str) -> MetricValues:
     """Returns the estimates' distance from theta, and their rate of change at the end.
 
-    Distance and energy of a chain are those of its base parameters. The remaining errors of the
-    estimates stay as they are and have no effect on the torque.
+    Distance and energy of a chain are computed from its base parameters. The other errors of
+    the estimates never change, and have no effect on the torque.
     """
     scenario = view.scenario
     estimates = view.compute_once(read_all_estimates).get(site)
@@ -393,7 +404,8 @@ def measure_parameter_error(view: RunView, site: str) -> MetricValues:
     metrics = unavailable(LEARNING, "theta of the arm is not known")
     slope = None
     if estimates.slope_per_s is not None:
-        slope = float(np.linalg.norm(np.array(estimates.slope_per_s)[learnt]))
+        learnt_slopes = np.array(estimates.slope_per_s)[learnt]
+        slope = float(np.linalg.norm(learnt_slopes))
     metrics["theta_slope_per_s"] = metric(slope, "less than two records in the last 5 s")
     metrics["unphysical_links"] = Metric(
         None, "it is no chain, of ten parameters a link", applies=False
@@ -440,8 +452,9 @@ def _compute_parameter_energy(
         energy = 0.5 * (errors**2 / Gamma[learnt]).sum(axis=1)
     else:
         B = find_base_parameters(arm, learnt).combination
-        weighted = np.linalg.solve(B * Gamma @ B.T, errors.T).T
-        energy = 0.5 * (errors * weighted).sum(axis=1)
+        gain = B * Gamma @ B.T
+        weighted = np.linalg.solve(gain, errors.T)
+        energy = 0.5 * (errors * weighted.T).sum(axis=1)
     return list(energy.tolist())
 
 

@@ -292,4 +292,5 @@ def _compute_reflected_lag(records: AlignedRecords, peer_records: AlignedRecords
         for joint_torque in peer_torque.T
     ]
     present = np.stack(columns, axis=1)
-    return arrived - present
+    lag: Array = arrived - present
+    return lag

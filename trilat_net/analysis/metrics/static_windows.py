@@ -89,19 +89,25 @@ def find_static_windows(view: RunView) -> list[StaticWindow]:
         rows_by_site[site] = row
         still &= recorded & _find_resting_rows(run)[row]
     window_ticks = int(np.ceil(WINDOW_S * first_records.rate_hz))
-    changes = np.diff(np.concatenate([[False], still, [False]]))
-    edges = np.flatnonzero(changes)
+    framed = np.concatenate([[False], still, [False]])
+    # starts and ends of the intervals in turns
+    edges = np.flatnonzero(np.diff(framed))
     windows = []
     for begin, end in edges.reshape(-1, 2).tolist():
         if end - begin <= window_ticks:
             continue
         ticks = slice(end - window_ticks - 1, end)
         window_rows = {site: row[ticks] for site, row in rows_by_site.items()}
-        torques = [runs[site].records.tau_x[row] for site, row in window_rows.items()]
-        largest_nm = max(float(np.abs(torque).max()) for torque in torques)
-        variation_nm = max(float(np.ptp(torque, axis=0).max()) for torque in torques)
-        reference_nm = max(largest_nm, MIN_LOAD_NM)
-        if not variation_nm > MAX_TORQUE_VARIATION * reference_nm:
+        largest_nm = []
+        variation_nm = []
+        for site, row in window_rows.items():
+            torque = runs[site].records.tau_x[row]
+            ranges = np.ptp(torque, axis=0)
+            largest_nm.append(float(np.abs(torque).max()))
+            variation_nm.append(float(ranges.max()))
+        reference_nm = max(max(largest_nm), MIN_LOAD_NM)
+        # also if the variation is NaN
+        if not max(variation_nm) > MAX_TORQUE_VARIATION * reference_nm:
             window = _average_window(runs, window_rows, first_records.t_s[ticks])
             windows.append(window)
     return windows
@@ -149,13 +155,18 @@ def _average_window(
     )
     for i, (site, run) in enumerate(runs.items()):
         row = rows[site]
-        script = run.torque.script
-        window.torque[site] = -run.records.tau_x[row].mean(axis=0)
-        window.environment[site] = run.torque.environment[row].mean(axis=0)
-        window.script[site] = None if script is None else script[row].mean(axis=0)
-        window.q[site] = run.records.q[row].mean(axis=0)
-        for j, peer in enumerate(run.records.used):
-            window.alpha[i, names.index(peer)] = run.dominance.alpha[row[-1], j]
+        records = run.records
+        torque = run.torque
+        window.torque[site] = -records.tau_x[row].mean(axis=0)
+        window.environment[site] = torque.environment[row].mean(axis=0)
+        window.script[site] = None
+        if torque.script is not None:
+            window.script[site] = torque.script[row].mean(axis=0)
+        window.q[site] = records.q[row].mean(axis=0)
+        # shares are constant in the window
+        alpha = run.dominance.alpha[row[-1]]
+        for peer, share in zip(records.used, alpha.tolist(), strict=True):
+            window.alpha[i, names.index(peer)] = share
     return window
 
 
