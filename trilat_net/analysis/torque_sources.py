@@ -332,10 +332,9 @@ def _evaluate_scripted_torque(source: TorqueSource, t_s: Array) -> Array:
     if source.kind is TorqueKind.RECORDED:
         assert source.table is not None
         table_s = source.table[:, 0]
-        torques = source.table[:, 1:].T
         columns = []
-        for torque in torques:
-            column = np.interp(t_s, table_s, torque, left=0.0, right=0.0)
+        for joint_torque in source.table[:, 1:].T:
+            column = np.interp(t_s, table_s, joint_torque, left=0.0, right=0.0)
             columns.append(column)
         return np.stack(columns, axis=1)
     if source.kind is TorqueKind.PULSE:
@@ -518,8 +517,9 @@ def _find_arm_damping(
         acts_in_all_rows = actor.start_s <= t_s[0] and actor.end_s > t_s[-1]
         if is_damper and acts_in_all_rows:
             viscous.append(actor.B)
-    joints = J.shape[2]
-    D = np.sum([np.zeros(joints), *viscous], axis=0)
+    D = np.zeros(J.shape[2])
+    for B in viscous:
+        D = D + np.array(B)
     lever_arms = np.einsum("kij,i->kj", J, np.array(wall.b))
     squared_arms = lever_arms**2
     with np.errstate(divide="ignore", invalid="ignore"):
