@@ -126,6 +126,7 @@ class WatchedCode:
             result = call()
         finally:
             self._running_tick = -1
+
         elapsed_ns = self._clock.monotonic_ns() - begun_ns
         if elapsed_ns > SHARE * self._period_ns:
             # If the number of involuntary switches has changed, the thread was interrupted.

@@ -234,7 +234,7 @@ class DeviceHand:
             stopped: Function that returns True to end the call.
             say: Function that prints a line for the user.
         """
-        is_present: bool | None = None
+        is_present: bool | None = None  # None before the first attempt
         while not (stopped() or self._hand.over):
             try:
                 with self._device:

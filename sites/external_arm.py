@@ -88,14 +88,15 @@ class ExternalArm:
         self._ring = ring
         self._dropped = dropped
         self._speed_limits = site.speed_limits
-        self._accepted_ns = 0
+        self._accepted_ns = 0  # arrival of the newest accepted measurement
         self._reported_order = ""
         self._clock = clock
         self._address = address
+        # Start of the driver that is followed, and number of its newest measurement.
         self._boot = -1
         self._n = -1
-        self._is_bound = False
-        self._is_counting = False
+        self._is_bound = False  # True once the session has started, see `bind`
+        self._is_counting = False  # True once missing measurements are counted
         self._silent_ns = 0
         self._polled_ns: int | None = None
 

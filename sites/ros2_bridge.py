@@ -649,7 +649,7 @@ def describe_target(
     live = scenario.sites[site].find_live_hand(is_open=True)
     assert live is not None
     end_effector = scenario.arms[site].end_effector(scenario.sites[site].q0_rad)
-    axes = len(end_effector)
+    axes = len(end_effector)  # 2 for an arm in a plane, 3 in space
     if live.mode == "joint":
         read = partial(read_joint_target, list_joint_names(scenario, site))
         return "target_joint", cdr.JOINT_STATE, read, hand.turn

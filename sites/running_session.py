@@ -104,6 +104,7 @@ class ShareHistory:
                 earlier than in the previous call.
         """
         started = sorted(ramp for ramp in self._later_ramps if ramp.start_ns <= t_ns)
+        # A ramp starts from the factors that the previous one had reached by then.
         for ramp in started:
             self._shares_before = self._interpolate(ramp.start_ns)
             self._ramp = ramp
@@ -582,8 +583,10 @@ class RunningSession:
         try:
             yield judgements.append
         finally:
-            judgement = judgements[-1] if judgements else None
-            outcome = {True: "succeeded", False: "failed", None: "ended"}[judgement]
+            outcome = "ended"
+            if judgements:
+                has_succeeded = judgements[-1]
+                outcome = "succeeded" if has_succeeded else "failed"
             self.mark(f"episode {name} {outcome}")
 
     @contextmanager

@@ -481,6 +481,7 @@ class RunningSite:
         """
         parts = self._parts
         nominal_ns = tick_ns(k + 1, parts.site.rate_hz)
+        # Start of the session as the present schedule implies it, for sites that join late.
         grid_ns = self._timing.schedule.due_ns(k + 1) - nominal_ns
         self._publisher.update(ticks=k + 1, grid_ns=grid_ns)
         self._publisher.answer_queries()
@@ -488,6 +489,7 @@ class RunningSite:
         self._publish_clocks(notices, t_ns)
         self._watch_members(t_ns)
         self._rejoin(t_ns)
+
         if parts.hand is not None:
             for _, text in parts.hand.news:
                 _, _, text_without_site = text.partition(": ")
@@ -496,6 +498,7 @@ class RunningSite:
         self._publish_news("mark", parts.changes.marks)
         self._publish_skipped(k, t_ns)
         self._publish_waiting(k, t_ns)
+
         second = t_ns // NS_PER_S
         if self._output is not None and second >= self._status_s + STATUS_PERIOD_S:
             self._status_s = second
@@ -817,7 +820,10 @@ class RunningSite:
             return "", ""
         if parts.interrupt.is_requested():
             return parts.name, f", ended by {signal.Signals(parts.interrupt.number).name}"
-        return next(iter(monitor.departed), ""), f": {self._departures}"
+
+        # The site has waited too long for peers that left.
+        first_departed = next(iter(monitor.departed), "")
+        return first_departed, f": {self._departures}"
 
     def _publish_end_event(self, kind: str, text: str, about: str = "") -> None:
         """Publishes an event with the number of executed ticks and the time of the last one."""

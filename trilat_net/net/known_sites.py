@@ -179,17 +179,18 @@ def find_known_endpoints(session: str, connection: "Connection") -> list[Endpoin
     Returns:
         The endpoints. None if not all sites of the session are known.
     """
-    keyed = bool(connection.keys_of)
+    has_keys = bool(connection.keys_of)
     known_sites = [
         known
         for known in find_known_sites(session)
-        if known.mode == connection.mode and known.keyed == keyed
+        if known.mode == connection.mode and known.keyed == has_keys
     ]
     if not known_sites:
         return None
-    if {known.site for known in known_sites} != set(known_sites[0].sites):
-        return None
-    return list_endpoints(known_sites)
+
+    known_names = {known.site for known in known_sites}
+    all_names = set(known_sites[0].sites)
+    return list_endpoints(known_sites) if known_names == all_names else None
 
 
 def stop_at_once(arguments: Sequence[str]) -> int | list[str]:

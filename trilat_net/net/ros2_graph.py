@@ -143,9 +143,11 @@ def parse_attachment(content: Any) -> Attachment | None:
         The attachment. None if there is none, or if it does not have the format of ROS.
     """
     data = b"" if content is None else bytes(content)
-    if len(data) != _ATTACHMENT.size or data[16] != _GID_BYTES:
+    if len(data) != _ATTACHMENT.size:
         return None
-    number, sent_unix_ns, _, gid = _ATTACHMENT.unpack(data)
+    number, sent_unix_ns, gid_length, gid = _ATTACHMENT.unpack(data)
+    if gid_length != _GID_BYTES:
+        return None
     return Attachment(number, sent_unix_ns, gid)
 
 

@@ -195,7 +195,8 @@ class LinkTimingMonitor:
         self.worst_ns = 0
         self.contradicted = False
         self.is_unacknowledged = False
-        self._received_ns = -1
+        self._received_ns = -1  # arrival of the newest sample
+        # Newest tick that the peer has acknowledged, and arrival of that acknowledgement.
         self._acknowledged_ns = -1
         self._acknowledged_tick = -1
         self._epoch_ns = peer.epoch_ns
