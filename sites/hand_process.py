@@ -70,11 +70,13 @@ class HandProcess(SiteClient):
         self._program = program
         self._code = hand_site.source
         self._pushes = hand_site.spec.mode == "force"
-        self._every = hand_site.scenario.sites[hand_site.name].rate_hz // hand_site.rate_hz
+        site_rate_hz = hand_site.scenario.sites[hand_site.name].rate_hz
+        self._ticks_per_view = site_rate_hz // hand_site.rate_hz
         self._sender = make_hand_sender(bus, clock, session, hand_site.name)
         self._views = bus.inbox(topics.key(session, hand_site.name, topics.VIEW), VIEWS_KEPT)
         self._announced_ns = 0
         self._waiting_views = deque[HandViewMessage]()
+        # A view must be answered within the delay with which decisions act.
         self._max_waiting = max(1, int(hand_site.delay_s * hand_site.rate_hz))
 
     def serve(self) -> None:
@@ -125,7 +127,7 @@ class HandProcess(SiteClient):
         """
         goal_field = "force" if self._pushes else "target"
         fields = {goal_field: goal or [], "grip": goal is not None}
-        self._sender.send(HandMessage, source=self._code, n=k // self._every, **fields)
+        self._sender.send(HandMessage, source=self._code, n=k // self._ticks_per_view, **fields)
 
 
 def read_view(message: HandViewMessage) -> HandView:

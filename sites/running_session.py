@@ -606,8 +606,9 @@ class RunningSession:
             records = bus.inbox(topics.key(self.name, site, topics.STATE), 256)
             events = bus.inbox(topics.key(self.name, site, topics.EVENT), 256)
             scenario = parse_embedded(info.scenario, self.name)
-            now_ns = 0
+            now_ns = 0  # time of the newest record, since the epoch
             history = ShareHistory(scenario, site)
+            # Changes from before the subscription.
             for event in list_past_events(bus, self._clock, self.name, site):
                 history.add_change(event.command)
 
@@ -615,7 +616,8 @@ class RunningSession:
                 nonlocal now_ns
                 for event in read_messages(events, Event):
                     history.add_change(event.command)
-                now_ns = max([now_ns, *(record.t_ns for record in read_records(records))])
+                for record in read_records(records):
+                    now_ns = max(now_ns, record.t_ns)
                 shares = history.advance_to(now_ns)
                 return dict(zip(scenario.peers(site), shares, strict=True))
 

@@ -310,15 +310,16 @@ def _describe_delays(samples: Sequence[tuple[int, int]], lasted_s: float) -> dic
         lasted_s: Duration of the measurement, in s.
     """
     numbers = {number for number, _ in samples}
+    sent = max(numbers) - min(numbers) + 1
     delays_us = np.array([delay_ns for _, delay_ns in samples]) / 1e3
     counts, edges_us = np.histogram(delays_us, bins=20)
-    percents = {"min": 0.0, "p50": 50.0, "p99": 99.0, "max": 100.0}
+    quantiles_us = {}
+    for name, percent in (("min", 0.0), ("p50", 50.0), ("p99", 99.0), ("max", 100.0)):
+        quantiles_us[name] = float(np.percentile(delays_us, percent))
     return {
         "messages": len(samples),
-        "lost": max(numbers) - min(numbers) + 1 - len(numbers),
+        "lost": sent - len(numbers),
         "rate_hz": len(samples) / lasted_s,
-        "delay_us": {
-            name: float(np.percentile(delays_us, percent)) for name, percent in percents.items()
-        },
+        "delay_us": quantiles_us,
         "histogram": {"edges_us": edges_us.tolist(), "counts": counts.tolist()},
     }

@@ -303,13 +303,17 @@ class SiteParts:
         changes = list(self.changes.pop_changes(k))
         if self.arm is None:
             return changes
-        # A site that joins a running session starts at a later tick, and has skipped none.
-        skipped = k - self._next_tick if self._next_tick >= 0 else 0
+
+        # The first tick has skipped none, also if it is the late first tick of a site that
+        # joins a running session.
+        is_first_tick = self._next_tick < 0
+        skipped = 0 if is_first_tick else k - self._next_tick
         self._next_tick = k + 1
-        mode = self.site.mode
         if skipped:
             self.buffer.skip(k - skipped, k)
             changes.append(self._make_order_change(k, "overrun", skipped))
+
+        mode = self.site.mode
         orders: list[SiteOrder] = [self.arm.pop_order(mode)]
         if self.switch is not None:
             orders.append(self.switch.pop_order(mode, self.site.life_reason))
@@ -386,7 +390,11 @@ def watch_law(
         return LawFailed(problem, site=site.name, code=law.code, tick=k)
 
     code = WatchedCode(f"the law {law.code}", site.rate_hz, fail, clock)
-    return CodeWatchdog(code), lambda tick: code.run(tick.k, lambda: site.step(tick))
+
+    def step(inputs: TickInput) -> TickRecord:
+        return code.run(inputs.k, lambda: site.step(inputs))
+
+    return CodeWatchdog(code), step
 
 
 def _run_warm_up(setup: SiteSetup, site: Site, step: Callable[[TickInput], TickRecord]) -> None:

@@ -219,12 +219,19 @@ class _AdmissibleLines:
         # Times are negative: each limit is relaxed by WANDER for every second of its age.
         self._relaxed_ceilings = self._ceilings - WANDER * self._ceiling_times_s
         self._relaxed_floors = self._floors + WANDER * self._floor_times_s
+
+        # Slope of the line through each pair of a ceiling (row) and a floor (column). A line
+        # below the ceiling and above the floor has at most this slope if the ceiling is later
+        # than the floor, and at least this slope if the ceiling is earlier.
         intervals_s = self._ceiling_times_s[:, None] - self._floor_times_s[None, :]
         gaps = self._relaxed_ceilings[:, None] - self._relaxed_floors[None, :]
         slopes = np.divide(gaps, intervals_s, out=np.zeros_like(gaps), where=intervals_s != 0.0)
-        # A ceiling after a floor limits the slope from above, a ceiling before one from below.
-        self.steepest = float(np.min(slopes, where=intervals_s > 0.0, initial=DRIFT_LIMIT))
-        self.flattest = float(np.max(slopes, where=intervals_s < 0.0, initial=-DRIFT_LIMIT))
+        is_later = intervals_s > 0.0
+        is_earlier = intervals_s < 0.0
+        self.steepest = float(np.min(slopes, where=is_later, initial=DRIFT_LIMIT))
+        self.flattest = float(np.max(slopes, where=is_earlier, initial=-DRIFT_LIMIT))
+
+        # At the same time, the ceiling must not be below the floor.
         simultaneous_gap = np.min(gaps, where=intervals_s == 0.0, initial=0.0)
         self.exist = bool(simultaneous_gap >= 0.0 and self.flattest <= self.steepest)
 

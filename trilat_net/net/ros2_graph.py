@@ -425,7 +425,7 @@ class Ros2Graph:
         return bool(self._session.info.routers_zid())
 
     def publisher(self, topic: str, kind: str, qos: QualityOfService) -> TopicPublisher:
-        """Creates a publisher.
+        """Creates a publisher of a topic, which ROS programs see.
 
         Args:
             topic: Name of the topic.

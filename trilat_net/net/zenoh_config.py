@@ -604,6 +604,7 @@ def make_access_rules(members: Sequence[str]) -> dict[str, Any]:
 
 
 _LIVELINESS = "liveliness_token", "declare_liveliness_subscriber", "liveliness_query"
+"""Kinds of messages about which members are present."""
 _ALL_MESSAGES = (
     "put",
     "delete",
@@ -633,19 +634,23 @@ def _derive_rules(member: str, role: _Role) -> Iterator[dict[str, Any]]:
 
     published = keys(member, role.publishes) + keys("*", role.addresses)
     received = keys("*", role.hears) + keys(member, role.hears_addressed)
+    local_presence = [topics.presence_key("*", member)]
     all_presences = [topics.presence_key("*", "*")]
+    watch_presence = ["declare_liveliness_subscriber", "liveliness_query"]
+
+    # What the member may send: its messages, its wish to receive messages, its replies, its
+    # queries, and the news that it is present.
     yield _make_rule(["ingress"], ["put"], published)
     yield _make_rule(["ingress"], ["declare_subscriber"], received)
     yield _make_rule(["ingress"], ["declare_queryable", "reply"], keys(member, role.answers))
     yield _make_rule(["ingress"], ["query"], keys("*", role.asks))
-    yield _make_rule(["ingress"], ["liveliness_token"], [topics.presence_key("*", member)])
-    yield _make_rule(
-        ["ingress"], ["declare_liveliness_subscriber", "liveliness_query"], all_presences
-    )
+    yield _make_rule(["ingress"], ["liveliness_token"], local_presence)
+    yield _make_rule(["ingress"], watch_presence, all_presences)
+
+    # What may be sent to the member: the counterparts of these messages.
+    published_by_all = keys("*", (*role.publishes, *role.addresses))
     yield _make_rule(["egress"], ["put"], received)
-    yield _make_rule(
-        ["egress"], ["declare_subscriber"], keys("*", (*role.publishes, *role.addresses))
-    )
+    yield _make_rule(["egress"], ["declare_subscriber"], published_by_all)
     yield _make_rule(["egress"], ["query"], keys("*", role.answers))
     yield _make_rule(["egress"], ["declare_queryable", "reply"], keys("*", role.asks))
     yield _make_rule(["egress"], _LIVELINESS, all_presences)
