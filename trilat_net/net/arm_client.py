@@ -513,6 +513,7 @@ class Hand(SiteClient):
         """Force of the operator ON the arm in the newest record, in N.
 
         For `turn`, these are the torques on the joints in N m.
+
         An operator with a target pulls the arm like a spring and a damper,
 
             F = K (target - pose) + B (target rate - pose rate).

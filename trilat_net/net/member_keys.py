@@ -114,13 +114,16 @@ def create_keys(
     faults = [_find_name_fault(members), *map(_find_host_fault, hosts)]
     if not 0 <= days <= MOST_DAYS:
         faults.append(f"keys hold for 0 to {MOST_DAYS} days, not {days}")
-    if fault := next(filter(None, faults), ""):
-        raise UsageError(fault)
-    is_occupied = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
+    for fault in faults:
+        if fault:
+            raise UsageError(fault)
+    is_empty_folder = folder.is_dir() and not any(folder.iterdir())
+    is_occupied = folder.exists() and not is_empty_folder
     if not folder.name or is_occupied:
         raise UsageError(
             f"{folder}: there is something already; keys are never replaced, name a new folder"
         )
+
     make_folder(folder.parent)
     with stage_output(folder, force=False, manifest=MEMBERS) as staged:
         staged.chmod(0o700)
@@ -201,18 +204,20 @@ def renew_keys(folder: str | Path, members: Sequence[str] = (), days: int = 30) 
         ) from None
     if authority_key.public_key() != old_authority.public_key():
         raise UsageError(f"{authority_folder}: the private key is not that of the certificate")
+
     present = [path.name for path in sorted(folder.iterdir()) if (path / MEMBERS).is_file()]
-    chosen = list(members) or present
-    if missing := [name for name in chosen if name not in present]:
+    names = list(members) or present
+    missing = [name for name in names if name not in present]
+    if missing:
         raise UsageError(
             f"{folder}: holds no keys of {', '.join(missing)}; it has {', '.join(present)}"
         )
+
     ends = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=days)
     authority = _sign_authority(authority_key, ends)
     # All certificates are signed before the first write, so that a fault changes no file.
     renewed = {
-        name: _renew_member(folder / name, old_authority, authority_key, ends)
-        for name in chosen
+        name: _renew_member(folder / name, old_authority, authority_key, ends) for name in names
     }
     for name, (certificate, member_list) in renewed.items():
         write_whole(folder / name / AUTHORITY, _encode(authority), mode=0o600)
@@ -220,7 +225,7 @@ def renew_keys(folder: str | Path, members: Sequence[str] = (), days: int = 30) 
         # The list comes last, because it states the new end of the keys.
         write_whole(folder / name / MEMBERS, member_list, mode=0o600)
     write_whole(authority_folder / AUTHORITY, _encode(authority), mode=0o600)
-    return [folder / name for name in chosen]
+    return [folder / name for name in names]
 
 
 def _renew_member(

@@ -330,11 +330,13 @@ def check_zenoh_file(
     if not isinstance(stated, dict):
         raise UsageError(f"{source}: a Zenoh configuration is one object in braces")
     settings = _remove_nulls(stated)
-    if reason := refusal(settings):
+    reason = refusal(settings)
+    if reason:
         refused = list(_find_refused_keys(settings, refusal, ()))
         problems = [f"{'/'.join(path)}: {_suggest_key(path, why)}" for path, why in refused]
         raise UsageError(_list_problems(source, problems or [reason]))
-    if problems := list(_find_problems(settings)):
+    problems = list(_find_problems(settings))
+    if problems:
         raise UsageError(_list_problems(source, problems))
     for path in (*_SET_BY_MODE, "low_pass_filter"):
         # The check has shown that the session's own value is the same.
