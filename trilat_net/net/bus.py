@@ -154,16 +154,16 @@ class Bus(Protocol):
 @lru_cache(256)
 def _compile_expression(expression: str) -> re.Pattern[str]:
     """Converts a key with wildcards to a regular expression, see `matches_key`."""
-    patterns = []
+    pattern = ""
     for chunk in expression.split("/"):
-        literals = map(re.escape, chunk.split("$*"))
         if chunk == "**":
-            patterns.append("(?:/[^/]+)*")
+            pattern += "(?:/[^/]+)*"
         elif chunk == "*":
-            patterns.append("/[^/]+")
+            pattern += "/[^/]+"
         else:
-            patterns.append("/" + "[^/]*".join(literals))
-    return re.compile("".join(patterns))
+            literals = map(re.escape, chunk.split("$*"))
+            pattern += "/" + "[^/]*".join(literals)
+    return re.compile(pattern)
 
 
 def matches_key(expression: str, key: str) -> bool:

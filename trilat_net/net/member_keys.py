@@ -113,7 +113,7 @@ def create_keys(
     folder = Path(folder)
     faults = [_find_name_fault(members), *map(_find_host_fault, hosts)]
     if not 0 <= days <= MOST_DAYS:
-        faults.append(f"keys hold for 0 to {MOST_DAYS} days, not {days}")
+        faults.append(f"keys are valid for 0 to {MOST_DAYS} days, not {days}")
     for fault in faults:
         if fault:
             raise UsageError(fault)
@@ -121,7 +121,7 @@ def create_keys(
     is_occupied = folder.exists() and not is_empty_folder
     if not folder.name or is_occupied:
         raise UsageError(
-            f"{folder}: there is something already; keys are never replaced, name a new folder"
+            f"{folder}: exists already; keys are never replaced, name a new folder"
         )
 
     make_folder(folder.parent)
@@ -136,13 +136,13 @@ def _find_name_fault(members: Sequence[Any]) -> str:
     for name in members:
         has_valid_letters = isinstance(name, str) and re.fullmatch("[A-Za-z0-9_-]+", name)
         if not has_valid_letters or len(name) > MOST_LETTERS or name == _AUTHORITY_FOLDER:
-            hint = "" if str(name).isascii() else "; its letters are a to z and A to Z"
+            hint = "" if str(name).isascii() else "; letters are a to z and A to Z"
             return (
-                f"a member's name is at most {MOST_LETTERS} letters, digits, _ and -, and not "
-                f"{_AUTHORITY_FOLDER}, not {ascii(name)[:80]}{hint}"
+                f"a member's name has at most {MOST_LETTERS} letters, digits, _ and -, and is "
+                f"not {_AUTHORITY_FOLDER}; this name is refused: {ascii(name)[:80]}{hint}"
             )
     if not members or len(members) > len(set(members)):
-        return "every member is named once, and there is one"
+        return "name at least one member, and each member once"
     return ""
 
 
@@ -188,7 +188,7 @@ def renew_keys(folder: str | Path, members: Sequence[str] = (), days: int = 30) 
     """
     folder = Path(folder)
     if not 0 <= days <= MOST_DAYS:
-        raise UsageError(f"keys hold for 0 to {MOST_DAYS} days, not {days}")
+        raise UsageError(f"keys are valid for 0 to {MOST_DAYS} days, not {days}")
     authority_folder = folder / _AUTHORITY_FOLDER
     try:
         old_authority = x509.load_pem_x509_certificate(
@@ -199,18 +199,21 @@ def renew_keys(folder: str | Path, members: Sequence[str] = (), days: int = 30) 
         )
     except (OSError, ValueError, TypeError) as error:
         raise UsageError(
-            f"{authority_folder}: no authority ({error}): without it, make new keys for all "
-            "with trilat keys new"
+            f"{authority_folder}: no authority ({error}); without it, make new keys for all "
+            "members with trilat keys new"
         ) from None
     if authority_key.public_key() != old_authority.public_key():
-        raise UsageError(f"{authority_folder}: the private key is not that of the certificate")
+        raise UsageError(
+            f"{authority_folder}: private key and certificate do not belong together"
+        )
 
     present = [path.name for path in sorted(folder.iterdir()) if (path / MEMBERS).is_file()]
     names = list(members) or present
     missing = [name for name in names if name not in present]
     if missing:
         raise UsageError(
-            f"{folder}: holds no keys of {', '.join(missing)}; it has {', '.join(present)}"
+            f"{folder}: has no keys of {', '.join(missing)}; there are keys of "
+            f"{', '.join(present)}"
         )
 
     ends = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=days)
@@ -447,13 +450,13 @@ def _check_permissions(path: Path, status: os.stat_result) -> None:
     user = os.geteuid()
     if user != 0 and status.st_uid not in (0, user):
         raise UsageError(
-            f"{path}: belongs to another user, who can change it: take keys of your own"
+            f"{path}: belongs to another user, who can change it: use keys of your own"
         )
     is_sticky_folder = stat.S_ISDIR(status.st_mode) and status.st_mode & stat.S_ISVTX
     others_may_write = status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
     if others_may_write and not is_sticky_folder:
         raise UsageError(
-            f"{path}: others may write it, and so say who takes part: chmod go-w {path}"
+            f"{path}: others can write it and decide who takes part: chmod go-w {path}"
         )
 
 
@@ -478,7 +481,8 @@ def read_member_keys(folder: str | Path, *, stops: bool = False) -> MemberKeys:
     folder = Path(folder)
     if (folder / _AUTHORITY_FOLDER).is_dir():
         raise UsageError(
-            f"{folder}: holds the keys of all; name the folder of one member, as in {folder}/m1"
+            f"{folder}: has the keys of all members; name the folder of one member, as in "
+            f"{folder}/m1"
         )
     try:
         _check_permissions(folder, folder.stat())
@@ -552,12 +556,12 @@ def _find_key_fault(
         ),
         (
             common_name != member,
-            f"the certificate is that of {common_name}, and {MEMBERS} names {member}",
+            f"the certificate is for {common_name}, but {MEMBERS} names {member}",
         ),
         (member not in members, f"{MEMBERS} does not list {member}"),
         (
             key.public_key() != certificate.public_key(),
-            "the private key is not that of the certificate",
+            "private key and certificate do not belong together",
         ),
         (
             begins > now,

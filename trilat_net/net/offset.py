@@ -112,10 +112,10 @@ class OffsetEstimate(NamedTuple):
             offset_ns: Value that is used for the offset at that time, in ns.
         """
         passed_s = (local_ns - self.local_ns) / NS_PER_S
-        upper_drift = self.drift_high
-        lower_drift = self.drift_low
-        if passed_s < 0.0:  # before the estimate, a smaller drift gives a larger offset
-            upper_drift, lower_drift = lower_drift, upper_drift
+        # Before the time of the estimate, a smaller drift gives a larger offset.
+        is_later = passed_s >= 0.0
+        upper_drift = self.drift_high if is_later else self.drift_low
+        lower_drift = self.drift_low if is_later else self.drift_high
         error_above = self.high_ns - offset_ns + passed_s * upper_drift
         error_below = offset_ns - self.low_ns - passed_s * lower_drift
         return max(0, math.ceil(max(error_above, error_below)))
@@ -237,13 +237,10 @@ class _AdmissibleLines:
 
     def _read_columns(self, limits: deque[OffsetLimit]) -> tuple[Array, Array]:
         """Returns the times of limits in s relative to the present, and their offsets in ns."""
-        times_ns = np.array(
-            [min(0, limit.local_ns - self._now_ns) for limit in limits], dtype=np.float64
-        )
-        offsets_ns = np.array(
-            [limit.offset_ns - self._base_ns for limit in limits], dtype=np.float64
-        )
-        return times_ns / NS_PER_S, offsets_ns
+        times_ns = [min(0, limit.local_ns - self._now_ns) for limit in limits]
+        offsets_ns = [limit.offset_ns - self._base_ns for limit in limits]
+        times_s = np.array(times_ns, dtype=np.float64) / NS_PER_S
+        return times_s, np.array(offsets_ns, dtype=np.float64)
 
     def estimate(self) -> OffsetEstimate:
         """Returns the middle line as the estimate, with the range of all lines as limits."""
@@ -299,8 +296,8 @@ class _AdmissibleLines:
                 level = sign * (values - slope * times)
                 excess = (level - level.min()) if round_index else np.zeros_like(level)
                 weights = (excess + _NOISE_NS) ** -2.0
-                total_weight = weights.sum()
-                from_mean = times - (weights * times).sum() / total_weight
+                mean_time = (weights * times).sum() / weights.sum()
+                from_mean = times - mean_time
                 numerator += float((weights * from_mean * values).sum())
                 denominator += float((weights * from_mean**2).sum())
             slope = numerator / denominator
@@ -330,11 +327,10 @@ class _SlewSegment:
         self._joined_offset_ns = estimate.extrapolate_ns(self._joined_ns)
         self._approach_rate = (self._joined_offset_ns - offset_ns) / SLEW_NS
         self._drift_per_ns = estimate.drift / NS_PER_S
-        # The bound is convex over the slew, so it is largest at one of the two ends.
-        self.bound_ns = max(
-            estimate.error_bound_ns(start_ns, offset_ns),
-            estimate.error_bound_ns(self._joined_ns, self._joined_offset_ns),
-        )
+        # The bound is convex over the slew, so the largest bound is at one of the two ends.
+        start_bound_ns = estimate.error_bound_ns(start_ns, offset_ns)
+        joined_bound_ns = estimate.error_bound_ns(self._joined_ns, self._joined_offset_ns)
+        self.bound_ns = max(start_bound_ns, joined_bound_ns)
 
     def evaluate_ns(self, local_ns: int) -> int:
         """Returns the offset in use at a time of the local clock, in ns."""
@@ -404,4 +400,6 @@ class SlewedOffset:
 
     def _select_segment(self, local_ns: int) -> _SlewSegment:
         """Returns the part of the offset in use to which a time belongs."""
-        return self._segment if local_ns >= self._segment.start_ns else self._previous_segment
+        if local_ns >= self._segment.start_ns:
+            return self._segment
+        return self._previous_segment

@@ -220,7 +220,7 @@ def _require_session_value(session_values: Mapping[str, Any]) -> _Requirement:
     return are_session_values, f"left out, or as a session sets it itself: {listed}"
 
 
-_MUST_BE_OFF = _require_value(False, "false: members meet at named endpoints and nowhere else")
+_MUST_BE_OFF = _require_value(False, "false: members connect only at named endpoints")
 _MUST_BE_EMPTY = _require_value([], "empty: it would change or thin out a session's messages")
 _TX = "transport/link/tx"
 
@@ -355,7 +355,7 @@ def _list_problems(source: str, problems: Sequence[str]) -> str:
     if len(problems) == 1:
         return f"{source}: {problems[0]}"
     count = count_nouns(len(problems), "setting")
-    return f"{source}: {count} cannot be taken: {'; '.join(problems)}"
+    return f"{source}: {count} cannot be accepted: {'; '.join(problems)}"
 
 
 def _find_problems(settings: Mapping[str, Any]) -> Iterator[str]:
@@ -378,7 +378,7 @@ def _find_problems(settings: Mapping[str, Any]) -> Iterator[str]:
             except OSError as error:
                 yield f"{key}: {value} cannot be read: {error.strerror}"
     if settings.get("access_control") and "enabled" not in settings["access_control"]:
-        yield "access_control: has no `enabled: true`, without which Zenoh lets everybody in"
+        yield "access_control: has no `enabled: true`, without which Zenoh admits everybody"
 
 
 _SET_BY_MODE = (
@@ -485,8 +485,8 @@ def _suggest_key(path: Sequence[str], reason: str) -> str:
     valid_keys = re.findall(r"`([^`]*)`", valid_text)
     similar = difflib.get_close_matches(unknown_key, valid_keys, 1)
     if similar:
-        return f"no key of Zenoh's; did you mean {similar[0]}?"
-    return f"no key of Zenoh's; there are {valid_text.replace('`', '')}"
+        return f"Zenoh has no such key; did you mean {similar[0]}?"
+    return f"Zenoh has no such key; there are {valid_text.replace('`', '')}"
 
 
 RECORDER = topics.RECORDER
@@ -508,21 +508,21 @@ class _Role(NamedTuple):
     A channel is a kind of messages, see `topics`.
 
     Attributes:
-        hears: Channels that the member receives from all members.
-        asks: Channels on which the member queries all members.
+        receives: Channels that the member receives from all members.
+        queries: Channels on which the member queries all members.
         publishes: Channels that the member publishes under its own name.
-        answers: Channels on which the member answers queries to its own name.
-        hears_addressed: Channels that the member receives under its own name.
-        addresses: Channels that the member publishes under the name of the member that shall
+        replies: Channels on which the member answers queries to its own name.
+        receives_addressed: Channels that the member receives under its own name.
+        publishes_to: Channels that the member publishes under the name of the member that shall
             receive them.
     """
 
-    hears: tuple[str, ...]
-    asks: tuple[str, ...]
+    receives: tuple[str, ...]
+    queries: tuple[str, ...]
     publishes: tuple[str, ...] = ()
-    answers: tuple[str, ...] = ()
-    hears_addressed: tuple[str, ...] = ()
-    addresses: tuple[str, ...] = ()
+    replies: tuple[str, ...] = ()
+    receives_addressed: tuple[str, ...] = ()
+    publishes_to: tuple[str, ...] = ()
 
 
 SITE_ROLE = _Role(
@@ -534,21 +534,21 @@ SITE_ROLE = _Role(
         topics.MEASURED,
         topics.VIEW,
     ),
-    answers=(topics.INFO, topics.PING, topics.PAST, topics.SET, topics.STOP),
-    hears=(topics.SAMPLE, topics.LINK, topics.EVENT),
-    asks=(topics.INFO, topics.PING, topics.STOP),
-    hears_addressed=(topics.STATE, topics.MEASURED, topics.HAND, topics.ENABLE),
+    replies=(topics.INFO, topics.PING, topics.PAST, topics.SET, topics.STOP),
+    receives=(topics.SAMPLE, topics.LINK, topics.EVENT),
+    queries=(topics.INFO, topics.PING, topics.STOP),
+    receives_addressed=(topics.STATE, topics.MEASURED, topics.HAND, topics.ENABLE),
 )
 """Role of a site."""
 ROLES = {
     RECORDER: _Role(
         publishes=(topics.EVENT, topics.STATS),
-        answers=(topics.INFO, topics.PING),
-        hears=(topics.STATE, topics.LINK, topics.EVENT),
-        asks=(topics.INFO, topics.PING, topics.PAST, topics.STOP),
+        replies=(topics.INFO, topics.PING),
+        receives=(topics.STATE, topics.LINK, topics.EVENT),
+        queries=(topics.INFO, topics.PING, topics.PAST, topics.STOP),
     ),
     OPERATOR: _Role(
-        hears=(
+        receives=(
             topics.SAMPLE,
             topics.STATE,
             topics.LINK,
@@ -556,13 +556,13 @@ ROLES = {
             topics.STATS,
             topics.VIEW,
         ),
-        asks=(topics.INFO, topics.PING, topics.PAST, topics.SET, topics.STOP),
-        addresses=(topics.HAND, topics.ENABLE),
+        queries=(topics.INFO, topics.PING, topics.PAST, topics.SET, topics.STOP),
+        publishes_to=(topics.HAND, topics.ENABLE),
     ),
     BRIDGE: _Role(
-        hears=(topics.STATE, topics.EVENT),
-        asks=(topics.INFO, topics.PAST, topics.SET, topics.STOP),
-        addresses=(topics.HAND, topics.MEASURED),
+        receives=(topics.STATE, topics.EVENT),
+        queries=(topics.INFO, topics.PAST, topics.SET, topics.STOP),
+        publishes_to=(topics.HAND, topics.MEASURED),
     ),
 }
 """Roles of the members that are not sites, by their names."""
@@ -634,8 +634,8 @@ def _derive_rules(member: str, role: _Role) -> Iterator[dict[str, Any]]:
         """Returns the keys of a member's channels in any session; "*" is any member."""
         return [topics.key("*", owner, channel) for channel in channels]
 
-    published = keys(member, role.publishes) + keys("*", role.addresses)
-    received = keys("*", role.hears) + keys(member, role.hears_addressed)
+    published = keys(member, role.publishes) + keys("*", role.publishes_to)
+    received = keys("*", role.receives) + keys(member, role.receives_addressed)
     local_presence = [topics.presence_key("*", member)]
     all_presences = [topics.presence_key("*", "*")]
     watch_presence = ["declare_liveliness_subscriber", "liveliness_query"]
@@ -644,17 +644,17 @@ def _derive_rules(member: str, role: _Role) -> Iterator[dict[str, Any]]:
     # queries, and the news that it is present.
     yield _make_rule(["ingress"], ["put"], published)
     yield _make_rule(["ingress"], ["declare_subscriber"], received)
-    yield _make_rule(["ingress"], ["declare_queryable", "reply"], keys(member, role.answers))
-    yield _make_rule(["ingress"], ["query"], keys("*", role.asks))
+    yield _make_rule(["ingress"], ["declare_queryable", "reply"], keys(member, role.replies))
+    yield _make_rule(["ingress"], ["query"], keys("*", role.queries))
     yield _make_rule(["ingress"], ["liveliness_token"], local_presence)
     yield _make_rule(["ingress"], watch_presence, all_presences)
 
     # What may be sent to the member: the counterparts of these messages.
-    published_by_all = keys("*", (*role.publishes, *role.addresses))
+    published_by_all = keys("*", (*role.publishes, *role.publishes_to))
     yield _make_rule(["egress"], ["put"], received)
     yield _make_rule(["egress"], ["declare_subscriber"], published_by_all)
-    yield _make_rule(["egress"], ["query"], keys("*", role.answers))
-    yield _make_rule(["egress"], ["declare_queryable", "reply"], keys("*", role.asks))
+    yield _make_rule(["egress"], ["query"], keys("*", role.replies))
+    yield _make_rule(["egress"], ["declare_queryable", "reply"], keys("*", role.queries))
     yield _make_rule(["egress"], _LIVELINESS, all_presences)
 
 
