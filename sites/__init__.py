@@ -1,1 +1,1 @@
-"""Run live sessions: one process per arm joins a session, runs its control loop, and leaves."""
+"""Runs live sessions: a process per arm joins a session, runs its control loop, and leaves."""

@@ -1,4 +1,4 @@
-"""Reply to requests to change something while a site runs.
+"""Replies to requests to change something while a site runs.
 
 Users change links, the weights with which a site follows its peers, and the end of the run.
 They stop and enable arms, and mark moments in the log. A site checks each request, replies, and

@@ -1,4 +1,4 @@
-"""Limit the computing time of a user's own code: a control law, an operator or a plant.
+"""Limits the computing time of a user's own code: a control law, an operator or a plant.
 
 The site calls such code in its control loop, so that slow code would make ticks late. The code
 may use 75 % (`SHARE`) of the period at which it is called. Additional time adds to its

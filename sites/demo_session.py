@@ -1,4 +1,4 @@
-"""Run a whole session on one machine, with a process per site and a recorder.
+"""Runs a whole session on one machine, with a process per site and a recorder.
 
 A site is a process that runs one arm and its control loop. The recorder is a process that
 writes the log of the session. `run_demo` runs such a session for the command `trilat demo`, and

@@ -1,4 +1,4 @@
-"""Move an arm with an input device, and render the reaction force of the arm on the device.
+"""Moves an arm with an input device, and renders the reaction force of the arm on it.
 
 The person presses a button of the device, the clutch, and moves the device. The target of the
 arm then moves by the same step, rotated and scaled as the scenario says. The force that the arm

@@ -1,4 +1,4 @@
-"""Check whether this machine is ready for a session, and say what to do about each problem.
+"""Checks whether this machine is ready for a session, and states how to solve each problem.
 
 A session consists of processes ("sites") that run arms at 1000 ticks per second and exchange
 their states over the network. The checks concern the keys, the network endpoints, the clocks,

@@ -1,4 +1,4 @@
-"""Receive the measurements of an external arm and the state of its dead-man switch.
+"""Receives the measurements of an external arm and the state of its dead-man switch.
 
 An arm is external (`plant = "external"` in the scenario) if it is a real arm, or a simulation
 in another program. Its driver sends the measured joint positions to the site, the process that

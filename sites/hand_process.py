@@ -1,4 +1,4 @@
-"""Run a user's own operator class as a process that moves the arm of a site.
+"""Runs a user's own operator class as a process that moves the arm of a site.
 
 An operator moves an arm. A user can write one as a class whose method `act` receives a view,
 the state of the site, and returns a target or a force. The site sends a view several times a

@@ -1,4 +1,4 @@
-"""Receive the goals of the operator who moves the arm of a site.
+"""Receives the goals of the operator who moves the arm of a site.
 
 An operator is a person or a program. The operator's goals, target positions or forces, arrive
 as messages over the network. `HandServer` serves people and programs that connect to the

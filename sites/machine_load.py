@@ -1,4 +1,4 @@
-"""Warn before a session if the processors of this machine are busy with other programs.
+"""Warns before a session if the processors of this machine are busy with other programs.
 
 Invariant:
     - The measurement changes nothing and takes 0.2 s.

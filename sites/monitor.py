@@ -1,4 +1,4 @@
-"""Show a running session in a terminal, with one row per site.
+"""Shows a running session in a terminal, with one row per site.
 
 The commands `trilat demo` and `trilat watch` use this module. In a terminal, the rows form a
 table that is refreshed four times a second. If the output is a file or a pipe, the same rows

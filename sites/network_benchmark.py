@@ -1,4 +1,4 @@
-"""Measure a network before a session: round trips by message size, message rate and transport.
+"""Measures a network before a session: round trips by message size, rate and transport.
 
 The near end sends messages to the far end (`trilat ping --answer`), which sends each of them
 back at once. The near end measures the round trip times and the lost messages. The results are

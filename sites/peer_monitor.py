@@ -1,4 +1,4 @@
-"""Follow during a run which other members of the session join, leave and end.
+"""Follows during a run which other members of the session join, leave and end.
 
 A member is a process that takes part in the session: a site or a recorder. Each start of a
 process has a boot, a random number that distinguishes it from earlier and later starts. A site

@@ -1,4 +1,4 @@
-"""Request real-time settings from the operating system, such as priority and locked memory.
+"""Requests real-time settings from the operating system, such as priority and locked memory.
 
 The settings reduce the time by which the ticks of a control loop are late: binding to a
 processor, precise sleeping (timer slack), memory that is not swapped to disk, real-time

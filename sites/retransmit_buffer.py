@@ -1,4 +1,4 @@
-"""Store the recent messages of a site, and send them again to recorders that missed them.
+"""Stores the recent messages of a site, and sends them again to recorders that missed them.
 
 Messages may be lost on the network. A recorder notices gaps in their numbers, and queries the
 site for the missing ones.

@@ -1,4 +1,4 @@
-"""Connect a running session with ROS 2 programs, in both directions.
+"""Connects a running session with ROS 2 programs, in both directions.
 
 A session consists of sites, processes that each run one arm. The bridge publishes the states of
 the sites as standard ROS messages, and offers the orders to stop and enable arms as ROS

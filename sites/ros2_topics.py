@@ -1,4 +1,4 @@
-"""Publish the states of a session's sites as ROS 2 topics.
+"""Publishes the states of a session's sites as ROS 2 topics.
 
 A site is a process that runs one arm. Its joint states, poses, torques and statistics become
 standard ROS messages on topics below `/<session>/<site>`, and the poses of its links become

@@ -1,4 +1,4 @@
-"""Control a running session from Python: stop arms, change links, move an arm, read records.
+"""Controls a running session from Python: stops arms, changes links, moves arms, reads records.
 
 A session is a set of processes ("sites") that each run one arm, and that exchange the states of
 their arms over the network. `session` returns a `RunningSession`, whose methods send requests

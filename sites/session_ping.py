@@ -1,4 +1,4 @@
-"""Measure the network of a running session, and the delays of ROS 2 topics.
+"""Measures the network of a running session, and the delays of ROS 2 topics.
 
 `ping_session` sends pings to all members of a session, and reports round trip times and the
 offsets of their clocks. It also reports the delays of the links between the sites, which the

@@ -1,4 +1,4 @@
-"""Create the parts of a site, which exist from the start of its process to its end.
+"""Creates the parts of a site, which exist from the start of its process to its end.
 
 A site is a process that runs one arm and its control loop. `SiteParts` creates the site in the
 simulation kernel, the queues for incoming messages, the publishers, the buffer for lost

@@ -1,4 +1,4 @@
-"""Run one site as one process: join a session, control the arm, and leave.
+"""Runs one site as one process: joins a session, controls the arm, and leaves.
 
 A site is a process that runs one arm and its control loop. `run_site` connects to the network,
 builds the parts of the site, agrees with the other members on the epoch (the time of tick 0),

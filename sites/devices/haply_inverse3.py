@@ -1,4 +1,4 @@
-"""Use an Inverse3 of Haply as an input device, through the service of its maker.
+"""Uses an Inverse3 of Haply as an input device, through the service of its maker.
 
 The service runs on the same machine and exchanges JSON messages over a WebSocket. It replies to
 each message with one state, so that this program determines the rate.

@@ -1,4 +1,4 @@
-"""Read a SpaceMouse of 3Dconnexion on Linux, from its hidraw file.
+"""Reads a SpaceMouse of 3Dconnexion on Linux, from its hidraw file.
 
 A SpaceMouse does not move. The deflection of its cap is interpreted as a velocity, which is
 integrated to a position.

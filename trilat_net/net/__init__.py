@@ -1,4 +1,4 @@
-"""Exchange messages between the processes of a session over the network.
+"""Exchanges messages between the processes of a session over the network.
 
 The package contains the network connection (`bus`, `zenoh_bus`, `connection`, `member_keys`),
 the messages and their encoding (`messages`, `requests`, `wire`, `topics`), the clocks and their

@@ -1,4 +1,4 @@
-"""Connect a program to a site: the driver of a real arm, its dead-man switch, or an operator.
+"""Connects a program to a site: the driver of a real arm, its dead-man switch, or an operator.
 
 A site is a process that computes the torque of one arm. If the arm is external (`plant =
 "external"` in the scenario), its driver sends the measured joint positions to the site, and

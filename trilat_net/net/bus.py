@@ -1,4 +1,4 @@
-"""Define the interface of a member's network connection, and the queues of waiting messages.
+"""Defines the interface of a member's network connection, and the queues of waiting messages.
 
 A member is a process that takes part in a session. Its network connection, the bus, publishes
 messages under keys, receives the messages of other members, and sends and answers queries.

@@ -1,4 +1,4 @@
-"""Read the time. No other module reads a clock of the operating system.
+"""Reads the time. No other module reads a clock of the operating system.
 
 Invariant:
     - Rule L1: code that needs the time receives a clock as an argument, so that tests and

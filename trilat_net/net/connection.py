@@ -1,4 +1,4 @@
-"""Decide how a process connects to the network of a session, and run the router process.
+"""Decides how a process connects to the network of a session, and runs the router process.
 
 A `Connection` consists of the endpoints at which a process listens and to which it connects,
 its mode, and optionally the keys that prove its identity. Opening it returns the bus through

@@ -1,4 +1,4 @@
-"""Find a running session from outside, connect to it, and send requests to its sites.
+"""Finds a running session from outside, connects to it, and sends requests to its sites.
 
 Programs that are not part of a session use this module: the commands that stop arms, change
 links or measure the network, and a playback of a log.

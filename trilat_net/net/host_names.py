@@ -1,4 +1,4 @@
-"""Check that host names in endpoints can be resolved, before a connection is opened.
+"""Checks that host names in endpoints can be resolved, before a connection is opened.
 
 Zenoh would try to connect to a misspelt host name for ever, without an error.
 

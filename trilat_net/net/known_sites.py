@@ -1,4 +1,4 @@
-"""Remember which sites run on this machine, so that `trilat stop` reaches them immediately.
+"""Remembers which sites run on this machine, so that `trilat stop` reaches them immediately.
 
 A site is a process that runs one arm. Each running site keeps a small file with its endpoints
 in the folder of its user. `trilat stop` reads these files and connects to the sites at once,

@@ -1,4 +1,4 @@
-"""Create, renew and read the keys with which the members of a session prove their identity.
+"""Creates, renews and reads the keys with which members of a session prove their identity.
 
 A member is a process that takes part in a session, such as a site or a recorder. `trilat keys
 new` creates a private certificate authority for the session, which signs one certificate per

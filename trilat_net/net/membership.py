@@ -1,4 +1,4 @@
-"""Find out which processes take part in a session, and which of them are present.
+"""Finds out which processes take part in a session, and which of them are present.
 
 A member is a process that takes part in a session: a site, which runs one arm and its control
 loop, or a recorder, which writes the log. Every start of a process has a boot, a random number

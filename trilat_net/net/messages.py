@@ -1,4 +1,4 @@
-"""Define the messages that the members of a session publish, and that a log stores.
+"""Defines the messages that the members of a session publish, and that a log stores.
 
 A member is a process that takes part in a session: a site, which runs one arm, or a recorder. A
 site publishes a `PeerSample` for the other sites and a `State` for the recorder in every tick

@@ -1,4 +1,4 @@
-"""Estimate the offset and drift between two clocks from the time stamps of messages.
+"""Estimates the offset and drift between two clocks from the time stamps of messages.
 
 A message cannot be received before it was sent. With
 

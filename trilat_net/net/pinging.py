@@ -1,4 +1,4 @@
-"""Measure the clocks of other members by pings, and repeat queries over an unreliable network.
+"""Measures the clocks of other members by pings, and repeats queries over a poor network.
 
 A member is a process that takes part in a session. A ping is a query to which a member replies
 at once, with the readings of its clock when the ping arrived and when the reply was sent. The

@@ -1,4 +1,4 @@
-"""Define the messages that one process sends to one other process of a session.
+"""Defines the messages that one process sends to one other process of a session.
 
 They are replies to pings, requests for changes, requests for lost messages, measurements of
 real arms, reports of dead-man switches, and goals of operators (the people or programs that

@@ -1,4 +1,4 @@
-"""Exchange messages with ROS 2 programs over Zenoh, without an installation of ROS.
+"""Exchanges messages with ROS 2 programs over Zenoh, without an installation of ROS.
 
 ROS 2 programs that use the middleware rmw_zenoh exchange their messages over Zenoh. `Ros2Graph`
 opens a Zenoh session of its own, as a client of ROS's router (rmw_zenohd) or of another Zenoh

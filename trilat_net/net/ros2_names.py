@@ -1,4 +1,4 @@
-"""Check the names of ROS 2 topics, services and nodes."""
+"""Checks the names of ROS 2 topics, services and nodes."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""Start a session: the members find each other and agree on the epoch, the time of tick 0.
+"""Starts a session: its members find each other and agree on the epoch, the time of tick 0.
 
 A member is a process that takes part in the session: a site, which runs one arm and its control
 loop, or a recorder. The first site of the scenario is the leader. A normal start has three

@@ -1,4 +1,4 @@
-"""Keep the time of a running site: when ticks are due, and how far the peers' clocks are off.
+"""Keeps the time of a running site: when ticks are due, and how far peers' clocks are off.
 
 A site executes one tick per period of its control loop. Tick k is due k * 10^9 // rate_hz ns
 after the epoch, the common start time of the session. Sites on one machine wake up one after

@@ -1,4 +1,4 @@
-"""Name the channels on which members of a session exchange messages, and number the messages.
+"""Names the channels on which members of a session exchange messages, and numbers messages.
 
 A member is a process of a session: a site or a recorder. Each message has a Zenoh key of the
 form trilat/<session>/<member>/<channel>, where the channel is the kind of the messages. The key

@@ -1,4 +1,4 @@
-"""Encode messages, and decode and check what arrives or what a log contains.
+"""Encodes messages, and decodes and checks what arrives or what a log contains.
 
 A payload is a MessagePack map with the field names as keys. The classes in `messages` and
 `requests` define the fields. The records and samples that a site publishes in every tick are

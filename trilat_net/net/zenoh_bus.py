@@ -1,4 +1,4 @@
-"""Implement the network connection of a member (`Bus`) over Eclipse Zenoh.
+"""Implements the network connection of a member (`Bus`) over Eclipse Zenoh.
 
 Only this module and `ros2_graph` import `zenoh`.
 

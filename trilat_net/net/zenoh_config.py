@@ -1,4 +1,4 @@
-"""Compose the Zenoh configuration of a member, and check the Zenoh file of a user.
+"""Composes the Zenoh configuration of a member, and checks the Zenoh file of a user.
 
 A member is a process that takes part in a session. Its Zenoh settings differ from Zenoh's
 defaults in three points that matter for a control loop at 1 kHz:
