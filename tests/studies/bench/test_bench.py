@@ -42,8 +42,8 @@ from trilat_net.studies.bench.bench_plan import (
 )
 from trilat_net.studies.bench.bench_results import (
     LEAST_CONTACT_N,
+    BenchCellResult,
     BenchRun,
-    CellResult,
     build_bench_page,
     encode_runs,
 )
@@ -286,9 +286,9 @@ def make_run(cell: BenchCell, seed: int, **more: Any) -> BenchRun:
     return BenchRun(cell.name, cell.inputs, seed, True, "", **facts)
 
 
-def place(*errors: float | None) -> CellResult:
+def place(*errors: float | None) -> BenchCellResult:
     cell = asked().cells[1]
-    return CellResult(
+    return BenchCellResult(
         cell, [make_run(cell, n, error_rad=error) for n, error in enumerate(errors)]
     )
 

@@ -138,7 +138,7 @@ _QUANTITIES_BY_TASK = {
 _JUDGEMENTS = (Stability.STABLE, Stability.OPEN, Stability.NOT_STABLE)
 
 
-class CellResult(NamedTuple):
+class BenchCellResult(NamedTuple):
     """A cell with the runs of all its seeds.
 
     Attributes:
@@ -216,10 +216,10 @@ class BenchResults(Result):
 
     def __init__(self, plan: BenchPlan, runs: dict[tuple[str, int], BenchRun]) -> None:
         self.plan = plan
-        self.places: list[CellResult] = []
+        self.places: list[BenchCellResult] = []
         for cell in plan.cells:
             cell_runs = [_confirm_run(runs, cell, seed) for seed in cell.seeds]
-            self.places.append(CellResult(cell, cell_runs))
+            self.places.append(BenchCellResult(cell, cell_runs))
         self.runs = [run for result in self.places for run in result.runs]
 
     def blocks(self) -> Iterator[Block]:
@@ -255,14 +255,14 @@ class BenchResults(Result):
         """Returns a row per cell."""
         return list(map(_build_row, self.places))
 
-    def select(self, task: str, law: str = "", link: str = "") -> Iterator[CellResult]:
+    def select(self, task: str, law: str = "", link: str = "") -> Iterator[BenchCellResult]:
         """Yields the results of a task; of a law and a link only, if these are not ""."""
         for result in self.places:
             cell = result.cell
             if cell.task == task and law in ("", cell.law) and link in ("", cell.link):
                 yield result
 
-    def find(self, task: str, law: str, link: str) -> CellResult | None:
+    def find(self, task: str, law: str, link: str) -> BenchCellResult | None:
         """Returns the result of a cell; None if the cell did not run."""
         return next(self.select(task, law, link), None)
 
@@ -369,7 +369,7 @@ def tabulate_properties(results: BenchResults, task: str) -> TextTable:
     return TextTable(headers, rows, align="lr")
 
 
-def _describe_properties(law_results: Sequence[CellResult]) -> list[str]:
+def _describe_properties(law_results: Sequence[BenchCellResult]) -> list[str]:
     """Returns the cells of a law's row in the table of properties, without its name."""
     bounded = 0
     passive = 0
@@ -393,7 +393,7 @@ def _describe_properties(law_results: Sequence[CellResult]) -> list[str]:
     ]
 
 
-def _format_least_energy(law_results: Sequence[CellResult]) -> str:
+def _format_least_energy(law_results: Sequence[BenchCellResult]) -> str:
     """Returns the least energy of the results in J, as a cell of a table."""
     energies_j = [result.energy_j for result in law_results if result.energy_j is not None]
     if not energies_j:
@@ -430,7 +430,7 @@ def tabulate_quantity(results: BenchResults, task: str, quantity: str) -> TextTa
     return TextTable((task, *links), rows, align="lr")
 
 
-def _describe_result(result: CellResult, quantity: str) -> str:
+def _describe_result(result: BenchCellResult, quantity: str) -> str:
     """Returns the mean of a quantity as a cell of a table, or why the cell has no number."""
     marks = {Stability.NOT_STABLE: UNSTABLE_MARK, Stability.OPEN: OPEN_MARK}
     mark = marks.get(result.judgement, "")
@@ -590,7 +590,7 @@ def _build_cell_columns(cell: BenchCell) -> dict[str, Any]:
     return {name: getattr(cell, name) for name in _CELL_COLUMNS}
 
 
-def _build_row(result: CellResult) -> dict[str, Any]:
+def _build_row(result: BenchCellResult) -> dict[str, Any]:
     """Returns the row of a cell in JSON and CSV, with unknown numbers as None."""
     share_low = None
     share_high = None
