@@ -124,7 +124,7 @@ def test_users_share_authority_and_feel_no_environment() -> None:
         assert rest["q"][:, 0] == pytest.approx([0.3, -0.3, slave], abs=1e-9)
         assert rest["tau_x"][:2, 0] == pytest.approx([-15.0, 45.0], abs=1e-4)
     told = " ".join(describe_law_conditions(scenario))
-    bound = "4 (d1 - K1 h / 2) (d2 - K2 h / 2) >= (T1 + T2 + h)^2 K1 K2, the last 401 ms"
+    bound = "4 (d1 - K1 h / 2) (d2 - K2 h / 2) >= (T1 + T2 + h)^2 K1 K2, T1 + T2 + h = 401 ms"
     assert f"authority at m1, m2 holds: {bound}" in told
     assert "authority at s holds: it follows and closes no loop" in told
 

@@ -1,7 +1,7 @@
 """The paper's adaptive law with each estimated parameter kept in an interval (a box).
 
 The torque is that of `Adaptive`, Eq. (13). The kernel computes the law
-(`core.control.project_estimate`); `AdaptiveBox.advance_estimate` states the projection in plain
+(`core.control.project_estimate`). `AdaptiveBox.advance_estimate` states the projection in plain
 Python, and `tests/control_laws/test_plain_torques.py` compares the two.
 """
 
@@ -21,10 +21,11 @@ from .interface import TuningSite
 class AdaptiveBox(Adaptive):
     """The paper's law with each estimate kept within its bounds.
 
-    If the box contains the true parameters, also on its edge, V' <= 0 still holds. If the true
-    parameters lie strictly inside, the box also removes the spring by which learning gravity
-    ties the arms to a pose. Projection after Ioannou and Sun, "Robust Adaptive Control" (1996),
-    4.4.
+    If the box contains the true parameters, also on its edge, V' <= 0 still holds. An estimate
+    that learns gravity acts like a spring that ties the arms to a pose; if the true parameters
+    lie strictly inside the box, the box removes this effect.
+
+    Source: Ioannou and Sun, "Robust Adaptive Control" (1996), 4.4, for the projection.
 
     Attributes:
         Lambda, Kp, Kd, Gamma, theta_hat0: as of `Adaptive`.
@@ -48,11 +49,13 @@ class AdaptiveBox(Adaptive):
             gain_s: duration of the step, s.
         """
         estimate = Adaptive.advance_estimate(self, theta_hat, Yr, gain_s)
-        return np.minimum(np.maximum(estimate, self.theta_low), self.theta_high)
+        above_low = np.maximum(estimate, self.theta_low)
+        return np.minimum(above_low, self.theta_high)
 
     def gains(self, theta: Array) -> Gains:
         """Returns the gains for the kernel."""
-        return Adaptive.gains(self, theta)._replace(low=self.theta_low, high=self.theta_high)
+        gains = Adaptive.gains(self, theta)
+        return gains._replace(low=self.theta_low, high=self.theta_high)
 
     def check(self, path: str, sites: int) -> None:  # noqa: ARG002 - as the other laws
         """Refuses an empty box, and a first estimate outside the box.

@@ -1,6 +1,6 @@
 """The adaptive law in a box, with a bounded term against torque that no estimate explains.
 
-The kernel computes this law (`core.control.robust_torque`); `AdaptiveRobust.compute_torque`
+The kernel computes this law (`core.control.robust_torque`). `AdaptiveRobust.compute_torque`
 states the same law in plain Python, and `tests/control_laws/test_plain_torques.py` compares the
 two.
 """
@@ -24,8 +24,10 @@ class AdaptiveRobust(AdaptiveBox):
 
     Premises: constant delays, no operator, theta in its box, and a disturbance of at most rho
     at each joint. Then the mean over time of the power that V dissipates is at most 0.3003
-    sum_i beta_i sum rho width. Nothing more is claimed. The term is smoothed after Slotine and
-    Li, "Applied Nonlinear Control" (1991), 7.1; docs/laws.md derives the bound.
+    sum_i beta_i sum rho width, and no stronger statement is proved; docs/laws.md derives the
+    bound.
+
+    Source: Slotine and Li, "Applied Nonlinear Control" (1991), 7.1, for the smooth term.
 
     Attributes:
         Lambda, Kp, Kd, Gamma, theta_hat0, theta_low, theta_high: as of `AdaptiveBox`.
@@ -77,22 +79,23 @@ class AdaptiveRobust(AdaptiveBox):
     def condition(self, situation: LawSituation) -> StabilityCondition:
         """Returns the mean-square bound on this site's part of the dissipated power, W."""
         pairs = zip(self.rho_nm, self.width_rad_s, strict=True)
-        bound_w = ROBUST_RESIDUE * sum(rho * width for rho, width in pairs)
-        is_constant = not np.isnan(situation.longest_s)
-        delays = "constant" if is_constant else "to be constant, and vary here"
+        joint_bounds = [rho * width for rho, width in pairs]
+        bound_w = ROBUST_RESIDUE * sum(joint_bounds)
+        delays_vary = bool(np.isnan(situation.longest_s))
+        delays = "to be constant, and vary here" if delays_vary else "constant"
         text = (
             f"delays are {delays}, theta is in its box: with torque of at most rho_nm that no "
-            "estimate explains the mean of beta times r'Kp r and the disagreement is at most "
+            "estimate explains, the mean of beta times r'Kp r and the disagreement is at most "
             f"beta times {bound_w:.3g} W here; sufficient"
         )
-        return StabilityCondition(True if is_constant else None, text)
+        return StabilityCondition(None if delays_vary else True, text)
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], at: TuningSite) -> dict[str, Any]:
         """Returns the [control] table of a site for tuned gains.
 
-        Near r = 0 the robust term adds a damping of rho / width. Its width makes that a tenth
-        of Kp, which the joints can take in addition.
+        Near r = 0 the robust term acts like a damping of rho / width. The width is chosen so
+        that this damping is a tenth of Kp.
         """
         width_rad_s = 10.0 * gains["rho_nm"] / gains["Kp"]
         return {**AdaptiveBox.write_control(gains, at), "width_rad_s": width_rad_s}

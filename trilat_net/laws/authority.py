@@ -3,7 +3,7 @@
     slave    tau = G + K (sum_j alpha_j q_j - q) - d qd
     user i   tau = G + K alpha_ij (q_j - q_i) - d qd_i,    j: the other user
 
-A user whose share of the authority is a has alpha_ij = 1 - a, so the user with less authority
+A user i with the share a of the authority has alpha_ij = 1 - a, so the user with less authority
 is guided more. A user's torque does not depend on the slave.
 """
 
@@ -31,8 +31,8 @@ from .interface import DAMPING, STIFFNESS, ControlLaw, TuningSite
 class Authority(ControlLaw):
     """Two users share the authority over a slave and feel each other, not the environment.
 
-    After Nudehi, Mukherjee and Ghodoussi, "A shared-control approach to haptic interface design
-    for minimally invasive telesurgical training", IEEE T-CST, 2005.
+    Source: Nudehi, Mukherjee and Ghodoussi, "A shared-control approach to haptic interface
+    design for minimally invasive telesurgical training", IEEE T-CST, 2005.
 
     Attributes:
         K: stiffness per joint, N m/rad.
@@ -54,11 +54,14 @@ class Authority(ControlLaw):
         """Writes the torque, and sends to the peers whether this site leads."""
         now.to_all.leads[0] = 1.0 if self.leads else 0.0
         for i in range(now.joints):
-            tau = self.gravity * now.gravity[i] - self.d[i] * now.qd[i]
+            K = self.K[i]
+            q = now.q[i]
+            damper = self.d[i] * now.qd[i]
+            tau = self.gravity * now.gravity[i] - damper
             for j in range(len(now.peers)):
                 peer = now.peers[j]
                 share = peer.alpha * now.received[j].leads[0]
-                tau += self.K[i] * share * (peer.q[i] - now.q[i])
+                tau += K * share * (peer.q[i] - q)
             now.tau[i] = tau
 
     def linear_gains(self, theta: Array) -> Gains | None:
@@ -71,7 +74,8 @@ class Authority(ControlLaw):
         form = LinearForm(len(at.inertia))
         for j in at.peers:
             leads = float(getattr(at.laws[j], "leads", False))
-            stiffness = at.alpha[at.site, j] * leads * np.array(self.K)
+            share = at.alpha[at.site, j] * leads
+            stiffness = share * np.array(self.K)
             form.add("tau", "q", -stiffness)
             form.add("tau", ("from", j), stiffness)
             form.add(("to", j), "q", 1.0)
@@ -79,14 +83,13 @@ class Authority(ControlLaw):
 
     def explain_idle_shares(self, at: LawSituation) -> str:
         """Returns which sites a user does not feel, because they do not lead, or ""."""
-        idle = [
-            name
-            for name, law in zip(at.names, at.laws, strict=True)
-            if not getattr(law, "leads", False)
-        ]
+        idle = []
+        for name, law in zip(at.names, at.laws, strict=True):
+            if not getattr(law, "leads", False):
+                idle.append(name)
         if not self.leads or not idle:
             return ""
-        return f"users feel those who lead alone, not {', '.join(idle)}"
+        return f"users feel only sites that lead, not {', '.join(idle)}"
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
         """Returns the condition of P+d among the users.
@@ -95,9 +98,8 @@ class Authority(ControlLaw):
         """
         users = [n for n, law in enumerate(situation.laws) if getattr(law, "leads", False)]
         if situation.site not in users:
-            return StabilityCondition(
-                True, "it follows and closes no loop: stable for every delay and d > 0"
-            )
+            text = "it follows and closes no loop: stable for every delay and d > 0"
+            return StabilityCondition(True, text)
         return judge_position_exchange(situation.restrict(users), "K", "d")
 
     @classmethod

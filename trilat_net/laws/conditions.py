@@ -1,11 +1,13 @@
-"""The statements of a control law about its stability and its small motions at a site.
+"""The stability condition of a control law at a site, and its linearised form.
+
+`trilat scenario check` and `trilat linear` print the condition. The linear analysis of a
+session assembles the linearised forms of its laws.
 
 Invariant:
     - A law states both once, as methods of its `Settings`.
-    - A condition, which `trilat scenario check` and `trilat linear` print, says if it is only
-      sufficient, and who proved it.
-    - The small motions of a law with states, or of a law that sends more than the motion, are
-      blocks of a matrix. The part that the law shares with a law of known gravity
+    - The text of a condition says whether the condition is only sufficient, and who proved it.
+    - A linear form consists of blocks of a matrix. It describes a law with states, or a law
+      that sends more than the motion. The part that the law shares with a law of known gravity
       (`linear_gains`) is not among these blocks.
 """
 
@@ -20,7 +22,7 @@ from ..core.vectors import Array
 PASSIVE_OUTSIDE = "operators and environments are passive (*sufficient*)"
 """The premise of each law that balances energy."""
 COMMON_MOTION_SHARE = 0.21723362821
-"""-min sin x / x: the damping per K T that the common motion of all sites needs at its most
+"""-min sin x / x: the ratio d / (K T) that the common motion of all sites needs at its most
 critical mass.
 """
 
@@ -59,7 +61,7 @@ class LawSituation(NamedTuple):
         return float(np.max(self.delay_s[self.alpha > 0.0], initial=0.0))
 
     def restrict(self, sites: Sequence[int]) -> "LawSituation":
-        """Returns the situation of the same site with only some of the sites."""
+        """Returns the situation of the same site among only some of the sites."""
         part = np.ix_(sites, sites)
         return self._replace(
             site=list(sites).index(self.site),
@@ -86,11 +88,12 @@ class StabilityCondition(NamedTuple):
 def find_least_reversible(alpha: Array) -> float | None:
     """Returns the least eigenvalue of reversible shares, or None if they are not reversible.
 
-    The eigenvalue bounds the ratio d / (K T).
+    Its negative is a lower bound of d / (K T), see `judge_position_exchange`.
     """
     if find_balancing_weights(alpha) is None:
         return None
-    return float(np.linalg.eigvals(alpha).real.min())
+    eigenvalues = np.linalg.eigvals(alpha)
+    return float(eigenvalues.real.min())
 
 
 def judge_position_exchange(
@@ -113,16 +116,17 @@ def judge_position_exchange(
     K = np.array([getattr(law, stiffness, [np.nan]) for law in laws])
     d = np.array([getattr(law, damping, [np.nan]) for law in laws])
     if np.isnan(situation.longest_s) or np.isnan(K).any():
-        return StabilityCondition(
-            None, "known for constant delays, and with this law at all sites"
-        )
+        text = "known for constant delays, and with this law at all sites"
+        return StabilityCondition(None, text)
     if np.isnan(hold_s):
-        return StabilityCondition(None, "known of held torques for sites of one tick rate")
+        text = "known of held torques for sites of one tick rate"
+        return StabilityCondition(None, text)
     scope = "sufficient whatever the masses"
     if hold_s:
+        damps_error = any(np.any(getattr(law, "Kd", 0.0)) for law in laws)
         least_inertia = 0.5 * float(d.max()) * hold_s
         scope = f"sufficient for arms above d h / 2 = {least_inertia:.3g} kg m^2"
-        if any(np.any(getattr(law, "Kd", 0.0)) for law in laws):
+        if damps_error:
             scope = "sufficient for heavy arms"
     if len(laws) == 2:
         return _judge_two_sites(situation, K, d, scope)
@@ -134,19 +138,24 @@ def _judge_two_sites(
 ) -> StabilityCondition:
     """Returns the condition of two sites, 4 d1 d2 >= (T1 + T2)^2 K1 K2."""
     hold_s = situation.hold_s
+    alpha = situation.alpha
     effective_d = d - 0.5 * K * hold_s
     round_trip_s = float(situation.delay_s.sum()) + hold_s
-    coupling = situation.alpha[0, 1] * situation.alpha[1, 0] * K[0] * K[1]
-    excess = float((4.0 * effective_d[0] * effective_d[1] - round_trip_s**2 * coupling).min())
+    coupling = alpha[0, 1] * alpha[1, 0] * K[0] * K[1]
+    left_side = 4.0 * effective_d[0] * effective_d[1]
+    right_side = round_trip_s**2 * coupling
+    excess = float((left_side - right_side).min())
+    # A condition that holds with equality passes in spite of rounding errors.
+    tolerance = 1e-9 * float(d.max()) ** 2
+    is_damped = bool((effective_d >= 0.0).all())
+    holds = excess >= -tolerance and is_damped
     round_trip_ms = f"{1e3 * round_trip_s:.4g} ms"
     text = f"4 d1 d2 >= (T1 + T2)^2 K1 K2, T1 + T2 = {round_trip_ms}"
     if hold_s:
         text = (
             "4 (d1 - K1 h / 2) (d2 - K2 h / 2) >= (T1 + T2 + h)^2 K1 K2, "
-            f"the last {round_trip_ms}"
+            f"T1 + T2 + h = {round_trip_ms}"
         )
-    is_met = excess >= -1e-9 * float(d.max()) ** 2
-    holds = is_met and bool((effective_d >= 0.0).all())
     return StabilityCondition(holds, f"{text} ({scope})")
 
 
@@ -157,24 +166,26 @@ def _judge_several_sites(
     T = situation.longest_s
     hold_s = situation.hold_s
     delays_s = situation.delay_s[situation.alpha > 0.0]
-    if np.ptp(K, axis=0).any() or np.ptp(d, axis=0).any() or np.ptp(delays_s):
-        return StabilityCondition(
-            None, "known of more than two sites for one K, one d and one delay"
-        )
+    gains_differ = np.ptp(K, axis=0).any() or np.ptp(d, axis=0).any()
+    if gains_differ or np.ptp(delays_s):
+        text = "known of more than two sites for one K, one d and one delay"
+        return StabilityCondition(None, text)
     least = find_least_reversible(situation.alpha)
     if least is None:
-        return StabilityCondition(
-            False, "shares that are not reversible: some heavy arms are unstable at any d"
-        )
+        text = "shares that are not reversible: some heavy arms are unstable at any d"
+        return StabilityCondition(False, text)
     common_share = COMMON_MOTION_SHARE
     if hold_s:
         common_share = _find_common_motion_share(2.0 * T / hold_s + 1.0)
     share = max(-least, common_share)
-    bound = 0.5 * hold_s * K[0] + share * K[0] * (T + 0.5 * hold_s)
-    first_term = "K h / 2 + " if hold_s else ""
-    delay = "(T + h / 2)" if hold_s else "T"
-    text = f"d > {first_term}{share:.4g} K {delay} = {bound.max():.4g}"
-    return StabilityCondition(bool((d[0] > bound).all()), f"{text} ({scope})")
+    hold_term = 0.5 * hold_s * K[0]
+    delay_term = share * K[0] * (T + 0.5 * hold_s)
+    bound = hold_term + delay_term
+    holds = bool((d[0] > bound).all())
+    formula = f"{share:.4g} K T"
+    if hold_s:
+        formula = f"K h / 2 + {share:.4g} K (T + h / 2)"
+    return StabilityCondition(holds, f"d > {formula} = {bound.max():.4g} ({scope})")
 
 
 def _find_common_motion_share(count: float) -> float:
@@ -186,7 +197,8 @@ def _find_common_motion_share(count: float) -> float:
         count: n = 2 T / h + 1, the delay in halves of a tick.
     """
     x = np.linspace(np.pi, 2.0 * np.pi, 1001)[1:-1] / count
-    return float(-(np.sin(count * x) / (count * np.sin(x))).min())
+    ratio = np.sin(count * x) / (count * np.sin(x))
+    return float(-ratio.min())
 
 
 BlockKey = str | tuple[str, int]
@@ -199,7 +211,7 @@ and "tau_h" for the torque ON the arm.
 
 
 class LinearSituation(NamedTuple):
-    """The facts on which a law's small motions may depend.
+    """The facts on which a law's linear form may depend.
 
     Attributes:
         site: the index of the site.
@@ -222,7 +234,7 @@ class LinearSituation(NamedTuple):
 
 
 class LinearForm:
-    """The small motions of a law at a site, as blocks of n rows and n columns, n joints.
+    """A law, linearised for small motions of a site with n joints, as blocks of n x n numbers.
 
     Args:
         joints: n, the number of joints.
@@ -253,8 +265,13 @@ class LinearForm:
         block = np.asarray(gain, dtype=np.float64)
         if block.ndim < 2:
             block = np.diag(np.broadcast_to(block, self.joints))
-        self.blocks[row, column] = self.blocks.get((row, column), 0.0) + block
+        previous = self.blocks.get((row, column), 0.0)
+        self.blocks[row, column] = previous + block
 
     def list_receivers(self) -> list[int]:
-        """Returns the indices of the peers that the law sends to."""
-        return sorted({int(row[1]) for row, _ in self.blocks if isinstance(row, tuple)})
+        """Returns the indices of the peers that the law sends to, in ascending order."""
+        receivers = set()
+        for row, _ in self.blocks:
+            if isinstance(row, tuple):
+                receivers.add(int(row[1]))
+        return sorted(receivers)

@@ -1,4 +1,4 @@
-"""The parts of a built-in control law, and the gains of a law as a scenario holds them.
+"""The base classes of built-in control laws, and the gains of a law as a scenario holds them.
 
 Invariant:
     - A law is one class. The annotations of the class are its gains, with ranges and defaults.
@@ -59,7 +59,7 @@ class TuningSite(NamedTuple):
 
 
 class LawSettings(Frozen, frozen=True):
-    """The gains of a law, and the properties of the law that follow from them.
+    """The gains of a law in a scenario, and the properties of the law that follow from them.
 
     A law may override each of these methods.
     """
@@ -75,7 +75,7 @@ class LawSettings(Frozen, frozen=True):
     planar: ClassVar[bool] = False
     """True if the law uses the planar arm's regressor and cannot control a chain."""
     compares_positions: ClassVar[bool] = False
-    """True if the law compares positions of end effectors, independent of the joints."""
+    """True if the law itself compares positions of end effectors, not angles of joints."""
 
     @property
     def plugged(self) -> bool:
@@ -171,7 +171,8 @@ class LawSettings(Frozen, frozen=True):
             check_law_class(
                 kind=self.kind, code=self.tag, context=context, sites=sites, scheme=scheme
             )
-            law: UserLaw = make_instance(self.kind, self.tag, context, asdict(self))
+            gains = asdict(self)
+            law: UserLaw = make_instance(self.kind, self.tag, context, gains)
             return law
 
         return make
@@ -185,7 +186,7 @@ def format_class_name(tag: str) -> str:
 class ControlLaw:
     """Base class of the built-in control laws.
 
-    A law may also define the methods of `LawSettings`.
+    A law may also define the methods of `LawSettings`, which its `Settings` then have.
 
     Attributes:
         Settings: the gains as a scenario holds them.
@@ -216,7 +217,8 @@ class ControlLaw:
         """
         for name, value in gains.items():
             default = getattr(type(self), name, None)
-            if not isinstance(default, bool | float | int | str | tuple | dict):
+            is_gain = isinstance(default, bool | float | int | str | tuple | dict)
+            if not is_gain:
                 raise TypeError(f"it has no gain {name!r}")
             setattr(self, name, value)
         self.begin(facts)
@@ -230,9 +232,8 @@ class ControlLaw:
         required = getattr(cls, "sites", None)
         if required in (None, len(roles)):
             return ""
-        return (
-            f"is for {count_nouns(required, 'site')}, and this has {len(roles)}: leave it out"
-        )
+        sites = count_nouns(required, "site")
+        return f"is for {sites}, and this has {len(roles)}: leave it out"
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], at: TuningSite) -> dict[str, Any]:
@@ -243,7 +244,7 @@ class ControlLaw:
 
 
 class EnergyLaw(ControlLaw):
-    """A law that balances energy.
+    """Base class of the laws that balance energy.
 
     The energy that one end sends is accounted for at the other end, so all sites must have the
     same law.
@@ -254,20 +255,29 @@ class EnergyLaw(ControlLaw):
 
 
 def _derive_settings(kind: type[ControlLaw], tag: str) -> type[LawSettings]:
-    """Returns the type that holds the gains of a law in a scenario."""
-    bases = [base for base in reversed(kind.__mro__) if issubclass(base, ControlLaw)][1:]
+    """Returns the type that holds the gains of a law in a scenario.
+
+    Args:
+        kind: the class of the law.
+        tag: the name of the law in a scenario.
+    """
     hints: dict[str, Any] = {}
-    inherited: dict[str, Any] = {}
-    for base in bases:
+    namespace: dict[str, Any] = {}
+    for base in reversed(kind.__mro__):
+        if base is ControlLaw or not issubclass(base, ControlLaw):
+            continue
         annotations = inspect.get_annotations(base).items()
         hints |= {name: hint for name, hint in annotations if not _is_class_variable(hint)}
         attributes = vars(base).items()
-        inherited |= {key: value for key, value in attributes if _depends_on_gains(key, value)}
+        namespace |= {key: value for key, value in attributes if _depends_on_gains(key, value)}
+    namespace["kind"] = kind
+    namespace["__doc__"] = kind.__doc__
+    fields = [(name, hint, getattr(kind, name)) for name, hint in hints.items()]
     settings: Any = msgspec.defstruct(
         "Settings",
-        [(name, hint, getattr(kind, name)) for name, hint in hints.items()],
+        fields,
         bases=(LawSettings,),
-        namespace={**inherited, "kind": kind, "__doc__": kind.__doc__},
+        namespace=namespace,
         module=kind.__module__,
         frozen=True,
         kw_only=True,
@@ -280,6 +290,7 @@ def _derive_settings(kind: type[ControlLaw], tag: str) -> type[LawSettings]:
 
 
 def _is_class_variable(hint: Any) -> bool:
+    """True for the annotations `ClassVar` and `ClassVar[...]`."""
     origin: Any = get_origin(hint) or hint
     return origin is ClassVar
 
@@ -314,15 +325,15 @@ def check_law_class(kind: Any, code: str, context: LawContext, sites: int, schem
     schemes = getattr(kind, "schemes", None) or (scheme,)
     if scheme not in schemes:
         allowed = " or ".join(map(repr, schemes))
-        raise ScenarioError(
-            f"{code} is for scheme = {allowed}, and here it is {scheme!r}", path=path
-        )
-    if getattr(kind, "needs_theta", False) and not context.theta:
-        raise ScenarioError(
+        problem = f"{code} is for scheme = {allowed}, and here it is {scheme!r}"
+        raise ScenarioError(problem, path=path)
+    needs_theta = getattr(kind, "needs_theta", False)
+    if needs_theta and not context.theta:
+        problem = (
             f"{code} needs the arm's parameters, which are unknown (arm.known = false): "
-            "identify the arm and leave known out, or choose a law that learns them",
-            path=path,
+            "identify the arm and leave known out, or choose a law that learns them"
         )
+        raise ScenarioError(problem, path=path)
 
 
 def _check_methods(kind: Any, code: str, path: str) -> None:
@@ -340,11 +351,12 @@ def _check_methods(kind: Any, code: str, path: str) -> None:
         return
     written = _find_written_attributes(kind)
     if written:
-        raise ScenarioError(
-            f"{code} writes self.{written[0]}: where torque needs that at the next tick, its "
-            f"class has remembers = ({written[0]!r},), else remembers = (); see {page}",
-            path=path,
+        name = written[0]
+        problem = (
+            f"{code} writes self.{name}: if torque needs that at the next tick, its "
+            f"class has remembers = ({name!r},), else remembers = (); see {page}"
         )
+        raise ScenarioError(problem, path=path)
 
 
 def _check_site_count(kind: Any, code: str, path: str, sites: int) -> None:
@@ -357,13 +369,14 @@ def _check_site_count(kind: Any, code: str, path: str, sites: int) -> None:
         bounds = (stated, stated)
     is_pair = isinstance(bounds, tuple | list) and len(bounds) == 2
     if not is_pair or not all(isinstance(bound, int) for bound in bounds):
-        raise ScenarioError(
-            f"{code}: sites must be as in 2 or (2, 4), is {stated!r}", path=path
-        )
+        problem = f"{code}: sites must be as in 2 or (2, 4), is {stated!r}"
+        raise ScenarioError(problem, path=path)
     least, most = bounds
     if not least <= sites <= most:
-        allowed = count_nouns(f"{least}" if least == most else f"{least} to {most}", "site")
-        raise ScenarioError(f"{code} is for {allowed}, and the scenario has {sites}", path=path)
+        numbers = f"{least}" if least == most else f"{least} to {most}"
+        allowed = count_nouns(numbers, "site")
+        problem = f"{code} is for {allowed}, and the scenario has {sites}"
+        raise ScenarioError(problem, path=path)
 
 
 def _find_written_attributes(kind: Any) -> list[str]:
@@ -405,8 +418,9 @@ def make_instance(
         return kind(context, **settings)
     except (Exception, SystemExit) as error:  # the user's code may raise anything
         arguments = ", ".join(f"{key} = {value!r}" for key, value in settings.items())
-        raise ScenarioError(
+        error_path = path or f"sites.{context.site}.control"
+        problem = (
             f"{code} cannot be made with {arguments or 'no settings'}: "
-            f"{type(error).__name__}: {error}",
-            path=path or f"sites.{context.site}.control",
-        ) from None
+            f"{type(error).__name__}: {error}"
+        )
+        raise ScenarioError(problem, path=error_path) from None

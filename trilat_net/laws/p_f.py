@@ -1,7 +1,7 @@
 """Direct force reflection: the master feels the external torque on the slave's arm.
 
-The kernel computes this law (`core.control.damped_torque`); `PF.compute_torque` states the
-same law in plain Python, and `tests/control_laws/test_plain_torques.py` compares the two.
+The kernel computes this law (`core.control.damped_torque`). `PF.compute_torque` states the same
+law in plain Python, and `tests/control_laws/test_plain_torques.py` compares the two.
 """
 
 from collections.abc import Mapping, Sequence
@@ -55,10 +55,10 @@ class PF(ControlLaw):
             qd: joint velocities, shape (n,), rad/s.
             felt: torque on the peers' arms as received, weighted by dominance, shape (n,), N m.
         """
-        K = np.array(self.K)
-        d = np.array(self.d)
-        k_f = np.array(self.k_f)
-        return G - K * e - d * qd + k_f * felt
+        spring = np.array(self.K) * e
+        damper = np.array(self.d) * qd
+        reflected = np.array(self.k_f) * felt
+        return G - spring - damper + reflected
 
     def gains(self, theta: Array) -> Gains:
         """Returns the gains for the kernel, for an arm with parameters theta."""
@@ -66,7 +66,7 @@ class PF(ControlLaw):
         return Gains(Law.KNOWN, K=self.K, d=self.d, k_f=self.k_f, known=known)
 
     def check(self, path: str, sites: int) -> None:
-        """Refuses a number of sites other than two, because the felt contact is ambiguous then.
+        """Refuses more or less than two sites, because the felt contact is ambiguous then.
 
         Raises:
             ScenarioError: with the path of the key.
@@ -94,7 +94,7 @@ class PF(ControlLaw):
         masters = roles.count("master")
         return (
             "reflects force between one master and one slave; this scenario has "
-            f"{sites}, {masters} of them masters: leave p_f out, or take contact"
+            f"{sites}, {masters} of them masters: leave p_f out, or choose the task contact"
         )
 
     @classmethod

@@ -24,8 +24,8 @@ class SaturatedPd(ControlLaw):
 
         tau = G - sum_j alpha_ij P tanh(K (q - q_j) / P) - d qd
 
-    Zakerimanesh, Hashemzadeh and Ghiasi, "Dual-user nonlinear teleoperation subjected to
-    varying time delay and bounded inputs", ISA Transactions 68, 2017.
+    Source: Zakerimanesh, Hashemzadeh and Ghiasi, "Dual-user nonlinear teleoperation subjected
+    to varying time delay and bounded inputs", ISA Transactions 68, 2017.
 
     Attributes:
         K: stiffness of small errors, per joint, N m/rad.
@@ -40,8 +40,8 @@ class SaturatedPd(ControlLaw):
     gravity: NotNegative = 1.0
 
     linear_note: ClassVar = (
-        "saturated_pd has the slope K of small errors: "
-        "where sites disagree at rest it pulls less"
+        "saturated_pd is linearised with the slope K of small errors; "
+        "the law pulls less where sites disagree at rest"
     )
     tune: ClassVar = {"K": STIFFNESS, "P": (0.5, 50.0, "N m"), "d": DAMPING}
     needs_theta: ClassVar = True
@@ -49,11 +49,14 @@ class SaturatedPd(ControlLaw):
     def torque(self, now: LawInput) -> None:
         """Writes the torque of each joint."""
         for i in range(now.joints):
-            tau = self.gravity * now.gravity[i] - self.d[i] * now.qd[i]
+            q = now.q[i]
+            P = self.P[i]
+            damper = self.d[i] * now.qd[i]
+            tau = self.gravity * now.gravity[i] - damper
             for j in range(len(now.peers)):
                 peer = now.peers[j]
-                stretch = self.K[i] * (now.q[i] - peer.q[i]) / self.P[i]
-                tau -= peer.alpha * self.P[i] * tanh(stretch)
+                spring = self.K[i] * (q - peer.q[i])
+                tau -= peer.alpha * P * tanh(spring / P)
             now.tau[i] = tau
 
     def linear_gains(self, theta: Array) -> Gains | None:
@@ -62,24 +65,28 @@ class SaturatedPd(ControlLaw):
         return Gains(Law.KNOWN, K=self.K, d=self.d, known=known)
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns the condition of P+d, and the speed up to which torques keep their limit.
+        """Returns the condition of P+d, and the speed up to which torques stay within limits.
 
-        The condition of P+d applies because the slope is nowhere above K.
+        The condition of P+d applies because the slope of the saturated spring is nowhere above
+        K.
         """
         condition = judge_position_exchange(situation, "K", "d")
         if not situation.gravity_nm:
             text = f"{condition.text}; and tau_limit_nm above gravity + P + d |qd|"
             return condition._replace(text=text)
         gravity = self.gravity * np.array(situation.gravity_nm)
-        margin = np.array(situation.tau_limit_nm) - gravity - np.array(self.P)
+        tau_limit = np.array(situation.tau_limit_nm)
+        margin = tau_limit - gravity - np.array(self.P)
         if margin.min() <= 0.0:
             n = int(margin.argmin())
             text = (
                 f"tau_limit_nm of joint {n + 1} is {-margin[n]:.3g} N m below gravity + P: "
-                "it would cut the pull off"
+                "the limit would cut off the pull"
             )
             return StabilityCondition(False, text)
+        # A joint without damping has no such speed: the quotient is infinite.
         with np.errstate(divide="ignore"):
-            speed = float(np.min(margin / np.array(self.d)))
+            speeds = margin / np.array(self.d)
+        speed = float(np.min(speeds))
         limit = f"gravity + P + d |qd| is within tau_limit_nm up to {speed:.3g} rad/s"
         return condition._replace(text=f"{condition.text}; {limit}")

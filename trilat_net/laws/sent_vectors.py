@@ -24,7 +24,7 @@ from ..fields import Frozen, reword_problem, split_refusal
 
 
 class SentVectorSpec(Frozen, frozen=True):
-    """A vector that a law sends at every tick, see `core.law_channel`.
+    """A vector that a law sends at every tick, as the law declares it, see `core.law_channel`.
 
     Attributes:
         unit: unit of its numbers, as in "J"; "" for dimensionless numbers.
@@ -72,36 +72,38 @@ def check_sends(channel: LawChannel, joints: int, path: str) -> None:
     Raises:
         ScenarioError: with the path of the key.
     """
+    sends_path = f"{path}.sends"
     for vector in channel.vectors:
         problem = _find_name_problem(vector.name)
         if problem:
-            raise ScenarioError(problem, path=f"{path}.sends.{vector.name}")
+            raise ScenarioError(problem, path=f"{sends_path}.{vector.name}")
     most = MAX_SENT * joints
     if channel.received_size > most:
         count = count_nouns(channel.received_size, "number")
-        raise ScenarioError(
-            f"sends {count} to each peer, and at most {most} are accepted, "
-            f"{MAX_SENT} per joint",
-            path=f"{path}.sends",
+        problem = (
+            f"sends {count} to each peer, and at most {most} are accepted, {MAX_SENT} per joint"
         )
+        raise ScenarioError(problem, path=sends_path)
     if channel.record_size > MAX_RECORD_SENT:
         count = count_nouns(channel.record_size, "number")
         receivers = count_nouns(channel.peers, "peer")
-        raise ScenarioError(
+        problem = (
             f"sends {count} to {receivers} together, and a record holds at most "
-            f"{MAX_RECORD_SENT}",
-            path=f"{path}.sends",
+            f"{MAX_RECORD_SENT}"
         )
+        raise ScenarioError(problem, path=sends_path)
 
 
 def _find_name_problem(name: str) -> str:
     """Returns why a name is unsuitable for a vector, or ""."""
-    is_attribute = name.isidentifier() and not keyword.iskeyword(name)
-    if not is_attribute or name.startswith("_") or len(name) > 24:
+    is_identifier = name.isidentifier() and not keyword.iskeyword(name)
+    is_public = not name.startswith("_") and len(name) <= 24
+    if not (is_identifier and is_public):
         return (
             "is no name for a vector: a letter, then letters, digits and _, at most 24 of them"
         )
-    if hasattr(np.record, name) or hasattr(tuple, name):
+    is_reserved = hasattr(np.record, name) or hasattr(tuple, name)
+    if is_reserved:
         return "is taken: every record of numbers has an attribute of that name; choose another"
     return ""
 
@@ -140,20 +142,22 @@ def read_sends(source: bytes, file: Path, code: str, path: str) -> SentVectorSpe
     sends: Any = {}
     class_name = code.partition(":")[2]
     law = parse_classes(source, file, path).get(class_name)
-    for node in law.body if law else ():
+    statements = law.body if law else []
+    for node in statements:
         if not isinstance(node, ast.Assign | ast.AnnAssign) or node.value is None:
             continue
         targets = node.targets if isinstance(node, ast.Assign) else [node.target]
         names = {target.id for target in targets if isinstance(target, ast.Name)}
         if "sends" not in names:
             continue
+        value = node.value
         location = f"{code}: sends in line {node.lineno} of {file.name}"
         try:
-            sends = ast.literal_eval(node.value)
+            sends = ast.literal_eval(value)
         except (ValueError, TypeError, RecursionError):
             problem = f"{location} must be written out, as it is read and not run"
             raise ScenarioError(problem, path=path) from None
-        if isinstance(node.value, ast.Dict) and len(sends) < len(node.value.keys):
+        if isinstance(value, ast.Dict) and len(sends) < len(value.keys):
             raise ScenarioError(f"{location} has a name twice", path=path)
     return convert_sends(sends, code, path)
 
@@ -172,8 +176,7 @@ def convert_sends(sends: Any, code: str, path: str) -> SentVectorSpecs:
     try:
         return msgspec.convert(sends, SentVectorSpecs)
     except msgspec.ValidationError as error:
-        problem, key = split_refusal(error)
+        refusal, key = split_refusal(error)
         example = "{'energy': {'unit': 'J', 'length': 'joints', 'per_peer': True}}"
-        raise ScenarioError(
-            f"{code}: sends{key}: {reword_problem(problem)}, as in {example}", path=path
-        ) from None
+        problem = f"{code}: sends{key}: {reword_problem(refusal)}, as in {example}"
+        raise ScenarioError(problem, path=path) from None

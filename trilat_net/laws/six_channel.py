@@ -1,4 +1,8 @@
-"""The four-channel law of two users and a slave whose dominance is given by one factor a."""
+"""The four-channel law of two users and a slave whose dominance is given by one factor a.
+
+The law changes nothing in the torque of `FourChannel`; it only requires the shares of this
+factor.
+"""
 
 from typing import ClassVar
 
@@ -14,8 +18,9 @@ class SixChannel(FourChannel):
 
     The sites are user 1, user 2 and the slave, in this order. User 1 follows the slave with
     weight a and user 2 with 1 - a. User 2 follows the slave with 1 - a and user 1 with a. The
-    slave follows user 1 with a and user 2 with 1 - a. After Khademian and Hashtrudi-Zaad,
-    IEEE/ASME T-Mech 17, 2012.
+    slave follows user 1 with a and user 2 with 1 - a.
+
+    Source: Khademian and Hashtrudi-Zaad, IEEE/ASME T-Mech 17, 2012.
     """
 
     sites: ClassVar = 3

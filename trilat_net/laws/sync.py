@@ -1,7 +1,7 @@
 """Adaptive synchronisation of outputs r = qd + Lambda q, with its defect under gravity.
 
-The output r contains the absolute pose. With gravity each equilibrium has Y_G' r = 0, where Y_G
-is the regressor of gravity, so the arms end at q = 0.
+The output r contains the absolute pose. Under gravity every equilibrium satisfies Y_G' r = 0,
+where Y_G is the regressor of gravity, so the arms end at q = 0.
 
 Invariant:
     - The estimate advances by the trapezoid rule, like the estimate of the adaptive law.
@@ -29,9 +29,11 @@ class Sync(ControlLaw):
         tau = Y(q, qd, -Lambda q, -Lambda qd) theta_hat + K (sum_j alpha_ij r_j - r)
         theta_hat' = -Gamma Y' r
 
-    The law is for planar arms. Chopra, Spong and Lozano, "Synchronization of bilateral
-    teleoperators with time delay", Automatica 44, 2008; the defect is described in Nuno, Ortega
-    and Basanez, Automatica 46, 2010.
+    The law is for planar arms.
+
+    Source: Chopra, Spong and Lozano, "Synchronization of bilateral teleoperators with time
+    delay", Automatica 44, 2008; the defect is described in Nuno, Ortega and Basanez, Automatica
+    46, 2010.
 
     Attributes:
         Lambda: weight of the pose in r, per joint, 1/s.
@@ -58,23 +60,28 @@ class Sync(ControlLaw):
 
     def torque(self, now: LawInput) -> None:
         """Writes the torque and the estimate."""
+        half_h = 0.5 * now.h_s
+        Lambda_1 = self.Lambda[0]
+        Lambda_2 = self.Lambda[1]
         q = (now.q[0], now.q[1])
         qd = (now.qd[0], now.qd[1])
-        v = (-self.Lambda[0] * q[0], -self.Lambda[1] * q[1])
-        a = (-self.Lambda[0] * qd[0], -self.Lambda[1] * qd[1])
-        first, second = regressor(g=self.g_m_s2, q=q, qd=qd, v=v, a=a)
+        v = (-Lambda_1 * q[0], -Lambda_2 * q[1])
+        a = (-Lambda_1 * qd[0], -Lambda_2 * qd[1])
         r = (qd[0] - v[0], qd[1] - v[1])
         for i in range(2):
             peer_output = now.qd_des[i] + self.Lambda[i] * now.q_des[i]
             now.tau[i] = self.K[i] * (peer_output - r[i])
+        first, second = regressor(g=self.g_m_s2, q=q, qd=qd, v=v, a=a)
         for p in range(len(self.Yr)):
             Yr = first[p] * r[0] + second[p] * r[1]
             if now.k > 0:
-                self.theta_hat[p] -= 0.5 * now.h_s * self.Gamma[p] * (self.Yr[p] + Yr)
+                gain_s = half_h * self.Gamma[p]
+                self.theta_hat[p] -= gain_s * (self.Yr[p] + Yr)
             self.Yr[p] = Yr
-            now.theta_hat[p] = self.theta_hat[p]
-            now.tau[0] += first[p] * self.theta_hat[p]
-            now.tau[1] += second[p] * self.theta_hat[p]
+            estimate = self.theta_hat[p]
+            now.theta_hat[p] = estimate
+            now.tau[0] += first[p] * estimate
+            now.tau[1] += second[p] * estimate
 
     def linear_gains(self, theta: Array) -> Gains | None:  # noqa: ARG002
         """Returns the adaptive law with r = qd + Lambda q instead of qd + Lambda e."""
@@ -88,14 +95,13 @@ class Sync(ControlLaw):
         )
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns that any constant delay is allowed, and where the arms end under gravity."""
+        """Returns the condition, constant delays, and the pose where gravity moves the arms."""
         if np.isnan(situation.longest_s):
-            return StabilityCondition(
-                None, "proved for constant delays, and a delay here varies"
-            )
+            text = "proved for constant delays, and a delay here varies"
+            return StabilityCondition(None, text)
         text = (
             "r of all sites agree for every constant delay, any Lambda, K and Gamma > 0 "
-            "(sufficient); but under gravity the arms end at q = 0, wherever they are led"
+            "(sufficient); but under gravity the arms end at q = 0, wherever users move them"
         )
         return StabilityCondition(True, text)
 

@@ -1,10 +1,13 @@
 """Two-layer control: a transparency layer whose torque is paid for by a tank of energy.
 
+The transparency layer is a spring and dampers. The passivity layer below it keeps the tank, and
+reduces the torque of the transparency layer to the energy in the tank.
+
 Invariant:
-    - The work that the arm does on its controller and the energy packets of the peers fill a
+    - The work that the arm does on its controller and the energy packets of the peers fill the
       tank. The work of the torque on the arm, tau times the step in q, empties it.
     - While the tank is empty, the transparency layer has no torque.
-    - Packets are cumulative, so lost samples lose no energy.
+    - Packets are cumulative sums, so no energy is lost with a lost sample.
 """
 
 from typing import Any, ClassVar
@@ -23,8 +26,10 @@ from .interface import ERROR_DAMPING, STIFFNESS, EnergyLaw
 class Tanks(EnergyLaw):
     """Springs to the reference, whose work is paid for by one tank of energy per site.
 
-    The tanks are passive for any shares and any delays. Franken, Stramigioli, Misra, Secchi and
-    Macchelli, IEEE Transactions on Robotics 27 (4), 2011.
+    The tanks are passive for any shares and any delays.
+
+    Source: Franken, Stramigioli, Misra, Secchi and Macchelli, IEEE Transactions on Robotics 27
+    (4), 2011.
 
     Attributes:
         K: stiffness of the transparency layer per joint, N m/rad.
@@ -35,9 +40,8 @@ class Tanks(EnergyLaw):
         packet_1_s: rate at which a tank is emptied towards the peers, 1/s.
         by_shares: true: the peers' packets are weighted by this site's dominance factors;
             false: they are equal.
-        acceleration_rad_s2: largest acceleration of a joint for which the tank reserves energy:
-            in the coming period of length h the joint moves by up to qd h plus half of this
-            acceleration times h^2.
+        acceleration_rad_s2: largest acceleration a of a joint for which the tank reserves
+            energy: in the coming period h the joint moves by up to qd h + a h^2 / 2.
     """
 
     K: PositiveJoints = (100.0,)
@@ -72,25 +76,34 @@ class Tanks(EnergyLaw):
         n = now.joints
         peers = len(now.peers)
         H = now.to_all.H[0]
+        # The work of the previous period, and the packets of the peers.
         for i in range(n):
-            H -= (now.tau_before[i] - self.carried[i]) * (now.q[i] - now.q_before[i])
+            coupling_torque = now.tau_before[i] - self.carried[i]
+            step = now.q[i] - now.q_before[i]
+            H -= coupling_torque * step
         for j in range(peers):
-            H += now.received[j].E[0] - self.E_seen[j]
-            self.E_seen[j] = now.received[j].E[0]
+            E = now.received[j].E[0]
+            H += E - self.E_seen[j]
+            self.E_seen[j] = E
         packet = self.packet * max(H, 0.0)
         H -= packet
         for j in range(peers):
             share = now.peers[j].alpha if self.by_shares else 1.0 / peers
             now.sent[j].E[0] += share * packet
         now.to_all.H[0] = H
+
+        # The torque of the transparency layer.
         power = 0.0
         torque_sum = 0.0
         for i in range(n):
+            qd = now.qd[i]
             error = now.q[i] - now.q_des[i]
-            rate = now.qd[i] - now.qd_des[i]
-            now.tau[i] = -self.K[i] * error - self.Kd[i] * rate - self.d[i] * now.qd[i]
-            power += now.tau[i] * now.qd[i]
-            torque_sum += abs(now.tau[i])
+            error_rate = qd - now.qd_des[i]
+            tau = -self.K[i] * error - self.Kd[i] * error_rate - self.d[i] * qd
+            now.tau[i] = tau
+            power += tau * qd
+            torque_sum += abs(tau)
+
         affordable = 1.0
         damping = 0.0
         if self.guarded:
@@ -99,14 +112,17 @@ class Tanks(EnergyLaw):
             affordable = 0.0 if H <= 0.0 else min(1.0, H / max(cost, H))
             damping = self.fill_nm_s_rad_J * max(self.level_J - H, 0.0)
         for i in range(n):
-            self.carried[i] = self.gravity * now.gravity[i]
-            now.tau[i] = self.carried[i] + affordable * now.tau[i] - damping * now.qd[i]
+            carried = self.gravity * now.gravity[i]
+            self.carried[i] = carried
+            now.tau[i] = carried + affordable * now.tau[i] - damping * now.qd[i]
 
     def energies(self, seen: LawRecords) -> LawEnergies:
         """Returns the packets and the energy in the tank; a tank dissipates nothing."""
         gave = [peer.sent["E"] for peer in seen.peers]
-        took = [seen.memory["E_seen"][:, j : j + 1] for j in range(len(gave))]
-        port = -sum_work(seen.tau - seen.memory["carried"], seen.q)
+        E_seen = seen.memory["E_seen"]
+        took = [E_seen[:, j : j + 1] for j in range(len(gave))]
+        coupling_torque = seen.tau - seen.memory["carried"]
+        port = -sum_work(coupling_torque, seen.q)
         return LawEnergies(
             gave=gave,
             took=took,
@@ -118,18 +134,14 @@ class Tanks(EnergyLaw):
 
     def explain_no_linear_form(self) -> str:
         """Returns why the law cannot be linearised."""
-        return (
-            "its torque is the layer's where a tank is full enough, and none where it is "
-            "empty: energy switches it"
-        )
+        return "the energy in the tank switches its torque on and off"
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns that tanks are passive, if a tank sends no more per tick than it contains."""
+        """Returns the condition: a tank sends no more energy per tick than it contains."""
         share = self.packet_1_s / situation.rate_hz
         if share > 1.0:
-            return StabilityCondition(
-                False, f"a tank sends {share:.3g} of its energy a tick, more than it has"
-            )
+            text = f"a tank sends {share:.3g} of its energy a tick, more than it has"
+            return StabilityCondition(False, text)
         text = (
             f"tanks are passive for any shares, delays and loss, where {PASSIVE_OUTSIDE}, and "
             f"joints accelerate by {self.acceleration_rad_s2:g} rad/s^2 at most"

@@ -4,9 +4,13 @@ A follower is moved by the force of a spring and a damper towards a goal,
 
     F = K (goal - q) + B (v - qd),    goal' = v,    v = sum_j alpha_j v_j
 
-where v_j are the velocities of the peers, weighted by dominance. Peer j feels -alpha_j F. If
-all sites follow, there is one coupling in each direction. While a site waits, aligns or holds,
-the difference between its reference and its peers is added to the goal without an energy cost.
+where v_j are the velocities of the peers and alpha_j are the dominance factors. Peer j feels
+-alpha_j F. If all sites follow, there is one coupling in each direction. While a site waits,
+aligns or holds, the difference between its reference and its peers is added to the goal without
+an energy cost.
+
+Names: `E_...` are sums of energy that an end has put in or taken, `W_...` are energies that an
+end observes; `led` belongs to the leader's end of a coupling, `followed` to the follower's.
 
 Invariant:
     - In each directed coupling of a follower to a leader, each end accounts cumulatively, per
@@ -27,8 +31,8 @@ from .conditions import PASSIVE_OUTSIDE, LawSituation, StabilityCondition
 from .interface import DAMPING, STIFFNESS, EnergyLaw
 
 SWEEPS = 3
-"""Number of iterations in which joints and couplings settle their limited torques, since these
-influence one another.
+"""Number of iterations for the limited torques of joints and couplings, which influence one
+another.
 """
 AHEAD = 2.0
 """Ticks of a leader's motion that are paid for in advance: a joint needs one tick to reverse
@@ -54,8 +58,9 @@ def book_leader_work(now: LawInput, j: int, i: int, torque: float, step: float) 
     Returns:
         The energy that the arm takes out of the coupling, J, zero or negative.
     """
-    now.sent[j].E_led[i] += max(torque * step, 0.0)
-    taken: float = min(torque * step, 0.0)
+    work = torque * step
+    now.sent[j].E_led[i] += max(work, 0.0)
+    taken: float = min(work, 0.0)
     return taken
 
 
@@ -84,18 +89,21 @@ def invert_inertia(law: Any, now: LawInput) -> None:
         for j in range(n):
             inverse[i * n + j] = now.inertia[i][j]
     for p in range(n):
-        pivot = inverse[p * n + p]
+        pivot_row = p * n
+        pivot = inverse[pivot_row + p]
         if pivot == 0.0:
             return
-        inverse[p * n + p] = 1.0
+        inverse[pivot_row + p] = 1.0
         for j in range(n):
-            inverse[p * n + j] /= pivot
+            inverse[pivot_row + j] /= pivot
         for i in range(n):
-            if i != p:
-                factor = inverse[i * n + p]
-                inverse[i * n + p] = 0.0
-                for j in range(n):
-                    inverse[i * n + j] -= factor * inverse[p * n + j]
+            if i == p:
+                continue
+            row = i * n
+            factor = inverse[row + p]
+            inverse[row + p] = 0.0
+            for j in range(n):
+                inverse[row + j] -= factor * inverse[pivot_row + j]
 
 
 @compiled
@@ -104,30 +112,36 @@ def limit_leader_torque(law: Any, now: LawInput, j: int, i: int) -> None:
 
     The controller reduces the follower's torque to a magnitude that the known energy pays for
     during the next `AHEAD` ticks. The prediction assumes that the joint continues its motion,
-    and adds the effect of the torques that this tick changes, the coupling's own torque
+    and adds the effect of the torques that change in this tick, the coupling's own torque
     included. An energy deficit is repaid by damping.
     """
     n = now.joints
     h = now.h_s
     index = j * n + i
+    qd = now.qd[i]
     requested = now.received[j].F[i]
     known_J = now.sent[j].W_led[i]
     available_J = max(known_J - law.floor, 0.0)
     sign = 1.0 if requested > 0.0 else -1.0
     magnitude = abs(requested)
-    step = now.qd[i] * h
+    step = qd * h
     step_per_torque = 0.0
     half = 0.5 * h * h
     if law.by_step:
         half *= AHEAD * AHEAD
         step_per_torque = half * law.inverse[i * n + i] / law.beta
-        step = AHEAD * step + AHEAD**2 * (law.predicted_step[i] - step)
+        step_change = law.predicted_step[i] - step
+        step = AHEAD * step + AHEAD**2 * step_change
         for m in range(n):
             step += half * law.inverse[i * n + m] * law.torque_change[m]
+
     # The step against the torque that the joint would make without this coupling's torque.
     current = law.F_now[index]
-    free_step = half * law.acceleration_rad_s2 - sign * step - step_per_torque * sign * current
-    if magnitude * (free_step + step_per_torque * magnitude) > available_J:
+    current_step = step_per_torque * sign * current
+    free_step = half * law.acceleration_rad_s2 - sign * step - current_step
+    cost_J = magnitude * (free_step + step_per_torque * magnitude)
+    if cost_J > available_J:
+        # The magnitude whose cost is the available energy.
         if step_per_torque > 0.0:
             square = free_step * free_step + 4.0 * step_per_torque * available_J
             root = max(math.sqrt(square) - free_step, 0.0)
@@ -135,12 +149,16 @@ def limit_leader_torque(law: Any, now: LawInput, j: int, i: int) -> None:
         else:
             magnitude = available_J / free_step
     torque = requested if not law.controlled else sign * magnitude
+
     deficit_J = law.floor - known_J
     if law.controlled and step_per_torque > 0.0 and deficit_J > 0.0:
-        squared_step = now.qd[i] * law.predicted_step[i]
+        # Damping dissipates its coefficient times qd times the step.
+        squared_step = qd * law.predicted_step[i]
         if squared_step > 0.0:
-            most = 0.25 * h * AHEAD**2 / (n * len(now.peers) * step_per_torque)
-            torque += now.qd[i] * min(0.1 * deficit_J / squared_step, most)
+            couplings = n * len(now.peers)
+            most = 0.25 * h * AHEAD**2 / (couplings * step_per_torque)
+            damping = min(0.1 * deficit_J / squared_step, most)
+            torque += qd * damping
     law.torque_change[i] -= (torque - current) / law.beta
     law.F_now[index] = torque
 
@@ -152,9 +170,11 @@ def find_known_energy(law: Any, now: LawInput, j: int, i: int) -> float:
     Half of the reserve is kept for steps that cost more than planned.
     """
     index = j * now.joints + i
+    moved_J = law.E_moved[index]
+    yielded_J = law.E_yielded[index]
     received_J = now.received[j].E_led[i]
-    known: float = received_J + 0.5 * law.reserve_J - law.E_moved[index] + law.E_yielded[index]
-    return known
+    known_J: float = received_J + 0.5 * law.reserve_J - moved_J + yielded_J
+    return known_J
 
 
 @compiled
@@ -176,12 +196,13 @@ def limit_follower_velocity(
     """
     index = j * now.joints + i
     h = now.h_s
-    peer = now.peers[j]
+    peer_velocity = now.peers[j].qd[i]
     known_J = find_known_energy(law, now, j, i)
     if law.by_step:
         known_J = max(known_J - price, 0.0)
-    law.v_led[index] = peer.qd[i]
-    remaining_J: float = known_J - max(force * peer.qd[i] * h, 0.0)
+    law.v_led[index] = peer_velocity
+    cost_J = max(force * peer_velocity * h, 0.0)
+    remaining_J: float = known_J - cost_J
     if law.controlled and remaining_J < 0.0 and abs(force) > _SLACK_NM:
         law.v_led[index] += remaining_J / (force * h)
     return remaining_J
@@ -205,8 +226,9 @@ def compute_drift_velocity(
         available_J: the energy that remains in all couplings together, J.
     """
     h = now.h_s
-    velocity = max(-law.drift_rad_s, min(law.drift_rad_s, error / now.h_s))
-    linear = law.force[i] * (1.0 if velocity > 0.0 else -1.0)
+    velocity = max(-law.drift_rad_s, min(law.drift_rad_s, error / h))
+    sign = 1.0 if velocity > 0.0 else -1.0
+    linear = law.force[i] * sign
     square = 0.0
     magnitude = abs(velocity)
     power = available_J / h
@@ -229,10 +251,13 @@ def compute_drift_velocity(
 def find_affordable_velocity(law: Any, now: LawInput, j: int, i: int, force: float) -> float:
     """Returns the goal's velocity by peer j, reduced where it costs more than is known."""
     index = j * now.joints + i
+    # The work of the force per velocity of the goal in a period.
     work = now.peers[j].alpha * force * now.h_s
     known_J = max(find_known_energy(law, now, j, i), 0.0)
     velocity = float(law.v_led[index])
-    return known_J / work if law.controlled and work * velocity > known_J else velocity
+    if law.controlled and work * velocity > known_J:
+        return known_J / work
+    return velocity
 
 
 @compiled
@@ -255,15 +280,17 @@ def book_follower(law: Any, now: LawInput, j: int, i: int, force: float, drift: 
     index = j * now.joints + i
     h = now.h_s
     sent = now.sent[j]
-    velocity = law.v_led[index] if law.by_step else now.peers[j].qd[i]
+    used_velocity = law.v_led[index]
+    velocity = used_velocity if law.by_step else now.peers[j].qd[i]
     energy = force * velocity * h
     if energy >= 0.0:
         law.E_moved[index] += energy
     else:
         sent.E_followed[i] -= energy
-    law.E_yielded[index] += force * (velocity - law.v_led[index]) * h - drift
-    received_J = now.received[j].E_led[i]
-    sent.W_followed[i] = received_J + law.reserve_J - law.E_moved[index] + law.E_yielded[index]
+    yielded_J = force * (velocity - used_velocity) * h
+    law.E_yielded[index] += yielded_J - drift
+    known_J = now.received[j].E_led[i] + law.reserve_J
+    sent.W_followed[i] = known_J - law.E_moved[index] + law.E_yielded[index]
 
 
 @compiled
@@ -280,11 +307,13 @@ def charge_unpaid_energy(law: Any, now: LawInput, i: int, spring: float) -> None
         spring: energy of the joint's spring now, J.
     """
     moved = now.q[i] - now.q_before[i] - law.alignment_step[i]
-    unpaid = law.force[i] * moved + spring - law.spring[i] - law.paid[i]
+    work = law.force[i] * moved
+    unpaid = work + spring - law.spring[i] - law.paid[i]
     for j in range(len(now.peers)):
         index = j * now.joints + i
         if law.by_step and now.k > 0:
-            charged = max(now.peers[j].alpha * unpaid, -law.lent[index])
+            peer_part = now.peers[j].alpha * unpaid
+            charged = max(peer_part, -law.lent[index])
             law.E_moved[index] += charged
             law.lent[index] += charged
         law.E_settled[index] = law.E_moved[index] - law.E_yielded[index]
@@ -315,7 +344,9 @@ def settle_follower(
     velocity = 0.0
     for sweep in range(1 + SWEEPS * law.by_step):
         if sweep > 0:
-            force = law.K[i] * stretch + law.B[i] * (velocity - now.qd[i])
+            spring_torque = law.K[i] * stretch
+            damper_torque = law.B[i] * (velocity - now.qd[i])
+            force = spring_torque + damper_torque
             force = max(law.low[i], min(law.high[i], force))
             if force * drift_velocity * h > available_J:
                 drift_velocity = available_J / (force * h)
@@ -328,13 +359,16 @@ def settle_follower(
                 )
             velocity += now.peers[j].alpha * law.v_led[index]
     for j in range(peers):
+        # Each coupling pays for drift compensation in proportion to its remaining energy.
         share = law.left_J[j * n + i] / available_J if available_J > 0.0 else 0.0
         drift = share * force * drift_velocity * h
         peer_force = now.peers[j].alpha * force
         book_follower(law=law, now=now, j=j, i=i, force=peer_force, drift=drift)
     law.goal[i] += h * velocity
     law.force[i] = force
-    law.paid[i] = force * velocity * h + force * law.alignment_step[i]
+    goal_work = force * velocity * h
+    alignment_work = force * law.alignment_step[i]
+    law.paid[i] = goal_work + alignment_work
 
 
 @compiled
@@ -355,27 +389,44 @@ def follow_peers(law: Any, now: LawInput, i: int) -> None:
         law.goal[i] = target
     offset = now.q_des[i] - target
     # The motion of the offset in half a period.
-    law.alignment_step[i] = 0.5 * h * (now.qd_des[i] - velocity) if offset != 0.0 else 0.0
+    law.alignment_step[i] = 0.0
+    if offset != 0.0:
+        law.alignment_step[i] = 0.5 * h * (now.qd_des[i] - velocity)
+
+    low = law.low[i]
+    high = law.high[i]
     stretch = law.goal[i] + offset - now.q[i]
-    spring_torque = max(law.low[i], min(law.high[i], K * stretch))
-    spring_J = spring_torque * (stretch - 0.5 * spring_torque / K) if K > 0.0 else 0.0
-    charge_unpaid_energy(law, now, i, spring_J)
+    spring_torque = K * stretch
     damper_torque = B * (velocity - now.qd[i])
-    law.force[i] = max(law.low[i], min(law.high[i], K * stretch + damper_torque))
+    force = max(low, min(high, spring_torque + damper_torque))
+    # Beyond the torque limit the energy of the spring grows linearly with its elongation.
+    spring_J = 0.0
+    if K > 0.0:
+        limited_torque = max(low, min(high, spring_torque))
+        mean_stretch = stretch - 0.5 * limited_torque / K
+        spring_J = limited_torque * mean_stretch
+    charge_unpaid_energy(law, now, i, spring_J)
+    law.force[i] = force
+
     # The expected elongation of the spring in this period.
     elongation = velocity * h - law.predicted_step[i]
-    price = max((0.5 * K * elongation - damper_torque) * elongation, 0.0)
+    mean_torque = 0.5 * K * elongation - damper_torque
+    price = max(mean_torque * elongation, 0.0)
     available_J = 0.0
     least_J = 0.0
     for j in range(peers):
         alpha = now.peers[j].alpha
-        now.sent[j].F[i] = alpha * law.force[i]
+        peer_force = alpha * force
+        peer_price = alpha * price
+        now.sent[j].F[i] = peer_force
         remaining_J = limit_follower_velocity(
-            law=law, now=now, j=j, i=i, force=alpha * law.force[i], price=alpha * price
+            law=law, now=now, j=j, i=i, force=peer_force, price=peer_price
         )
-        law.left_J[j * n + i] = max(remaining_J, 0.0) * (alpha > 0.0)
-        available_J += law.left_J[j * n + i]
+        left_J = max(remaining_J, 0.0) * (alpha > 0.0)
+        law.left_J[j * n + i] = left_J
+        available_J += left_J
         least_J = min(least_J, remaining_J)
+
     drift_velocity = 0.0
     if law.drift_rad_s > 0.0 and available_J > 0.0 and least_J >= 0.0:
         error = target - law.goal[i] - h * velocity
@@ -396,22 +447,25 @@ def follow_peers(law: Any, now: LawInput, i: int) -> None:
 class Tdpa(EnergyLaw):
     """Time-domain passivity control with delay: each end monitors its coupling, and damps.
 
-    Each site follows, by K and B, the integral of its peers' velocities, weighted by dominance,
-    and the peers feel that torque. With K = 0 and B = 0 a site only leads. After Ryu, Artigas
-    and Preusche (2010); of several sites after Panzirsch and others (2012).
+    A spring K and a damper B move each site towards the integral of its peers' velocities,
+    weighted by dominance, and the peers feel the torque of K and B. With K = 0 and B = 0 a site
+    only leads.
+
+    Source: Ryu, Artigas and Preusche (2010); for several sites Panzirsch and others (2012).
 
     Attributes:
         K: spring by which the site follows, per joint, N m/rad; 0: the site follows nobody.
         B: damper by which the site follows, per joint, N m s/rad.
         acceleration_rad_s2: largest change per tick of a joint's acceleration by torques other
-            than the law's, as far as the leaders' controllers cover it in advance. Half of the
-            reserve covers it too.
-        drift_rad_s: largest velocity by which positions are brought to agreement again; 0: they
-            drift.
+            than the law's that the leaders' controllers plan for. Half of the reserve pays for
+            larger changes.
+        drift_rad_s: largest velocity by which positions that have drifted apart are brought
+            together again; 0: positions drift.
         reserve_J: initial energy of an end per joint and peer, J.
         energy: "step": energy that the arm receives, torque times the step in q; "velocity":
             torque times velocity times period, as published.
-        beta: divisor of the site's torque, dimensionless: it weights whom each user feels.
+        beta: divisor of the site's torque, dimensionless; it scales the forces that the users
+            feel relative to each other.
     """
 
     K: NotNegativeJoints = (100.0,)
@@ -445,7 +499,7 @@ class Tdpa(EnergyLaw):
     )
     needs_model: ClassVar = True
     tune: ClassVar = {"K": STIFFNESS, "B": DAMPING}
-    known_facts: ClassVar = "gravity, and inertia for two ticks"
+    known_facts: ClassVar = "gravity, and inertia to predict two ticks"
     controlled = True
     """False switches the controllers off, for comparison: energies are only observed."""
 
@@ -509,22 +563,24 @@ class Tdpa(EnergyLaw):
             for j in range(peers):
                 felt += self.F_now[j * n + i]
             # The part of the felt torque that keeps the joint's torque within its limits.
-            applied = max(force - self.high[i], min(force - self.low[i], felt))
+            least_felt = force - self.high[i]
+            most_felt = force - self.low[i]
+            applied = max(least_felt, min(most_felt, felt))
             share = 1.0 if applied == felt else applied / felt
             step = now.qd[i] * now.h_s
             for j in range(peers):
                 index = j * n + i
-                self.F_led[index] = share * self.F_now[index]
+                torque = share * self.F_now[index]
+                self.F_led[index] = torque
                 if not self.by_step:
-                    now.sent[j].W_led[i] += book_leader_work(
-                        now=now, j=j, i=i, torque=self.F_led[index], step=step
-                    )
+                    taken = book_leader_work(now=now, j=j, i=i, torque=torque, step=step)
+                    now.sent[j].W_led[i] += taken
             now.tau[i] = self.carried[i] + (force - applied) / self.beta
 
     def energies(self, seen: LawRecords) -> LawEnergies:
         """Returns the energies of both ends of all couplings.
 
-        Energies of following are those up to the period before.
+        The follower's energies are those up to the previous period.
         """
         gave = []
         took = []
@@ -535,15 +591,17 @@ class Tdpa(EnergyLaw):
             sent = peer.sent
             followed = np.vstack([np.zeros(n), sent["E_followed"][:-1]])
             gave.append(np.hstack([sent["E_led"], followed]))
-            settled = seen.memory["E_settled"][:, j * n : (j + 1) * n]
+            columns = slice(j * n, (j + 1) * n)
+            settled = seen.memory["E_settled"][:, columns]
             taken_by_follower = settled - self.reserve_J
             taken_by_leader = received["E_followed"] - sent["W_led"]
             took.append(np.hstack([taken_by_follower, taken_by_leader]))
             observed.append(np.hstack([sent["W_led"], sent["W_followed"]]))
+        coupling_torque = seen.tau - seen.memory["carried"]
         return LawEnergies(
             gave=gave,
             took=took,
-            port=-self.beta * sum_work(seen.tau - seen.memory["carried"], seen.q),
+            port=-self.beta * sum_work(coupling_torque, seen.q),
             store=seen.memory["spring"],
             observed=observed,
             weight=self.beta,
@@ -552,27 +610,26 @@ class Tdpa(EnergyLaw):
 
     def explain_no_linear_form(self) -> str:
         """Returns why the law cannot be linearised."""
-        return (
-            "its controllers act by the energy observed, which is of second order in the motion"
-        )
+        return "its controllers act by energies, which are of second order in the motion"
 
     def explain_idle_shares(self, at: LawSituation) -> str:  # noqa: ARG002
-        """Returns that a site without K and B follows nobody, or ""."""
+        """Returns the reason for a site without K and B, which follows nobody, or ""."""
         return "" if any(self.K) or any(self.B) else "K = 0 and B = 0 follow nobody"
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:  # noqa: ARG002
-        """Returns that the couplings are passive as far as motion can be predicted."""
+        """Returns the condition: passive surroundings, and motion that can be predicted."""
         text = (
             "couplings are passive for any delays, jitter, loss and shares, where "
-            f"{PASSIVE_OUTSIDE}, "
+            f"{PASSIVE_OUTSIDE}"
         )
         if self.energy == "velocity":
-            return StabilityCondition(True, f"{text}in books that leak tau qdd h^2 / 2 a tick")
+            leak = "up to tau qdd h^2 / 2 per tick, which the accounts by velocity miss"
+            return StabilityCondition(True, f"{text}, {leak}")
         beyond = ""
         if self.acceleration_rad_s2:
             beyond = f" beyond {self.acceleration_rad_s2:g} rad/s^2"
         text += (
-            "while half of reserve_J pays for what other torques change accelerations by in a "
+            ", while half of reserve_J pays for changes of acceleration by other torques in a "
             f"tick{beyond}"
         )
         return StabilityCondition(True, text)
