@@ -1,4 +1,4 @@
-"""Fields of a scenario: base of its types, ranges of its numbers, checks of its tables.
+"""The fields of a scenario's types: their base class, ranges of numbers, and checks of tables.
 
 Invariant:
     - An error names the path of the key as the author wrote it, and the nearest valid name.
@@ -38,15 +38,16 @@ def find_kinds(package: str, base: type[K]) -> Iterator[type[K]]:
         package: the dotted name of the package.
         base: the base class.
     """
-    for file in pkgutil.iter_modules(import_module(package).__path__):
+    folders = import_module(package).__path__
+    for file in pkgutil.iter_modules(folders):
         name = f"{package}.{file.name}"
         for value in vars(import_module(name)).values():
-            if not (isinstance(value, type) and issubclass(value, base)):
+            is_kind = isinstance(value, type) and issubclass(value, base)
+            if not is_kind or value.__module__ != name:
                 continue
             tag = value.__struct_config__.tag
             # Without a tag of its own, a class is only a base of others.
-            has_tag = tag is not None and tag != value.__name__
-            if value.__module__ == name and has_tag:
+            if tag is not None and tag != value.__name__:
                 yield value
 
 
@@ -57,12 +58,12 @@ Positive = Annotated[float, Meta(gt=0.0, le=MAX_QUANTITY)]
 NotNegative = Annotated[float, Meta(ge=0.0, le=MAX_QUANTITY)]
 Share = Annotated[float, Meta(ge=0.0, le=1.0)]
 Real = Annotated[float, Meta(ge=-MAX_QUANTITY, le=MAX_QUANTITY)]
+_MAX_PARAMETERS = MAX_JOINTS * LINK_PARAMETERS
 _PER_JOINT = Meta(min_length=1, max_length=MAX_JOINTS, extra={"per": "joints"})
-_PER_PARAMETER = Meta(
-    min_length=1, max_length=MAX_JOINTS * LINK_PARAMETERS, extra={"per": "parameters"}
-)
+_PER_PARAMETER = Meta(min_length=1, max_length=_MAX_PARAMETERS, extra={"per": "parameters"})
 _PER_COORDINATE = Meta(min_length=1, max_length=MAX_JOINTS, extra={"per": "shared"})
 _PER_AXIS = Meta(min_length=2, max_length=3, extra={"per": "axes"})
+_POINT = Meta(min_length=2, max_length=3, extra={"point": "axes"})
 Joints = Annotated[tuple[Real, ...], _PER_JOINT]
 PositiveJoints = Annotated[tuple[Positive, ...], _PER_JOINT]
 NotNegativeJoints = Annotated[tuple[NotNegative, ...], _PER_JOINT]
@@ -71,7 +72,7 @@ NotNegativeParameters = Annotated[tuple[NotNegative, ...], _PER_PARAMETER]
 PositiveCoordinates = Annotated[tuple[Positive, ...], _PER_COORDINATE]
 NotNegativeCoordinates = Annotated[tuple[NotNegative, ...], _PER_COORDINATE]
 NotNegativeAxes = Annotated[tuple[NotNegative, ...], _PER_AXIS]
-Point = Annotated[tuple[Real, ...], Meta(min_length=2, max_length=3, extra={"point": "axes"})]
+Point = Annotated[tuple[Real, ...], _POINT]
 RateHz = Annotated[int, Meta(ge=1, le=20_000)]
 
 TomlTable = dict[str, Any]
@@ -135,8 +136,9 @@ def _vector_keys(kind: StructType, extra: str) -> Mapping[str, str]:
     counts = {}
     for key, hint in get_type_hints(kind, include_extras=True).items():
         for meta in getattr(hint, "__metadata__", ()):
-            if isinstance(meta, Meta) and meta.extra is not None and extra in meta.extra:
-                counts[key] = str(meta.extra[extra])
+            annotations = meta.extra if isinstance(meta, Meta) else None
+            if annotations is not None and extra in annotations:
+                counts[key] = str(annotations[extra])
     return counts
 
 
@@ -150,15 +152,16 @@ def expand_vectors(table: TomlTable, kind: StructType, counts: VectorCounts) -> 
         kind: the type of the table.
         counts: the counts of the site's vectors.
     """
-    per = _vector_keys(kind, "per")
+    lengths = {key: getattr(counts, per) for key, per in _vector_keys(kind, "per").items()}
     expanded: TomlTable = {}
     for field in msgspec.structs.fields(kind):
-        if field.name in per and isinstance(field.default, tuple):
-            expanded[field.name] = [field.default[0]] * getattr(counts, per[field.name])
+        name = field.name
+        if name in lengths and isinstance(field.default, tuple):
+            expanded[name] = [field.default[0]] * lengths[name]
     for key, value in table.items():
         is_single = is_number(value) or is_distribution(value)
-        if key in per and is_single:
-            expanded[key] = [value] * getattr(counts, per[key])
+        if key in lengths and is_single:
+            expanded[key] = [value] * lengths[key]
         else:
             expanded[key] = value
     return expanded
@@ -179,10 +182,11 @@ def find_count_problem(
     for key, per in vectors.items():
         required = getattr(counts, per)
         value = table.get(key)
-        if isinstance(value, list) and len(value) != required:
-            noun = "coordinates" if per == "shared" else per
-            numbers = count_nouns(len(value), "number")
-            return KeyProblem(key, f"has {numbers}, and {_OWNERS[per]} {required} {noun}")
+        if not isinstance(value, list) or len(value) == required:
+            continue
+        noun = "coordinates" if per == "shared" else per
+        numbers = count_nouns(len(value), "number")
+        return KeyProblem(key, f"has {numbers}, and {_OWNERS[per]} {required} {noun}")
     return None
 
 
@@ -244,10 +248,11 @@ def check_keys(table: Any, valid: Sequence[str], path: str) -> TomlTable:
     if not isinstance(table, dict):
         raise ScenarioError("must be a table", path=path)
     for key in table:
-        if key not in valid:
-            key_path = f"{path}.{key}" if path else key
-            hint = suggest_nearest(key, valid) or f"; valid are {', '.join(valid)}"
-            raise ScenarioError(f"unknown key{hint}", path=key_path)
+        if key in valid:
+            continue
+        key_path = f"{path}.{key}" if path else key
+        hint = suggest_nearest(key, valid) or f"; valid are {', '.join(valid)}"
+        raise ScenarioError(f"unknown key{hint}", path=key_path)
     return table
 
 
@@ -277,12 +282,12 @@ def check_finite(value: Any, path: str) -> None:
     if isinstance(value, float) and not math.isfinite(value):
         raise ScenarioError(f"must be a finite number, is {value}", path=path)
     if isinstance(value, int) and not -(2**63) <= value < 2**63:
-        raise ScenarioError(
-            f"must be a number of at most 64 bits, has {value.bit_length()}", path=path
-        )
+        problem = f"must be a number of at most 64 bits, has {value.bit_length()}"
+        raise ScenarioError(problem, path=path)
     if isinstance(value, dict):
         for key, entry in value.items():
-            check_finite(entry, f"{path}.{key}" if path else key)
+            entry_path = f"{path}.{key}" if path else key
+            check_finite(entry, entry_path)
     if isinstance(value, list):
         for n, entry in enumerate(value):
             check_finite(entry, f"{path}[{n}]")
@@ -310,7 +315,7 @@ UNITS = {
 
 
 def split_unit(name: str) -> tuple[str, str]:
-    """Returns a name in words without its unit, and the unit, or "" without a unit.
+    """Returns the words of a name before its unit, and the unit, or "" without a unit.
 
     The longest ending that is a unit counts.
 
@@ -319,7 +324,7 @@ def split_unit(name: str) -> tuple[str, str]:
     """
     parts = name.split("_")
     for n in range(1, len(parts)):
-        unit = UNITS.get("_".join(parts[n:]), "")
-        if unit:
-            return " ".join(parts[:n]), unit
+        ending = "_".join(parts[n:])
+        if ending in UNITS:
+            return " ".join(parts[:n]), UNITS[ending]
     return " ".join(parts), ""

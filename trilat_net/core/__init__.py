@@ -6,7 +6,6 @@ folder describes the stages of a tick, the state of a site, and each file.
 Invariant:
 
 - Nothing in this package reads a clock, opens a socket, logs, or draws a random number that the
-  scenario does not seed. Only `jit` and `plugged` use files, for
-  compiled code.
+  scenario does not seed. Only `jit` and `plugged` use files, for compiled code.
 - It depends on the standard library, NumPy, Numba, `errors` and `process` alone.
 """

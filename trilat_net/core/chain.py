@@ -404,17 +404,21 @@ def inverse_dynamics(
         first = LINK_PARAMETERS * i
         V = (three(row.V_lin), three(row.V_ang))
         W = (three(row.W_lin), three(row.W_ang))
-        # I A
-        inertial_lin, inertial_ang = _momentum(theta, first, three(row.A_lin), three(row.A_ang))
-        # V x* I W + W x* I V - I (V x W)
-        V_x_I_W = _force_cross(V, _momentum(theta, first, W[0], W[1]))
-        W_x_I_V = _force_cross(W, _momentum(theta, first, V[0], V[1]))
+        A = (three(row.A_lin), three(row.A_ang))
         V_x_W = _motion_cross(V, W)
-        I_V_x_W = _momentum(theta, first, V_x_W[0], V_x_W[1])
-        turning_lin = subtract(add(V_x_I_W[0], W_x_I_V[0]), I_V_x_W[0])
-        turning_ang = subtract(add(V_x_I_W[1], W_x_I_V[1]), I_V_x_W[1])
-        put_three(row.f_lin, add(inertial_lin, scale(0.5, turning_lin)))
-        put_three(row.f_ang, add(inertial_ang, scale(0.5, turning_ang)))
+        I_V = _momentum(theta, first, V[0], V[1])
+        I_W = _momentum(theta, first, W[0], W[1])
+        I_A = _momentum(theta, first, A[0], A[1])
+        # V x* I W + W x* I V - I (V x W)
+        first_part = _force_cross(V, I_W)
+        second_part = _force_cross(W, I_V)
+        third_part = _momentum(theta, first, V_x_W[0], V_x_W[1])
+        force_sum = add(first_part[0], second_part[0])
+        torque_sum = add(first_part[1], second_part[1])
+        turning_force = subtract(force_sum, third_part[0])
+        turning_torque = subtract(torque_sum, third_part[1])
+        put_three(row.f_lin, add(I_A[0], scale(0.5, turning_force)))
+        put_three(row.f_ang, add(I_A[1], scale(0.5, turning_torque)))
     for i in range(n - 1, -1, -1):
         row = chain[i]
         rigid = _along_axis(row, three(row.f_lin), three(row.f_ang))
@@ -463,7 +467,9 @@ def parameter_gradient(chain: RowArray, gradient: Array) -> None:
         V = (three(row.V_lin), three(row.V_ang))
         W = (three(row.W_lin), three(row.W_ang))
         A = (three(row.A_lin), three(row.A_ang))
-        s = (subtract(V[0], W[0]), subtract(V[1], W[1]))
+        s_lin = subtract(V[0], W[0])
+        s_ang = subtract(V[1], W[1])
+        s = (s_lin, s_ang)
         V_x_s = _motion_cross(V, s)
         W_x_s = _motion_cross(W, s)
         V_x_W = _motion_cross(V, W)
@@ -499,15 +505,22 @@ def _add_composite(row: Row, before: Row) -> None:
     polar = 2.0 * dot(p, mc) + m * dot(p, p)
     p_x, p_y, p_z = p
     mc_x, mc_y, mc_z = mc
+    # The moments of inertia about the previous link's origin.
+    I_xx = I_x[0] + polar - 2.0 * p_x * mc_x - m * p_x * p_x
+    I_xy = I_x[1] - p_x * mc_y - p_y * mc_x - m * p_x * p_y
+    I_yy = I_y[1] + polar - 2.0 * p_y * mc_y - m * p_y * p_y
+    I_xz = I_x[2] - p_x * mc_z - p_z * mc_x - m * p_x * p_z
+    I_yz = I_y[2] - p_y * mc_z - p_z * mc_y - m * p_y * p_z
+    I_zz = I_z[2] + polar - 2.0 * p_z * mc_z - m * p_z * p_z
     total[0] += m
     for j in range(3):
         total[1 + j] += mc[j] + m * p[j]
-    total[4] += I_x[0] + polar - 2.0 * p_x * mc_x - m * p_x * p_x
-    total[5] += I_x[1] - p_x * mc_y - p_y * mc_x - m * p_x * p_y
-    total[6] += I_y[1] + polar - 2.0 * p_y * mc_y - m * p_y * p_y
-    total[7] += I_x[2] - p_x * mc_z - p_z * mc_x - m * p_x * p_z
-    total[8] += I_y[2] - p_y * mc_z - p_z * mc_y - m * p_y * p_z
-    total[9] += I_z[2] + polar - 2.0 * p_z * mc_z - m * p_z * p_z
+    total[4] += I_xx
+    total[5] += I_xy
+    total[6] += I_yy
+    total[7] += I_xz
+    total[8] += I_yz
+    total[9] += I_zz
 
 
 @leaf
@@ -642,18 +655,19 @@ def find_acceleration(
     mass_matrix(chain, theta)
     for i in range(n):
         row: Row = chain[i]
+        M_i = row.M
         for j in range(i):
-            other: Row = chain[j]
+            M_j = chain[j].M
             for k in range(j):
                 pivot = chain[k].M[k]
-                row.M[j] -= row.M[k] * other.M[k] * pivot
-            row.M[j] /= other.M[j]
+                M_i[j] -= M_i[k] * M_j[k] * pivot
+            M_i[j] /= M_j[j]
         for k in range(i):
             pivot = chain[k].M[k]
-            row.M[i] -= row.M[k] * row.M[k] * pivot
+            M_i[i] -= M_i[k] * M_i[k] * pivot
         total = torque[i] - row.bias
         for k in range(i):
-            total -= row.M[k] * qdd[k]
+            total -= M_i[k] * qdd[k]
         qdd[i] = total
     for i in range(n - 1, -1, -1):
         qdd[i] /= chain[i].M[i]

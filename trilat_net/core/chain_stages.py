@@ -23,12 +23,7 @@ from .control import limit_torque, robust_torque
 from .exogenous import TorqueSourceRows, TorqueTable, put_torque_on_chain
 from .jit import leaf
 from .site_setup import Law
-from .task_space import (
-    add_task_torque,
-    update_pose,
-    update_task_errors,
-    update_wrench,
-)
+from .task_space import add_task_torque, update_pose, update_task_errors, update_wrench
 from .vectors import Array, Row, RowArray, Vector
 
 _ADAPTIVE = int(Law.ADAPTIVE)
@@ -56,6 +51,7 @@ def update_errors(s: Row, chain: RowArray) -> None:
 
 @leaf
 def _update_joint_errors(s: Row, joints: int) -> None:
+    """Writes e, ed, v, a and r for sites that share joint angles."""
     for i in range(joints):
         s.e[i] = s.q[i] - s.q_des[i]
         s.ed[i] = s.qd[i] - s.qd_des[i]
@@ -68,7 +64,8 @@ def _update_joint_errors(s: Row, joints: int) -> None:
 def advance_estimate(s: Row, gain_s: float, Yr: Vector) -> None:
     """Advances the estimate by the time `gain_s`, Eq. (15), within its box."""
     for p in range(s.parameters):
-        estimate = s.theta_hat[p] - gain_s * s.Gamma[p] * Yr[p]
+        step = gain_s * s.Gamma[p] * Yr[p]
+        estimate = s.theta_hat[p] - step
         s.theta_hat[p] = min(max(estimate, s.low[p]), s.high[p])
 
 
@@ -93,11 +90,15 @@ def update_torque(s: Row, chain: RowArray) -> None:
         if not s.task:
             torque -= s.Kd[i] * s.ed[i]
             if s.law != _ADAPTIVE:
-                torque += s.k_f[i] * s.felt[i] - s.K[i] * s.e[i]
+                reflected = s.k_f[i] * s.felt[i]
+                spring = s.K[i] * s.e[i]
+                torque += reflected - spring
         if s.law == _ADAPTIVE:
             torque -= s.Kp[i] * s.r[i]
-            if s.friction[i] != 1.0:
-                torque -= (1.0 - s.friction[i]) * friction_torque(chain[i], s.v[i])
+            # The inverse dynamics contain the friction in full.
+            uncompensated = 1.0 - s.friction[i]
+            if uncompensated != 0.0:
+                torque -= uncompensated * friction_torque(chain[i], s.v[i])
             if s.rho[i] > 0.0:
                 torque -= robust_torque(s.rho[i], s.width[i], s.r[i])
         else:
@@ -108,8 +109,9 @@ def update_torque(s: Row, chain: RowArray) -> None:
 @leaf
 def put_gravity(s: Row, chain: RowArray, theta: Array, torque: Array) -> None:
     """Writes the gravity torque for these parameters, N m, shape (n,), after `place_joints`."""
-    propagate_motion(chain=chain, gravity=s.gravity, qd=s.zeros, v=s.zeros, a=s.zeros)
-    inverse_dynamics(chain=chain, theta=theta, v=s.zeros, a=s.zeros, torque=torque)
+    zeros = s.zeros
+    propagate_motion(chain=chain, gravity=s.gravity, qd=zeros, v=zeros, a=zeros)
+    inverse_dynamics(chain=chain, theta=theta, v=zeros, a=zeros, torque=torque)
 
 
 @leaf
@@ -266,7 +268,7 @@ def advance_arm(
     actors: TorqueSourceRows,
     table: TorqueTable,
 ) -> bool:
-    """Advances q and qd by one period under the torque `s.u`.
+    """Advances q and qd by one period under the torque `s.u` (Runge-Kutta, fourth order).
 
     Returns:
         False if the result is not finite; q and qd are unchanged then.
@@ -275,7 +277,8 @@ def advance_arm(
     for i in range(n):
         s.stage_q[i] = s.q[i]
         s.stage_qd[i] = s.qd[i]
-        s.sum_qd[i] = s.sum_qdd[i] = 0.0
+        s.sum_qd[i] = 0.0
+        s.sum_qdd[i] = 0.0
     half = 0.5 * h_s
     _put_acceleration(t_s=t_s, s=s, chain=chain, actors=actors, table=table)
     _use_stage(s, n, 1.0, half)
@@ -285,13 +288,16 @@ def advance_arm(
     _use_stage(s, n, 2.0, h_s)
     _put_acceleration(t_s=t_s + h_s, s=s, chain=chain, actors=actors, table=table)
     _use_stage(s, n, 1.0, 0.0)
-    finite = True
+    sixth = h_s / 6.0
+    are_finite = True
     for i in range(n):
-        s.stage_q[i] = s.q[i] + h_s / 6.0 * s.sum_qd[i]
-        s.stage_qd[i] = s.qd[i] + h_s / 6.0 * s.sum_qdd[i]
-        finite = finite and isfinite(s.stage_q[i]) and isfinite(s.stage_qd[i])
-    if finite:
+        q = s.q[i] + sixth * s.sum_qd[i]
+        qd = s.qd[i] + sixth * s.sum_qdd[i]
+        s.stage_q[i] = q
+        s.stage_qd[i] = qd
+        are_finite = are_finite and isfinite(q) and isfinite(qd)
+    if are_finite:
         for i in range(n):
             s.q[i] = s.stage_q[i]
             s.qd[i] = s.stage_qd[i]
-    return finite
+    return are_finite

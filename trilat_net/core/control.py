@@ -4,8 +4,9 @@ The functions are for the planar two-link arm; `chain_stages` has the same laws 
 Gains are diagonal matrices, written as vectors with one number per joint (N m s/rad; Lambda in
 1/s) or per parameter. Angles are in rad, speeds in rad/s, torques in N m.
 
-Invariant: the errors and the regressor of tick k never depend on the estimate of tick k, which
-keeps the update of second order explicit.
+Invariant:
+    - The errors and the regressor of tick k do not depend on the estimate of tick k. Therefore
+      the second-order update of the estimate needs no equation to be solved.
 
 Source: Eq. (9)-(13), (15) of the paper; P+d and PD+d after Nuno, Basanez, Ortega and Spong,
 "Position Tracking for Non-linear Teleoperators with Variable Time Delay", Int. J. Robotics
@@ -31,19 +32,13 @@ def control_errors(
 
     e = q - q_des,  ed = qd - qd_des,  r = qd + Lambda e        Eq. (9), (18), (10)
     """
-    e = (
-        q[0] - q_des[0],
-        q[1] - q_des[1],
-    )
-    ed = (
-        qd[0] - qd_des[0],
-        qd[1] - qd_des[1],
-    )
-    r = (
-        qd[0] + Lambda[0] * e[0],
-        qd[1] + Lambda[1] * e[1],
-    )
-    return e, ed, r
+    e_1 = q[0] - q_des[0]
+    e_2 = q[1] - q_des[1]
+    ed_1 = qd[0] - qd_des[0]
+    ed_2 = qd[1] - qd_des[1]
+    r_1 = qd[0] + Lambda[0] * e_1
+    r_2 = qd[1] + Lambda[1] * e_2
+    return (e_1, e_2), (ed_1, ed_2), (r_1, r_2)
 
 
 @leaf
@@ -54,13 +49,15 @@ def regressor_transpose_times(Y: tuple[Five, Five], r: Vector) -> Five:
         Y: the regressor of Eq. (12), two rows of five numbers.
         r: shape (2,).
     """
-    a, b = Y
+    first, second = Y
+    r_1 = r[0]
+    r_2 = r[1]
     return (
-        a[0] * r[0] + b[0] * r[1],
-        a[1] * r[0] + b[1] * r[1],
-        a[2] * r[0] + b[2] * r[1],
-        a[3] * r[0] + b[3] * r[1],
-        a[4] * r[0] + b[4] * r[1],
+        first[0] * r_1 + second[0] * r_2,
+        first[1] * r_1 + second[1] * r_2,
+        first[2] * r_1 + second[2] * r_2,
+        first[3] * r_1 + second[3] * r_2,
+        first[4] * r_1 + second[4] * r_2,
     )
 
 
@@ -105,24 +102,26 @@ def adaptive_torque(
         ed: derivative of the error.
         limit: the largest torque of a joint.
     """
-    total_0 = 0.0
-    total_1 = 0.0
+    first, second = Y
+    torque_1 = 0.0
+    torque_2 = 0.0
     for p in range(5):
-        total_0 += Y[0][p] * theta_hat[p]
-        total_1 += Y[1][p] * theta_hat[p]
-    total_0 -= Kp[0] * r[0] + Kd[0] * ed[0]
-    total_1 -= Kp[1] * r[1] + Kd[1] * ed[1]
-    return limit_torque(total_0, limit), limit_torque(total_1, limit)
+        torque_1 += first[p] * theta_hat[p]
+        torque_2 += second[p] * theta_hat[p]
+    torque_1 -= Kp[0] * r[0] + Kd[0] * ed[0]
+    torque_2 -= Kp[1] * r[1] + Kd[1] * ed[1]
+    return limit_torque(torque_1, limit), limit_torque(torque_2, limit)
 
 
 @leaf
 def robust_torque(rho: float, width: float, r: float) -> float:
     """Returns rho r / sqrt(r^2 + width^2), a smooth form of rho sign(r).
 
-    The law subtracts it. With a disturbance d of at most rho, the power (d - robust torque) r
-    is at most ROBUST_RESIDUE rho width.
+    The law subtracts this torque. With a disturbance d of at most rho, the power
+    (d - robust torque) r is at most ROBUST_RESIDUE rho width.
     """
-    return rho * (r / sqrt(r * r + width * width))
+    smooth_sign = r / sqrt(r * r + width * width)
+    return rho * smooth_sign
 
 
 @leaf
@@ -135,7 +134,7 @@ def _clip(value: float, low: float, high: float) -> float:
 
 @leaf
 def project_estimate(theta_hat: Vector, low: Vector, high: Vector) -> Five:
-    """Returns the projection of an estimate on its box: each parameter, limited to its range.
+    """Returns the projection of an estimate into its box: each parameter limited to its range.
 
     If Gamma is diagonal and the true theta lies in the box, the projection never increases
     (theta_hat - theta)' Gamma^-1 (theta_hat - theta). V' <= 0 therefore still holds.
@@ -170,8 +169,8 @@ def damped_torque(
 
     - P+d: Kd = k_f = 0. For N sites with reversible shares, one K, one d and one constant delay
       T, the linearised loop is stable for all masses if d >= max(abs(lambda_min(alpha)),
-      0.2172) K T; for two sites if 4 d_1 d_2 > (T_1 + T_2)^2 K_1 K_2. For other shares no such
-      bound exists.
+      0.2172) K T; for two sites if 4 d_1 d_2 > (T_1 + T_2)^2 K_1 K_2. For other shares no bound
+      of this form exists.
     - PD+d: k_f = 0.
     - Direct force reflection: Kd = 0, with K and d at the slave, d and k_f at the master.
 
@@ -189,7 +188,13 @@ def damped_torque(
         felt: the torque on the peers' arms as received, weighted by dominance.
         limit: the largest torque of a joint.
     """
-    G = gravity(theta, g, q)
-    total_0 = G[0] - K[0] * e[0] - d[0] * qd[0] - Kd[0] * ed[0] + k_f[0] * felt[0]
-    total_1 = G[1] - K[1] * e[1] - d[1] * qd[1] - Kd[1] * ed[1] + k_f[1] * felt[1]
-    return limit_torque(total_0, limit), limit_torque(total_1, limit)
+    G_1, G_2 = gravity(theta, g, q)
+    torque_1 = G_1 - K[0] * e[0]
+    torque_1 -= d[0] * qd[0]
+    torque_1 -= Kd[0] * ed[0]
+    torque_1 += k_f[0] * felt[0]
+    torque_2 = G_2 - K[1] * e[1]
+    torque_2 -= d[1] * qd[1]
+    torque_2 -= Kd[1] * ed[1]
+    torque_2 += k_f[1] * felt[1]
+    return limit_torque(torque_1, limit), limit_torque(torque_2, limit)

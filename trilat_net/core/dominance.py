@@ -5,7 +5,7 @@ of alpha_ij q_j over its peers, Eq. (6). Upsilon = I - alpha is the matrix of th
 
 Invariant:
 
-- Each row of alpha sums to one, Eq. (7), and the diagonal is zero.
+- Each row of alpha sums to 1, Eq. (7), and the diagonal is zero.
 - beta is the LEFT null vector of Upsilon.
 - While factors change, they are a function of time and of the ramps alone. Between two rows
   that sum to 1, every row sums to 1.
@@ -13,7 +13,7 @@ Invariant:
   along the smooth polynomial 3 x^2 - 2 x^3.
 
 Source: Eq. (6), (7), (20) of the paper. The paper uses beta = (1, 1, 1). That is the right null
-vector of Upsilon, and a left one only if the columns sum to one as well. The left null vector
+vector of Upsilon, and a left one only if the columns sum to 1 as well. The left null vector
 of an irreducible matrix is its Perron vector, positive and unique up to its length.
 """
 
@@ -72,10 +72,10 @@ def is_irreducible(alpha: Array) -> bool:
 def find_balancing_weights(alpha: Array) -> Array | None:
     """Returns D > 0 with D_i alpha_ij = D_j alpha_ji (detailed balance), or None.
 
-    Shares that have such weights are reversible: their products along each circle equal those
-    against it (Kolmogorov), as in alpha12 alpha23 alpha31 = alpha13 alpha32 alpha21 for three
-    sites, and the eigenvalues of alpha are real. Links out of a group of sites that reach each
-    other belong to no circle and are ignored.
+    Shares that have such weights are reversible: their products around each circle are equal in
+    both directions (Kolmogorov), as in alpha12 alpha23 alpha31 = alpha13 alpha32 alpha21 for
+    three sites, and the eigenvalues of alpha are real. Links out of a group of sites that reach
+    each other belong to no circle and are ignored.
 
     Args:
         alpha: the shares, shape (N, N).
@@ -96,10 +96,11 @@ def find_balancing_weights(alpha: Array) -> Array | None:
             for j in np.flatnonzero(followed[i]).tolist():
                 forward = D[i] * alpha[i, j]
                 share_back = alpha[j, i]
+                imbalance = abs(forward - D[j] * share_back)
                 if not D[j] and share_back:
                     D[j] = forward / share_back
                     waiting.append(j)
-                elif abs(forward - D[j] * share_back) > ROW_SUM_TOLERANCE * forward:
+                elif imbalance > ROW_SUM_TOLERANCE * forward:
                     return None
     return D
 
@@ -119,9 +120,12 @@ def perron_vector(alpha: Array) -> Array:
         raise ValueError("alpha is reducible: beta has a zero entry or is not unique")
     a = alpha.copy()
     size = len(a)
+    # Eliminate the last site: its followers follow its peers instead.
     for last in range(size - 1, 0, -1):
-        a[:last, last] /= a[last, :last].sum()
-        a[:last, :last] += np.outer(a[:last, last], a[last, :last])
+        row = a[last, :last]
+        a[:last, last] /= row.sum()
+        column = a[:last, last]
+        a[:last, :last] += np.outer(column, row)
     beta = np.zeros(size)
     beta[0] = 1.0
     for site in range(1, size):
@@ -145,7 +149,8 @@ def _interpolate(
     """Returns the factor at time t of a linear change from `before` to `after`."""
     if t_ns >= end_ns:
         return after
-    return before + (after - before) * ((t_ns - start_ns) / (end_ns - start_ns))
+    progress = (t_ns - start_ns) / (end_ns - start_ns)
+    return before + (after - before) * progress
 
 
 @leaf
@@ -183,10 +188,10 @@ def apply_ramps(t_ns: int, count: int, ramps: Array, links: RowArray) -> None:
         link.alpha = _interpolate(
             t_ns=t_ns, start_ns=start_ns, end_ns=end_ns, before=before, after=after
         )
+        link.alpha_rate = 0.0
         if t_ns < end_ns:
-            link.alpha_rate = (after - before) / ((end_ns - start_ns) * 1e-9)
-        else:
-            link.alpha_rate = 0.0
+            duration_s = (end_ns - start_ns) * 1e-9
+            link.alpha_rate = (after - before) / duration_s
 
 
 def fold_ramps(t_ns: int, count: int, ramps: Array) -> int:
@@ -255,26 +260,30 @@ def update_stale_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
     if site.on_stale == _USE or site.mode == _DIVERGED:
         return
     stale = any_peer_stale(t_ns, site.stale_ns, links)
-    if stale and (site.mode == _RUN or site.mode == _RETURN):
+    follows = site.mode == _RUN or site.mode == _RETURN
+    stopped = site.mode == _HOLD or site.mode == _BRAKE
+    if stale and follows:
         braking = site.on_stale == _ACT_BRAKE
         for i in range(site.q_held.shape[0]):
             pose = site.x[i] if site.task else site.q[i]
             site.q_held[i] = pose if braking else site.q_followed[i]
         site.mode = _BRAKE if braking else _HOLD
         site.return_from_ns = 0
-    elif not stale and (site.mode == _HOLD or site.mode == _BRAKE):
+    elif not stale and stopped:
         site.mode = _RETURN
         site.return_from_ns = t_ns
-    if site.mode == _RETURN and t_ns - site.return_from_ns >= site.return_ns:
+    elapsed_ns = t_ns - site.return_from_ns
+    if site.mode == _RETURN and elapsed_ns >= site.return_ns:
         site.mode = _RUN
     if site.mode == _RUN:
         return
-    x = (t_ns - site.return_from_ns) / site.return_ns if site.mode == _RETURN else 0.0
+    x = elapsed_ns / site.return_ns if site.mode == _RETURN else 0.0
     share = x * x * (3.0 - 2.0 * x)
     share_rate = 6.0 * x * (1.0 - x) / (site.return_ns * 1e-9)
     for i in range(site.q_held.shape[0]):
-        distance = site.q_des[i] - site.q_held[i]
-        site.q_des[i] = site.q_held[i] + share * distance
+        held = site.q_held[i]
+        distance = site.q_des[i] - held
+        site.q_des[i] = held + share * distance
         site.qd_des[i] = share * site.qd_des[i] + share_rate * distance
 
 
@@ -295,12 +304,16 @@ def update_reference(t_ns: int, site: SiteRow, links: RowArray, ramps: Array) ->
     put(site.q_followed, site.q_des)
     put(site.qd_followed, site.qd_des)
     for i in range(site.q_des.shape[0]):
-        q_des = qd_des = felt = 0.0
+        q_des = 0.0
+        qd_des = 0.0
+        felt = 0.0
         for j in range(links.shape[0]):
             link: LinkRow = links[j]
-            q_des += link.alpha * link.q[i]
-            qd_des += link.alpha * link.qd[i] + link.alpha_rate * link.q[i]
-            felt -= link.alpha * link.tau_x[i]
+            alpha = link.alpha
+            q = link.q[i]
+            q_des += alpha * q
+            qd_des += alpha * link.qd[i] + link.alpha_rate * q
+            felt -= alpha * link.tau_x[i]
         site.q_des[i] = q_des
         site.qd_des[i] = qd_des
         site.felt[i] = felt

@@ -8,8 +8,9 @@ must not.
 - The polynomials of sine and cosine, for up to an eighth of a turn in either direction, and the
   rational functions of the hyperbolic tangent are those of S. Moshier's Cephes library.
 
-Invariant: all results are additions and products in a fixed order, without the mathematics
-library of the platform. An arm therefore moves alike on each machine with IEEE doubles.
+Invariant:
+    - All results are sums, products and quotients in a fixed order, without the mathematics
+      library of the platform. An arm therefore moves alike on each machine with IEEE doubles.
 """
 
 import math

@@ -1,7 +1,7 @@
 """Exogenous torque: the effect of operators and environments on the arm.
 
 Scenarios state the torque ON the arm; the paper's tau_x, which Eq. (8) subtracts, is the
-negative of this torque. In the code an actor is one operator or environment.
+negative of this torque. In the code an actor is an operator or an environment.
 
 Invariant:
     - The torque is a function of time and of the arm's state, so each stage of the integrator
@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .chain import Three, dot, place_end_effector, three
+from .chain import Three, add, dot, place_end_effector, scale, three
 from .elementary import sincos
 from .jit import leaf
 from .plugged import call_address, compile_to_address, list_numbers
@@ -127,6 +127,7 @@ def torque_source_dtype(width: int) -> np.dtype[np.void]:
     integers = ("kind", "sampled", "table_first", "table_count", "call", "coordinates")
     scalars = (*_SCALARS, "t_s")
     vectors = (*_NUMBERS, "at", "speed", "effort")
+    # The fields of 64-bit integers, 64-bit floats and vectors follow one another.
     fields: list[Any] = [(name, "i8") for name in integers]
     fields += [(name, "f8") for name in scalars]
     fields += [(name, "f8", (width,)) for name in vectors]
@@ -160,8 +161,9 @@ def torque_source_rows(
         joints: the number of joints of the arm.
         axes: the number of axes of its space.
     """
+    width = 1 + joints
     rows = np.zeros(len(actors), torque_source_dtype(max(joints, axes)))
-    tables = [np.zeros((0, 1 + joints))]
+    tables = [np.zeros((0, width))]
     first = 0
     row: Row
     for row, actor in zip(rows, actors, strict=True):
@@ -175,14 +177,16 @@ def torque_source_rows(
         row.coordinates = axes if actor.kind is TorqueKind.OWN_TIP else joints
         content = actor.table
         if actor.kind in OWN_KINDS:
+            # The numbers of the user's model are stored in rows of the table.
             row.call = compile_to_address(actor.model, "act", rows.dtype)
             numbers = list_numbers(actor.model)
-            row_count = math.ceil(len(numbers) / (1 + joints))
-            content = np.resize(numbers, (row_count, 1 + joints))
+            row_count = math.ceil(len(numbers) / width)
+            content = np.resize(numbers, (row_count, width))
         if content is None:
             continue
-        table = np.zeros((len(content), 1 + joints))
-        table[:, : np.shape(content)[1]] = content
+        columns = np.shape(content)[1]
+        table = np.zeros((len(content), width))
+        table[:, :columns] = content
         tables.append(table)
         row.table_first = first
         row.table_count = len(table)
@@ -202,9 +206,10 @@ def minimum_jerk(t_s: float, start_s: float, end_s: float) -> Pair:
         return 0.0, 0.0
     if t_s >= end_s:
         return 1.0, 0.0
-    x = (t_s - start_s) / (end_s - start_s)
+    duration_s = end_s - start_s
+    x = (t_s - start_s) / duration_s
     progress = x * x * x * (10.0 + x * (6.0 * x - 15.0))
-    rate = 30.0 * x * x * (1.0 - x) * (1.0 - x) / (end_s - start_s)
+    rate = 30.0 * x * x * (1.0 - x) * (1.0 - x) / duration_s
     return progress, rate
 
 
@@ -212,13 +217,24 @@ def minimum_jerk(t_s: float, start_s: float, end_s: float) -> Pair:
 def _spring_along(
     actor: Row, i: int, progress: float, rate: float, at: float, speed: float
 ) -> float:
-    """Returns the force of a hand's spring and damper along one coordinate.
+    """Returns the force of a hand's spring and damper along coordinate `i`, N or N m.
 
-    K (target - at) + B (target' - speed),    target = a + progress (b - a)
+        K (target - at) + B (target' - speed),    target = a + progress (b - a)
+
+    Args:
+        actor: the actor's row.
+        i: the coordinate.
+        progress: progress of the target from `a` to `b`.
+        rate: its derivative, 1/s.
+        at: position of the arm along the coordinate, rad or m.
+        speed: its derivative.
     """
-    distance: float = actor.b[i] - actor.a[i]
-    spring: float = actor.K[i] * (actor.a[i] + progress * distance - at)
-    damper: float = actor.B[i] * (rate * distance - speed)
+    start: float = actor.a[i]
+    distance: float = actor.b[i] - start
+    target = start + progress * distance
+    target_speed = rate * distance
+    spring: float = actor.K[i] * (target - at)
+    damper: float = actor.B[i] * (target_speed - speed)
     return spring + damper
 
 
@@ -226,6 +242,7 @@ def _spring_along(
 def _target_progress(actor: Row, t_s: float) -> Pair:
     """Returns the progress of a target from `a` to `b`, and its rate, 1/s."""
     if actor.kind >= _LIVE_TIP:
+        # `a` is the present target, and `b` the target one second later.
         return 0.0, 1.0
     return minimum_jerk(t_s, actor.move_start_s, actor.move_end_s)
 
@@ -267,13 +284,15 @@ def _find_table_rows(actor: Row, t_s: float, table: TorqueTable) -> tuple[int, i
     """
     first = actor.table_first
     count = actor.table_count
-    if count < 1 or t_s < table[first, 0] or t_s > table[first + count - 1, 0]:
+    last = first + count - 1
+    if count < 1 or t_s < table[first, 0] or t_s > table[last, 0]:
         return -1, -1, 0.0
     before = count_started(table, first, count, t_s) - 1
     low = first + max(min(before, count - 2), 0)
-    high = min(low + 1, first + count - 1)
-    span_s = table[high, 0] - table[low, 0]
-    fraction = (t_s - table[low, 0]) / span_s if span_s > 0.0 else 0.0
+    high = min(low + 1, last)
+    low_s = table[low, 0]
+    span_s = table[high, 0] - low_s
+    fraction = (t_s - low_s) / span_s if span_s > 0.0 else 0.0
     return low, high, fraction
 
 
@@ -283,8 +302,10 @@ def _recorded_torque(actor: Row, t_s: float, table: TorqueTable) -> Pair:
     low, high, x = _find_table_rows(actor, t_s, table)
     if low < 0:
         return 0.0, 0.0
-    first = table[low, 1] + x * (table[high, 1] - table[low, 1])
-    second = table[low, 2] + x * (table[high, 2] - table[low, 2])
+    first_step = table[high, 1] - table[low, 1]
+    second_step = table[high, 2] - table[low, 2]
+    first = table[low, 1] + x * first_step
+    second = table[low, 2] + x * second_step
     return first, second
 
 
@@ -301,10 +322,13 @@ def _chirp_size(actor: Row, t_s: float) -> float:
 
     sin(2 pi x (f0 + (f1 - f0) x / (2 span)))
     """
+    first_hz = actor.b[0]
+    last_hz = actor.b[1]
     span_s = actor.move_end_s - actor.move_start_s
     x = t_s - actor.start_s
     x -= span_s * math.floor(x / span_s)
-    mean_hz = actor.b[0] + 0.5 * (actor.b[1] - actor.b[0]) / span_s * x
+    # The mean frequency of the sweep so far.
+    mean_hz = first_hz + 0.5 * (last_hz - first_hz) / span_s * x
     return _sine_of_turns(x * mean_hz)
 
 
@@ -312,8 +336,12 @@ def _chirp_size(actor: Row, t_s: float) -> float:
 def _multisine_size(actor: Row, t_s: float, table: TorqueTable) -> float:
     """Returns the sum of the sines of a multisine, each with amplitude 1."""
     total = 0.0
-    for n in range(actor.table_first, actor.table_first + actor.table_count):
-        total += _sine_of_turns(table[n, 0] * (t_s - actor.start_s) + table[n, 1])
+    first = actor.table_first
+    elapsed_s = t_s - actor.start_s
+    for n in range(first, first + actor.table_count):
+        frequency_hz = table[n, 0]
+        phase_turns = table[n, 1]
+        total += _sine_of_turns(frequency_hz * elapsed_s + phase_turns)
     return total
 
 
@@ -325,7 +353,9 @@ def _scripted_size(actor: Row, t_s: float, table: TorqueTable) -> float:
     of the paper. The paper does not print the numbers of its pulses.
     """
     if actor.kind == _PULSE:
-        s, _ = sincos(math.pi * (t_s - actor.start_s) / (actor.end_s - actor.start_s))
+        elapsed_s = t_s - actor.start_s
+        duration_s = actor.end_s - actor.start_s
+        s, _ = sincos(math.pi * elapsed_s / duration_s)
         return s * s
     if actor.kind == _CHIRP:
         return _chirp_size(actor, t_s)
@@ -338,12 +368,16 @@ def _wall_force(actor: Row, at: Pair, speed: Pair) -> Pair:
 
     The force acts along the wall's normal and never pulls.
     """
-    depth = (actor.a[0] - at[0]) * actor.b[0] + (actor.a[1] - at[1]) * actor.b[1]
+    normal_x = actor.b[0]
+    normal_y = actor.b[1]
+    x = actor.a[0] - at[0]
+    y = actor.a[1] - at[1]
+    depth = x * normal_x + y * normal_y
     if not depth > 0.0:
         return 0.0, 0.0
-    outward = speed[0] * actor.b[0] + speed[1] * actor.b[1]
+    outward = speed[0] * normal_x + speed[1] * normal_y
     push = max(actor.K[0] * depth - actor.B[0] * outward, 0.0)
-    return push * actor.b[0], push * actor.b[1]
+    return push * normal_x, push * normal_y
 
 
 @leaf
@@ -360,7 +394,9 @@ def _call_user_function(actor: Row, t_s: float, table: TorqueTable) -> None:
     for i in range(actor.coordinates):
         actor.effort[i] = 0.0
     first = actor.table_first
-    call_address(actor.call, (table[first : first + actor.table_count].reshape(-1), actor))
+    end = first + actor.table_count
+    numbers = table[first:end].reshape(-1)
+    call_address(actor.call, (numbers, actor))
 
 
 @leaf
@@ -379,18 +415,20 @@ def _end_effector_torque(
 ) -> SourceTorque:
     """Returns the joint torque J' F of an actor at the end effector, and |F| of a wall, N."""
     _, at = forward_kinematics(lengths, q)
-    x, y = end_effector_jacobian(lengths, q)
-    speed = (x[0] * qd[0] + x[1] * qd[1], y[0] * qd[0] + y[1] * qd[1])
+    J_x, J_y = end_effector_jacobian(lengths, q)
+    speed_x = J_x[0] * qd[0] + J_x[1] * qd[1]
+    speed_y = J_y[0] * qd[0] + J_y[1] * qd[1]
+    speed = (speed_x, speed_y)
     wall_n = 0.0
     if actor.kind == _WALL:
-        force = _wall_force(actor, at, speed)
-        wall_n = math.sqrt(force[0] * force[0] + force[1] * force[1])
+        force_x, force_y = _wall_force(actor, at, speed)
+        wall_n = math.sqrt(force_x * force_x + force_y * force_y)
     elif actor.kind == _OWN_TIP:
-        force = _user_effort(actor=actor, t_s=t_s, at=at, speed=speed, table=table)
+        force_x, force_y = _user_effort(actor=actor, t_s=t_s, at=at, speed=speed, table=table)
     else:
-        force = _spring_force(actor, t_s, at, speed)
-    torque_0 = x[0] * force[0] + y[0] * force[1]
-    torque_1 = x[1] * force[0] + y[1] * force[1]
+        force_x, force_y = _spring_force(actor, t_s, at, speed)
+    torque_0 = J_x[0] * force_x + J_y[0] * force_y
+    torque_1 = J_x[1] * force_x + J_y[1] * force_y
     return torque_0, torque_1, wall_n
 
 
@@ -481,14 +519,16 @@ def _force_in_space(
             return x, y, z
         if actor.kind == _LIVE_FORCE:
             x, y, z = three(actor.a)
-        share = _live_share(actor, x * x + y * y + z * z)
+        square = x * x + y * y + z * z
+        share = _live_share(actor, square)
         return share * x, share * y, share * z
     normal = three(actor.b)
     point = three(actor.a)
     depth = dot(point, normal) - dot(at, normal)
     if not depth > 0.0:
         return 0.0, 0.0, 0.0
-    push = max(actor.K[0] * depth - actor.B[0] * dot(speed, normal), 0.0)
+    outward = dot(speed, normal)
+    push = max(actor.K[0] * depth - actor.B[0] * outward, 0.0)
     return push * normal[0], push * normal[1], push * normal[2]
 
 
@@ -515,9 +555,10 @@ def _add_joint_torque(
                 square += pull * pull
             share = _live_share(actor, square)
         for i in range(joints):
-            torque[i] += share * _spring_along(
+            pull = _spring_along(
                 actor=actor, i=i, progress=progress, rate=rate, at=q[i], speed=qd[i]
             )
+            torque[i] += share * pull
     elif actor.kind == _VISCOUS:
         for i in range(joints):
             torque[i] -= actor.B[i] * qd[i]
@@ -525,7 +566,9 @@ def _add_joint_torque(
         low, high, x = _find_table_rows(actor, t_s, table)
         if low >= 0:
             for i in range(joints):
-                torque[i] += table[low, 1 + i] + x * (table[high, 1 + i] - table[low, 1 + i])
+                recorded = table[low, 1 + i]
+                step = table[high, 1 + i] - recorded
+                torque[i] += recorded + x * step
     elif actor.kind == _OWN_JOINTS:
         for i in range(joints):
             actor.at[i] = q[i]
@@ -545,14 +588,12 @@ def _tip_motion(qd: Vector, tip: Vector, chain: RowArray) -> tuple[Three, Three]
 
     Its Jacobian remains in the chain's rows.
     """
-    at = place_end_effector(chain, tip)
-    v_0 = v_1 = v_2 = 0.0
+    position = place_end_effector(chain, tip)
+    velocity = (0.0, 0.0, 0.0)
     for i in range(chain.shape[0]):
-        J = chain[i].J_lin
-        v_0 = v_0 + J[0] * qd[i]
-        v_1 = v_1 + J[1] * qd[i]
-        v_2 = v_2 + J[2] * qd[i]
-    return at, (v_0, v_1, v_2)
+        column = three(chain[i].J_lin)
+        velocity = add(velocity, scale(qd[i], column))
+    return position, velocity
 
 
 @leaf
@@ -606,5 +647,6 @@ def put_torque_on_chain(
         for i in range(n):
             torque[i] += dot(three(chain[i].J_lin), force)
         if actor.kind == _WALL:
-            largest_n = max(largest_n, math.sqrt(dot(force, force)))
+            force_n = math.sqrt(dot(force, force))
+            largest_n = max(largest_n, force_n)
     return largest_n

@@ -1,8 +1,9 @@
 """A fingerprint of the platform's arithmetic, computed from its results.
 
-Invariant (L5): two platforms with the same fingerprint gave the same bits for many sines and
-cosines, and for a short run of two sites with random links. Only between such platforms does
-verification require equal bits.
+Invariant (L5):
+    - Two platforms with the same fingerprint gave the same bits for many sines and cosines, and
+      for a short run of two sites with random links. Verification requires equal bits only
+      between platforms with the same fingerprint.
 """
 
 import hashlib

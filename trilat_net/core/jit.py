@@ -3,8 +3,9 @@
 
 Machine code is kept in the user's cache directory, in a folder named after a hash of all
 sources of the core. (Numba alone notices a change of the file that holds a leaf, but not of the
-leaves that it calls.) A wheel contains such a folder with code for the generic processor of its
-platform, which is used if the user's folder has no code for this processor.
+leaves that this leaf calls.) A wheel contains such a folder, with code for the generic
+processor of its platform. This code is used if the user's folder has no code for the present
+processor.
 
 A leaf that another leaf calls is an inner leaf. It is kept as unoptimised LLVM code, which is
 optimised as a part of the leaf that Python calls.
@@ -43,7 +44,8 @@ from ..process import end_process_at_signals
 P = ParamSpec("P")
 R = TypeVar("R")
 
-# With little address space LLVM and OpenBLAS would try for ever, deaf to signals, or abort.
+# With little address space LLVM and OpenBLAS would retry for ever without reacting to signals,
+# or abort.
 with suppress(OSError, IndexError):  # only Linux has the file
     _limits = Path("/proc/self/limits").read_text("utf-8")
     _address_space = _limits.partition("Max address space")[2].split()[0]
@@ -94,7 +96,10 @@ def is_core_cached() -> bool:
     """
     folders = [_CACHE, _SHIPPED if _ships else None]
     for folder in folders:
-        if folder is not None and any(folder.rglob("kernel.site_tick-*.nbc")):
+        if folder is None:
+            continue
+        files = folder.rglob("kernel.site_tick-*.nbc")
+        if any(files):
             return True
     return False
 
@@ -143,11 +148,12 @@ _register("numba:compile", compiling_notice)
 def _mangle_record(record: types.Record) -> tuple[str, tuple[str]]:
     """Returns the name of a record in symbols of machine code, from a hash of its fields.
 
-    Numba itself numbers records in the order in which a process meets them. Leaves that two
+    Numba itself numbers records in the order in which a process uses them. Leaves that two
     processes compiled for two layouts would then have equal symbols, and a third process that
     loads both from the cache would mix them up.
     """
-    return "Record", (f"r{hashlib.sha256(record.name.encode()).hexdigest()[:16]}",)
+    digest = hashlib.sha256(record.name.encode()).hexdigest()
+    return "Record", (f"r{digest[:16]}",)
 
 
 _record: Any = types.Record
@@ -174,10 +180,12 @@ class _LeafLocator:
     from_function = classmethod(lambda cls, function, file: cls(function, file))
 
     def get_cache_path(self) -> str:
-        return str((_CACHE or _SHIPPED) / self._py_file.parent.name)
+        root = _CACHE or _SHIPPED
+        return str(root / self._py_file.parent.name)
 
     def get_source_stamp(self) -> str:
-        return hashlib.sha256(self._py_file.read_bytes()).hexdigest()
+        source = self._py_file.read_bytes()
+        return hashlib.sha256(source).hexdigest()
 
     def get_disambiguator(self) -> str:
         return str(self._line)
@@ -187,7 +195,7 @@ class _LeafLocator:
 
 
 class _LeafCacheImpl(CompileResultCacheImpl):
-    """Converts compiled leaves to what the cache keeps, and back.
+    """Converts compiled leaves to the content of cache files, and back.
 
     An inner leaf is kept as LLVM code, other leaves as machine code.
     """
@@ -234,16 +242,20 @@ class _CompressedFiles(IndexDataCacheFile):
         names = self._load_index()
         first, _, last = self._data_name(0).rpartition(".0.")
         digest = hashlib.sha256(repr(key).encode()).hexdigest()[:8]
-        names[key] = f"{first}.{digest}.{last}"
+        name = f"{first}.{digest}.{last}"
+        names[key] = name
         self._save_index(names)
-        self._save_data(names[key], code)
+        self._save_data(name, code)
 
     def _save_data(self, name: str, code: Any) -> None:
+        content = zlib.compress(self._dump(code), 1)
         with self._open_for_write(self._data_path(name)) as file:
-            file.write(zlib.compress(self._dump(code), 1))
+            file.write(content)
 
     def _load_data(self, name: str) -> Any:
-        return pickle.loads(zlib.decompress(Path(self._data_path(name)).read_bytes()))
+        path = Path(self._data_path(name))
+        content = zlib.decompress(path.read_bytes())
+        return pickle.loads(content)
 
 
 class _LeafCache(FunctionCache):
@@ -256,9 +268,10 @@ class _LeafCache(FunctionCache):
         base = self._impl.filename_base
         stamp = self._cache_file._source_stamp
         folder = Path(self._cache_path)
+        shipped_folder = _SHIPPED / folder.name
         files = cast(Any, _CompressedFiles)
         self._cache_file = files(str(folder), base, stamp)
-        self._shipped = files(str(_SHIPPED / folder.name), base, stamp)
+        self._shipped = files(str(shipped_folder), base, stamp)
         self._inner = files(str(folder), f"{base}-within", stamp)
 
     def load_overload(self, signature: Any, context: Any) -> Any:
@@ -270,9 +283,11 @@ class _LeafCache(FunctionCache):
             result = self._load_overload(signature, context)
             if result is not None or not _ships:
                 return result
+            # The wheel's code is indexed by the platform and a processor named "generic".
             triple = context.codegen().magic_tuple()[0]
             generic = SimpleNamespace(magic_tuple=lambda: (triple, "generic", ""))
-            kept = self._shipped.load(self._index_key(signature, generic))
+            key = self._index_key(signature, generic)
+            kept = self._shipped.load(key)
             return None if kept is None else self._impl.rebuild(context, kept)
 
     def _save_overload(self, signature: Any, result: Any) -> None:
@@ -281,7 +296,8 @@ class _LeafCache(FunctionCache):
 
     def load_inner(self, argument_types: Any, context: Any) -> Any:
         """Returns the kept inner leaf for these types of arguments, or None."""
-        kept = self._inner.load(self._index_key(argument_types, context.codegen()))
+        key = self._index_key(argument_types, context.codegen())
+        kept = self._inner.load(key)
         return None if kept is None else self._impl.rebuild(context, kept)
 
     def save_inner(self, argument_types: Any, result: Any) -> None:
@@ -293,10 +309,10 @@ class _LeafCache(FunctionCache):
 
 
 class _LeafLibrary(JITCodeLibrary):
-    """The code of a leaf; that of an inner leaf is neither optimised nor made executable.
+    """The code of a leaf; the code of an inner leaf is neither optimised nor made executable.
 
-    It is optimised once, as a part of the outer leaf. Numba would also optimise each leaf on
-    the way, and add a wrapper for calls from Python to each: half of the time of compilation.
+    An inner leaf is optimised once, as a part of the outer leaf. Numba would also optimise each
+    inner leaf alone, and add a wrapper for calls from Python: half of the time of compilation.
     """
 
     is_inner = False
@@ -304,7 +320,8 @@ class _LeafLibrary(JITCodeLibrary):
     def serialize_using_object_code(self) -> tuple[str, str, Any]:
         if not self.is_inner:
             return super().serialize_using_object_code()
-        return self.name, _INNER, self._get_module_for_linking().as_bitcode()
+        module = self._get_module_for_linking()
+        return self.name, _INNER, module.as_bitcode()
 
     def _optimize_final_module(self) -> None:
         if not self.is_inner:
@@ -368,14 +385,16 @@ class _Leaf(CPUDispatcher):
     _compiler: Any
 
     def get_call_template(self, arguments: Any, keywords: Any) -> Any:
-        """Returns the call for these types; constants count by their type alone."""
-        plain = {name: types.unliteral(keyword) for name, keyword in keywords.items()}
-        return super().get_call_template(tuple(map(types.unliteral, arguments)), plain)
+        """Returns the call for these types; a constant counts by its type, not its value."""
+        plain_arguments = tuple(map(types.unliteral, arguments))
+        plain_keywords = {name: types.unliteral(kind) for name, kind in keywords.items()}
+        return super().get_call_template(plain_arguments, plain_keywords)
 
     def add_overload(self, result: Any) -> None:
         """Adds a compiled form; an inner leaf is not registered for calls from Python."""
         if getattr(result.library, "is_inner", False):
-            self.overloads[tuple(result.signature.args)] = result
+            argument_types = tuple(result.signature.args)
+            self.overloads[argument_types] = result
         else:
             super().add_overload(result)
 
@@ -400,11 +419,12 @@ class _Leaf(CPUDispatcher):
 
 
 def bind_leaf(function: Callable[P, R], *arguments: P.args, **_: P.kwargs) -> Callable[P, R]:
-    """Returns a leaf compiled for the types of these arguments, which checks types no more."""
+    """Returns a leaf compiled for the types of these arguments; calls no longer check types."""
     if _config.DISABLE_JIT:
         return function
     dispatcher: Any = function
-    return cast(Callable[P, R], dispatcher.compile(tuple(map(numba.typeof, arguments))))
+    argument_types = tuple(map(numba.typeof, arguments))
+    return cast(Callable[P, R], dispatcher.compile(argument_types))
 
 
 def leaf(function: Callable[P, R]) -> Callable[P, R]:

@@ -24,6 +24,7 @@ from .vectors import Array, Row, RowArray
 
 @leaf
 def _update_model(s: Row, chain: RowArray | None) -> None:
+    """Writes G, M and the bias torque of the arm, which is planar if `chain` is None."""
     if chain is None:
         two_link_stages.update_model(s)
     else:
@@ -36,7 +37,8 @@ def update_law_view(
 ) -> None:
     """Writes the parts of a law's view that no stage has written: time, model and peers.
 
-    The torque becomes NaN, so that a torque which the law does not write is found.
+    The torque becomes NaN, so that the check after the law finds a torque that the law has not
+    written.
     """
     s: Row = site[0]
     s.k = k
@@ -50,7 +52,8 @@ def update_law_view(
     for j in range(links.shape[0]):
         link: Row = links[j]
         link.tick = link.used
-        link.age_s = (t_ns - tick_ns(max(link.used, 0), link.rate_hz)) * 1e-9
+        stamp_ns = tick_ns(max(link.used, 0), link.rate_hz)
+        link.age_s = (t_ns - stamp_ns) * 1e-9
 
 
 _PER_JOINT = ("q", "qd", "tau_x", "tau_before", "q_before", "tau", "gravity", "bias")
@@ -64,8 +67,9 @@ def _name_vectors(vectors: Sequence[SentVector], numbers: list[float]) -> Simple
     named = SimpleNamespace()
     first = 0
     for vector in vectors:
-        setattr(named, vector.name, LawVector(numbers[first : first + vector.length]))
-        first += vector.length
+        end = first + vector.length
+        setattr(named, vector.name, LawVector(numbers[first:end]))
+        first = end
     return named
 
 
@@ -82,30 +86,38 @@ class PlainLaw:
     """
 
     def __init__(self, law: UserLaw, setup: SiteSetup, arrays: SiteArrays, sent: Array) -> None:
+        channel = setup.channel
+        layout = setup.layout
+        n = layout.joints
+        m = layout.shared
         self._law = law
         self._setup = setup
         self._arrays = arrays
         self._sent = sent
         self._update = update_law_view
+
         site = arrays.site[0]
-        layout = setup.layout
-        n = layout.joints
-        m = layout.shared
-        views = {name: site[_IN_ROW.get(name, name)][:n] for name in _PER_JOINT}
-        views |= {name: site[name][:m] for name in _PER_COORDINATE}
-        self._views = {**views, "theta_hat": site["theta_hat"][: layout.parameters]}
+        self._views: dict[str, Array] = {}
+        for name in _PER_JOINT:
+            field = _IN_ROW.get(name, name)
+            self._views[name] = site[field][:n]
+        for name in _PER_COORDINATE:
+            self._views[name] = site[name][:m]
+        self._views["theta_hat"] = site["theta_hat"][: layout.parameters]
         self._inertia = site["M"][:n, :n]
         self._limit = site["tau_limit"][:n]
-        columns = [arrays.links[name] for name in PeerView._fields]
-        self._of_peers = [column if column.ndim == 1 else column[:, :m] for column in columns]
+
+        self._peer_columns: list[Any] = []
+        for name in PeerView._fields:
+            column = arrays.links[name]
+            self._peer_columns.append(column if column.ndim == 1 else column[:, :m])
+
         self._received = None if arrays.channel is None else arrays.channel.received
         self._receives = setup.received_vectors
-        self._sends = {
-            per_peer: setup.channel.select_vectors(per_peer=per_peer)
-            for per_peer in (False, True)
-        }
-        self._to_all_size = setup.channel.count_numbers(per_peer=False)
-        self._peer_size = setup.channel.count_numbers(per_peer=True)
+        self._sends_to_all = channel.select_vectors(per_peer=False)
+        self._sends_to_peer = channel.select_vectors(per_peer=True)
+        self._to_all_size = channel.count_numbers(per_peer=False)
+        self._peer_size = channel.count_numbers(per_peer=True)
 
     def bind(self) -> None:
         """Compiles the leaf that `compute` calls, and looks up its types once and for all."""
@@ -123,7 +135,8 @@ class PlainLaw:
         a = self._arrays
         setup = self._setup
         self._update(k, t_ns, a.site, a.links, a.chain)
-        results = call_law(self._law, setup.name, self._read(k), self._collect_sent)
+        now = self._read(k)
+        results = call_law(self._law, setup.name, now, self._collect_sent)
         self._views["tau"][:] = np.clip(results.torque, -self._limit, self._limit)
         self._views["theta_hat"][:] = results.theta_hat
         self._sent[:] = results.sent
@@ -141,16 +154,18 @@ class PlainLaw:
     def _read(self, k: int) -> LawInput:
         """Returns the input of tick k, after `update_law_view`."""
         setup = self._setup
-        columns: list[Any] = [column.tolist() for column in self._of_peers]
+        columns: list[Any] = [column.tolist() for column in self._peer_columns]
         # The last three columns are the vectors q, qd and tau_x.
         columns[4:] = [map(LawVector, rows) for rows in columns[4:]]
         peers = tuple(map(PeerView, *columns))
-        received = () if self._received is None else self._received.tolist()
+        received = [] if self._received is None else self._received.tolist()
+        from_peers = [_name_vectors(self._receives, numbers) for numbers in received]
         sent = self._sent.tolist()
         to_peers = []
         for j in range(len(peers)):
             first = self._to_all_size + j * self._peer_size
-            to_peers.append(_name_vectors(self._sends[True], sent[first:]))
+            to_peers.append(_name_vectors(self._sends_to_peer, sent[first:]))
+        vectors = {name: LawVector(view.tolist()) for name, view in self._views.items()}
         return LawInput(
             k=k,
             t_s=k / setup.rate_hz,
@@ -158,11 +173,11 @@ class PlainLaw:
             joints=setup.layout.joints,
             coordinates=setup.layout.shared,
             peers=peers,
-            received=tuple(_name_vectors(self._receives, numbers) for numbers in received),
+            received=tuple(from_peers),
             sent=tuple(to_peers),
-            to_all=_name_vectors(self._sends[False], sent),
+            to_all=_name_vectors(self._sends_to_all, sent),
             inertia=LawVector(map(LawVector, self._inertia.tolist())),
-            **{name: LawVector(view.tolist()) for name, view in self._views.items()},
+            **vectors,
         )
 
     def _collect_sent(self, now: LawInput) -> list[float]:
@@ -171,27 +186,28 @@ class PlainLaw:
         Raises:
             ValueError: a vector has another length than the law declares.
         """
-        sent = self._collect_vectors(now.to_all, "to_all", per_peer=False)
+        sent = _collect_vectors(self._sends_to_all, now.to_all, "to_all")
         for j, to_peer in enumerate(now.sent):
-            sent += self._collect_vectors(to_peer, f"sent[{j}]", per_peer=True)
+            sent += _collect_vectors(self._sends_to_peer, to_peer, f"sent[{j}]")
         return sent
 
-    def _collect_vectors(self, vectors: Any, name: str, *, per_peer: bool) -> list[float]:
-        """Returns the numbers of the vectors for all peers, or for one peer.
 
-        Args:
-            vectors: the law's values by name.
-            name: name of these vectors in the law's input, for errors.
-            per_peer: which of the declared vectors they are.
+def _collect_vectors(declared: Sequence[SentVector], vectors: Any, name: str) -> list[float]:
+    """Returns the numbers of a law's vectors one after another.
 
-        Raises:
-            ValueError: a vector has another length than the law declares.
-        """
-        numbers: list[float] = []
-        for vector in self._sends[per_peer]:
-            values = list(getattr(vectors, vector.name))
-            if len(values) != vector.length:
-                count = count_nouns(len(values), "number")
-                raise ValueError(f"{name}.{vector.name} has {count}, not {vector.length}")
-            numbers += map(float, values)
-        return numbers
+    Args:
+        declared: the vectors that the law declares.
+        vectors: the law's values, as attributes.
+        name: name of `vectors` in the law's input, for errors.
+
+    Raises:
+        ValueError: a vector has another length than the law declares.
+    """
+    numbers: list[float] = []
+    for vector in declared:
+        values = list(getattr(vectors, vector.name))
+        if len(values) != vector.length:
+            count = count_nouns(len(values), "number")
+            raise ValueError(f"{name}.{vector.name} has {count}, not {vector.length}")
+        numbers += map(float, values)
+    return numbers

@@ -101,7 +101,7 @@ this, and LOST is above it.
 def span_ticks(span_ns: int, rate_hz: int) -> int:
     """Returns the number of ticks that span a time, rounded up.
 
-    The same as `first_tick_at`, but in plain Python: callers need no compiled core.
+    The result is that of `first_tick_at`, in plain Python: callers need no compiled core.
     """
     return -(-span_ns * rate_hz // NS_PER_S)
 
@@ -124,8 +124,8 @@ def calendar_pages(
 def release_tick(tick: int, rate_hz: int, link: LinkArrays) -> int:
     """Returns the receiver's tick at which sample `tick` comes into use if it arrives in time.
 
-    LOST if the link loses the sample, or if the sample is so old that the link has forgotten
-    its due time.
+    The result is LOST if the link loses the sample, or if the sample is so old that the link
+    has forgotten its due time.
     """
     row: LinkRow = link.state[0]
     dues = link.dues
@@ -235,11 +235,11 @@ def accept_sample(
 
 @leaf
 def release_sample(k: int, rate_hz: int, link: LinkArrays) -> None:
-    """Brings the newest sample that tick k releases into use; without one the last one stays.
+    """Brings the newest sample that tick k releases into use.
 
-    Every tick must be released once, in order. The deliveries of all samples with a stamp up to
-    t_k are scheduled here, so that the first sample after a long silence costs no more than any
-    other.
+    If tick k releases no sample, the last sample stays in use. Every tick must be released
+    once, in order. The deliveries of all samples with a stamp up to t_k are scheduled here, so
+    that the first sample after a long silence costs no more than any other.
 
     Args:
         k: the tick of the receiver.

@@ -8,8 +8,8 @@ Invariant:
 - The reference never jumps: the site aligns with the remaining peers, and again with a peer
   that returns.
 
-`gone` of a link is 0 while the peer is present, -1 while it is lost, and while it is heard
-again the time since then, ns since the epoch.
+`gone` of a link is 0 while the peer is present, and -1 while the peer is lost. When a lost peer
+is heard again, `gone` becomes the time of that tick, ns since the epoch.
 """
 
 from .chain import add, scale, three

@@ -1,7 +1,8 @@
-"""Counter-based random numbers: pure functions of their purpose, without state or order.
+"""Counter-based random numbers: pure functions of their arguments, without state or order.
 
-Invariant (L4): a draw is a function of (seed, link, sample index, purpose) alone. It is the
-same on every machine, in every driver, and in any order of arrival.
+Invariant (L4):
+    - A draw is a function of (seed, link, sample index, purpose) alone, and is therefore the
+      same on every machine, in every driver, and in any order of arrival.
 
 The generator is Philox-4x32 with ten rounds: Salmon, Moraes, Dror and Shaw, "Parallel Random
 Numbers: As Easy as 1, 2, 3", SC 2011. NumPy has Philox too, but compiled leaves need it for
@@ -24,6 +25,7 @@ _LOW = np.uint64(0xFFFFFFFF)
 _SHIFT = np.uint64(32)
 _ROUNDS = 10
 
+# A shift that leaves the upper 26 of 32 bits, and powers of 2.
 _TO_26 = np.uint64(6)
 _TWO_26 = 67_108_864.0
 _TWO_52 = 4_503_599_627_370_496.0
@@ -55,12 +57,14 @@ def philox(
         k1: upper word of the key.
     """
     for _ in range(_ROUNDS):
-        p0 = _M0 * c0
-        p1 = _M1 * c2
-        c0 = (p1 >> _SHIFT) ^ c1 ^ k0
-        c1 = p1 & _LOW
-        c2 = (p0 >> _SHIFT) ^ c3 ^ k1
-        c3 = p0 & _LOW
+        product_0 = _M0 * c0
+        product_1 = _M1 * c2
+        upper_0 = product_0 >> _SHIFT
+        upper_1 = product_1 >> _SHIFT
+        c0 = upper_1 ^ c1 ^ k0
+        c1 = product_1 & _LOW
+        c2 = upper_0 ^ c3 ^ k1
+        c3 = product_0 & _LOW
         k0 = (k0 + _W0) & _LOW
         k1 = (k1 + _W1) & _LOW
     return c0, c1, c2, c3
@@ -111,7 +115,8 @@ def standard_normal(key: DrawKey, sample: int, purpose: int, attempt: int) -> fl
     """
     u, v = uniforms(key, sample, purpose, attempt)
     radius = math.sqrt(-2.0 * math.log(u))
-    return radius * math.cos(2.0 * math.pi * v)
+    angle = 2.0 * math.pi * v
+    return radius * math.cos(angle)
 
 
 @leaf
@@ -136,6 +141,9 @@ def standard_gamma(key: DrawKey, sample: int, purpose: int, shape: float) -> flo
         root = 1.0 + c * x
         v = root * root * root
         u, _ = uniforms(key, sample, purpose + 1, attempt)
-        if v > 0.0 and math.log(u) < 0.5 * x * x + d - d * v + d * math.log(v):
+        if v <= 0.0:
+            continue
+        log_acceptance = 0.5 * x * x + d - d * v + d * math.log(v)
+        if math.log(u) < log_acceptance:
             return boost * d * v
     return boost * d

@@ -2,7 +2,7 @@
 
 Invariant:
     - A function is compiled for the layout of its numbers and of its row.
-    - The numbers themselves are in a table, so that another value compiles nothing.
+    - The numbers themselves are in a table, so that a new value compiles nothing.
     - No function recompiles the kernel.
 """
 
@@ -34,22 +34,27 @@ def _call_compiled(_context: Any, address: Any, arguments: Any) -> Any:
     """
 
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        convention = context.call_conv
+        address_value, tuple_value = values
         argument_types = tuple(signature.args[1])
-        function_type = context.call_conv.get_function_type(types.none, argument_types)
-        pointer = builder.inttoptr(values[0], function_type.as_pointer())
-        unpacked: Any = cgutils.unpack_tuple(builder, values[1])  # type: ignore[no-untyped-call]
-        status, _ = context.call_conv.call_function(
-            builder, pointer, types.none, argument_types, unpacked
+        function_type = convention.get_function_type(types.none, argument_types)
+        pointer = builder.inttoptr(address_value, function_type.as_pointer())
+        unpack: Any = cgutils.unpack_tuple
+        argument_values = unpack(builder, tuple_value)
+        status, _ = convention.call_function(
+            builder, pointer, types.none, argument_types, argument_values
         )
         with builder.if_then(status.is_error, likely=False):
-            context.call_conv.return_status_propagate(builder, status)
+            convention.return_status_propagate(builder, status)
         return context.get_dummy_value()
 
     return types.none(address, arguments), generate
 
 
 def _call_plain(address: int, arguments: tuple[Any, ...]) -> None:
-    _PLAIN[address](*arguments)
+    """Calls a function by the number that replaces its address if Numba is disabled."""
+    function = _PLAIN[address]
+    function(*arguments)
 
 
 call_address: Any = _call_plain if _config.DISABLE_JIT else _call_compiled
@@ -59,7 +64,7 @@ call_address: Any = _call_plain if _config.DISABLE_JIT else _call_compiled
 def digest_sibling_sources(function: Callable[..., Any]) -> str:
     """Returns a hash of all source files in the folder of a function of this package.
 
-    It is "" for a function from elsewhere.
+    The result is "" for a function of another package.
     """
     folder = Path(function.__code__.co_filename).parent
     if not folder.is_relative_to(Path(__file__).parents[1]):
@@ -79,7 +84,8 @@ def _find_numbers(model: Any) -> dict[str, Array]:
     numbers = {}
     for name in model.__struct_fields__:
         value = np.asarray(getattr(model, name))
-        if value.dtype.kind in "fiub":
+        is_number = value.dtype.kind in "fiub"
+        if is_number:
             numbers[name] = value.astype(np.float64)
     return numbers
 
@@ -87,6 +93,7 @@ def _find_numbers(model: Any) -> dict[str, Array]:
 def list_numbers(model: Any) -> Array:
     """Returns the numbers of a model one after another, in the order of its fields."""
     fields = [value.ravel() for value in _find_numbers(model).values()]
+    # A model without numbers gives an empty array.
     return np.concatenate([np.zeros(0), *fields])
 
 
@@ -94,12 +101,12 @@ def list_numbers(model: Any) -> Array:
 def _compile(
     function: Callable[..., None], form: np.dtype[np.void], row: np.dtype[np.void]
 ) -> Any:
-    """Returns the compiled form of a function, called with a row of numbers and a row.
+    """Returns the compiled form of a function, called with an array of numbers and a row.
 
     Args:
         function: the function.
-        form: layout of its numbers.
-        row: layout of its row.
+        form: layout of the numbers of its model.
+        row: layout of the row.
     """
     count = form.itemsize // 8
     compute = numba.njit(**_OPTIONS)(function)
@@ -110,7 +117,8 @@ def _compile(
     if _config.DISABLE_JIT:
         return call
     numba_types: Any = numba
-    signature = types.none(types.float64[::1], numba_types.from_dtype(row))
+    row_type = numba_types.from_dtype(row)
+    signature = types.none(types.float64[::1], row_type)
     sources = digest_sibling_sources(function)
     if sources:
         text = f"{sources} {function.__module__} {function.__qualname__} {form} {row}"
@@ -123,14 +131,19 @@ def compile_to_address(model: Any, name: str, row: np.dtype[np.void]) -> int:
     """Compiles a function of a model, and returns the address of the machine code.
 
     Args:
-        model: the model; the function is called with its numbers and a row.
+        model: an operator, an environment or a delay model. The function is called with the
+            model's numbers and a row.
         name: the name of the function.
         row: layout of the row.
     """
-    numbers = _find_numbers(model)
-    fields: Any = [(key, value.dtype, value.shape) for key, value in numbers.items()]
+    fields: Any = []
+    for field, value in _find_numbers(model).items():
+        fields.append((field, value.dtype, value.shape))
+    if not fields:
+        fields.append(("nothing", "f8"))
     function = getattr(type(model), name)
-    call = _compile(function, np.dtype((np.record, fields or [("nothing", "f8")])), row)
+    form = np.dtype((np.record, fields))
+    call = _compile(function, form, row)
     if _config.DISABLE_JIT:
         _PLAIN[id(call)] = call
         return id(call)

@@ -1,7 +1,7 @@
 """How an arm comes to rest where it is, and stays there.
 
 An arm rests while its site waits, holds, is stopped or in fault. The reference of a joint
-starts at the joint's own angle and speed v, and comes to rest within T. Per period h,
+starts at the joint's angle q and speed v, and comes to rest within T. Per period h,
 
     |qd_ref| falls by the factor 1 - h / T_left,
     T_left = max(LEAST_STOP_S - t, max_i |qd_ref_i| / a_i),
@@ -13,23 +13,28 @@ down sooner, this is qd_ref = v (1 - t / T) with T = max(LEAST_STOP_S, max_i |v_
 is the integral of qd_ref. While an arm is fast (see below) or a torque is at its limit, q_ref
 moves along with a joint that would otherwise move away from it.
 
-The torque is that of the law on this reference. Only the gravity torque, as far as it is known
-or estimated, replaces it for a law that failed, for a law that does not hold by its reference,
-and for each law while the arm is fast: while B |qd| of some joint exceeds the limit of its
-torque. To either torque
+The torque is that of the law on this reference. The gravity torque, as far as it is known or
+estimated, replaces the law's torque
+
+- if the law failed,
+- if a user's law does not declare (`holds = True`) that it is right while its reference rests,
+- in task space, unless the law is a kernel law of known gravity,
+- while the arm is fast: while B |qd| of some joint exceeds the limit of its torque.
+
+To either torque the kernel adds
 
     w - B s,    s = qd - qd_ref + Lambda (q - q_ref),    w' = -k B s
 
-is added. w starts as the part of the last torque that the law does not explain, times 1 - max B
-|qd| / tau_limit: the torque of a slow arm holds unknown gravity or hands, the torque of a fast
-arm follows from its motion. While the arm brakes, w loses B |qd| in each tick in which w acts
-in the direction of the joint's motion. Lambda is that of the adaptive law in joint space, and
+w starts as the part of the last torque that the law does not explain, times 1 - max B |qd| /
+tau_limit: the torque of a slow arm holds unknown gravity or hands, the torque of a fast arm
+follows from its motion. While the arm brakes, w loses B |qd| in each tick in which w acts in
+the direction of the joint's motion. Lambda is that of the adaptive law in joint space, and
 otherwise `REST_RATE_1_S`. In task space the estimate is kept. docs/links.md derives the energy
-that all this can add to an arm.
+that these terms can add to an arm.
 
-The limit of a torque's rate never holds back a torque that takes power from the arm: against
-the motion of a joint its torque may change by B |qd| more in a tick. This is the step of a
-viscous brake B that is applied at that speed. It brings the joint to rest within
+The limit of a torque's rate never delays a torque that takes power from the arm: against the
+motion of a joint its torque may change by B |qd| more in a tick. This is the step of a viscous
+brake B that is applied at that speed. The brake brings the joint to rest within
 `RestGains.time_s`, and vanishes with the speed.
 
 Invariant:
@@ -81,7 +86,8 @@ def find_brake_ratio(site: SiteRow) -> float:
     """Returns the largest ratio of B |qd| to the torque limit, over the joints."""
     ratio = 0.0
     for i in range(site.joints):
-        ratio = max(ratio, site.damping[i] * abs(site.qd[i]) / site.tau_limit[i])
+        brake = site.damping[i] * abs(site.qd[i])
+        ratio = max(ratio, brake / site.tau_limit[i])
     return ratio
 
 
@@ -97,7 +103,8 @@ def rests_by_law(site: SiteRow) -> bool:
     """True if the torque of an arm at rest contains that of its law, which still adapts."""
     holds = site.law != _USER or site.holds != 0
     learns_in_task = site.task != 0 and site.law != _KNOWN
-    usable = holds and not learns_in_task and site.reason != _NOT_FINITE
+    failed = site.reason == _NOT_FINITE
+    usable = holds and not learns_in_task and not failed
     return bool(usable and not is_fast(site))
 
 
@@ -107,7 +114,8 @@ def enter_rest(t_ns: int, mode: int, reason: int, site: SiteRow) -> None:
 
     An arm that rests already keeps its reference, unless its law failed now or before.
     """
-    keeps_reference = rests(site) and reason != _NOT_FINITE and site.reason != _NOT_FINITE
+    failed = reason == _NOT_FINITE or site.reason == _NOT_FINITE
+    keeps_reference = rests(site) and not failed
     site.mode = mode
     site.reason = reason
     if keeps_reference:
@@ -152,6 +160,7 @@ def advance_rest_reference(t_ns: int, ticks: int, site: SiteRow) -> None:
     if t_ns == site.return_from_ns:
         return
     step_s = ticks / site.rate_hz
+    # The time from the start of the rest to the previous tick.
     elapsed_s = (t_ns - site.return_from_ns) * 1e-9 - step_s
     remaining_s = _find_remaining_s(elapsed_s, site)
     share = 0.0
@@ -159,19 +168,23 @@ def advance_rest_reference(t_ns: int, ticks: int, site: SiteRow) -> None:
         share = 1.0 - step_s / remaining_s
     fast = is_fast(site)
     for i in range(site.joints):
+        qd = site.qd[i]
         q_ref, rate_before = _read_reference(site, i)
         rate = share * rate_before
-        if rate * site.qd[i] <= 0.0:
+        if rate * qd <= 0.0:
             rate = 0.0
-        elif abs(rate) > abs(site.qd[i]):
-            rate = site.qd[i]
+        elif abs(rate) > abs(qd):
+            rate = qd
         step = 0.5 * step_s * (rate_before + rate)
-        if fast or abs(site.tau[i]) >= site.tau_limit[i]:
+        is_limited = abs(site.tau[i]) >= site.tau_limit[i]
+        if fast or is_limited:
             # Without the law, or at its limit, the torque does not pay for a growing distance
             # from the reference. The spring would later return that distance as energy of its
             # own, so the reference moves along with the joint.
-            joint_step = site.q[i] - site.q_before[i]
-            if (joint_step - step) * (site.q_before[i] - q_ref) >= 0.0:
+            q_before = site.q_before[i]
+            joint_step = site.q[i] - q_before
+            distance = q_before - q_ref
+            if (joint_step - step) * distance >= 0.0:
                 step = joint_step
         _write_reference(site, i, q_ref + step, rate)
 
@@ -182,7 +195,8 @@ def _brakes(t_ns: int, site: SiteRow) -> bool:
 
     It brakes for at least LEAST_STOP_S, until the reference rests, and while a joint is fast.
     """
-    brakes = t_ns - site.return_from_ns < LEAST_STOP_S * NS_PER_S or is_fast(site)
+    elapsed_ns = t_ns - site.return_from_ns
+    brakes = elapsed_ns < LEAST_STOP_S * NS_PER_S or is_fast(site)
     for i in range(site.joints):
         _, rate = _read_reference(site, i)
         brakes = brakes or rate != 0.0
@@ -207,9 +221,12 @@ def put_rest_reference(site: SiteRow, q: Array, qd: Array) -> None:
 @leaf
 def _find_slip(site: SiteRow, i: int) -> float:
     """Returns s = qd - qd_ref + Lambda (q - q_ref) of joint i, rad/s."""
-    q, qd = _read_reference(site, i)
-    rate = site.Lambda[i] if site.law == _ADAPTIVE and not site.task else REST_RATE_1_S
-    slip: float = site.qd[i] - qd + rate * (site.q[i] - q)
+    q_ref, qd_ref = _read_reference(site, i)
+    Lambda = REST_RATE_1_S
+    if site.law == _ADAPTIVE and not site.task:
+        Lambda = site.Lambda[i]
+    error = site.q[i] - q_ref
+    slip: float = site.qd[i] - qd_ref + Lambda * error
     return slip
 
 
@@ -230,14 +247,19 @@ def add_rest_torque(k: int, t_ns: int, site: SiteRow) -> None:
     if k > site.first:
         share = max(0.0, 1.0 - find_brake_ratio(site))
     for i in range(site.joints):
+        qd = site.qd[i]
+        damping = site.damping[i]
+        w = site.tau_held[i]
         if t_ns == site.return_from_ns:
-            site.tau_held[i] = share * (site.tau_before[i] - site.tau[i])
-        if brakes and site.tau_held[i] * site.qd[i] > 0.0:
-            site.tau_held[i] = _shrink(site.tau_held[i], site.damping[i] * site.qd[i])
-        torque = site.tau[i] + site.tau_held[i] - site.damping[i] * _find_slip(site, i)
+            unexplained = site.tau_before[i] - site.tau[i]
+            w = share * unexplained
+        if brakes and w * qd > 0.0:
+            w = _shrink(w, damping * qd)
+        torque = site.tau[i] + w - damping * _find_slip(site, i)
         if not isfinite(torque):
             torque = 0.0
-            site.tau_held[i] = 0.0
+            w = 0.0
+        site.tau_held[i] = w
         site.u[i] = torque
         site.tau[i] = limit_torque(torque, site.tau_limit[i])
 
@@ -250,7 +272,8 @@ def advance_rest(site: SiteRow) -> None:
     """
     for i in range(site.joints):
         step = -site.integral[i] * _find_slip(site, i) / site.rate_hz
-        if isfinite(step) and (site.u[i] - site.tau[i]) * step <= 0.0:
+        excess = site.u[i] - site.tau[i]
+        if isfinite(step) and excess * step <= 0.0:
             site.tau_held[i] += step
 
 
@@ -262,10 +285,12 @@ def limit_torque_rate(site: SiteRow) -> None:
     """
     braking = rests(site)
     for i in range(site.joints):
-        if site.tau_rate[i] < inf:
-            most = site.tau_rate[i] / site.rate_hz
+        rate_limit = site.tau_rate[i]
+        if rate_limit < inf:
+            most = rate_limit / site.rate_hz
             before = site.tau_before[i]
             brake = site.damping[i] * site.qd[i] if braking else 0.0
             low = before - most - max(brake, 0.0)
             high = before + most - min(brake, 0.0)
-            site.tau[i] = min(max(site.tau[i], low), high)
+            tau = site.tau[i]
+            site.tau[i] = min(max(tau, low), high)

@@ -51,14 +51,15 @@ def arctan(x: float) -> float:
 @leaf
 def rotation_matrix(vector: Three) -> Matrix:
     """Returns the rotation matrix of a rotation vector, three rows (Rodrigues)."""
-    angle = math.sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2])
+    x, y, z = vector
+    angle = math.sqrt(x * x + y * y + z * z)
     s, c = sincos(angle)
+    # The limits of the quotients for small angles.
     by_sine = 1.0
     by_cosine = 0.5
     if angle > _SMALL:
         by_sine = s / angle
         by_cosine = (1.0 - c) / (angle * angle)
-    x, y, z = vector
     xx = by_cosine * x * x
     yy = by_cosine * y * y
     zz = by_cosine * z * z
@@ -68,22 +69,22 @@ def rotation_matrix(vector: Three) -> Matrix:
     sx = by_sine * x
     sy = by_sine * y
     sz = by_sine * z
-    return (
-        (1.0 - yy - zz, xy - sz, xz + sy),
-        (xy + sz, 1.0 - xx - zz, yz - sx),
-        (xz - sy, yz + sx, 1.0 - xx - yy),
-    )
+    row_x = (1.0 - yy - zz, xy - sz, xz + sy)
+    row_y = (xy + sz, 1.0 - xx - zz, yz - sx)
+    row_z = (xz - sy, yz + sx, 1.0 - xx - yy)
+    return row_x, row_y, row_z
 
 
 @leaf
 def _quaternion(R: Array | Matrix) -> tuple[float, Three]:
     """Returns the quaternion (w, v) of a rotation, with w >= 0.
 
-    It is computed from its largest component (Shepperd, 1978).
+    The method starts from the largest component (Shepperd, 1978), and so never divides by a
+    small number.
     """
-    (xx, xy, xz) = R[0]
-    (yx, yy, yz) = R[1]
-    (zx, zy, zz) = R[2]
+    xx, xy, xz = R[0]
+    yx, yy, yz = R[1]
+    zx, zy, zz = R[2]
     trace = xx + yy + zz
     if trace >= max(xx, yy, zz):
         w = 1.0 + trace
@@ -97,7 +98,8 @@ def _quaternion(R: Array | Matrix) -> tuple[float, Three]:
     else:
         w = yx - xy
         v = (xz + zx, yz + zy, 1.0 + zz - xx - yy)
-    length = math.sqrt(w * w + v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+    x, y, z = v
+    length = math.sqrt(w * w + x * x + y * y + z * z)
     if w < 0.0:
         length = -length
     return w / length, scale(1.0 / length, v)
@@ -107,10 +109,13 @@ def _quaternion(R: Array | Matrix) -> tuple[float, Three]:
 def rotation_vector(R: Array | Matrix) -> Three:
     """Returns the rotation vector of a rotation matrix (rows), rad."""
     w, v = _quaternion(R)
-    n = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+    x, y, z = v
+    n = math.sqrt(x * x + y * y + z * z)
     if n < _SMALL:
         return scale(2.0 / w, v)
-    angle = 2.0 * (arctan(n / w) if n <= w else 0.5 * math.pi - arctan(w / n))
+    # `arctan` takes arguments up to 1.
+    half_angle = arctan(n / w) if n <= w else 0.5 * math.pi - arctan(w / n)
+    angle = 2.0 * half_angle
     return scale(angle / n, v)
 
 
@@ -120,29 +125,33 @@ def relative_rotation(R: Array | Matrix, other: Array | Matrix) -> Three:
 
     This is the rotation from the orientation `other` to the orientation R.
     """
-    a = other[0]
-    b = other[1]
-    c = other[2]
-    first = _times_rows(R[0], a, b, c)
-    second = _times_rows(R[1], a, b, c)
-    third = _times_rows(R[2], a, b, c)
+    row_1 = other[0]
+    row_2 = other[1]
+    row_3 = other[2]
+    first = _times_rows(R[0], row_1, row_2, row_3)
+    second = _times_rows(R[1], row_1, row_2, row_3)
+    third = _times_rows(R[2], row_1, row_2, row_3)
     return rotation_vector((first, second, third))
 
 
 @leaf
 def _times_rows(row: Three, a: Three, b: Three, c: Three) -> Three:
-    """Returns the scalar products of a row with three rows."""
-    x = row[0] * a[0] + row[1] * a[1] + row[2] * a[2]
-    y = row[0] * b[0] + row[1] * b[1] + row[2] * b[2]
-    z = row[0] * c[0] + row[1] * c[1] + row[2] * c[2]
-    return x, y, z
+    """Returns the scalar products of `row` with the three rows a, b and c."""
+    x = row[0]
+    y = row[1]
+    z = row[2]
+    with_a = x * a[0] + y * a[1] + z * a[2]
+    with_b = x * b[0] + y * b[1] + z * b[2]
+    with_c = x * c[0] + y * c[1] + z * c[2]
+    return with_a, with_b, with_c
 
 
 @leaf
 def compose_rotations(turn: Three, vector: Three) -> Three:
     """Returns the rotation `vector` followed by the rotation `turn` in base axes, rad."""
+    turn_matrix = rotation_matrix(turn)
     inverse = rotation_matrix(scale(-1.0, vector))
-    return relative_rotation(rotation_matrix(turn), inverse)
+    return relative_rotation(turn_matrix, inverse)
 
 
 @leaf
@@ -164,30 +173,34 @@ def angular_velocity(turn: Three, rate: Three) -> Three:
     angle = length(turn)
     a2 = angle * angle
     if angle < _SHORT:
-        by_once = 0.5 - a2 / 24.0 + a2 * a2 / 720.0
-        by_twice = 1.0 / 6.0 - a2 / 120.0 + a2 * a2 / 5040.0
+        a4 = a2 * a2
+        once_gain = 0.5 - a2 / 24.0 + a4 / 720.0
+        twice_gain = 1.0 / 6.0 - a2 / 120.0 + a4 / 5040.0
     else:
         s, c = sincos(angle)
-        by_once = (1.0 - c) / a2
-        by_twice = (angle - s) / (a2 * angle)
+        once_gain = (1.0 - c) / a2
+        twice_gain = (angle - s) / (a2 * angle)
     once = cross(turn, rate)
     twice = cross(turn, once)
-    return add(rate, add(scale(by_once, once), scale(by_twice, twice)))
+    correction = add(scale(once_gain, once), scale(twice_gain, twice))
+    return add(rate, correction)
 
 
 @leaf
 def rotation_vector_rate(turn: Three, velocity: Three) -> Three:
     """Returns the derivative of a rotation vector at this angular velocity, rad/s.
 
-    It is the inverse of `angular_velocity`.
+    The function is the inverse of `angular_velocity`.
     """
     angle = length(turn)
     a2 = angle * angle
     if angle < _SHORT:
-        by_twice = 1.0 / 12.0 + a2 / 720.0 + a2 * a2 / 30240.0
+        a4 = a2 * a2
+        twice_gain = 1.0 / 12.0 + a2 / 720.0 + a4 / 30240.0
     else:
         s, c = sincos(0.5 * angle)
-        by_twice = (1.0 - 0.5 * angle * c / s) / a2
+        twice_gain = (1.0 - 0.5 * angle * c / s) / a2
     once = cross(turn, velocity)
     twice = cross(turn, once)
-    return add(velocity, add(scale(-0.5, once), scale(by_twice, twice)))
+    correction = add(scale(-0.5, once), scale(twice_gain, twice))
+    return add(velocity, correction)

@@ -1,9 +1,9 @@
-"""The limit of the reference's speed, and the return of the torque to that of the law.
+"""Limits of the reference's speed, and the return of the torque from rest to that of the law.
 
 Invariant:
 
 - The reference moves no faster than its limit, whatever the peers do.
-- Without limits, and in modes in which the arm rests, nothing changes.
+- A reference without a speed limit is not changed.
 """
 
 from math import inf, isfinite
@@ -20,46 +20,55 @@ BLEND_S = 0.1
 
 @leaf
 def limit_reference(k: int, site: SiteRow) -> None:
-    """Limits the speed of the reference; a reference that was held back catches up later.
+    """Limits the speed of the reference.
 
-    At the first tick the reference starts from the pose of the arm.
+    A reference that was held back catches up later. At the first tick the reference starts from
+    the pose of the arm.
     """
     if k == site.first:
         for i in range(site.shared):
             site.q_followed[i] = site.x[i] if site.task else site.q[i]
     if has_orientation(site) and site.qd_des_limit[3] < inf:
         _limit_turn(site)
-    for i in range(min(site.shared, count_linear_coordinates(site))):
+    count = min(site.shared, count_linear_coordinates(site))
+    for i in range(count):
         limit = site.qd_des_limit[i]
         if limit == inf:
             continue
-        step = site.q_des[i] - site.q_followed[i]
+        q_before = site.q_followed[i]
+        step = site.q_des[i] - q_before
         most = limit / site.rate_hz
         if abs(step) > most:
             sign = 1.0 if step > 0.0 else -1.0
-            site.q_des[i] = site.q_followed[i] + sign * most
+            site.q_des[i] = q_before + sign * most
             site.qd_des[i] = sign * limit
         else:
-            site.qd_des[i] = min(max(site.qd_des[i], -limit), limit)
+            rate = site.qd_des[i]
+            site.qd_des[i] = min(max(rate, -limit), limit)
 
 
 @leaf
 def _limit_turn(site: SiteRow) -> None:
     """Limits the angular velocity of the reference about each axis, keeping the turn's axis."""
-    previous = rotation_matrix(three(site.q_followed[3:]))
-    turn = relative_rotation(rotation_matrix(three(site.q_des[3:])), previous)
+    vector_before = three(site.q_followed[3:])
+    before = rotation_matrix(vector_before)
+    wanted = rotation_matrix(three(site.q_des[3:]))
+    turn = relative_rotation(wanted, before)
     share = 1.0
     for i in range(3):
+        size = abs(turn[i])
         most = site.qd_des_limit[3 + i] / site.rate_hz
-        if abs(turn[i]) * share > most:
-            share = most / abs(turn[i])
+        if size * share > most:
+            share = most / size
     if share < 1.0:
         limited_turn = scale(share, turn)
-        put_three(site.q_des[3:], compose_rotations(limited_turn, three(site.q_followed[3:])))
-        put_three(site.qd_des[3:], scale(share * site.rate_hz, turn))
+        velocity = scale(share * site.rate_hz, turn)
+        put_three(site.q_des[3:], compose_rotations(limited_turn, vector_before))
+        put_three(site.qd_des[3:], velocity)
     for i in range(3, 6):
         limit = site.qd_des_limit[i]
-        site.qd_des[i] = min(max(site.qd_des[i], -limit), limit)
+        rate = site.qd_des[i]
+        site.qd_des[i] = min(max(rate, -limit), limit)
 
 
 @leaf
@@ -74,6 +83,8 @@ def is_torque_finite(site: SiteRow) -> bool:
 @leaf
 def return_to_law(t_ns: int, site: SiteRow) -> None:
     """Blends the torque from the last torque at rest to that of the law, within BLEND_S."""
-    share = min((t_ns - site.return_from_ns) * 1e-9 / BLEND_S, 1.0)
+    elapsed_s = (t_ns - site.return_from_ns) * 1e-9
+    share = min(elapsed_s / BLEND_S, 1.0)
     for i in range(site.joints):
-        site.tau[i] = site.tau_held[i] + share * (site.tau[i] - site.tau_held[i])
+        at_rest = site.tau_held[i]
+        site.tau[i] = at_rest + share * (site.tau[i] - at_rest)

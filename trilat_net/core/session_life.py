@@ -95,7 +95,8 @@ def _all_heard(t_ns: int, silence_ns: int, links: RowArray) -> bool:
     """True if a sample of each peer with a share came into use within the last `silence_ns`."""
     for j in range(links.shape[0]):
         link: LinkRow = links[j]
-        if link.alpha > 0.0 and (link.used < 0 or t_ns - link.used_ns > silence_ns):
+        is_silent = link.used < 0 or t_ns - link.used_ns > silence_ns
+        if link.alpha > 0.0 and is_silent:
             return False
     return True
 
@@ -107,8 +108,10 @@ def _alignment_s(site: SiteRow) -> float:
     for i in range(count_linear_coordinates(site)):
         distance = max(distance, abs(site.q_held[i]))
     if has_orientation(site):
-        distance = max(distance, length(three(site.q_held[3:])))
-    duration_s: float = max(MIN_ALIGN_NS * 1e-9, 1.5 * distance / site.align_speed)
+        angle = length(three(site.q_held[3:]))
+        distance = max(distance, angle)
+    needed_s = 1.5 * distance / site.align_speed
+    duration_s: float = max(MIN_ALIGN_NS * 1e-9, needed_s)
     return duration_s
 
 
@@ -123,15 +126,19 @@ def _start_alignment(t_ns: int, site: SiteRow, reason: int, q: Array, qd: Array)
         q: the reference from which the site aligns.
         qd: its rate.
     """
-    turn = rate = (0.0, 0.0, 0.0)
+    turn = (0.0, 0.0, 0.0)
+    rate = (0.0, 0.0, 0.0)
     if has_orientation(site):
+        site_rotation = rotation_matrix(three(q[3:]))
         peers_rotation = rotation_matrix(three(site.q_des[3:]))
-        turn = relative_rotation(rotation_matrix(three(q[3:])), peers_rotation)
+        turn = relative_rotation(site_rotation, peers_rotation)
         peers_rate = rotate_by_vector(turn, three(site.qd_des[3:]))
-        rate = rotation_vector_rate(turn, subtract(three(qd[3:]), peers_rate))
+        velocity = subtract(three(qd[3:]), peers_rate)
+        rate = rotation_vector_rate(turn, velocity)
     near = length(turn) <= site.align_limit
     for i in range(count_linear_coordinates(site)):
-        near = near and abs(q[i] - site.q_des[i]) <= site.align_limit
+        distance = abs(q[i] - site.q_des[i])
+        near = near and distance <= site.align_limit
     if not near:
         site.reason = _ALIGN_LIMIT
         return
@@ -164,14 +171,17 @@ def _extrapolate_reference(site: SiteRow) -> None:
         site.q_followed[i] += h_s * site.qd_followed[i]
     if has_orientation(site):
         turn = scale(h_s, three(site.qd_followed[3:]))
-        put_three(site.q_followed[3:], compose_rotations(turn, three(site.q_followed[3:])))
+        reference = compose_rotations(turn, three(site.q_followed[3:]))
+        put_three(site.q_followed[3:], reference)
 
 
 @leaf
 def is_law_returning(t_ns: int, site: SiteRow) -> bool:
     """True if the torque of a site still returns to that of its law after a rest."""
+    # A site that drops or restores a peer aligns without a rest before.
     rested = site.reason != _DROPPED and site.reason != _RESTORED
-    returning: bool = site.mode == _ALIGN and rested and t_ns - site.return_from_ns < RETURN_NS
+    elapsed_ns = t_ns - site.return_from_ns
+    returning: bool = site.mode == _ALIGN and rested and elapsed_ns < RETURN_NS
     return returning
 
 
@@ -211,6 +221,7 @@ def _apply_order(t_ns: int, site: SiteRow) -> None:
     site.order = 0
     site.skipped = 0
     moves = mode in (_RUN, _ALIGN)
+    stops = order in (_ORDER_STOP, _ORDER_RELEASED)
     if order == _ORDER_RESET and mode == _FAULT:
         enter_rest(t_ns, _WAITING, _RESET, site)
     elif order == _ORDER_ENABLE and mode == _STOPPED:
@@ -219,12 +230,14 @@ def _apply_order(t_ns: int, site: SiteRow) -> None:
         enter_rest(t_ns, _WAITING, _HELD, site)
     elif order == _ORDER_STOP and mode == _STOPPED:
         site.reason = _STOP
-    elif order in (_ORDER_STOP, _ORDER_RELEASED) and mode != _FAULT and mode != _STOPPED:
-        latch_mode(t_ns, site, _STOPPED, _STOP if order == _ORDER_STOP else _RELEASED)
+    elif stops and mode != _FAULT and mode != _STOPPED:
+        reason = _STOP if order == _ORDER_STOP else _RELEASED
+        latch_mode(t_ns, site, _STOPPED, reason)
     elif mode in (_FAULT, _STOPPED):
         return
     elif order == _ORDER_ARM_LOST or skipped > FAULT_OVERRUN_TICKS:
-        latch_mode(t_ns, site, _FAULT, _ARM_SILENT if order == _ORDER_ARM_LOST else _OVERRUN)
+        reason = _ARM_SILENT if order == _ORDER_ARM_LOST else _OVERRUN
+        latch_mode(t_ns, site, _FAULT, reason)
     elif order == _ORDER_ARM_SILENT and moves:
         enter_rest(t_ns, _HOLD, _ARM_SILENT, site)
     elif order == _ORDER_ARM_SILENT:
@@ -244,18 +257,20 @@ def _update_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
     if site.mode == _FAULT or site.mode == _STOPPED or site.reason == _ARM_SILENT:
         return
     heard = _all_heard(t_ns, site.stale_ns, links)
+    moves = site.mode == _RUN or site.mode == _ALIGN
+    elapsed_ns = t_ns - site.return_from_ns
     if heard and site.mode == _WAITING:
         _leave_rest(t_ns, site, _PEERS_HERE)
-    elif heard and site.mode == _HOLD and site.return_from_ns != t_ns:
+    elif heard and site.mode == _HOLD and elapsed_ns != 0:
         _leave_rest(t_ns, site, _PEERS_BACK)
-    elif not heard and (site.mode == _RUN or site.mode == _ALIGN):
+    elif not heard and moves:
         enter_rest(t_ns, _HOLD, _PEER_SILENT, site)
-    elif site.regrouped and (site.mode == _RUN or site.mode == _ALIGN):
+    elif site.regrouped and moves:
         _extrapolate_reference(site)
         _start_alignment(
             t_ns=t_ns, site=site, reason=site.regrouped, q=site.q_followed, qd=site.qd_followed
         )
-    elif site.mode == _ALIGN and (t_ns - site.return_from_ns) * 1e-9 >= _alignment_s(site):
+    elif site.mode == _ALIGN and elapsed_ns * 1e-9 >= _alignment_s(site):
         site.mode = _RUN
         site.reason = _ALIGNED
         site.return_from_ns = t_ns
@@ -287,11 +302,13 @@ def update_session_life(t_ns: int, site: SiteRow, links: RowArray) -> None:
 def _find_offset(t_ns: int, duration_s: float, site: SiteRow, i: int) -> tuple[float, float]:
     """Returns the offset of coordinate i from the peers' reference, and its rate."""
     x = (t_ns - site.return_from_ns) * 1e-9 / duration_s
+    remaining = 1.0 - x
     start = site.q_held[i]
-    start_rate = duration_s * site.qd_held[i]
-    offset = start * (1.0 - x * x * (3.0 - 2.0 * x)) + start_rate * x * (1.0 - x) * (1.0 - x)
-    slope = start_rate * (1.0 - x) * (1.0 - 3.0 * x) - start * 6.0 * x * (1.0 - x)
-    return offset, slope / duration_s
+    start_slope = duration_s * site.qd_held[i]
+    from_start = start * (1.0 - x * x * (3.0 - 2.0 * x))
+    from_slope = start_slope * x * remaining * remaining
+    slope = start_slope * remaining * (1.0 - 3.0 * x) - start * 6.0 * x * remaining
+    return from_start + from_slope, slope / duration_s
 
 
 @leaf
@@ -307,7 +324,9 @@ def _add_offset(t_ns: int, site: SiteRow) -> None:
         y, y_rate = _find_offset(t_ns, duration_s, site, 4)
         z, z_rate = _find_offset(t_ns, duration_s, site, 5)
         turn = (x, y, z)
-        peers_rate = rotate_by_vector(turn, three(site.qd_des[3:]))
-        turn_velocity = angular_velocity(turn, (x_rate, y_rate, z_rate))
-        put_three(site.q_des[3:], compose_rotations(turn, three(site.q_des[3:])))
-        put_three(site.qd_des[3:], add(turn_velocity, peers_rate))
+        turn_rate = (x_rate, y_rate, z_rate)
+        peers_velocity = rotate_by_vector(turn, three(site.qd_des[3:]))
+        turn_velocity = angular_velocity(turn, turn_rate)
+        reference = compose_rotations(turn, three(site.q_des[3:]))
+        put_three(site.q_des[3:], reference)
+        put_three(site.qd_des[3:], add(turn_velocity, peers_velocity))

@@ -1,8 +1,9 @@
 """The arrays of a running site: how a setup fills them, and how they grow during a run.
 
-A site's state is one row of a structured array (`SiteRow`, in `row_fields`): as an argument of
-compiled code it costs a quarter of a microsecond, and its fields have the paper's names. Each
-peer has a row of its link (`LinkRow`), a table of link models and a calendar.
+The state of a site is one row of a structured array (`SiteRow`, in `row_fields`). As an
+argument of compiled code, a row costs a quarter of a microsecond, and its fields have the
+paper's names. Each peer has a row of its link (`LinkRow`), a table of link models and a
+calendar.
 
 Invariant:
 
@@ -36,7 +37,8 @@ from .site_setup import Gains, Law, Layout, LinkSetup, SiteSetup
 from .ticks import MAX_ARRIVALS, NS_PER_S, CoreChange, DominanceRamp, LifeOrder, Mode
 from .vectors import Array, IntArray, Points, Row, RowArray
 
-_GAINS = tuple(name for name in Gains._fields if name not in ("law", "theta_hat0", "absolute"))
+_OTHER_GAINS = ("law", "theta_hat0", "absolute")
+_GAINS = tuple(name for name in Gains._fields if name not in _OTHER_GAINS)
 """Constant gains, named as the site's fields are; theta_hat0 becomes `theta_hat`."""
 
 
@@ -135,14 +137,20 @@ def build_site_arrays(
     links = setup.links
     layout = layout or setup.layout
     peers = len(links)
-    kept_dues = pages or _kept_dues(setup)
+    spare_models, spare_ramps = spare
+    kept_dues = pages or _count_kept_dues(setup)
     pages = pages or needed_pages(setup)
     calendars = np.zeros((peers, pages), sample_dtype(layout.shared))
     calendars["tick"] = -1
-    rows, models, points = _build_links(links, spare[0], layout.shared)
-    actors, table = torque_source_rows(setup.actors, layout.joints, 3 if layout.chain else 2)
-    ramps = np.zeros((1 + len(setup.ramps) + spare[1], RAMP_COLUMNS + peers))
+    rows, models, points = _build_links(links, spare_models, layout.shared)
+    axes = 3 if layout.chain else 2
+    actors, table = torque_source_rows(setup.actors, layout.joints, axes)
+    ramp_count = 1 + len(setup.ramps) + spare_ramps
+    ramps = np.zeros((ramp_count, RAMP_COLUMNS + peers))
     ramps[0, RAMP_COLUMNS:] = [link.alpha for link in links]
+    chain = None
+    if setup.chain is not None:
+        chain = build_chain(setup.chain.joints, layout.joints)
     has_channel = plugged or setup.law_factory is not None
     arrays = SiteArrays(
         site=_build_site(setup, layout),
@@ -154,7 +162,7 @@ def build_site_arrays(
         ramps=ramps,
         actors=actors,
         table=table,
-        chain=None if setup.chain is None else build_chain(setup.chain.joints, layout.joints),
+        chain=chain,
         channel=_build_channel(setup, pages) if has_channel else None,
     )
     for ramp in setup.ramps:
@@ -163,7 +171,7 @@ def build_site_arrays(
 
 
 def needed_pages(setup: SiteSetup) -> int:
-    """Returns the pages of a calendar for the delays of a setup.
+    """Returns the number of pages of a calendar for the delays of a setup.
 
     Senders may be up to `_NEAR_NS` ahead of the site.
     """
@@ -177,17 +185,19 @@ def links_bytes(setup: SiteSetup, pages: int) -> int:
     if setup.law_factory is not None:
         numbers = sum(vector.length for vector in setup.received_vectors)
     page_bytes = sample_dtype(setup.layout.shared).itemsize + 8 * numbers
-    link_bytes = pages * page_bytes + 8 * _kept_dues(setup)
+    dues_bytes = 8 * _count_kept_dues(setup)
+    link_bytes = pages * page_bytes + dues_bytes
     return len(setup.links) * link_bytes
 
 
-def _kept_dues(setup: SiteSetup) -> int:
+def _count_kept_dues(setup: SiteSetup) -> int:
     """Returns the number of due times that a link keeps.
 
-    They span the stamps from the latest possible sample to the one farthest ahead.
+    The due times span the stamps from the latest possible sample to the sample farthest ahead.
     """
     fastest_hz = max(setup.rate_hz, *(link.rate_hz for link in setup.links))
-    return span_ticks(MAX_DELAY_US * 1000 + AHEAD_LIMIT_NS, fastest_hz) + _SLACK
+    span_ns = MAX_DELAY_US * 1000 + AHEAD_LIMIT_NS
+    return span_ticks(span_ns, fastest_hz) + _SLACK
 
 
 def widen_calendars(arrays: SiteArrays, k: int, pages: int) -> SiteArrays:
@@ -199,6 +209,7 @@ def widen_calendars(arrays: SiteArrays, k: int, pages: int) -> SiteArrays:
         pages: the new number of pages, a power of two.
     """
     ticks = np.arange(k, k + arrays.calendars.shape[1])
+    # A tick's page is its lowest bits, as the number of pages is a power of two.
     old_pages = ticks & (len(ticks) - 1)
     new_pages = ticks & (pages - 1)
     calendars = np.zeros((len(arrays.links), pages), arrays.calendars.dtype)
@@ -255,17 +266,21 @@ class CalendarSizer:
             peer: the peer's index.
             tick: the sample's stamp.
         """
-        wait = span_ticks(self._delay_us[peer] * 1000, self._rate_hz) + _SLACK
-        ahead = tick * self._rate_hz // self._peer_hz[peer] - k
-        if ahead > span_ticks(AHEAD_LIMIT_NS, self._rate_hz):
+        rate_hz = self._rate_hz
+        peer_hz = self._peer_hz[peer]
+        wait = span_ticks(self._delay_us[peer] * 1000, rate_hz) + _SLACK
+        ahead = tick * rate_hz // peer_hz - k
+        if ahead > span_ticks(AHEAD_LIMIT_NS, rate_hz):
             return arrays
+        needed = ahead + wait
         pages = arrays.calendars.shape[1]
-        if ahead + wait > pages < self.most_pages:
-            pages = min(1 << (ahead + wait).bit_length(), self.most_pages)
+        if needed > pages < self.most_pages:
+            pages = min(1 << needed.bit_length(), self.most_pages)
             # Samples of missed ticks still wait in the pages of those ticks.
             first = k - int(arrays.site["skipped"][0])
             arrays = widen_calendars(arrays, first, pages)
-        self.newest[peer] = (k + pages - wait) * self._peer_hz[peer] // self._rate_hz
+        newest_tick = k + pages - wait
+        self.newest[peer] = newest_tick * peer_hz // rate_hz
         return arrays
 
 
@@ -274,7 +289,8 @@ def add_ramp(arrays: SiteArrays, ramp: DominanceRamp) -> None:
     site: Row = arrays.site[0]
     count = int(site.ramps)
     ramps = arrays.ramps
-    index = 1 + int(np.searchsorted(ramps[1:count, 0], ramp.start_ns, side="right"))
+    starts_ns = ramps[1:count, 0]
+    index = 1 + int(np.searchsorted(starts_ns, ramp.start_ns, side="right"))
     ramps[index + 1 : count + 1] = ramps[index:count].copy()
     ramps[index] = (ramp.start_ns, ramp.end_ns, *ramp.alpha)
     site.ramps = count + 1
@@ -285,7 +301,8 @@ def add_model(arrays: SiteArrays, peer: int, model: LinkModel) -> None:
     link: Row = arrays.links[peer]
     models = arrays.models[peer]
     count = int(link.models)
-    index = 1 + int(np.searchsorted(models["from_ns"][1:count], model.from_ns, side="right"))
+    starts_ns = models["from_ns"][1:count]
+    index = 1 + int(np.searchsorted(starts_ns, model.from_ns, side="right"))
     models[index + 1 : count + 1] = models[index:count].copy()
     models[index] = model
     link.models = count + 1
@@ -356,12 +373,12 @@ def stack_site_arrays(
         longest_us: the longest delay of such a change, us.
         late_ns: largest lateness of a sample, ns.
     """
-    delays_us = [
-        max_delay_us(link.models, link.traces) for setup in setups for link in setup.links
-    ]
+    for setup in setups:
+        for link in setup.links:
+            longest_us = max(longest_us, max_delay_us(link.models, link.traces))
     fastest_hz = max(setup.rate_hz for setup in setups)
     margin_ns = late_ns + _SLACK * NS_PER_S // fastest_hz
-    pages = calendar_pages(fastest_hz, max(*delays_us, longest_us), margin_ns)
+    pages = calendar_pages(fastest_hz, longest_us, margin_ns)
     layouts = [setup.layout for setup in setups]
     largest = Layout(*map(max, zip(*layouts, strict=True)))
     plugged = any(setup.law_factory is not None for setup in setups)
@@ -370,22 +387,24 @@ def stack_site_arrays(
         for setup in setups
     ]
     _share_tables(sites)
-    columns: dict[str, list[Any]] = {
-        name: [getattr(site, name) for site in sites] for name in SiteArrays._fields
-    }
-    if not largest.chain:
-        del columns["chain"]
-    channels = [site.channel for site in sites if site.channel is not None]
-    del columns["channel"]
-    joined: dict[str, Any] = {
-        name: np.concatenate(columns.pop(name)) for name in ("points", "table")
-    }
-    if channels:
-        joined["channel"] = _stack_channels(setups, channels)
-    stacked: dict[str, Any] = {name: _stack_padded(column) for name, column in columns.items()}
-    for row, site in zip(stacked["actors"], sites, strict=True):
+    actors = _stack_padded([site.actors for site in sites])
+    for row, site in zip(actors, sites, strict=True):
         row["sampled"][len(site.actors) :] = _NEVER_SAMPLED
-    return SiteArrays(**{"chain": None, "channel": None, **stacked, **joined})
+    chains = [site.chain for site in sites if site.chain is not None]
+    channels = [site.channel for site in sites if site.channel is not None]
+    return SiteArrays(
+        site=_stack_padded([site.site for site in sites]),
+        links=_stack_padded([site.links for site in sites]),
+        models=_stack_padded([site.models for site in sites]),
+        dues=_stack_padded([site.dues for site in sites]),
+        calendars=_stack_padded([site.calendars for site in sites]),
+        points=np.concatenate([site.points for site in sites]),
+        ramps=_stack_padded([site.ramps for site in sites]),
+        actors=actors,
+        table=np.concatenate([site.table for site in sites]),
+        chain=_stack_padded(chains) if largest.chain else None,
+        channel=_stack_channels(setups, channels) if channels else None,
+    )
 
 
 def _share_tables(sites: Sequence[SiteArrays]) -> None:
@@ -404,7 +423,10 @@ def select_site(stacked: SiteArrays, i: int, layout: Layout) -> SiteArrays:
     """Returns the arrays of site `i` of a stack; its rows may be longer than its layout."""
     channel = stacked.channel
     if channel is not None:
-        channel = ChannelArrays(*(array[i] for array in channel))
+        channel = ChannelArrays(channel.waiting[i], channel.received[i], channel.columns[i])
+    chain = stacked.chain
+    if chain is not None:
+        chain = chain[i, : layout.joints]
     return stacked._replace(
         site=stacked.site[i],
         links=stacked.links[i],
@@ -413,7 +435,7 @@ def select_site(stacked: SiteArrays, i: int, layout: Layout) -> SiteArrays:
         calendars=stacked.calendars[i],
         ramps=stacked.ramps[i],
         actors=stacked.actors[i],
-        chain=None if stacked.chain is None else stacked.chain[i, : layout.joints],
+        chain=chain,
         channel=channel,
     )
 
@@ -431,9 +453,12 @@ def _stack_channels(
             to_all = link.channel.count_numbers(per_peer=False)
             to_each = link.channel.count_numbers(per_peer=True)
             columns[columns >= to_all] += link.index_at_peer * to_each
-    waiting, received, columns = map(_stack_padded, zip(*channels, strict=True))
+    waiting = _stack_padded([channel.waiting for channel in channels])
+    received = _stack_padded([channel.received for channel in channels])
+    columns = _stack_padded([channel.columns for channel in channels])
     for channel, padded in zip(channels, columns, strict=True):
-        padded[:, channel.columns.shape[1] :] = -1
+        count = channel.columns.shape[1]
+        padded[:, count:] = -1
     return ChannelArrays(waiting, received, columns)
 
 
@@ -442,7 +467,8 @@ def _stack_padded(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
     shape = np.max([array.shape for array in arrays], axis=0)
     padded = []
     for array in arrays:
-        widths = [(0, most - length) for most, length in zip(shape, array.shape, strict=True)]
+        missing = shape - array.shape
+        widths = [(0, count) for count in missing]
         padded.append(np.pad(array, widths))
     return np.stack(padded)
 
@@ -517,14 +543,14 @@ def _list_vectors(setup: SiteSetup) -> dict[str, Any]:
 def _build_channel(setup: SiteSetup, pages: int) -> ChannelArrays:
     """Returns the channels of a site's peers, with zeros for all received numbers."""
     vectors = setup.received_vectors
-    links = setup.links
+    peers = len(setup.links)
     numbers = sum(vector.length for vector in vectors)
-    columns = np.array([link.channel.find_columns(vectors) for link in links], dtype=np.int64)
-    shape = (len(links), numbers)
+    columns = [link.channel.find_columns(vectors) for link in setup.links]
+    shape = (peers, numbers)
     return ChannelArrays(
-        waiting=np.zeros((len(links), pages, numbers)),
+        waiting=np.zeros((peers, pages, numbers)),
         received=np.zeros(shape),
-        columns=columns.reshape(shape),
+        columns=np.array(columns, dtype=np.int64).reshape(shape),
     )
 
 
@@ -538,12 +564,16 @@ def _build_links(
     most_models = max(len(link.models) for link in links)
     rows = np.zeros(len(links), link_dtype(shared))
     all_models = np.zeros((len(links), most_models + spare), LINK_MODEL_DTYPE)
-    traces = [trace for link in links for trace in link.traces if trace is not None]
-    outages = [outage for link in links for outage in link.outages]
-    pairs = [point for trace in traces for point in trace]
-    points = np.array(pairs + outages, dtype=np.int64).reshape(-1, 2)
+    trace_points: list[Any] = []
+    outages: list[Any] = []
+    for link in links:
+        for trace in link.traces:
+            if trace is not None:
+                trace_points.extend(trace)
+        outages.extend(link.outages)
+    points = np.array(trace_points + outages, dtype=np.int64).reshape(-1, 2)
     trace_first = 0
-    outage_first = sum(map(len, traces))
+    outage_first = len(trace_points)
     row: Row
     for row, models, link in zip(rows, all_models, links, strict=True):
         row.alpha = link.alpha
@@ -559,7 +589,8 @@ def _build_links(
         row.outage_count = len(link.outages)
         outage_first += len(link.outages)
         row.models = len(link.models)
-        for n, (model, trace) in enumerate(zip(link.models, link.traces, strict=True)):
+        pairs = zip(link.models, link.traces, strict=True)
+        for n, (model, trace) in enumerate(pairs):
             count = 0 if trace is None else len(trace)
             models[n] = model._replace(trace_first=trace_first, trace_count=count)
             trace_first += count

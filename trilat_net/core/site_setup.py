@@ -1,6 +1,7 @@
 """The setup of a site: the resolved numbers and names from which a site is built.
 
-Invariant: besides the setup, only the inputs of the ticks influence a site's numbers.
+Invariant:
+    - Besides the setup, only the inputs of the ticks influence a site's numbers.
 """
 
 import math
@@ -90,7 +91,7 @@ class StaleRule(NamedTuple):
 class MotionLimits(NamedTuple):
     """Limits of an arm's angles, and of the rates of its reference and torque.
 
-    Each is one number for all, or one number per joint or coordinate.
+    A limit is one number for all joints or coordinates, or one number per joint or coordinate.
 
     Attributes:
         q_min: least joint angles, rad.
@@ -355,8 +356,7 @@ class Gains(NamedTuple):
         width: speed r at which the robust torque is 0.71 rho, shape (n,), rad/s.
         friction: share of a chain's joint friction that ADAPTIVE compensates, shape (n,).
         absolute: true: r of ADAPTIVE is qd + Lambda q, and Kp couples it to r of the peers;
-        only
-            linear analysis uses this.
+            only linear analysis uses this.
     """
 
     law: Law

@@ -136,7 +136,7 @@ class Site:
     def _find_hand(self, index: int) -> tuple[Array, Array, Array]:
         """Returns the fields of the live hand at `index` among the actors.
 
-        They are the grip, the target, and the target one second later.
+        The fields are the grip, the target, and the target one second later.
         """
         actors = self._arrays.actors
         size = (self.layout.hand - 3) // 2
@@ -378,7 +378,7 @@ class Site:
     def release_tick(self, peer: int, tick: int) -> int | None:
         """Returns the site's tick that brings a peer's sample into use if it arrives in time.
 
-        None if its link loses the sample or has forgotten its due time.
+        The result is None if the link loses the sample or has forgotten its due time.
         """
         release = int(find_release(peer, tick, self._arrays))
         return None if release == LOST else release

@@ -60,17 +60,21 @@ def update_pose(s: Row, chain: RowArray) -> None:
     if s.shared == POSE:
         last: Row = chain[chain.shape[0] - 1]
         put_three(s.x[3:], relative_rotation(last.R_base, s.tip_back))
+    J = s.J
+    xd = s.xd
     for j in range(s.shared):
-        s.xd[j] = 0.0
+        xd[j] = 0.0
     for i in range(chain.shape[0]):
         row: Row = chain[i]
         rate = s.qd[i]
         for j in range(3):
-            s.J[j, i] = s.scale * row.J_lin[j]
-            s.xd[j] += s.J[j, i] * rate
+            linear = s.scale * row.J_lin[j]
+            J[j, i] = linear
+            xd[j] += linear * rate
             if s.shared == POSE:
-                s.J[3 + j, i] = row.J_ang[j]
-                s.xd[3 + j] += row.J_ang[j] * rate
+                angular = row.J_ang[j]
+                J[3 + j, i] = angular
+                xd[3 + j] += angular * rate
     _update_jacobian_rate(s, chain, position)
 
 
@@ -152,34 +156,38 @@ def _factor(s: Row, damping: float) -> None:
 
     An axis that is not followed has a row of zeros in J, and gets a unit pivot.
     """
+    J = s.J
+    A = s.A
     for j in range(s.shared):
         for k in range(j + 1):
             total = 0.0
             if k == j:
                 total = damping + 1.0 - s.axes[j]
             for i in range(s.joints):
-                total += s.J[j, i] * s.J[k, i]
+                total += J[j, i] * J[k, i]
             for p in range(k):
-                pivot = s.A[p, p]
-                total -= s.A[j, p] * s.A[k, p] * pivot
+                pivot = A[p, p]
+                total -= A[j, p] * A[k, p] * pivot
             if k < j:
-                pivot = s.A[k, k]
+                pivot = A[k, k]
                 total = total / pivot if pivot > TINY else 0.0
-            s.A[j, k] = total
+            A[j, k] = total
 
 
 @leaf
 def _solve(s: Row, b: Array, y: Array) -> None:
-    """Writes the solution of L D L' y = b."""
-    for j in range(s.shared):
+    """Writes the solution y of L D L' y = b, with the factors in `s.A`."""
+    A = s.A
+    m = s.shared
+    for j in range(m):
         y[j] = b[j]
         for k in range(j):
-            y[j] -= s.A[j, k] * y[k]
-    for j in range(s.shared - 1, -1, -1):
-        pivot = s.A[j, j]
+            y[j] -= A[j, k] * y[k]
+    for j in range(m - 1, -1, -1):
+        pivot = A[j, j]
         y[j] = y[j] / pivot if pivot > TINY else 0.0
-        for k in range(j + 1, s.shared):
-            y[j] -= s.A[k, j] * y[k]
+        for k in range(j + 1, m):
+            y[j] -= A[k, j] * y[k]
 
 
 @leaf
@@ -190,9 +198,10 @@ def _factor_damped(s: Row) -> None:
     `s.singular_value`.
     """
     for j in range(s.shared):
+        mask = s.axes[j]
         for i in range(s.joints):
-            s.J[j, i] *= s.axes[j]
-            s.Jd[j, i] *= s.axes[j]
+            s.J[j, i] *= mask
+            s.Jd[j, i] *= mask
     _factor(s, 0.0)
     limit = s.singular_value * s.singular_value
     trace = 0.0
@@ -221,8 +230,9 @@ def _update_axis_errors(s: Row) -> None:
         reference = rotation_matrix(three(s.q_des[3:]))
         put_three(s.e[3:], relative_rotation(orientation, reference))
     for j in range(s.shared):
-        s.e[j] *= s.axes[j]
-        s.ed[j] *= s.axes[j]
+        mask = s.axes[j]
+        s.e[j] *= mask
+        s.ed[j] *= mask
 
 
 @leaf
@@ -234,44 +244,50 @@ def update_task_errors(s: Row) -> None:
     """
     n = s.joints
     m = s.shared
+    J = s.J
+    Jd = s.Jd
+    b = s.b
+    y = s.y
+    v = s.v
+    a = s.a
+    Jd_y = s.stage_q
+    J_y = s.stage_qd
     _update_axis_errors(s)
     _factor_damped(s)
     k = s.posture_rate
-    Jd_y = s.stage_q
-    J_y = s.stage_qd
     # y, from J J' y = -Lambda e - J psi
     for j in range(m):
-        s.b[j] = -s.Lambda[j] * s.e[j]
+        b[j] = -s.Lambda[j] * s.e[j]
         for i in range(n):
             posture_error = s.q[i] - s.posture[i]
-            s.b[j] += s.J[j, i] * k * posture_error
+            b[j] += J[j, i] * k * posture_error
     # v and a start as psi and its derivative.
     for i in range(n):
         posture_error = s.q[i] - s.posture[i]
-        s.v[i] = -k * posture_error
-        s.a[i] = -k * s.qd[i]
-    _solve(s, s.b, s.y)
+        v[i] = -k * posture_error
+        a[i] = -k * s.qd[i]
+    _solve(s, b, y)
     for i in range(n):
         Jd_y[i] = 0.0
         J_y[i] = 0.0
         for j in range(m):
-            y = s.y[j]
-            Jd_y[i] += s.Jd[j, i] * y
-            J_y[i] += s.J[j, i] * y
+            Jd_y[i] += Jd[j, i] * y[j]
+            J_y[i] += J[j, i] * y[j]
     # y', from J J' y' = -Lambda e' - Jd (psi + J' y) - J (psi' + Jd' y)
     for j in range(m):
-        s.b[j] = -s.Lambda[j] * s.ed[j]
+        b[j] = -s.Lambda[j] * s.ed[j]
         for i in range(n):
-            turning = s.Jd[j, i] * (s.v[i] + J_y[i])
-            s.b[j] -= turning + s.J[j, i] * (s.a[i] + Jd_y[i])
-    _solve(s, s.b, s.y)
+            Jd_part = Jd[j, i] * (v[i] + J_y[i])
+            J_part = J[j, i] * (a[i] + Jd_y[i])
+            b[j] -= Jd_part + J_part
+    _solve(s, b, y)
     # v = psi + J' y and a = psi' + Jd' y + J' y'
     for i in range(n):
-        s.v[i] += J_y[i]
-        s.a[i] += Jd_y[i]
+        v[i] += J_y[i]
+        a[i] += Jd_y[i]
         for j in range(m):
-            s.a[i] += s.J[j, i] * s.y[j]
-        s.r[i] = s.qd[i] - s.v[i]
+            a[i] += J[j, i] * y[j]
+        s.r[i] = s.qd[i] - v[i]
 
 
 @leaf
@@ -294,9 +310,10 @@ def add_task_torque(s: Row, gains: Array, values: Array, factor: float, torque: 
 @leaf
 def update_wrench(s: Row) -> None:
     """Writes the wrench at the end effector that corresponds to tau_x, (J J')^-1 J tau_x."""
+    b = s.b
     # b = J tau_x; `on_arm` is -tau_x.
     for j in range(s.shared):
-        s.b[j] = 0.0
+        b[j] = 0.0
         for i in range(s.joints):
-            s.b[j] -= s.J[j, i] * s.on_arm[i]
-    _solve(s, s.b, s.wrench)
+            b[j] -= s.J[j, i] * s.on_arm[i]
+    _solve(s, b, s.wrench)

@@ -198,8 +198,7 @@ class TickInput(NamedTuple):
         commands: the changes that were commanded since the previous tick.
         measured: the present state of an external arm; None: unchanged.
         hand: the action of a live hand in this tick, see `live_hand.empty_hand_vector`; empty:
-        nobody
-            holds the arm.
+            nobody holds the arm.
     """
 
     k: int

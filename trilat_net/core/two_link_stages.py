@@ -88,8 +88,9 @@ def put_gravity(s: Row, theta: Array, torque: Array) -> None:
 
     The last columns of the regressor are g cos q_1 and g cos(q_1 + q_2).
     """
+    inner = s.Y[0, 3] * theta[3]
     outer = s.Y[1, 4] * theta[4]
-    put(torque, (s.Y[0, 3] * theta[3] + outer, outer))
+    put(torque, (inner + outer, outer))
 
 
 @leaf
@@ -191,9 +192,8 @@ def _acceleration(
     on_arm = torque_on_arm(
         t_s=t_s, q=q, qd=qd, lengths=lengths, actors=actors, table=table, sampled=0
     )
-    return forward_dynamics(
-        theta=theta, g=g, q=q, qd=qd, torque=(on_arm[0] + u[0], on_arm[1] + u[1])
-    )
+    torque = (on_arm[0] + u[0], on_arm[1] + u[1])
+    return forward_dynamics(theta=theta, g=g, q=q, qd=qd, torque=torque)
 
 
 @leaf
