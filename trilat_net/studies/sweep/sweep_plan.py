@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...analysis.metrics.log_metrics import find_quantity
-from ...errors import ScenarioError, UsageError
+from ...errors import ScenarioError, UsageError, count_nouns
 from ...fields import is_number, split_unit, suggest_nearest
 from ...scenario import Scenario, apply_overrides
 from ...scenario.code_consent import allow_own_code
@@ -469,7 +469,9 @@ def _resolve_seeds(seeds: int | Sequence[int], scenario_seed: int) -> tuple[int,
             )
         seeds = range(scenario_seed, scenario_seed + seeds)
     if len(seeds) > MAX_SEEDS:
-        raise UsageError(f"--seeds has {len(seeds)} seeds, more than {MAX_SEEDS}")
+        raise UsageError(
+            f"--seeds has {count_nouns(len(seeds), 'seed')}, more than {MAX_SEEDS}"
+        )
     for seed in seeds:
         if not 0 <= seed < 2**63:
             raise UsageError(f"a seed is from 0 to 2^63 - 1, not {seed}")
