@@ -227,7 +227,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
 
     Attributes:
         observation_names: with `flat`, the name of each number of an observation, as in
-            "peer_q[1][0]".
+            "q[0]". A number of a matrix has two indices, its row and its column.
 
     Raises:
         ScenarioError: the scenario or an override is not valid.
