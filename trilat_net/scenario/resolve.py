@@ -1,16 +1,24 @@
-"""Resolve an author's tables into a complete scenario: defaults, presets, key checks.
+"""Completes the tables of a scenario file: defaults, presets, inherited keys, named files.
 
-`resolve_scenario` writes out every default, joins the tables of all sites with those of each
-site, draws the numbers that are given as distributions, reads the files that the scenario
-names (URDF files, delay traces), and checks names and keys. `validate.build_scenario` then
-turns the result into types and checks ranges.
+A scenario is a TOML file that describes an experiment. Its author may leave out most keys. The
+function `resolve_scenario` returns tables in which nothing is left out:
+
+1. It checks the names of all keys.
+2. It writes out every default, and copies the keys of the tables for all sites (such as
+   `[arm]`) into the table of each site.
+3. It replaces each number that is given as a probability distribution by a number that is drawn
+   from the distribution with the seed of the scenario.
+4. It reads the files that the scenario names (URDF files of arms, traces of delays), so that
+   the result needs no other file.
+
+Afterwards, `validate.build_scenario` converts the result to types, and checks the ranges.
 
 Invariant:
-    - A key is checked in the table in which its author wrote it, so that the path in an error
-      is a path that the author finds in the file.
-    - A preset is a table that an author could have written; `scenarios/_presets.toml` contains
-      the presets with their sources. A resolved scenario holds the keys of a preset, not its
-      name.
+    - A key is checked in the table in which its author wrote it. Therefore an author finds the
+      path in an error message in the file.
+    - A preset is a table that an author could have written as well. The file
+      `scenarios/_presets.toml` contains the presets and their sources. A resolved scenario
+      contains the keys of a preset, but not its name, so that it does not change with a preset.
 """
 
 import math
@@ -86,7 +94,7 @@ _DEFAULT_SEED = 1
 _DEFAULT_LAW = "adaptive"
 T = TypeVar("T")
 _MIN_DOWN_LENGTH = 1e-6
-"""A gravity direction whose components sum to less than this has no direction."""
+"""Smallest sum of the absolute components of a vector that still counts as a direction."""
 MAX_SITES = 32
 """Largest number of sites of an experiment. Every pair of sites has two links."""
 
@@ -117,25 +125,29 @@ PRESETS: dict[str, dict[str, Any]] = {
     **tomllib.loads(_PRESETS_FILE.read_text(encoding="utf-8")),
     **_GRID,
 }
-"""Keys of a link by the name of the preset.
+"""The keys of a link that each preset stands for, by the name of the preset.
 
-A preset of the grid delays each direction by half of the round trip and loses samples
-independently of each other.
+The presets of the grid, such as `rtt68-loss10`, delay each direction by half of the round trip.
+They lose each sample independently of the others.
 """
 
 TRACE_KEYS = ("file", "of")
-"""Keys with which an author names the source of a trace; a resolved link has the trace."""
+"""Keys of a link that name a file of delays. A resolved link contains the delays instead."""
 
 
 def resolve_scenario(tables: TomlTable, folder: Path | None) -> TomlTable:
-    """Returns an author's tables with every default written out, in the shape of `Scenario`.
+    """Returns the tables of a scenario file with every default and every file written out.
 
     Args:
-        tables: the author's tables.
-        folder: the folder of the files that the tables name; None: they may not name any file.
+        tables: Tables of the scenario file, as its author wrote them.
+        folder: Folder in which the files are searched that the tables name. None refuses
+            tables that name a file.
+
+    Returns:
+        Tables with the keys of `Scenario`.
 
     Raises:
-        ScenarioError: a key is unknown, missing or wrong, with its path.
+        ScenarioError: A key is unknown, missing or wrong. The error contains its path.
     """
     _check_top_level(tables)
     draws = Draws(tables.get("seed", _DEFAULT_SEED), tables.get("drawn", {}))
@@ -146,29 +158,34 @@ def resolve_scenario(tables: TomlTable, folder: Path | None) -> TomlTable:
     dominance_rows = _resolve_dominance(tables["dominance"], site_names)
     links = resolve_links(tables, site_names, folder)
     _resolve_views(sites, folder)
-    top_level = {
-        key: _use_unix_line_ends(tables[key])
-        for key in _TOP_LEVEL_KEYS
-        if key in tables and key != "rate_hz"
-    }
+    timeline = resolve_timeline(tables.get("timeline", []), links, site_names)
+
+    top_level: TomlTable = {"duration_s": 20.0, "seed": _DEFAULT_SEED, "scheme": "second_order"}
+    for key in _TOP_LEVEL_KEYS:
+        # The common tick rate is already a key of each site.
+        if key in tables and key != "rate_hz":
+            top_level[key] = _use_unix_line_ends(tables[key])
+
     used_files = [site["arm"].get("urdf") for site in sites.values()]
+    used_texts = {name: text for name, text in urdf_texts.items() if name in used_files}
     return {
-        "duration_s": 20.0,
-        "seed": _DEFAULT_SEED,
-        "scheme": "second_order",
         **top_level,
         "sites": sites,
         "dominance": dominance_rows,
         "links": links,
-        "timeline": resolve_timeline(tables.get("timeline", []), links, site_names),
+        "timeline": timeline,
         "expect": expect,
         "drawn": msgspec.to_builtins(draws.drawn),
-        "urdf": {name: text for name, text in urdf_texts.items() if name in used_files},
+        "urdf": used_texts,
     }
 
 
 def _check_top_level(tables: TomlTable) -> None:
-    """Checks the keys of the whole scenario and those of its tables for all sites."""
+    """Checks the names of the scenario's keys, and those of its tables for all sites.
+
+    Raises:
+        ScenarioError: A key is unknown, a required table is missing, or a number is not finite.
+    """
     check_keys(tables, _TOP_LEVEL_KEYS + _TABLES, "")
     check_finite(tables, "")
     for required in ("name", "sites", "dominance"):
@@ -183,7 +200,17 @@ def _check_top_level(tables: TomlTable) -> None:
 def _resolve_expect(
     written: TomlTable, sites: TomlTable, urdf_texts: dict[str, str]
 ) -> TomlTable:
-    """Returns the expectations, with numbers in place of the names of joints in windows."""
+    """Returns the table of expectations, with indices in place of names of joints.
+
+    An expectation states what a test of the scenario requires of a run. It may apply to a
+    window of time and to one joint. The author may name this joint as in the URDF file of the
+    arm; the result contains its index.
+
+    Args:
+        written: Table `expect` as its author wrote it.
+        sites: Resolved tables of the sites, by name.
+        urdf_texts: Texts of the URDF files, by name.
+    """
     expect = dict(written)
     if "windows" in expect:
         joint_names = {
@@ -194,7 +221,18 @@ def _resolve_expect(
 
 
 def _resolve_dominance(written: Any, site_names: list[str]) -> TomlTable:
-    """Returns the rows of the dominance matrix by site."""
+    """Returns the weights with which every site follows its peers, the dominance factors.
+
+    Args:
+        written: Table `dominance` as its author wrote it.
+        site_names: Names of the sites.
+
+    Returns:
+        For each site, the factor of each of its peers, by name.
+
+    Raises:
+        ScenarioError: A site has no row, or its row is not valid.
+    """
     table = check_keys(written, site_names, "dominance")
     rows = {}
     for name in site_names:
@@ -208,30 +246,52 @@ def _resolve_dominance(written: Any, site_names: list[str]) -> TomlTable:
 def _read_urdf_files(tables: TomlTable, folder: Path | None) -> dict[str, str]:
     """Returns the text of every URDF file that an arm names, by the name of the file.
 
-    A text in the table `urdf` of the scenario comes first, then a shipped file, then a file in
-    `folder`.
+    The table `urdf` of a resolved scenario contains the texts of its files. A text in this
+    table has priority, then a file that the package ships, then a file in `folder`.
+
+    Raises:
+        ScenarioError: A file cannot be read, or no file may be named.
     """
-    embedded = check_keys(tables.get("urdf", {}), list(tables.get("urdf", {})), "urdf")
-    for name, text in embedded.items():
+    embedded_texts = check_keys(tables.get("urdf", {}), list(tables.get("urdf", {})), "urdf")
+    for name, text in embedded_texts.items():
         if not isinstance(text, str):
             raise ScenarioError("must be the text of a URDF", path=f"urdf.{name}")
-    sites = tables["sites"] if isinstance(tables["sites"], dict) else {}
+
     arms = {"arm": tables.get("arm")}
+    sites = tables["sites"] if isinstance(tables["sites"], dict) else {}
     for site_name, site in sites.items():
         if isinstance(site, dict):
             arms[f"sites.{site_name}.arm"] = site.get("arm")
+
     texts: dict[str, str] = {}
     for path, arm in arms.items():
         name = arm.get("urdf", "") if isinstance(arm, dict) else ""
         if not isinstance(name, str):
             raise ScenarioError("must be a file's name", path=f"{path}.urdf")
-        if name and name not in texts:
-            text = embedded[name] if name in embedded else _read_urdf(name, folder, path)
-            texts[name] = _use_unix_line_ends(text)
+        if not name or name in texts:
+            continue
+        if name in embedded_texts:
+            text = embedded_texts[name]
+        else:
+            text = _read_urdf(name, folder, path)
+        texts[name] = _use_unix_line_ends(text)
     return texts
 
 
 def _read_urdf(name: str, folder: Path | None, path: str) -> str:
+    """Returns the text of a URDF file.
+
+    At most one character more than allowed is read. The parser then refuses the text as too
+    long.
+
+    Args:
+        name: Name of the file, as the arm names it.
+        folder: Folder of the scenario. None refuses every file.
+        path: Path of the arm's table, for error messages.
+
+    Raises:
+        ScenarioError: The file cannot be read, or no file may be named.
+    """
     if folder is None:
         raise ScenarioError("no file may be named here", path=f"{path}.urdf")
     try:
@@ -245,7 +305,11 @@ def _read_urdf(name: str, folder: Path | None, path: str) -> str:
 
 
 def _find_file(name: str, folder: Path) -> Path:
-    """Returns the shipped file of a plain name, else the file in `folder`."""
+    """Returns the shipped file of a name, or the file in `folder` if there is none.
+
+    Only a name without a folder can be that of a shipped file. The returned path need not
+    exist.
+    """
     shipped = Path(str(SHIPPED_FOLDER / name))
     is_plain_name = "/" not in name and "\\" not in name
     return shipped if is_plain_name and shipped.is_file() else folder / name
@@ -254,7 +318,18 @@ def _find_file(name: str, folder: Path) -> Path:
 def _resolve_control(
     written: Any, default: TomlTable, path: str, counts: VectorCounts
 ) -> TomlTable:
-    """Returns a law and its gains; missing gains come from a default of the same law."""
+    """Returns the complete table of a control law and its gains.
+
+    Args:
+        written: Table `control` of a site as its author wrote it.
+        default: Table `control` for all sites. Its gains replace missing gains if it names the
+            same law; other laws have other gains.
+        path: Path of the table, for error messages.
+        counts: Lengths to which a single number per vector is expanded.
+
+    Raises:
+        ScenarioError: There is no such law, or it has no such gain.
+    """
     if not isinstance(written, dict):
         raise ScenarioError("must be a table", path=path)
     default_law = default.get("law", _DEFAULT_LAW)
@@ -270,7 +345,22 @@ def _resolve_control(
 def _resolve_user_law(
     code: str, written: TomlTable, default: TomlTable, path: str
 ) -> TomlTable:
-    """Returns the table of a user's law, with the hash of its file and its sent vectors."""
+    """Returns the table of a control law that a user wrote as a Python class.
+
+    The table contains the name of the class, the hash of its file, and the vectors that the law
+    sends to its peers. The file is read, but not executed.
+
+    Args:
+        code: Module and class, for example "package.module:Law".
+        written: Table `control` of the site. Apart from the key `law`, it contains the
+            arguments of the class.
+        default: Table `control` for all sites. Its arguments apply if it names the same class.
+        path: Path of the table, for error messages.
+
+    Raises:
+        ScenarioError: The name is not valid, the file cannot be read, or the table contains a
+            key that it must not have.
+    """
     if not re.fullmatch(CLASS_PATTERN, code):
         problem = f"must be as in package.module:Law, is {code!r}"
         raise ScenarioError(problem, path=f"{path}.law")
@@ -298,7 +388,11 @@ def _resolve_user_law(
 
 
 def _use_unix_line_ends(value: Any) -> Any:
-    """Returns a text, or each text in a list, with the line ends that TOML keeps."""
+    r"""Returns a text, or a list of texts, with "\n" at the end of each line.
+
+    TOML stores line ends in this form. Without the conversion, a file that was written on
+    Windows would be another experiment. Values of other types are returned unchanged.
+    """
     if isinstance(value, list):
         return [_use_unix_line_ends(entry) for entry in value]
     if isinstance(value, str):
@@ -307,7 +401,16 @@ def _use_unix_line_ends(value: Any) -> Any:
 
 
 def _resolve_sites(tables: TomlTable, draws: Draws, urdf_texts: dict[str, str]) -> TomlTable:
-    """Returns the complete table of every site."""
+    """Returns the complete table of every site, by name.
+
+    Args:
+        tables: Tables of the scenario file.
+        draws: Draws the numbers that are given as distributions.
+        urdf_texts: Texts of the URDF files, by name.
+
+    Raises:
+        ScenarioError: There are too few or too many sites, or a table is not valid.
+    """
     if not isinstance(tables["sites"], dict):
         raise ScenarioError("must be tables [sites.NAME]", path="sites")
     site_tables = {
@@ -323,11 +426,15 @@ def _resolve_sites(tables: TomlTable, draws: Draws, urdf_texts: dict[str, str]) 
             f"an experiment has at least two sites, this one has {len(site_tables)}",
             path="sites",
         )
-    # If one arm is a chain, all arms are: every run computes with the same leaves.
-    chains = any(
-        site["arm"].get("urdf") or site["task"].get("space", "joints") != "joints"
-        for site in site_tables.values()
-    )
+
+    # The kernel computes planar arms with their own formulas, and all other arms as chains. If
+    # one arm is a chain, all arms are: every run uses the same functions for all its sites.
+    chains = False
+    for site in site_tables.values():
+        shares_pose = site["task"].get("space", "joints") != "joints"
+        if site["arm"].get("urdf") or shares_pose:
+            chains = True
+
     return {
         name: _resolve_site(
             name=name,
@@ -342,7 +449,19 @@ def _resolve_sites(tables: TomlTable, draws: Draws, urdf_texts: dict[str, str]) 
 
 
 def _join_site_groups(name: str, written: Any, tables: TomlTable) -> TomlTable:
-    """Returns a site's table in which each group is joined with the table of all sites."""
+    """Returns the table of a site, completed with the keys that all sites share.
+
+    The groups of keys in `SITE_GROUPS`, such as `arm` and `limits`, may be written once for all
+    sites, and again for a single site. The keys of the single site have priority.
+
+    Args:
+        name: Name of the site.
+        written: Table of the site as its author wrote it.
+        tables: Tables of the scenario file.
+
+    Raises:
+        ScenarioError: The name is not valid, or a key is unknown.
+    """
     path = f"sites.{name}"
     if not _SITE_NAME.fullmatch(name) or name in _RESERVED_NAMES:
         raise ScenarioError(
@@ -362,9 +481,14 @@ def _join_site_groups(name: str, written: Any, tables: TomlTable) -> TomlTable:
 
 
 def _join_group(shared: TomlTable, local: TomlTable) -> TomlTable:
-    """Returns a site's table of a group, with the keys that only the table of all sites has.
+    """Returns a site's table of one group, with missing keys from the table for all sites.
 
-    The inertias in the table `links` of an arm are joined link by link and key by key.
+    The table `links` of an arm contains a table for each link. These are joined link by link
+    and key by key, so that a site may change a single inertia.
+
+    Args:
+        shared: Table of the group for all sites.
+        local: Table of the group of the site.
     """
     joined = {**shared, **local}
     shared_links = shared.get("links")
@@ -387,13 +511,17 @@ def _resolve_site(
 ) -> TomlTable:
     """Returns the complete table of a site.
 
+    The steps depend on each other. The model of the arm is built first, because it states the
+    number of joints, and thereby the lengths of the site's vectors. The order of the draws
+    decides which random number each key gets, so it must not change.
+
     Args:
-        name: the name of the site.
-        site: its table, joined with the tables of all sites.
-        tables: the tables of the scenario.
-        draws: draws the numbers that are given as distributions.
-        urdf_texts: the texts of URDF files, by name.
-        chains: whether the arms of the scenario are chains.
+        name: Name of the site.
+        site: Table of the site, joined with the tables for all sites. It is changed.
+        tables: Tables of the scenario file.
+        draws: Draws the numbers that are given as distributions.
+        urdf_texts: Texts of the URDF files, by name.
+        chains: Whether the arms of the scenario are general chains of joints.
     """
     path = f"sites.{name}"
     site["arm"], model = _resolve_arm(
@@ -413,6 +541,7 @@ def _resolve_site(
     _check_counts(site, counts, path)
 
     def locate_end_effector() -> list[float]:
+        # If the table is wrong, `validate` refuses it later. Until then, zeros stand in.
         if model is None or not all(map(is_number, site["q0_rad"])):
             return [0.0] * counts.axes
         return model.end_effector(site["q0_rad"])
@@ -425,25 +554,31 @@ def _resolve_site(
 
 
 def _list_default_limits(site: TomlTable, model: ArmModel | None) -> TomlTable:
-    """Returns the limits of a site that follow from its arm's file and from its stale rule."""
+    """Returns the limits of a site that apply if its author states none.
+
+    The efforts and speeds of a chain's joints come from its URDF file. A joint for which the
+    file states no positive finite limit has the default of `Limits`. A simulated arm with the
+    stale rule "glide" also has a limit on the torque's rate of change.
+    """
     limits: TomlTable = {}
     if site["on_stale"].get("action") == "glide" and site.get("plant") != "external":
         limits["tau_rate_limit_nm_s"] = GLIDE_TAU_RATE_NM_S
     if model is None or model.chain is None:
         return limits
-    for key, stated_limits in (
-        ("tau_limit_nm", model.efforts),
-        ("qd_limit_rad_s", model.speeds),
-    ):
+
+    file_limits = {"tau_limit_nm": model.efforts, "qd_limit_rad_s": model.speeds}
+    for key, stated_limits in file_limits.items():
         default = getattr(Limits(), key)
         limits[key] = [limit if 0.0 < limit < math.inf else default for limit in stated_limits]
     return limits
 
 
 def _draw_site_numbers(site: TomlTable, draws: Draws, path: str) -> None:
-    """Draws the start, the limits, the rules, the task and the gains of a site, in place.
+    """Draws the numbers of a site that are given as distributions, in place.
 
-    The order of the draws decides the order of keys in the table `drawn`.
+    These are the start, the limits, the rules for stale samples, the task and the gains of the
+    control law. The order of the draws decides the order of the keys in the table `drawn`, and
+    thereby the text and the hash of the scenario.
     """
     start = {key: site[key] for key in ("q0_rad", "qd0_rad_s")}
     site |= draws.draw_numbers(start, path)
@@ -458,10 +593,22 @@ def _draw_site_numbers(site: TomlTable, draws: Draws, path: str) -> None:
 def _resolve_arm(
     site: TomlTable, draws: Draws, urdf_texts: dict[str, str], chains: bool, path: str
 ) -> tuple[TomlTable, ArmModel | None]:
-    """Returns the complete table of an arm, and its model or None, see `_model_arm`.
+    """Returns the complete table of an arm and its model.
 
-    The table `links` and the armature are resolved apart: the table holds tables instead of
-    numbers, and the armature has one number per joint, which only the model knows.
+    The key `armature_kg_m2` (rotor inertias) may contain one number per joint, and only the
+    model knows the number of joints. Therefore the model is built without this key first, and
+    again with the key. The key `links` contains tables instead of numbers, and is resolved
+    separately.
+
+    Args:
+        site: Table of the site.
+        draws: Draws the numbers that are given as distributions.
+        urdf_texts: Texts of the URDF files, by name.
+        chains: Whether the arms of the scenario are general chains of joints.
+        path: Path of the arm's table, for error messages.
+
+    Returns:
+        The table and the model. The model is None if validation will refuse the table.
     """
     table = dict(site["arm"])
     task_table = site["task"]
@@ -488,7 +635,18 @@ def _resolve_arm(
 
 
 def _resolve_link_inertias(written: Any, draws: Draws, path: str) -> TomlTable:
-    """Returns the masses and inertias that an arm gives its links, drawn and checked."""
+    """Returns the masses and inertias that an author states for links of an arm.
+
+    They replace those of the URDF file. Numbers that are given as distributions are drawn.
+
+    Args:
+        written: Table `links` of the arm as its author wrote it.
+        draws: Draws the numbers.
+        path: Path of the table, for error messages.
+
+    Raises:
+        ScenarioError: A table is not valid, or states nothing.
+    """
     links: TomlTable = {}
     if not isinstance(written, dict):
         raise ScenarioError("must be a table of links", path=path)
@@ -504,10 +662,11 @@ def _resolve_link_inertias(written: Any, draws: Draws, path: str) -> TomlTable:
 
 
 def _convert_table(table: TomlTable, kind: type[T], path: str) -> T:
-    """Returns the struct of a table.
+    """Converts a table to a struct of a given type.
 
     Raises:
-        ScenarioError: a value is refused, with the path of its key below `path`.
+        ScenarioError: A value has a wrong type or range. The error contains the path of its
+            key.
     """
     try:
         return msgspec.convert(table, kind)
@@ -517,7 +676,7 @@ def _convert_table(table: TomlTable, kind: type[T], path: str) -> T:
 
 
 def _list_joint_names(arm_table: TomlTable, urdf_texts: dict[str, str]) -> tuple[str, ...]:
-    """Returns the names of an arm's joints; () for the planar arm."""
+    """Returns the names of an arm's joints. Empty for the planar arm."""
     if not arm_table.get("urdf"):
         return ()
     chain = read_arm(msgspec.convert(arm_table, Arm), urdf_texts)
@@ -534,10 +693,21 @@ def _model_arm(
     chains: bool,
     path: str,
 ) -> ArmModel | None:
-    """Returns the model of an arm, or None if validation will refuse a key of its tables.
+    """Returns the model of an arm, which knows the dynamics and the number of joints.
+
+    A planar arm is not needed for the resolution itself. If its tables contain a wrong value,
+    the result is None, and `validate.build_scenario` refuses the value later with a better
+    message.
+
+    Args:
+        table: Table of the arm.
+        task_table: Table `task` of the site: the coordinates that the sites share.
+        urdf_texts: Texts of the URDF files, by name.
+        chains: Whether the arms of the scenario are general chains of joints.
+        path: Path of the arm's table, for error messages.
 
     Raises:
-        ScenarioError: the model needs a key that is wrong, or a key belongs to another kind of
+        ScenarioError: The model needs a key that is wrong, or a key belongs to another kind of
             arm.
     """
     try:
@@ -547,16 +717,19 @@ def _model_arm(
             return None
         arm = _convert_table(table, Arm, path)
     _check_arm_keys(arm, table, chains, path)
+
     task_path = f"{path.removesuffix('arm')}task"
     try:
         task = msgspec.convert(task_table, Task)
     except msgspec.ValidationError:
         if any(map(is_distribution, task_table.values())):
             return None
+        # The conversion is repeated, because it raises a readable error.
         task = _convert_table(task_table, Task, task_path)
-    idle = task.find_idle_key(task_table)
-    if idle is not None:
-        raise ScenarioError(idle.problem, path=f"{task_path}.{idle.key}")
+    unused_key = task.find_idle_key(task_table)
+    if unused_key is not None:
+        raise ScenarioError(unused_key.problem, path=f"{task_path}.{unused_key.key}")
+
     try:
         return build_arm(arm, task, urdf_texts, chains)
     except ScenarioError as error:
@@ -566,7 +739,14 @@ def _model_arm(
 
 
 def _check_arm_keys(arm: Arm, table: TomlTable, chains: bool, path: str) -> None:
-    """Refuses keys that the kind of arm does not have, and gravity without a direction."""
+    """Refuses keys that belong to another kind of arm, and gravity without a direction.
+
+    Args:
+        arm: The arm.
+        table: Table from which the arm was built. It shows which keys the author wrote.
+        chains: Whether the arms of the scenario are general chains of joints.
+        path: Path of the table, for error messages.
+    """
     foreign_keys = ArmLinks._fields if arm.urdf else CHAIN_KEYS
     for key in table:
         if key in foreign_keys:
@@ -586,7 +766,13 @@ def _check_arm_keys(arm: Arm, table: TomlTable, chains: bool, path: str) -> None
 
 
 def _check_counts(site: TomlTable, counts: VectorCounts, path: str) -> None:
-    """Refuses vectors of a site that have too few or too many numbers."""
+    """Refuses vectors of a site that have too few or too many numbers.
+
+    Args:
+        site: Resolved table of the site.
+        counts: Number of joints of the arm, and number of coordinates that the sites share.
+        path: Path of the site, for error messages.
+    """
     law = site["control"].get("law", _DEFAULT_LAW)
     tables: list[tuple[TomlTable, type[Frozen], str]] = [
         (site, SiteSpec, path),
@@ -613,13 +799,28 @@ def _check_counts(site: TomlTable, counts: VectorCounts, path: str) -> None:
 
 
 def resolve_dominance_row(written: Any, names: list[str], site: str, path: str) -> TomlTable:
-    """Returns a site's row of the dominance matrix, checked, with the factor of every peer."""
+    """Returns the dominance factors of a site: the weights with which it follows its peers.
+
+    Args:
+        written: Row as its author wrote it. A peer that it does not name has the factor 0.
+        names: Names of all sites.
+        site: Name of the site that follows.
+        path: Path of the row, for error messages.
+
+    Returns:
+        The factor of every peer, by name.
+
+    Raises:
+        ScenarioError: A factor is not a number, or the row as a whole is not valid.
+    """
     row = check_keys(written, names, path)
     for peer, factor in row.items():
         if not is_number(factor):
             raise ScenarioError(f"must be a number, is {factor!r}", path=f"{path}.{peer}")
+
     factors = {name: float(row.get(name, 0.0)) for name in names}
-    problem = dominance.find_row_problem(np.array(list(factors.values())), names.index(site))
+    row_vector = np.array(list(factors.values()))
+    problem = dominance.find_row_problem(row_vector, names.index(site))
     if problem:
         raise ScenarioError(problem, path=path)
     del factors[site]
@@ -627,12 +828,15 @@ def resolve_dominance_row(written: Any, names: list[str], site: str, path: str) 
 
 
 def resolve_links(tables: TomlTable, names: list[str], folder: Path | None) -> TomlTable:
-    """Returns every link, complete, from the tables [link] and [links].
+    """Returns the complete table of every link, from the tables `link` and `links`.
+
+    A link is the directed connection from a peer to a site. The table `link` applies to all
+    links, and the table `links` contains exceptions by name, for example "m1->s".
 
     Args:
-        tables: the tables of the scenario.
-        names: the names of the sites.
-        folder: the folder of the files of traces; None: no file may be named.
+        tables: Tables of the scenario file.
+        names: Names of the sites.
+        folder: Folder of the files of delays that links name. None refuses every file.
     """
     link_names = [f"{peer}->{site}" for site in names for peer in names if peer != site]
     written = check_keys(tables.get("links", {}), link_names, "links")
@@ -654,7 +858,11 @@ def resolve_links(tables: TomlTable, names: list[str], folder: Path | None) -> T
 
 
 def _resolve_views(sites: TomlTable, folder: Path | None) -> None:
-    """Completes the table `view` of each site that has one, in place."""
+    """Completes the table `view` of each site that has one, in place.
+
+    A view is the delay with which the user of a site sees the other arms. It has the keys of a
+    link, but does not inherit any from the table `link`.
+    """
     for name, site in sites.items():
         if "view" in site:
             path = f"sites.{name}.view"
@@ -665,18 +873,18 @@ def _resolve_views(sites: TomlTable, folder: Path | None) -> None:
 def _complete_link(
     link: TomlTable, name: str, path: str, folder: Path | None, trace_path: str = ""
 ) -> TomlTable:
-    """Returns a link with the trace from its file and the keys that follow from others.
+    """Returns a link with the delays from its file, and with the keys that follow from others.
 
     Args:
-        link: the table of the link.
-        name: the name of the link, by which a log stores its delays.
-        path: the path of the link in errors.
-        folder: the folder of the file; None: no file may be named.
-        trace_path: the path of the table that names the file; "": it is `path`, and there is
-            no table [link] from which a missing key could come.
+        link: Table of the link.
+        name: Name of the link, by which a log stores its delays.
+        path: Path of the link, for error messages.
+        folder: Folder of the file. None refuses a link that names a file.
+        trace_path: Path of the table that names the file. Empty for a view: its file is named
+            at `path`, and no key can come from the table `link`.
 
     Raises:
-        ScenarioError: a key is missing, or the file cannot be used.
+        ScenarioError: A key is missing, or the file cannot be used.
     """
     if link["model"] == "trace":
         link = _read_trace_file(link, name, trace_path or path, folder)
@@ -690,48 +898,65 @@ def _complete_link(
 
 
 def resolve_link(written: Any, base: TomlTable, path: str) -> TomlTable:
-    """Returns a link: its written keys, and all other keys from its base.
+    """Returns a link in which missing keys are taken from a base or from a preset.
 
-    A link that names a preset takes the other keys from the preset, and a link that names a
-    model takes none. The file of a trace is not read yet.
+    A link that names a preset takes all other keys from the preset. A link that names a delay
+    model takes no keys from elsewhere, because the models have different keys. Otherwise the
+    missing keys are those of the base. Files of delays are not read here.
 
     Args:
-        written: the table of the link as its author wrote it.
-        base: a resolved link.
-        path: the path of the table in errors.
+        written: Table of the link as its author wrote it.
+        base: Resolved link, usually that of the table `link`.
+        path: Path of the table, for error messages.
+
+    Raises:
+        ScenarioError: There is no such preset, model or key, or the preset has another model.
     """
     if not isinstance(written, dict):
         raise ScenarioError("must be a table", path=path)
-    start = {} if "model" in written else base
+    defaults = {} if "model" in written else base
     if "preset" in written:
         check_choice(written["preset"], list(PRESETS), f"{path}.preset")
-        start = PRESETS[written["preset"]]
-    model = written.get("model", start.get("model", "constant"))
+        defaults = PRESETS[written["preset"]]
+
+    model = written.get("model", defaults.get("model", "constant"))
     check_choice(model, list(DELAY_MODELS), f"{path}.model")
-    if model != start.get("model", model):
-        conflict = f"the preset {written['preset']!r} is {start['model']!r}"
+    if model != defaults.get("model", model):
+        conflict = f"the preset {written['preset']!r} is {defaults['model']!r}"
         raise ScenarioError(
             f"is {model!r}, but {conflict}: give one of the two", path=f"{path}.model"
         )
+
     file_keys = TRACE_KEYS if model == "trace" else ()
     valid_keys = ("model", "preset", *field_names(DELAY_MODELS[model]), *file_keys)
     local_table = check_keys(written, valid_keys, path)
-    # A trace replaces the file of the base, and a file replaces its trace.
+
+    # Delays that are written out replace the file of the defaults, and a file replaces delays.
     replaced_keys: tuple[str, ...] = ()
     if "trace" in local_table:
         replaced_keys = TRACE_KEYS
     elif "file" in local_table:
         replaced_keys = ("trace",)
-    kept = {key: value for key, value in start.items() if key not in replaced_keys}
-    link = {**kept, **local_table, "model": model}
+    inherited = {key: value for key, value in defaults.items() if key not in replaced_keys}
+    link = {**inherited, **local_table, "model": model}
     link.pop("preset", None)
     return link
 
 
 def _read_trace_file(link: TomlTable, name: str, path: str, folder: Path | None) -> TomlTable:
-    """Returns a link with the trace from its file in place of the keys that name the file.
+    """Returns a link with the delays from its file in place of the keys that name the file.
 
-    If the file is a log, the trace is that of the log's link `of`, by default the link `name`.
+    The file is a table of times and delays, or a log. From a log, the delays of the link `of`
+    are taken, by default those of the link with the same name.
+
+    Args:
+        link: Table of the link. It is not changed.
+        name: Name of the link.
+        path: Path of the table that names the file, for error messages.
+        folder: Folder of the file. None refuses every file.
+
+    Raises:
+        ScenarioError: The keys contradict each other, or the file cannot be used.
     """
     link = dict(link)
     file = link.pop("file", None)
@@ -754,15 +979,20 @@ def _read_trace_file(link: TomlTable, name: str, path: str, folder: Path | None)
 
 
 def resolve_timeline(written: Any, links: TomlTable, names: list[str]) -> list[TomlTable]:
-    """Returns the changes of the timeline, each complete in itself.
+    """Returns the planned changes of a scenario, each complete in itself.
 
-    A change of a link states the whole link: keys that it leaves out are those after the
-    changes before it.
+    A change affects a link or the dominance factors of a site. An author may state only those
+    keys of a link that change. In the result, each change states the whole link: the other keys
+    have the values that the earlier changes left.
 
     Args:
-        written: the author's list of changes.
-        links: the links at the start, resolved, by name.
-        names: the names of the sites.
+        written: List `timeline` as its author wrote it.
+        links: Resolved links at the start of the run, by name.
+        names: Names of the sites.
+
+    Raises:
+        ScenarioError: A change is not valid, or the changes are not in the order of their
+            times.
     """
     if not isinstance(written, list):
         raise ScenarioError("must be a list of tables [[timeline]]", path="timeline")
@@ -772,6 +1002,7 @@ def resolve_timeline(written: Any, links: TomlTable, names: list[str]) -> list[T
     for n, entry in enumerate(written):
         path = f"timeline[{n}]"
         change = dict(check_keys(entry, TIMELINE_KEYS, path))
+
         at_s = change.get("at_s")
         if not is_number(at_s):
             raise ScenarioError("must be a time in s", path=f"{path}.at_s")
@@ -781,11 +1012,14 @@ def resolve_timeline(written: Any, links: TomlTable, names: list[str]) -> list[T
                 path=f"{path}.at_s",
             )
         previous_s = at_s
-        if ("link" in change) == ("dominance" in change):
+
+        names_both_or_neither = ("link" in change) == ("dominance" in change)
+        if names_both_or_neither:
             raise ScenarioError("names either a link or, as dominance, a site", path=path)
         for key in ("link", "dominance"):
             if not isinstance(change.get(key, ""), str):
                 raise ScenarioError(f"must be a name, is {change[key]!r}", path=f"{path}.{key}")
+
         change["to"] = resolve_target(change, current_links, names, path)
         if "link" in change:
             current_links[change["link"]] = change["to"]
@@ -796,13 +1030,16 @@ def resolve_timeline(written: Any, links: TomlTable, names: list[str]) -> list[T
 def resolve_target(
     change: TomlTable, current_links: TomlTable, names: list[str], path: str
 ) -> TomlTable:
-    """Returns the complete link, or row of the dominance matrix, to which a change leads.
+    """Returns the state after a change: a complete link, or all dominance factors of a site.
 
     Args:
-        change: the table of the change, with a key `link` or `dominance`.
-        current_links: the links before the change, by name.
-        names: the names of the sites.
-        path: the path of the change in errors.
+        change: Table of the change, with a key `link` or `dominance`.
+        current_links: Links before the change, by name.
+        names: Names of the sites.
+        path: Path of the change, for error messages.
+
+    Raises:
+        ScenarioError: There is no such link or site, or a value is not valid.
     """
     written = change.get("to", {})
     if "link" in change:
@@ -815,11 +1052,22 @@ def resolve_target(
 
 
 def _change_link(written: Any, link: str, current_links: TomlTable, path: str) -> TomlTable:
-    """Returns the complete link after a change of it."""
+    """Returns the complete table of a link after a change.
+
+    A change may neither read a file nor move the outages of the link. It may not replace one
+    table of recorded delays by another.
+
+    Args:
+        written: Table `to` of the change, with the keys that change.
+        link: Name of the link.
+        current_links: Links before the change, by name.
+        path: Path of the change, for error messages.
+    """
     if link not in current_links:
         names = list(current_links)
         hint = suggest_nearest(link, names) or f"; links are {', '.join(names)}"
         raise ScenarioError(f"there is no link {link!r}{hint}", path=f"{path}.link")
+
     before = current_links[link]
     after = resolve_link(written, before, f"{path}.to")
     if any(key in after for key in TRACE_KEYS):
@@ -828,6 +1076,7 @@ def _change_link(written: Any, link: str, current_links: TomlTable, path: str) -
         raise ScenarioError("a run cannot change to another trace", path=f"{path}.to.model")
     if "outages_s" in written and written["outages_s"] != before.get("outages_s"):
         raise ScenarioError("belongs to [links], it cannot change", path=f"{path}.to.outages_s")
+
     after = {**DELAY_MODELS[after["model"]].derive_keys(after), **after}
     if "outages_s" in before:
         after["outages_s"] = before["outages_s"]

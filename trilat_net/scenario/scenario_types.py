@@ -1,10 +1,14 @@
-"""The types of a complete scenario: sites, changes and the core's setup of a site.
+"""Defines the types of a complete scenario: sites, limits, planned changes, and the whole.
+
+A scenario describes an experiment: a site is a process that runs one arm and its control loop,
+and each pair of sites is connected by two directed links. The types also translate a scenario
+into the setup from which the simulation kernel builds a site (`Scenario.setup`).
 
 Invariant:
-    - Keys end in their unit; symbols are the paper's.
-    - `Scenario.text` is canonical: it loads to the same scenario, and its SHA-256 names the
-      experiment.
-    - A change names the time from which it holds, and is complete in itself.
+    - The name of a key ends in its unit. Symbols are those of the paper.
+    - `Scenario.text` is canonical: loading it gives the same scenario. Its SHA-256 hash
+      identifies the experiment.
+    - A change contains the time from which it holds, and the whole state after it.
 """
 
 import hashlib
@@ -50,23 +54,29 @@ from .own_plant import OwnPlant
 
 
 class OnStale(Frozen, frozen=True, omit_defaults=True):
-    """The rule for a peer whose sample in use is too old, or who is silent.
+    """Stale rule of a site: its reaction if the samples of a peer are too old or missing.
+
+    A peer is another site whose states this site receives. A sample is the state that a site
+    publishes in one tick of its control loop.
 
     Attributes:
-        action: "use": the site goes on with the sample; "hold": it stays at the last reference;
-            "brake": it stays where the arm is; "glide": at the start it waits for all peers,
-            it lets its reference come to rest if no sample of a peer came into use for a time,
-            and it aligns with its peers without a jump.
-        age_ms: age of a sample beyond which it is too old, ms; not for "glide".
-        return_s: duration of the return once a fresh sample is in use, s; not for "glide".
-        silence_ms: for "glide", the time without a new sample in use after which a peer is
-            silent, ms.
-        align_speed_rad_s: for "glide", the speed with which the site goes to its peers, rad/s;
-            m/s for a position.
-        align_limit_rad: for "glide", the longest way that the site goes by itself, rad; m for a
-            position.
-        on_lost: for "glide", "hold": the site holds while a peer is silent; "degrade": it goes
-            on without a silent master, as long as the others reach each other.
+        action: What the site does. "use": It goes on with the old sample. "hold": It keeps its
+            last reference. "brake": It keeps the position where its arm is. "glide": At the
+            start, it waits for all peers. If no sample of a peer has come into use for
+            `silence_ms`, its reference decelerates to rest. Later it aligns with its peers
+            without a jump.
+        age_ms: Age of a sample beyond which it is too old, in ms. Not used by "glide".
+        return_s: Duration of the return to the reference after a fresh sample has come into
+            use, in s. Not used by "glide".
+        silence_ms: For "glide": time without a new sample in use after which a peer counts as
+            silent, in ms.
+        align_speed_rad_s: For "glide": speed with which the site moves to its peers, in rad/s,
+            or in m/s if the sites share a position.
+        align_limit_rad: For "glide": longest path that the site moves by itself, in rad, or in
+            m if the sites share a position.
+        on_lost: For "glide": reaction to a silent peer. "hold": The site waits for the peer.
+            "degrade": It goes on without a silent master, as long as the remaining sites all
+            reach each other.
     """
 
     action: Literal["use", "hold", "brake", "glide"] = "use"
@@ -79,7 +89,7 @@ class OnStale(Frozen, frozen=True, omit_defaults=True):
 
     @property
     def rule(self) -> site_setup.StaleRule:
-        """The rule in the form of the core."""
+        """Rule in the form that the simulation kernel uses."""
         if self.action == "glide":
             return site_setup.StaleRule(
                 action=site_setup.StaleAction.GLIDE,
@@ -100,31 +110,33 @@ SpeedLimits = Annotated[tuple[SpeedLimit, ...], Meta(min_length=1, max_length=MA
 
 
 GLIDE_TAU_RATE_NM_S = 1000.0
-"""Default limit of the torque's rate of change under the rule "glide".
+"""Default limit of the torque's rate of change under the stale rule "glide", in N m/s.
 
-1 N m per millisecond is what Franka's arms ask for.
+It is the limit of Franka's arms, 1 N m per millisecond.
 """
 
 
 def _or_infinity(limit: Any) -> Any:
+    """Returns a limit, or infinity if there is none."""
     return math.inf if limit is None else limit
 
 
 class Limits(Frozen, frozen=True):
-    """The limits of a site. A limit is one number, or one number per joint.
+    """Limits of a site. Each limit is one number for all joints, or one number per joint.
 
     Attributes:
-        tau_limit_nm: largest control torque of a joint, N m; a larger torque is cut off. Left
-            out: the efforts that the file of a chain states.
-        qd_limit_rad_s: joint speed beyond which a run counts as diverged and ends, rad/s. Under
-            the rule "glide" the site is in fault instead, and the run goes on. Left out: the
-            speeds that the file of a chain states.
-        tau_rate_limit_nm_s: largest rate of change of the control torque of a joint, N m/s.
-            Left out: no limit, but `GLIDE_TAU_RATE_NM_S` under the rule "glide".
-        qd_des_limit_rad_s: largest speed of the reference, rad/s; m/s for a position.
-        q_min_rad: least angle of a joint, rad; only with the rule "glide": beyond it the site
-            is in fault.
-        q_max_rad: largest angle of a joint, rad, likewise.
+        tau_limit_nm: Largest control torque of a joint, in N m. A larger torque is cut off. By
+            default, the efforts in the URDF file of a chain.
+        qd_limit_rad_s: Joint speed beyond which a run counts as diverged and ends, in rad/s.
+            Under the stale rule "glide", only the site stops with a fault, and the run goes on.
+            By default, the speeds in the URDF file of a chain.
+        tau_rate_limit_nm_s: Largest rate of change of a joint's control torque, in N m/s. By
+            default there is no limit, but `GLIDE_TAU_RATE_NM_S` under the stale rule "glide".
+        qd_des_limit_rad_s: Largest speed of the reference, in rad/s, or in m/s if the sites
+            share a position.
+        q_min_rad: Smallest angle of a joint, in rad. Beyond it, the site stops with a fault.
+            Allowed only under the stale rule "glide".
+        q_max_rad: Largest angle of a joint, in rad. Like `q_min_rad`.
     """
 
     tau_limit_nm: Positive | PositiveJoints = 200.0
@@ -136,7 +148,10 @@ class Limits(Frozen, frozen=True):
 
     @property
     def motion(self) -> site_setup.MotionLimits:
-        """The limits of the motion in the form of the core; infinite if left out."""
+        """Limits of the motion in the form that the simulation kernel uses.
+
+        A limit that the author left out is infinite.
+        """
         return site_setup.MotionLimits(
             q_min=-math.inf if self.q_min_rad is None else self.q_min_rad,
             q_max=_or_infinity(self.q_max_rad),
@@ -146,24 +161,27 @@ class Limits(Frozen, frozen=True):
 
 
 class SiteSpec(Frozen, frozen=True):
-    """A site: an arm with its control loop.
+    """Description of a site: an arm with its control loop.
 
     Attributes:
-        role: the role of the site for a reader of figures; it enters no formula.
-        rate_hz: tick rate of the loop, Hz.
-        q0_rad: start pose, rad.
-        qd0_rad_s: start velocity, rad/s.
-        arm: the arm.
-        control: the control law and its gains.
-        limits: the limits of torques, speeds and positions.
-        on_stale: the rule for a peer whose samples are too old.
-        task: the coordinates that the site follows: joint angles, or those of the end effector.
-        hands: the operators who act on the arm.
-        environment: the walls and other bodies that act on the arm.
-        plant: "simulated"; "external": an arm outside of the program, whose state is measured;
-            or a user's class that moves the arm.
-        view: delay, loss and order of the picture in which the site's user sees its peers, as
-            for a link; None: the user sees the samples in use. It enters no formula.
+        role: Role of the site for people who read figures, and for the stale rule "degrade". It
+            enters no formula.
+        rate_hz: Tick rate of the control loop, in Hz.
+        q0_rad: Start pose, in rad.
+        qd0_rad_s: Start velocity, in rad/s.
+        arm: Arm of the site.
+        control: Control law and its gains.
+        limits: Limits of torques, speeds and positions.
+        on_stale: Reaction if the samples of a peer are too old or missing.
+        task: Coordinates that the site shares with its peers: its joint angles, or the pose of
+            its end effector.
+        hands: Operators: persons or programs who move the arm.
+        environment: Walls and other bodies that act on the arm.
+        plant: Who moves the arm. "simulated": The program. "external": A real robot, whose
+            state is measured. Otherwise a user's class, which computes the motion.
+        view: Delay, loss and order of the picture in which the user of the site sees the other
+            arms. It has the keys of a link. None: the user sees the samples that the controller
+            uses. It enters no formula.
     """
 
     role: Literal["master", "slave"]
@@ -181,10 +199,14 @@ class SiteSpec(Frozen, frozen=True):
     view: Link | None = None
 
     def find_live_hand(self, *, is_open: bool = False) -> LiveHand | None:
-        """Returns the hand that acts while the session runs, or None.
+        """Returns the operator who may move the arm while the session runs.
 
         Args:
-            is_open: true: only a hand that anybody in the session may hold.
+            is_open: If True, an operator counts only if any member of the session may take the
+                role.
+
+        Returns:
+            The operator. None if the site has no such operator.
         """
         for hand in self.hands:
             if isinstance(hand, LiveHand) and (hand.is_open or not is_open):
@@ -198,7 +220,7 @@ SITE_GROUPS: dict[str, type[Frozen]] = {
     "on_stale": OnStale,
     "task": Task,
 }
-"""Tables that a scenario may have for all sites, and each site for itself, with their types."""
+"""Groups of keys that may be written once for all sites and again for one site, by table."""
 
 
 SiteOrder = Literal[
@@ -213,29 +235,33 @@ SiteOrder = Literal[
     "released",
     "held",
 ]
-"""Orders to a site; "": none.
+"""Commands that change the mode of a site. The empty text means that there is no command.
 
-Stop, enable and reset come from outside; the site gives the others to itself.
+Users send "stop", "enable" and "reset". The site itself causes the others, for example
+"arm_lost" if no measurement has arrived from its robot.
 """
 TIMELINE_KEYS = ("at_s", "link", "dominance", "to", "ramp_s")
-"""Keys of a change on the timeline of a scenario."""
+"""Keys of a planned change in a scenario file."""
 
 
 class Change(Frozen, frozen=True, omit_defaults=True):
-    """A change of a link or of dominance factors, or an order to a site.
+    """Change of a link or of dominance factors, or a command to a site.
 
-    Exactly one of `link`, `dominance` and `site` is given. Only records have `site`.
+    A scenario plans changes in its timeline; users request further ones during a run. Exactly
+    one of `link`, `dominance` and `site` is not empty. Only the changes in records of a run
+    have `site`.
 
     Attributes:
-        at_s: when the change takes effect, s after the epoch; for a link, the stamp from which
-            samples are affected.
-        link: the link that changes, as in "m1->s".
-        dominance: the site whose dominance factors change.
-        to: the whole link after the change, or all factors of the row.
-        ramp_s: duration of the linear change of the factors, s.
-        site: the site that gets an order.
-        order: the order, see `core.ticks.LifeOrder`.
-        ticks: for "overrun", how many ticks the site missed.
+        at_s: Time at which the change takes effect, in s after the epoch, the common start
+            time. A link changes for samples that are sent at this time or later.
+        link: Name of the link that changes, for example "m1->s".
+        dominance: Name of the site whose dominance factors change. A dominance factor is the
+            weight with which the site follows a peer.
+        to: State after the change: all keys of the link, or the factors of all peers.
+        ramp_s: Duration of the linear transition to the new factors, in s.
+        site: Name of the site that receives a command.
+        order: The command, see `core.ticks.LifeOrder`.
+        ticks: For the command "overrun": number of ticks that the site missed.
     """
 
     at_s: Annotated[float, Meta(ge=0.0, le=1e6)]
@@ -249,17 +275,25 @@ class Change(Frozen, frozen=True, omit_defaults=True):
 
     @property
     def start_ns(self) -> int:
-        """When the change takes effect, ns since the epoch."""
+        """Time at which the change takes effect, in ns after the epoch."""
         return round(self.at_s * 1e9)
 
     @property
     def after(self) -> LinkBase:
-        """The link after the change."""
+        """Link after the change."""
         return msgspec.convert(self.to, Link)
 
 
 def scheduled_links(timeline: Sequence[Change], name: str) -> Iterator[tuple[int, LinkBase]]:
-    """Yields the later states of a link in order, each with its first stamp, ns."""
+    """Yields the states that a link takes during the run, apart from its state at the start.
+
+    Args:
+        timeline: Changes of the run, in the order of their times.
+        name: Name of the link.
+
+    Yields:
+        The send time of the first affected sample, in ns after the epoch, and the link.
+    """
     for change in timeline:
         if change.link == name:
             yield change.start_ns, change.after
@@ -273,20 +307,25 @@ _ABSENT_VALUES: dict[str, tuple[Any, ...]] = {
         ("tau_rate_limit_nm_s", "qd_des_limit_rad_s", "q_min_rad", "q_max_rad", "view"), (None,)
     ),
 }
-"""Keys that older scenarios lack, with the values that have no effect.
+"""Values that mean the same as a missing key, for keys that were added in later versions.
 
-These values are left out of the text, so that the text of an older scenario stays the same.
+They are left out of the canonical text. Otherwise the text of an older scenario, and with it
+the hash, would change.
 """
 _POSE_NUMBERS = 7
-"""Numbers of the pose of a body: a position and a quaternion."""
+"""Number of values of the pose of a body: three for the position, four for the quaternion."""
 _SLAVE_COLOUR = 2
 """Index of the slave's colour in a palette."""
 _NUMBER_LIST = re.compile(r"\[\n(?:    [-+.\de]+,\n)+\]")
-"""A list of numbers that is written one number per line."""
+"""Matches a list in which each number has its own line, as `tomli_w` writes lists."""
 
 
 def _drop_unused_keys(arm: dict[str, Any]) -> None:
-    """Removes from an arm's table the keys of other kinds of arms, and defaults of a chain."""
+    """Removes the keys that have no effect from the table of an arm, in place.
+
+    These are the keys of the other kind of arm, and keys of a chain that have their default
+    values.
+    """
     defaults = msgspec.to_builtins(Arm())
     is_chain = bool(arm["urdf"])
     unused_keys = ArmLinks._fields if is_chain else ()
@@ -297,38 +336,39 @@ def _drop_unused_keys(arm: dict[str, Any]) -> None:
 
 
 def _drop_absent_values(table: dict[str, Any]) -> None:
-    """Removes from a table the values that mean the same as their absence."""
+    """Removes the values that mean the same as a missing key from a table, in place."""
     for key, absent_values in _ABSENT_VALUES.items():
         if key in table and table[key] in absent_values:
             del table[key]
 
 
 def _join_number_list(match: re.Match[str]) -> str:
-    """Returns a list of numbers in one line."""
+    """Returns a list of numbers on one line, for a match of `_NUMBER_LIST`."""
     return " ".join(match[0].split()).replace("[ ", "[").replace(", ]", "]")
 
 
 class Scenario(Frozen, frozen=True, dict=True):
-    """An experiment, resolved: every value of every site and link is explicit.
+    """An experiment in which every value of every site and link is explicit.
 
     >>> tn.load_scenario("paper").names
     ('m1', 'm2', 's')
 
     Attributes:
-        name: the name of the session and the log.
-        title: one line for people.
-        about: a paragraph for people.
-        assumed: assumptions that the source of the experiment does not state.
-        duration_s: its duration, s.
-        seed: the seed; every random draw is a function of it.
-        scheme: "second_order" or "digital", see `Scheme`.
-        sites: the sites, in order; the first leads a live session.
-        dominance: row i, column j: factor of site j in the reference of site i, Eq. (6).
-        links: "j->i" for every pair of sites.
-        timeline: changes during the run.
-        expect: expectations, see `trilat test`.
-        drawn: the distributions that numbers of the sites were drawn from, by dotted key.
-        urdf: the texts of the files that describe arms, by their names.
+        name: Name of the session and of its log file.
+        title: Title of one line.
+        about: Description of one paragraph.
+        assumed: Assumptions that the source of the experiment does not state.
+        duration_s: Duration of the run, in s.
+        seed: Seed of the random numbers. Every random draw is a function of the seed.
+        scheme: Integration scheme: "second_order" or "digital", see `Scheme`.
+        sites: Sites by name, in order. The first one leads a live session.
+        dominance: Matrix of dominance factors, Eq. (6). The entry of row i and column j is the
+            weight of site j in the reference of site i.
+        links: For every ordered pair of sites, the link from j to i, under the name "j->i".
+        timeline: Planned changes during the run.
+        expect: Conditions that a run must satisfy, see `trilat test`.
+        drawn: Distributions from which numbers were drawn, by the dotted key of the number.
+        urdf: Texts of the files that describe arms, by file name.
     """
 
     name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_\-]*\Z", max_length=64)]
@@ -347,9 +387,10 @@ class Scenario(Frozen, frozen=True, dict=True):
     assumed: tuple[str, ...] = ()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Returns the state for a copy in another process, with the text.
+        """Returns the state for a copy in another process, together with the canonical text.
 
-        Defaults are left out of the text by their identity, which a copy does not keep.
+        msgspec leaves out a default if it is the same object as the default of the class. A
+        copy has equal but different objects, so its text would contain additional keys.
         """
         return (*super().__reduce__(), {"text": self.text})
 
@@ -360,10 +401,10 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @cached_property
     def arms(self) -> dict[str, ArmModel]:
-        """The model of each site's arm.
+        """Model of each site's arm, by the name of the site.
 
         Raises:
-            ScenarioError: an arm's file cannot be used.
+            ScenarioError: The URDF file of an arm cannot be used.
         """
         chains = any(spec.arm.urdf or spec.task.shared for spec in self.sites.values())
         models = {}
@@ -380,22 +421,27 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @cached_property
     def alpha(self) -> Array:
-        """The dominance matrix, shape (N, N), Eq. (6)."""
+        """Matrix of dominance factors, shape (N, N), Eq. (6)."""
         return np.array(
             [[self.dominance[i].get(j, 0.0) for j in self.names] for i in self.names]
         )
 
     @cached_property
     def controls(self) -> tuple[ChosenLaw, ...]:
-        """The law of every site, with the gains that follow from the shares at the start."""
+        """Control law of every site.
+
+        Some laws have gains that follow from the dominance factors at the start. These gains
+        are filled in.
+        """
         laws = [spec.control for spec in self.sites.values()]
         return tuple(law.resolve_shares(self.names, self.alpha) for law in laws)
 
     @property
     def beta(self) -> Array | None:
-        """Left null vector of Upsilon, shape (N,), sum 1, Eq. (20).
+        """Weights of the sites in the energy function V of the stability proof, shape (N,).
 
-        None if alpha is reducible.
+        The vector is the left null vector of the matrix Upsilon, scaled to the sum 1, Eq. (20).
+        None if alpha is reducible, because the vector is not unique then.
         """
         if not dominance.is_irreducible(self.alpha):
             return None
@@ -403,36 +449,50 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @cached_property
     def text(self) -> str:
-        """The canonical TOML text."""
+        """Canonical TOML text of the scenario.
+
+        Loading the text gives the same scenario. Keys without effect are left out.
+        """
         tables: dict[str, Any] = msgspec.to_builtins(self)
         descriptions = {key: tables.pop(key) for key in ("name", "title", "about", "assumed")}
         descriptions = {key: value for key, value in descriptions.items() if value}
         for site in tables["sites"].values():
             _drop_unused_keys(site["arm"])
+
         _drop_absent_values(tables)
         for site in tables["sites"].values():
             _drop_absent_values(site)
             _drop_absent_values(site["control"])
             _drop_absent_values(site["limits"])
+
+        # Texts for people have several lines. The tables with numbers do not.
         urdf_texts = tables.pop("urdf", None)
-        numbers = _NUMBER_LIST.sub(_join_number_list, tomli_w.dumps(tables))
-        files = ""
+        description_text = tomli_w.dumps(descriptions, multiline_strings=True)
+        number_text = _NUMBER_LIST.sub(_join_number_list, tomli_w.dumps(tables))
+        urdf_text = ""
         if urdf_texts:
-            files = tomli_w.dumps({"urdf": urdf_texts}, multiline_strings=True)
-        return tomli_w.dumps(descriptions, multiline_strings=True) + numbers + files
+            urdf_text = tomli_w.dumps({"urdf": urdf_texts}, multiline_strings=True)
+        return description_text + number_text + urdf_text
 
     @cached_property
     def sha256(self) -> str:
-        """The hash of the canonical text, which names the experiment."""
+        """SHA-256 hash of the canonical text. It identifies the experiment."""
         return hashlib.sha256(self.text.encode()).hexdigest()
 
     def assign_colours(self, colours: int) -> list[int]:
-        """Returns the index of a colour for each site, then those of the unused colours.
+        """Returns the index of a colour for each site, for figures.
 
-        A slave gets the slave's colour. Sites beyond the number of colours begin anew.
+        The slave gets a fixed colour, so that it looks the same in the figures of all
+        scenarios. Until a slave has been met, this colour is reserved for it. The other sites
+        get the first free colours.
 
         Args:
-            colours: the number of colours of the palette.
+            colours: Number of colours of the palette.
+
+        Returns:
+            A permutation of the colours. The first entries belong to the sites in their order;
+            the others are not used. If there are more sites than colours, the caller starts
+            again from the first entry.
         """
         free = list(range(colours))
         assigned = []
@@ -451,11 +511,11 @@ class Scenario(Frozen, frozen=True, dict=True):
         return [*assigned, *free]
 
     def ticks(self, site: str) -> int:
-        """Returns the number of ticks of a site."""
+        """Returns the number of ticks of a site in the whole run."""
         return max(1, round(self.duration_s * self.sites[site].rate_hz))
 
     def peers(self, site: str) -> tuple[str, ...]:
-        """Returns the peers of a site, in scenario order."""
+        """Returns the names of the other sites, in the order of the scenario."""
         return tuple(name for name in self.names if name != site)
 
     def _all_links(self) -> list[LinkBase]:
@@ -467,38 +527,38 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @property
     def random(self) -> bool:
-        """True if any number is drawn: another seed is then another run."""
+        """True if any number is drawn at random, so that another seed gives another run."""
         return bool(self.drawn) or self.links_random
 
     @property
     def links_random(self) -> bool:
-        """True if some link draws its delays or losses during the run."""
+        """True if a link draws its delays or losses at random during the run."""
         return any(link.random for link in self._all_links())
 
     @property
     def measured(self) -> bool:
-        """True if some link injects no delay, so that the real network decides."""
+        """True if a link injects no delay, so that the real network decides."""
         return any(link.measured for link in self._all_links())
 
     @property
     def external(self) -> tuple[str, ...]:
-        """The sites whose arms are measured: outside of the program, or users' plants."""
+        """Names of the sites whose arms are real robots or computed by a user's class."""
         return tuple(name for name, spec in self.sites.items() if spec.plant != "simulated")
 
     @property
     def slave(self) -> str:
-        """The first site whose role is slave, else the last site."""
+        """Name of the first site whose role is slave. The last site if there is no slave."""
         slaves = [name for name, spec in self.sites.items() if spec.role == "slave"]
         return slaves[0] if slaves else self.names[-1]
 
     @property
     def outside(self) -> tuple[str, ...]:
-        """The sites whose arms are outside of the program."""
+        """Names of the sites whose arms are real robots."""
         return tuple(name for name, spec in self.sites.items() if spec.plant == "external")
 
     @property
     def open_hands(self) -> tuple[str, ...]:
-        """The sites whose arms anybody in the session may hold."""
+        """Names of the sites whose arms any member of the session may move."""
         return tuple(
             name
             for name, spec in self.sites.items()
@@ -507,24 +567,29 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @property
     def sites_may_return(self) -> bool:
-        """True if a session outlives its sites.
+        """True if sites may leave a session and return while it runs.
 
-        Each site then waits for its peers and aligns with them again.
+        This requires the stale rule "glide" at every site: the remaining sites wait for the
+        site that left, and align with it again.
         """
         return all(spec.on_stale.action == "glide" for spec in self.sites.values())
 
     def draw_seed(self, site: str) -> int:
-        """Returns the seed for the random numbers of users' code at a site."""
+        """Returns the seed for the random numbers of a user's code at a site.
+
+        The seed depends on the name of the site, so that sites with the same code draw
+        different numbers.
+        """
         return zlib.crc32(f"{self.seed}/{site}".encode())
 
     def channel(self, site: str) -> LawChannel:
-        """Returns the vectors that the law of a site sends to its peers."""
+        """Returns the layout of the vectors that the law of a site sends to its peers."""
         sends: SentVectorSpecs = getattr(self.sites[site].control, "sends", {})
         layout = site_setup.Layout.of_arm(self.arms[site].chain)
         return build_channel(sends, layout, len(self.names) - 1)
 
     def layout(self, site: str) -> site_setup.Layout:
-        """Returns the lengths of a site's vectors."""
+        """Returns the lengths of the vectors in a site's records."""
         live_hand = self.sites[site].find_live_hand()
         actors = () if live_hand is None else (live_hand.actor,)
         layout = site_setup.Layout.of_arm(
@@ -533,16 +598,18 @@ class Scenario(Frozen, frozen=True, dict=True):
         return layout._replace(bodies=_POSE_NUMBERS * len(self.bodies_m(site)))
 
     def bodies_m(self, site: str) -> dict[str, tuple[float, float, float]]:
-        """Returns the bodies that a site's plant moves besides its arm.
+        """Returns the sizes of the bodies that a site's plant moves in addition to its arm.
+
+        Only a user's class can move bodies, for example a box that the arm pushes.
 
         Returns:
-            The sizes of each body along its own axes, m, by name.
+            Extents of each body along its own axes, in m, by name.
         """
         plant = self.sites[site].plant
         return plant.bodies if isinstance(plant, OwnPlant) else {}
 
     def setup(self, site: str) -> site_setup.SiteSetup:
-        """Returns the setup from which the core builds a site."""
+        """Returns the setup from which the simulation kernel builds a site."""
         spec = self.sites[site]
         arm = self.arms[site]
         index = self.names.index(site)
@@ -580,8 +647,8 @@ class Scenario(Frozen, frozen=True, dict=True):
     def motion_limits(self, site: str) -> site_setup.MotionLimits:
         """Returns the limits of a site's motion, with room for its start pose.
 
-        A joint that starts beyond `q_min_rad` or `q_max_rad` by no more than the margin may be
-        there during the whole run: its limit on that side lies the margin farther out.
+        A joint may start a little beyond `q_min_rad` or `q_max_rad`, up to a margin. For such a
+        joint, the limit on that side is moved outward by the margin for the whole run.
         """
         spec = self.sites[site]
         arm = self.arms[site]
@@ -602,7 +669,11 @@ class Scenario(Frozen, frozen=True, dict=True):
         )
 
     def gains(self, site: str) -> site_setup.Gains:
-        """Returns the gains of a site's law; under the rule `glide` with a box of estimates."""
+        """Returns the gains of a site's law.
+
+        Under the stale rule "glide", they include bounds of the parameters that an adaptive law
+        estimates.
+        """
         spec = self.sites[site]
         arm = self.arms[site]
         gains = spec.control.gains(arm.theta)
@@ -611,10 +682,11 @@ class Scenario(Frozen, frozen=True, dict=True):
         return bound_estimates(gains, arm, spec.limits.tau_limit_nm, spec.arm.g_m_s2)
 
     def _rest_gains(self, site: str) -> site_setup.RestGains:
-        """Returns the gains with which a site's arm comes to rest."""
+        """Returns the gains of the controller that brings a site's arm to rest."""
         spec = self.sites[site]
         arm = self.arms[site]
         gains = spec.control.linear_gains(arm.theta) or spec.control.gains(arm.theta)
+        # the damping that the law of the site already has, on each joint
         law_damping: Array = np.zeros(arm.counts.joints) + gains.Kp + gains.d
         return compute_rest_gains(
             arm=arm,
@@ -626,7 +698,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         )
 
     def _link_setup(self, peer: str, site: str) -> site_setup.LinkSetup:
-        """Returns the setup of the link from a peer to a site."""
+        """Returns the setup of the link from a peer to a site, for the simulation kernel."""
         name = f"{peer}->{site}"
         first_link = self.links[name]
         later_links = scheduled_links(self.timeline, name)
@@ -656,13 +728,13 @@ class Scenario(Frozen, frozen=True, dict=True):
         )
 
     def _followed_sites(self, index: int) -> int:
-        """Returns the set of sites that a site follows, as bits."""
+        """Returns the sites that a site follows, as an integer with bit n set for site n."""
         return sum(1 << n for n, share in enumerate(self.alpha[index]) if share > 0.0)
 
     def _speed_limit(self, site: str) -> tuple[float, ...]:
-        """Returns the largest speed of each joint of a site, rad/s.
+        """Returns the largest speed of each joint of a site, in rad/s.
 
-        The result is () if the sites do not share joint angles.
+        Empty if the sites do not share joint angles.
         """
         spec = self.sites[site]
         joints = self.arms[site].counts.joints
@@ -673,19 +745,20 @@ class Scenario(Frozen, frozen=True, dict=True):
     def ramp(
         self, site: str, shares: dict[str, float], start_ns: int, ramp_s: float
     ) -> DominanceRamp:
-        """Returns a change of a site's dominance factors in the form of the core.
+        """Returns a change of a site's dominance factors in the form that the kernel uses.
 
         Args:
-            site: the site.
-            shares: its dominance factors after the change, by peer.
-            start_ns: when the change begins, ns since the epoch.
-            ramp_s: how long the change lasts, s.
+            site: Name of the site.
+            shares: Dominance factors after the change, by peer. A peer that is missing has the
+                factor 0.
+            start_ns: Start of the change, in ns after the epoch.
+            ramp_s: Duration of the linear transition, in s.
         """
         alpha = tuple(shares.get(peer, 0.0) for peer in self.peers(site))
         return DominanceRamp(start_ns, start_ns + round(ramp_s * 1e9), alpha)
 
     def scripted_ramps(self, site: str) -> list[DominanceRamp]:
-        """Returns the changes of a site's dominance factors on the timeline."""
+        """Returns the planned changes of a site's dominance factors."""
         return [
             self.ramp(site, change.to, change.start_ns, change.ramp_s)
             for change in self.timeline
@@ -693,7 +766,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         ]
 
     def without_hands(self) -> "Scenario":
-        """Returns the same experiment without operators."""
+        """Returns the same experiment without the operators who move the arms."""
         sites = {
             name: msgspec.structs.replace(spec, hands=()) for name, spec in self.sites.items()
         }

@@ -1,13 +1,16 @@
-"""Validate a resolved scenario: its tables become types, and wrong values become errors.
+"""Converts the resolved tables of a scenario to types, and refuses values that cannot work.
 
-`build_scenario` converts the tables and runs every check that no range of a single key can
-express. `refuse_external_arms`, `refuse_live_only` and `check_outside_arms` are for callers
-that need more than a valid scenario: a run in virtual time, or a live session with robots.
+`build_scenario` converts the tables. The types themselves limit the range of each single key;
+the functions of this module check conditions that involve several keys, for example that a
+joint starts within its stops. `refuse_external_arms`, `refuse_live_only` and
+`check_outside_arms` are for callers that need more than a valid scenario: a run in virtual
+time, or a live session with real robots.
 
 Invariant:
-    - An error names the path of the key.
-    - If a law needs something that a scenario lacks (knowledge of the arm, a number of sites),
-      the scenario is refused before anything runs, with the reason.
+    - An error contains the path of the key in the scenario file.
+    - Some control laws need something that not every scenario provides, such as knowledge of
+      the arm, or exactly two sites. If it is missing, the scenario is refused before anything
+      runs, with the reason.
 """
 
 import functools
@@ -37,18 +40,21 @@ from .operators.program_hand import ProgramHand
 from .scenario_types import Change, OnStale, Scenario, SiteSpec
 
 RANK_TOLERANCE = 1e-6
-"""Singular values below this share of the largest one belong to directions without motion."""
+"""Ratio of a singular value to the largest one below which the direction counts as immobile."""
 
 
 def refuse_external_arms(scenario: Scenario, exempt: Collection[str] = ()) -> None:
-    """Refuses arms that the program does not simulate.
+    """Refuses scenarios with arms that the program does not simulate itself.
+
+    Such an arm is either a real robot outside of the program, or a user's class that computes
+    the motion.
 
     Args:
-        scenario: the scenario.
-        exempt: sites whose arms may be external, because their motion is known from a log.
+        scenario: The scenario.
+        exempt: Names of sites whose arms may be external, because a log contains their motion.
 
     Raises:
-        ScenarioError: an arm of another site is external.
+        ScenarioError: The arm of another site is external.
     """
     for name in scenario.external:
         if name in exempt:
@@ -66,17 +72,21 @@ def refuse_external_arms(scenario: Scenario, exempt: Collection[str] = ()) -> No
 
 
 OUTSIDE_LIMITS = ("tau_rate_limit_nm_s", "qd_des_limit_rad_s", "q_min_rad", "q_max_rad")
-"""Limits that an arm outside of the program must have besides the usual limits."""
+"""Optional limits that become mandatory for a real robot."""
 
 
 def check_outside_arms(scenario: Scenario) -> None:
-    """Refuses arms outside of the program that lack limits or the stale rule "glide".
+    """Refuses real robots that lack limits, or whose site does not have the stale rule "glide".
 
-    This is checked before a session, and not for every scenario, because logs of earlier
-    versions may lack these keys.
+    The stale rule of a site says how it reacts if the samples of a peer are late or missing.
+    Only under "glide" does the reference never jump.
+
+    The check is made before a session, and not for every scenario, because the scenarios in
+    logs of earlier versions may lack these keys.
 
     Raises:
-        ScenarioError: with the path of the first key that is missing or wrong.
+        ScenarioError: A key is missing or wrong. The error contains the path of the first such
+            key.
     """
     for name in scenario.outside:
         site = scenario.sites[name]
@@ -104,8 +114,8 @@ def refuse_live_only(scenario: Scenario) -> None:
     """Refuses a scenario that only a live session can run.
 
     Raises:
-        ScenarioError: an arm is external; or a link has the delay of the real network
-            ("measured"), which would be one tick in virtual time.
+        ScenarioError: An arm is external, or a link has the model "measured": it injects no
+            delay, so that the real network decides. In virtual time there is no real network.
     """
     refuse_external_arms(scenario)
     if scenario.measured:
@@ -120,15 +130,18 @@ def refuse_live_only(scenario: Scenario) -> None:
 
 
 def check_law(name: str, site: SiteSpec, sites: int) -> None:
-    """Refuses a law that its site cannot carry out, and an arm that contradicts its plant.
+    """Refuses a control law that its site cannot carry out, and keys that contradict its plant.
+
+    The plant says who computes or measures the motion of the arm: the program, a user's class,
+    or a real robot.
 
     Args:
-        name: the name of the site.
-        site: the site.
-        sites: the number of sites of the scenario.
+        name: Name of the site.
+        site: The site.
+        sites: Number of sites of the scenario.
 
     Raises:
-        ScenarioError: with the path of the key.
+        ScenarioError: A condition fails. The error contains the path of the key.
     """
     path = f"sites.{name}"
     law = site.control
@@ -140,6 +153,8 @@ def check_law(name: str, site: SiteSpec, sites: int) -> None:
             f"{site.task.space!r}: choose adaptive, p_d, pd_d or p_f there",
             path=f"{path}.control.law",
         )
+
+    # An adaptive law estimates the parameters theta of the arm, and with them its weight.
     learns_arm = getattr(law.kind, "needs_theta", False)
     feeds_gravity = getattr(law, "gravity", 0.0) * site.arm.g_m_s2 > 0.0
     if not site.arm.known and not learns_arm and feeds_gravity:
@@ -152,7 +167,12 @@ def check_law(name: str, site: SiteSpec, sites: int) -> None:
 
 
 def _check_plant(path: str, site: SiteSpec) -> None:
-    """Refuses keys that contradict whether the arm is simulated or outside of the program."""
+    """Refuses keys that only a simulated arm, or only a real robot, can have.
+
+    Args:
+        path: Path of the site, for error messages.
+        site: The site.
+    """
     external = site.plant != "simulated"
     if not site.arm.known and not external:
         raise ScenarioError(
@@ -172,14 +192,13 @@ def _check_plant(path: str, site: SiteSpec) -> None:
         if getattr(site, group):
             raise ScenarioError(
                 "an arm that is outside of the program, or a user's own plant, is pushed "
-                "there: "
-                "leave them out",
+                "there: leave them out",
                 path=f"{path}.{group}",
             )
 
 
 def _list_literals(hint: Any) -> tuple[str, ...]:
-    """Returns the literal texts in a type, in a union with other types or not."""
+    """Returns the texts that a `Literal` type, or a union that contains one, permits."""
     literals: tuple[str, ...] = ()
     for argument in get_args(hint):
         literals += (argument,) if isinstance(argument, str) else _list_literals(argument)
@@ -198,15 +217,20 @@ _CHOICES = {
         (OnStale, "on_lost"),
     )
 }
-"""The texts that a key may have, by the name of the key."""
+"""Permitted texts of the keys that have a fixed set of values, by the name of the key."""
 
 
 def build_scenario(resolved: TomlTable) -> Scenario:
-    """Returns the scenario of resolved tables.
+    """Converts resolved tables to a scenario, and checks it completely.
+
+    The order of the checks decides which error is reported if a scenario contains several.
+
+    Args:
+        resolved: Tables from `resolve.resolve_scenario`.
 
     Raises:
-        ScenarioError: a value has a wrong type or range, or values contradict each other; with
-            the path of the key.
+        ScenarioError: A value has a wrong type or range, or values contradict each other. The
+            error contains the path of the key.
     """
     scenario = _convert_scenario(resolved)
     _check_joint_space(scenario)
@@ -216,6 +240,7 @@ def build_scenario(resolved: TomlTable) -> Scenario:
         _check_limits(scenario, name)
     _check_task_poses(scenario)
     _check_energy_laws(scenario)
+
     for name, site in scenario.sites.items():
         check_law(name, site, len(scenario.sites))
         joints = scenario.layout(name).joints
@@ -223,6 +248,7 @@ def build_scenario(resolved: TomlTable) -> Scenario:
         _check_actors(site.hands, f"sites.{name}.hands")
         _check_hands(site, f"sites.{name}.hands")
         _check_actors(site.environment, f"sites.{name}.environment")
+
     _check_received(scenario)
     _check_links(scenario)
     _check_stale_rules(scenario)
@@ -230,16 +256,23 @@ def build_scenario(resolved: TomlTable) -> Scenario:
         check_change(change, f"timeline[{n}]")
     for name in scenario.names:
         check_links_memory(scenario, name)
+
     joint_counts = {name: model.counts.joints for name, model in scenario.arms.items()}
     problem = find_expect_problem(scenario.expect, joint_counts)
     if problem is not None:
         raise ScenarioError(problem.problem, path=f"expect.{problem.key}")
+
     timeline = tuple(_normalise_change(change) for change in scenario.timeline)
     return msgspec.structs.replace(scenario, timeline=timeline)
 
 
 def _convert_scenario(resolved: TomlTable) -> Scenario:
-    """Returns the struct of resolved tables; an error says if the number was drawn."""
+    """Converts resolved tables to the struct of the scenario.
+
+    Raises:
+        ScenarioError: A value has a wrong type or range. If the value was drawn at random, the
+            error says so, because its author did not write this number.
+    """
     try:
         return msgspec.convert(resolved, Scenario)
     except msgspec.ValidationError as error:
@@ -253,9 +286,10 @@ def _convert_scenario(resolved: TomlTable) -> Scenario:
 
 
 def _normalise_change(change: Change) -> Change:
-    """Returns a change whose link is written as in `Scenario.links`.
+    """Returns a change whose link is written in the same form as the links of the scenario.
 
-    350 and 350.0 are then the same experiment.
+    Authors may write 350 or 350.0. Both must give the same text, so that both are the same
+    experiment with the same hash.
     """
     if not change.link:
         return change
@@ -263,10 +297,15 @@ def _normalise_change(change: Change) -> Change:
 
 
 def _check_joint_space(scenario: Scenario) -> None:
-    """Refuses arms that share different coordinates, and laws that do not support chains."""
+    """Refuses arms that cannot share coordinates, and laws that do not support chains.
+
+    All sites share either joint angles or the pose of the end effector. Joint angles can only
+    be compared between arms with the same number of joints.
+    """
     joint_counts = {name: model.counts.joints for name, model in scenario.arms.items()}
     spaces = {name: site.task.space for name, site in scenario.sites.items()}
     first = scenario.names[0]
+
     for name, joints in joint_counts.items():
         if spaces[name] != spaces[first]:
             raise ScenarioError(
@@ -291,11 +330,12 @@ def _check_joint_space(scenario: Scenario) -> None:
 
 
 def _check_links(scenario: Scenario) -> None:
-    """Refuses links, and views of users, whose keys contradict each other."""
+    """Refuses links, and delayed views of users, whose keys contradict each other."""
     links = {f"links.{name}": link for name, link in scenario.links.items()}
     views = {
         f"sites.{name}.view": site.view for name, site in scenario.sites.items() if site.view
     }
+
     for path, link in {**links, **views}.items():
         problem = link.find_problem()
         if problem is not None:
@@ -307,27 +347,33 @@ def _check_links(scenario: Scenario) -> None:
 
 
 def _check_damping(scenario: Scenario) -> None:
-    """Refuses gains that a light joint of a chain cannot take.
+    """Refuses damping gains that are too large for the inertia of a light joint of a chain.
 
-    A torque -K qd that is held over a period h makes a single joint of inertia M swing from
-    tick to tick if K h / M >= 1 (second-order scheme) or 2 (digital scheme). For several joints
-    K / M is the largest eigenvalue of K M^-1, here in the start pose.
+    A sampled damping torque -K qd is held for one tick of duration h. A single joint of inertia
+    M then oscillates from tick to tick if K h / M >= 1 with the second-order scheme, or K h / M
+    >= 2 with the digital scheme. For several joints, the largest eigenvalue of K M^-1 takes the
+    place of K / M. It is computed for the start pose.
     """
     for name, model in scenario.arms.items():
         site = scenario.sites[name]
         if model.chain is None or isinstance(site.control, ImportedLaw) or not site.arm.known:
             continue
+
         gains = site.control.gains(model.theta)
+        # The robust term acts as a damping rho / width inside its boundary layer.
         robust = np.divide(gains.rho, gains.width)
         damping = np.zeros(model.counts.joints) + gains.Kp + gains.d + robust
         damping += gains.Kd if site.task.space == "joints" else 0.0
-        # K M^-1 has the eigenvalues of the symmetric K^(1/2) M^-1 K^(1/2).
+
+        # K M^-1 has the eigenvalues of the symmetric matrix K^(1/2) M^-1 K^(1/2).
         root = np.sqrt(damping)
         inverse_inertia = np.linalg.inv(model.inertia(np.array(site.q0_rad)))
         rates_1_s, modes = np.linalg.eigh(root * inverse_inertia * root[:, None])
+
         limit = 1.0 if scenario.scheme == "second_order" else 2.0
         ratio = rates_1_s[-1] / site.rate_hz
         if ratio >= limit:
+            # The mode with the largest eigenvalue moves this joint most.
             worst = int(np.argmax(np.abs(modes[:, -1])))
             raise ScenarioError(
                 f"damps joint {model.joint_names[worst]} by {damping[worst]:g} N m s/rad in "
@@ -339,12 +385,16 @@ def _check_damping(scenario: Scenario) -> None:
 
 
 def _check_received(scenario: Scenario) -> None:
-    """Refuses vectors of one name and different lengths that a site receives from its peers."""
+    """Refuses law vectors that a site receives under one name but with different lengths.
+
+    A control law may send additional vectors to the peers, each with a name. A site stores the
+    vectors of all its peers in one array per name, so their lengths must agree.
+    """
     for site in scenario.names:
-        senders: dict[str, tuple[str, int]] = {}
+        first_senders: dict[str, tuple[str, int]] = {}
         for peer in scenario.peers(site):
             for name, _, length, _ in scenario.channel(peer).vectors:
-                first, first_length = senders.setdefault(name, (peer, length))
+                first, first_length = first_senders.setdefault(name, (peer, length))
                 if first_length != length:
                     raise ScenarioError(
                         f"has {count_nouns(length, 'number')}, and {name} of {first} has "
@@ -354,9 +404,11 @@ def _check_received(scenario: Scenario) -> None:
 
 
 def _check_energy_laws(scenario: Scenario) -> None:
-    """Refuses sites that do not all have the same law where a law keeps account of energy.
+    """Refuses scenarios in which only some sites have a law that keeps account of energy.
 
-    Such a law may have further conditions on the scheme and the tick rates of all sites.
+    Such a law proves passivity by counting the energy that enters and leaves the links. It
+    works only if both ends of each link count. It may have further conditions on the
+    integration scheme and the tick rates.
     """
     laws = {name: site.control for name, site in scenario.sites.items()}
     rates_hz = {name: site.rate_hz for name, site in scenario.sites.items()}
@@ -368,15 +420,21 @@ def _check_energy_laws(scenario: Scenario) -> None:
 def _check_energy_law(
     scheme: str, name: str, laws: dict[str, LawSettings], rates_hz: dict[str, int]
 ) -> None:
-    """Refuses a law at site `name` that keeps account of energy and whose conditions fail."""
+    """Refuses an energy-counting law at one site if its conditions on all sites fail.
+
+    Args:
+        scheme: Integration scheme of the scenario.
+        name: Name of the site whose law counts energy.
+        laws: Law of every site, by name.
+        rates_hz: Tick rate of every site, by name.
+    """
     law = laws[name]
     tag = law.tag
     for other_name, other_law in laws.items():
         if type(other_law) is not type(law):
             raise ScenarioError(
                 f"{name} has {tag}, which all sites must have: choose {tag} here, or another "
-                "law "
-                f"at {name}",
+                f"law at {name}",
                 path=f"sites.{other_name}.control.law",
             )
     if scheme not in law.kind.schemes:
@@ -391,7 +449,7 @@ def _check_energy_law(
 
 
 def _check_start_poses(scenario: Scenario) -> None:
-    """Refuses joints of chains that start farther beyond a stop than the margin."""
+    """Refuses joints of chains that start farther beyond a mechanical stop than the margin."""
     for name, model in scenario.arms.items():
         if model.chain is None:
             continue
@@ -413,12 +471,18 @@ def _check_start_poses(scenario: Scenario) -> None:
 
 
 def _check_limits(scenario: Scenario, name: str) -> None:
-    """Refuses limits of position that leave no room, do nothing or exclude the start."""
+    """Refuses position limits that leave no room, have no effect or exclude the start pose.
+
+    Args:
+        scenario: The scenario.
+        name: Name of the site.
+    """
     site = scenario.sites[name]
     path = f"sites.{name}.limits"
     limits = scenario.motion_limits(name)
     low = limits.q_min
     high = limits.q_max
+
     for key in ("q_min_rad", "q_max_rad"):
         if getattr(site.limits, key) is not None and site.on_stale.action != "glide":
             raise ScenarioError(
@@ -428,6 +492,8 @@ def _check_limits(scenario: Scenario, name: str) -> None:
             )
     if not np.all(np.less(low, high)):
         raise ScenarioError("must be above q_min_rad everywhere", path=f"{path}.q_max_rad")
+
+    # `low` and `high` already include the margin for a start beyond the written limits.
     start = np.array(site.q0_rad)
     is_beyond = (start < low) | (start > high)
     if np.any(is_beyond):
@@ -440,14 +506,26 @@ def _check_limits(scenario: Scenario, name: str) -> None:
 
 
 def _check_task_poses(scenario: Scenario) -> None:
-    """Refuses task axes along which an end effector cannot move, and singular start poses."""
+    """Checks the start poses of all sites that share the pose of the end effector."""
     for name, model in scenario.arms.items():
         if model.shares_pose:
             _check_task_pose(scenario, name)
 
 
 def _check_task_pose(scenario: Scenario, name: str) -> None:
-    """Refuses the task axes of a site if its Jacobian in the start pose is rank-deficient."""
+    """Refuses a start pose from which the end effector cannot move along all followed axes.
+
+    The rows of the Jacobian J belong to the axes that the site follows. A row of zeros is an
+    axis along which no joint moves the end effector. If J does not have full row rank, the pose
+    is singular: the end effector cannot move along some combination of the axes.
+
+    Args:
+        scenario: The scenario.
+        name: Name of the site.
+
+    Raises:
+        ScenarioError: The end effector cannot move along an axis or a combination of axes.
+    """
     model = scenario.arms[name]
     q0_rad = scenario.sites[name].q0_rad
     is_followed = np.array(model.axes) > 0.0
@@ -455,6 +533,7 @@ def _check_task_pose(scenario: Scenario, name: str) -> None:
     J = model.task_jacobian(q0_rad)[is_followed]
     joints = model.counts.joints
     path = f"sites.{name}.task.axes"
+
     for axis, row in zip(followed, J, strict=True):
         if np.abs(row).max() < RANK_TOLERANCE:
             raise ScenarioError(
@@ -468,6 +547,7 @@ def _check_task_pose(scenario: Scenario, name: str) -> None:
             f"at most {count_nouns(joints, 'axis')}",
             path=path,
         )
+
     directions, singular_values, _ = np.linalg.svd(J)
     if singular_values[-1] < RANK_TOLERANCE * singular_values[0]:
         # The last left singular vector is the direction that the end effector cannot move in.
@@ -486,7 +566,12 @@ def _check_task_pose(scenario: Scenario, name: str) -> None:
 def _check_actors(
     actors: Sequence[operators.Operator | operators.Environment], path: str
 ) -> None:
-    """Refuses operators or environments whose keys contradict each other."""
+    """Refuses operators or bodies of the environment whose keys contradict each other.
+
+    Args:
+        actors: The operators or bodies of one site.
+        path: Path of their list, for error messages.
+    """
     for n, actor in enumerate(actors):
         problem = actor.find_problem()
         if problem is not None:
@@ -494,24 +579,29 @@ def _check_actors(
 
 
 def _check_hands(site: SiteSpec, path: str) -> None:
-    """Refuses hands of a site that nobody could hold, or that act between its ticks.
+    """Refuses operators of a site that cannot exist, or that would act between its ticks.
 
-    An arm has at most one live hand, and only if the program simulates the arm. The rate of a
-    hand that is a program divides the tick rate of the site.
+    An arm has at most one live operator: a person, or a program in the session, who moves the
+    arm during the run. The program must simulate this arm. An operator that is a user's program
+    acts every n-th tick, so its rate must divide the tick rate of the site.
+
+    Args:
+        site: The site.
+        path: Path of the list of operators, for error messages.
     """
-    live_hands = [
+    live_indices = [
         n for n, hand in enumerate(site.hands) if isinstance(hand, kernel_operators.LiveHand)
     ]
-    if live_hands and site.plant != "simulated":
+    if live_indices and site.plant != "simulated":
         raise ScenarioError(
             "is a live hand, and the arm is outside of the program, or a user's own plant: the "
             "torque of a person who holds such an arm is measured, as tau_x",
-            path=f"{path}[{live_hands[0]}].kind",
+            path=f"{path}[{live_indices[0]}].kind",
         )
-    if len(live_hands) > 1:
+    if len(live_indices) > 1:
         raise ScenarioError(
-            f"is a second live hand besides {path}[{live_hands[0]}]; an arm has one",
-            path=f"{path}[{live_hands[1]}].kind",
+            f"is a second live hand besides {path}[{live_indices[0]}]; an arm has one",
+            path=f"{path}[{live_indices[1]}].kind",
         )
     for n, hand in enumerate(site.hands):
         if isinstance(hand, ProgramHand) and site.rate_hz % hand.rate_hz:
@@ -522,10 +612,17 @@ def _check_hands(site: SiteSpec, path: str) -> None:
 
 
 def check_links_memory(scenario: Scenario, site: str) -> None:
-    """Refuses links of a site whose delays would take more memory than `MAX_LINKS_BYTES`.
+    """Refuses links of a site whose samples in transit would need too much memory.
+
+    The memory grows with the delay, the tick rate and the number of peers. `MAX_LINKS_BYTES` is
+    the limit.
+
+    Args:
+        scenario: The scenario.
+        site: Name of the site that receives the samples.
 
     Raises:
-        ScenarioError: with the site's path.
+        ScenarioError: The limit is exceeded. The error contains the path of the site.
     """
     setup = scenario.setup(site)
     size_bytes = links_bytes(setup, needed_pages(setup))
@@ -539,15 +636,17 @@ def check_links_memory(scenario: Scenario, site: str) -> None:
 
 
 def _check_stale_rules(scenario: Scenario) -> None:
-    """Refuses stale rules under which a site would hold in every run.
+    """Refuses stale rules under which a site would wait for its peers during the whole run.
 
-    Tick periods alone must not make a peer silent, and the fixed delay of a link alone must not
-    make its samples too old.
+    The stale rule of a site says when the samples of a peer are too old, and what happens then.
+    The tick period of a peer alone must not make it count as silent, and the fixed delay of a
+    link alone must not make its samples too old.
     """
     _check_lost(scenario)
     for name, site in scenario.sites.items():
         rule = site.on_stale
         peers = scenario.peers(name)
+
         slowest_hz = min(scenario.sites[other].rate_hz for other in (name, *peers))
         if rule.action == "glide" and rule.silence_ms < 2e3 / slowest_hz:
             raise ScenarioError(
@@ -555,6 +654,8 @@ def _check_stale_rules(scenario: Scenario) -> None:
                 f"is {rule.silence_ms:g}",
                 path=f"sites.{name}.on_stale.silence_ms",
             )
+
+        # Only these two rules compare the age of samples with `age_ms`.
         if rule.action not in ("hold", "brake"):
             continue
         for peer in peers:
@@ -571,7 +672,11 @@ def _check_stale_rules(scenario: Scenario) -> None:
 
 
 def _check_lost(scenario: Scenario) -> None:
-    """Refuses the rule "degrade" where no site can go on without any of the masters."""
+    """Refuses the rule "degrade" if no site can go on without any of the masters.
+
+    Under this rule, a site goes on without a master arm that has become silent. It then needs
+    another site that it follows.
+    """
     degrading = [
         name for name, site in scenario.sites.items() if site.on_stale.on_lost == "degrade"
     ]
@@ -591,16 +696,21 @@ def _check_lost(scenario: Scenario) -> None:
 
 
 def _can_lose_master(scenario: Scenario, name: str) -> bool:
-    """True if a site can go on without a master that it follows.
+    """True if a site can go on after some master that it follows has become silent.
 
-    The site must follow another site as well, and the remaining sites must all reach each
-    other.
+    The site must follow another site as well. The remaining sites must all reach each other
+    along nonzero dominance factors: their dominance matrix must be irreducible.
+
+    Args:
+        scenario: The scenario.
+        name: Name of the site.
     """
     alpha = scenario.alpha
     shares = alpha[scenario.names.index(name)]
     for n, site in enumerate(scenario.sites.values()):
         if site.role != "master":
             continue
+        # the dominance matrix without the row and the column of this master
         remaining = np.delete(np.delete(alpha, n, 0), n, 1)
         follows_others = shares[n] > 0.0 and shares.sum() > shares[n]
         if follows_others and is_irreducible(remaining):
@@ -611,8 +721,14 @@ def _can_lose_master(scenario: Scenario, name: str) -> bool:
 def check_change(change: Change, path: str) -> None:
     """Refuses a change of a link after which the link is not valid.
 
+    Changes of dominance factors have been checked when they were resolved, and are accepted.
+
+    Args:
+        change: The change.
+        path: Path of the change, for error messages.
+
     Raises:
-        ScenarioError: with the path of the key, which begins with `path`.
+        ScenarioError: The link is not valid. The error contains the path of the key.
     """
     if not change.link:
         return
@@ -630,7 +746,12 @@ def check_change(change: Change, path: str) -> None:
 
 
 def _reword(problem: str, path: str) -> str:
-    """Returns a message of msgspec in the words of a scenario's author."""
+    """Translates an error message of msgspec to words that an author of scenarios understands.
+
+    Args:
+        problem: Message of msgspec.
+        path: Path of the refused key.
+    """
     if problem.startswith("Invalid enum value"):
         value = problem.removeprefix("Invalid enum value ")
         choices = _CHOICES[path.rpartition(".")[2]]
@@ -641,10 +762,15 @@ def _reword(problem: str, path: str) -> str:
 
 
 def _name_key(resolved: TomlTable, path: str) -> str:
-    """Returns the path of a refused key with a name in place of msgspec's `[...]`.
+    """Returns the path of a refused key, with a name in place of msgspec's `[...]`.
 
-    msgspec writes `sites[...].q0_rad[0]` for an entry of a dictionary. Each entry is tried
-    alone, and the first that is refused at that path is named.
+    msgspec does not say which entry of a dictionary it refused: it writes
+    `sites[...].q0_rad[0]`. To find the entry, the conversion is repeated with each entry alone.
+    The first one that is refused at the same path is named.
+
+    Args:
+        resolved: Tables that msgspec refused. The dictionary is left with a single entry.
+        path: Path from the message of msgspec.
     """
     before, placeholder, after = path.partition("[...]")
     if not placeholder:
