@@ -1,18 +1,24 @@
-"""Delay traces of links: from a CSV file, a log, or the output of `irtt` or `ping`.
+"""Reads delay traces: tables of send times and the delay that each message had.
+
+A link of the model "trace" repeats the delays of a trace. The table is a CSV file such as
 
     t_s,delay_ms
     0.000,41.2
     0.001,lost
 
-A resolved scenario holds a trace as a text, see `format_trace`.
+or it is taken from the log of a run. `import_trace` builds such a table from the output of
+`irtt` or `ping`, programs that measure the delay of a network. A resolved scenario contains the
+trace as a text, see `format_trace`.
 
 Invariant:
-    - A scenario that ran does not need the file again.
-    - Times count from the first point of the trace; in a measurement from the first sending.
-      Times and delays are whole microseconds.
-    - A sample without an answer is lost. So is a sample that took longer than a link may take.
-    - Half a round trip stands for one way, unless one way was measured and is asked for.
-    - Data of others is read where it is, never shipped.
+    - A resolved scenario does not need the file any more.
+    - Times count from the first point of the trace, and in a measurement from the first sent
+      message. Times and delays are whole microseconds.
+    - A message without an answer is lost. A message that took longer than a link may take
+      counts as lost as well.
+    - The delay in one direction is taken as half of the round trip, unless it was measured and
+      the caller requests it.
+    - Measurements of other people are read where they are. The package ships none.
 """
 
 import csv
@@ -43,28 +49,36 @@ MAX_TRACE_POINTS = 200_000
 
 _LOST = "lost"
 LONGEST_MS = MAX_DELAY_US / 1e3
+"""Longest delay that a link may have, in ms."""
 TracePoint = tuple[float, float]
-"""A time, s, and a delay, ms; the delay of a lost sample is infinite."""
+"""Send time of a message in s, and its delay in ms. The delay of a lost message is infinite."""
 
 _LOG_READER = "trilat_net.log.log_reader", "read_link_delays"
-"""Module and function that read the delays of a log.
+"""Module and function that read the delays of a link from a log.
 
-They are imported when they are needed, because their package is above this one.
+They are imported at run time: the package `log` imports this one, so that an import at the top
+would be circular.
 """
 
 
 def _read_csv(path: Path) -> list[TracePoint]:
-    """Returns the points of a file with lines t_s,delay_ms, with or without a head."""
-    points: list[TracePoint] = []
-    is_first_line = True
+    """Returns the points of a CSV file with the columns `t_s,delay_ms`.
+
+    A header line is optional. Empty lines, and lines that start with "#", are ignored.
+
+    Raises:
+        ValueError: A line does not contain a time and a delay.
+    """
     with open_regular(path) as stream:
         text = decode_text(stream.read())
+    points: list[TracePoint] = []
+    is_first_line = True
     for number, cells in enumerate(csv.reader(io.StringIO(text, newline="")), start=1):
         if not any(cells) or cells[0].lstrip().startswith("#"):
             continue
-        is_head = is_first_line and len(cells) == 2 and not any(map(_is_number, cells))
+        is_header = is_first_line and len(cells) == 2 and not any(map(_is_number, cells))
         is_first_line = False
-        if is_head:
+        if is_header:
             continue
         try:
             time_text, delay_text = (cell.strip() for cell in cells)
@@ -76,6 +90,7 @@ def _read_csv(path: Path) -> list[TracePoint]:
 
 
 def _is_number(cell: str) -> bool:
+    """True if a cell contains a number."""
     try:
         float(cell)
     except ValueError:
@@ -84,14 +99,17 @@ def _is_number(cell: str) -> bool:
 
 
 def read_trace(path: Path, link: str) -> str:
-    """Returns the text of the trace in a file.
+    """Reads a delay trace from a CSV file, or from the log of a run.
 
     Args:
-        path: a table `t_s,delay_ms`, or a log.
-        link: the link of the log, as in "m1->s".
+        path: CSV file with the columns `t_s,delay_ms`, or a log.
+        link: Name of the link whose delays are taken from a log, for example "m1->s".
+
+    Returns:
+        The trace in the text form of `format_trace`.
 
     Raises:
-        ScenarioError: the file cannot be read, or does not hold a trace.
+        ScenarioError: The file cannot be read, or contains no trace.
     """
     try:
         if path.suffix != ".mcap":
@@ -106,10 +124,14 @@ def read_trace(path: Path, link: str) -> str:
 
 
 def format_trace(points: Sequence[TracePoint]) -> str:
-    """Returns the text of a trace: "t_us delay_us, ...", with "lost" for a lost sample.
+    """Returns a trace as a text, in the form in which a scenario contains it.
+
+    The form is "t_us delay_us, t_us delay_us, ...", in microseconds, with "lost" in place of
+    the delay of a lost message. Times count from the first point.
 
     Raises:
-        ValueError: there are no points or too many, or a number is out of range or of order.
+        ValueError: There are no points or too many, a number is out of range, or the times do
+            not increase.
     """
     if not points:
         raise ValueError("has no points")
@@ -118,6 +140,7 @@ def format_trace(points: Sequence[TracePoint]) -> str:
             f"has {count_nouns(len(points), 'point')}, at most {MAX_TRACE_POINTS} are allowed: "
             "cut or thin it out"
         )
+    first_s = points[0][0]
     previous_us = -1
     texts = []
     for number, (t_s, delay_ms) in enumerate(points, start=1):
@@ -125,12 +148,14 @@ def format_trace(points: Sequence[TracePoint]) -> str:
             raise ValueError(
                 f"point {number}: its time must be finite and not negative, is {t_s:g} s"
             )
-        if math.isnan(delay_ms) or delay_ms < 0.0 or LONGEST_MS < delay_ms < math.inf:
+        # an infinite delay means that the message was lost
+        is_too_long = LONGEST_MS < delay_ms < math.inf
+        if math.isnan(delay_ms) or delay_ms < 0.0 or is_too_long:
             raise ValueError(
                 f"point {number}: its delay must be from 0 to {LONGEST_MS:g} ms or {_LOST!r}, "
                 f"is {delay_ms:g}"
             )
-        t_us = round((t_s - points[0][0]) * 1e6)
+        t_us = round((t_s - first_s) * 1e6)
         if t_us <= previous_us:
             raise ValueError(
                 f"point {number}: its time, {t_s:g} s, must be later than that of the point "
@@ -144,59 +169,74 @@ def format_trace(points: Sequence[TracePoint]) -> str:
 
 @lru_cache(maxsize=64)
 def parse_trace(text: str) -> Points:
-    """Returns the points of a trace, shape (n, 2), see `core.vectors.Points`.
+    """Parses the text form of a trace.
+
+    The result is cached, because the trace of a link is needed many times.
 
     Args:
-        text: the text of `format_trace`.
+        text: Trace in the form of `format_trace`.
+
+    Returns:
+        Read-only array of times and delays in microseconds, shape (n, 2). A lost message has
+        the delay `LOST`, see `core.vectors.Points`.
 
     Raises:
-        ValueError: the text is not of that form.
+        ValueError: The text does not have this form, or a number is out of range.
     """
     pairs = []
     for part in text.split(", "):
-        t_text, _, delay_text = part.partition(" ")
+        time_text, _, delay_text = part.partition(" ")
         try:
-            pairs.append((int(t_text), LOST if delay_text == _LOST else int(delay_text)))
+            delay_us = LOST if delay_text == _LOST else int(delay_text)
+            pairs.append((int(time_text), delay_us))
         except ValueError:
             raise ValueError(f"reads {part[:40]!r} where a point is 't_us delay_us'") from None
+
     points: Points = np.array(pairs, dtype=np.int64).reshape(-1, 2)
-    t_us, delay_us = points.T
+    times_us, delays_us = points.T
     has_valid_length = 0 < len(points) <= MAX_TRACE_POINTS
-    if not has_valid_length or t_us[0] != 0 or np.any(np.diff(t_us) <= 0):
+    if not has_valid_length or times_us[0] != 0 or np.any(np.diff(times_us) <= 0):
         raise ValueError(f"must be 1 to {MAX_TRACE_POINTS} points in order, the first at 0")
-    if np.any(delay_us < LOST) or np.any(delay_us > MAX_DELAY_US):
+    if np.any(delays_us < LOST) or np.any(delays_us > MAX_DELAY_US):
         raise ValueError(f"its delays must be from 0 to {MAX_DELAY_US} us, or {_LOST!r}")
     points.flags.writeable = False
     return points
 
 
 WAYS = ("half", "send", "receive", "whole")
-"""How a delay follows from a measurement: half of a round trip; the way there or back, which
-`irtt` measures; or the number as it is.
+"""How the delay of a link is computed from a measured delay.
+
+"half": Half of the round trip. "send", "receive": Delay in one direction, which only `irtt`
+measures. "whole": The measured number itself.
 """
 _MAX_BYTES = 2**30
+"""Largest number of bytes that are read from a file."""
 _COLUMN = re.compile(r"(?P<name>.+?)(?:[_ ](?P<suffix>s|ms|us|ns)|\((?P<unit>s|ms|us|ns)\))?$")
+"""Matches the head of a column with its unit, for example "rtt_ms" or "delay(ms)"."""
 _GZIP_MAGIC = b"\x1f\x8b"
+"""First two bytes of a gzip file."""
 _UNIT_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _NO_ANSWER_TEXTS = ("lost", "-1", "", "nan", "inf")
-"""Delays of lost samples in a table."""
+"""Texts that stand in place of the delay of a lost message in tables."""
 _TIME_NAMES = ("t", "time", "timestamp", "pub_time")
 _DELAY_NAMES = ("delay", "rtt", "latency")
 
 
 @dataclass(frozen=True, repr=False)
 class MeasuredTrace(Result):
-    """A trace from a measurement.
+    """Delay trace that was imported from a measurement.
 
     Attributes:
-        points: times of sending since the first one, s, and delays, ms; infinite for a lost
-            sample.
-        too_long: number of samples that count as lost because they took longer than a link may.
-        doubled: number of samples that are left out because another sample has the same time.
-        cut: number of samples that are left out at the end because a trace has at most
-            `MAX_TRACE_POINTS`.
-        begin_known: False if samples may have been sent before the first point.
-        end_known: False if samples may have been sent after the last point.
+        points: Send time of each message since the first one in s, and its delay in ms. The
+            delay of a lost message is infinite.
+        too_long: Number of messages that count as lost because they took longer than a link
+            may.
+        doubled: Number of messages that were left out because another one has the same send
+            time.
+        cut: Number of messages that were left out at the end, because a trace has at most
+            `MAX_TRACE_POINTS` points.
+        begin_known: False if messages before the first point may be missing from the file.
+        end_known: False if messages after the last point may be missing from the file.
     """
 
     points: tuple[TracePoint, ...]
@@ -208,15 +248,19 @@ class MeasuredTrace(Result):
 
     @property
     def delay_ms(self) -> Array:
-        """The delays of the samples that were not lost, in order."""
+        """Delays of the messages that were not lost, in order, in ms."""
         return np.array([ms for _, ms in self.points if math.isfinite(ms)])
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns plain values, with the keys of `trilat trace import --json`."""
-        delay_ms = self.delay_ms
+        """Returns statistics of the trace, with the keys of `trilat trace import --json`.
+
+        The statistics of the delays are left out if all messages were lost. The correlation is
+        the lag-one autocorrelation of the delays; 0 if all delays are equal.
+        """
         is_lost = np.array([math.isinf(ms) for _, ms in self.points])
+        # a burst begins where a lost message follows one that was not lost
         bursts = int(np.sum(np.diff(is_lost.astype(np.int8), prepend=0) == 1))
-        facts: dict[str, Any] = {
+        statistics: dict[str, Any] = {
             "samples": len(self.points),
             "span_s": self.points[-1][0],
             "lost_percent": 100.0 * float(is_lost.mean()),
@@ -227,54 +271,70 @@ class MeasuredTrace(Result):
             "begin_known": self.begin_known,
             "end_known": self.end_known,
         }
+        delay_ms = self.delay_ms
         if not len(delay_ms):
-            return facts
-        least, median, p99, most = np.percentile(delay_ms, (0.0, 50.0, 99.0, 100.0)).tolist()
+            return statistics
+
+        smallest_ms, median_ms, p99_ms, largest_ms = np.percentile(
+            delay_ms, (0.0, 50.0, 99.0, 100.0)
+        ).tolist()
         deviations = delay_ms - delay_ms.mean()
         correlation = 0.0
         if deviations.any():
             lagged_product = deviations[1:] @ deviations[:-1]
             correlation = float(lagged_product / (deviations @ deviations))
         return {
-            **facts,
-            "min_ms": least,
-            "p50_ms": median,
+            **statistics,
+            "min_ms": smallest_ms,
+            "p50_ms": median_ms,
             "mean_ms": float(delay_ms.mean()),
-            "p99_ms": p99,
-            "max_ms": most,
+            "p99_ms": p99_ms,
+            "max_ms": largest_ms,
             "deviation_ms": float(delay_ms.std()),
             "correlation": correlation,
         }
 
     def blocks(self) -> list[str]:
-        """Returns the lines of the text for people."""
-        facts = self.to_dict()
-        samples = count_nouns(facts["samples"], "sample")
-        lost = f"{facts['lost_percent']:.2f} % lost, {facts['lost_in_a_row']:.1f} in a row"
-        lines = [f"{samples} in {facts['span_s']:.1f} s, {lost}"]
-        if "min_ms" in facts:
+        """Returns the lines that show the statistics to a user."""
+        statistics = self.to_dict()
+        samples = count_nouns(statistics["samples"], "sample")
+        lost_percent = f"{statistics['lost_percent']:.2f} % lost"
+        burst_length = f"{statistics['lost_in_a_row']:.1f} in a row"
+        lines = [f"{samples} in {statistics['span_s']:.1f} s, {lost_percent}, {burst_length}"]
+
+        if "min_ms" in statistics:
             figures = ", ".join(
-                f"{name} {facts[f'{name}_ms']:.2f}"
+                f"{name} {statistics[f'{name}_ms']:.2f}"
                 for name in ("min", "p50", "mean", "p99", "max", "deviation")
             )
             lines.append(f"delay, ms: {figures}")
-            lines.append(f"correlation from one sample to the next: {facts['correlation']:.3f}")
-        counted_texts = {
+            correlation = statistics["correlation"]
+            lines.append(f"correlation from one sample to the next: {correlation:.3f}")
+
+        count_texts = {
             "too_long": f"took longer than {LONGEST_MS / 1e3:g} s and count as lost",
             "doubled": "have the time of another one and are left out",
             "cut": f"are left out at the end: a trace has at most {MAX_TRACE_POINTS} points",
         }
-        lines += [f"{facts[key]} {text}" for key, text in counted_texts.items() if facts[key]]
+        for key, text in count_texts.items():
+            if statistics[key]:
+                lines.append(f"{statistics[key]} {text}")
+
         unknown_texts = {
             "begin_known": "the file does not tell what was sent before its first sample",
             "end_known": "the file does not tell how the measurement ended: "
             "later losses are missing",
         }
-        lines += [text for key, text in unknown_texts.items() if not facts[key]]
+        for key, text in unknown_texts.items():
+            if not statistics[key]:
+                lines.append(text)
         return lines
 
     def write_rows(self) -> str:
-        """Returns the table that a link of the model "trace" reads: t_s,delay_ms."""
+        """Returns the trace as a CSV text with the columns `t_s,delay_ms`.
+
+        A link of the model "trace" can read this text from a file.
+        """
         rows = ["t_s,delay_ms"]
         for t_s, ms in self.points:
             delay_text = _LOST if math.isinf(ms) else f"{ms:.3f}"
@@ -285,7 +345,7 @@ class MeasuredTrace(Result):
 def import_trace(
     path: str | Path, form: str, *, way: str = "", column: str = "", every_s: float = 1.0
 ) -> MeasuredTrace:
-    """Returns the trace of a file of `irtt client -o`, `ping` or `fping`, or of a table.
+    """Imports a delay trace from the output of `irtt`, `ping` or `fping`, or from a table.
 
     >>> with open("table.csv", "w") as table:
     ...     print("t_s,rtt_ms", "0.0,20", "0.1,40", sep=chr(10), file=table)
@@ -293,17 +353,20 @@ def import_trace(
     [10.0, 20.0]
 
     Args:
-        path: the file; it may be gzipped, and its text may be UTF-16.
-        form: "irtt", "ping" or "csv"; a table "csv" has a head with the names of its columns.
-        way: one of `WAYS`. "send" and "receive" are for irtt, and its clocks must then agree.
-            "": half of a round trip, which irtt, ping and a column "rtt" state; other delays as
-            they are.
-        column: the column of delays in a table; "": the first column named like a delay.
-        every_s: the interval of a `ping` that prints no times, as without -D or on Windows, s.
+        path: The file. It may be compressed with gzip, and its text may be UTF-16.
+        form: Format of the file: "irtt" (of `irtt client -o`), "ping" or "csv". A "csv" file
+            has a header line with the names and units of its columns.
+        way: How the delay of the link is computed, one of `WAYS`. "send" and "receive" exist
+            only for irtt, and require that its two clocks agree. By default, round trips are
+            halved (irtt, ping, and a column "rtt"), and other delays are used as they are.
+        column: Name of the column of delays in a table. By default, the first column whose name
+            says that it is a delay.
+        every_s: Interval between the messages of a `ping` that prints no times, in s. `ping`
+            prints none without its option -D, and none on Windows.
 
     Raises:
-        UsageError: there is no such form, or it has no such way.
-        ScenarioError: the file cannot be read, or is not of that form.
+        UsageError: There is no such format, or `way` does not exist for this format.
+        ScenarioError: The file cannot be read, or does not have this format.
     """
     if form not in _READERS:
         raise UsageError(f"a trace is imported from {', '.join(_READERS)}, not from {form!r}")
@@ -315,26 +378,29 @@ def import_trace(
             raw = stream.read(_MAX_BYTES)
     except OSError as error:
         raise ScenarioError(f"{path}: cannot be read: {error.strerror or error}") from None
+
     try:
         if raw.startswith(_GZIP_MAGIC):
             raw = gzip.decompress(raw)
         text = decode_text(raw, any_code_page=True)
     except (ValueError, EOFError, OSError) as error:
         raise ScenarioError(f"{path}: {error}") from None
+
     try:
         measurement = _READERS[form](text, way, column, every_s)
         return _build_trace(measurement)
+    # A JSON text of another form lacks keys, or has values of other types.
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ScenarioError(f"{path}: is not of the form {form}: {error}") from None
 
 
 class _Measurement(NamedTuple):
-    """The samples in a file.
+    """Messages that a file of a measurement contains.
 
     Attributes:
-        samples: times of sending, s, and delays, ms.
-        begin_known: False if samples may have been sent before the first one.
-        end_known: False if samples may have been sent after the last one.
+        samples: Send time of each message in s, and its delay in ms.
+        begin_known: False if messages before the first one may be missing from the file.
+        end_known: False if messages after the last one may be missing from the file.
     """
 
     samples: list[TracePoint]
@@ -343,28 +409,37 @@ class _Measurement(NamedTuple):
 
 
 def _build_trace(measurement: _Measurement) -> MeasuredTrace:
-    """Returns the trace of a measurement: in order, with times from the first sending on."""
+    """Returns the trace of a measurement.
+
+    The messages are sorted by their send times, which then count from the first one. Of several
+    messages with the same time in microseconds, only the first is kept.
+
+    Raises:
+        ValueError: There are no messages, or a delay is negative.
+    """
     if not measurement.samples:
         raise ValueError("it has no samples")
     samples = sorted(measurement.samples, key=lambda sample: sample[0])
-    begin_s = samples[0][0]
+    first_s = samples[0][0]
     points = []
     too_long = 0
     doubled = 0
-    last_us = -1
+    previous_us = -1
     for sent_s, delay_ms in samples:
-        t_us = round((sent_s - begin_s) * 1e6)
-        if t_us <= last_us:
+        t_us = round((sent_s - first_s) * 1e6)
+        if t_us <= previous_us:
             doubled += 1
             continue
+        # NaN is refused as well
         if not delay_ms >= 0.0:
             raise ValueError(
                 f"a delay of {delay_ms:g} ms: the clocks do not agree, half of the round trip "
                 "is known"
             )
-        last_us = t_us
+        previous_us = t_us
         too_long += LONGEST_MS < delay_ms < math.inf
         points.append((t_us * 1e-6, delay_ms if delay_ms <= LONGEST_MS else math.inf))
+
     trace = MeasuredTrace(
         points=tuple(points[:MAX_TRACE_POINTS]),
         too_long=too_long,
@@ -373,18 +448,24 @@ def _build_trace(measurement: _Measurement) -> MeasuredTrace:
         begin_known=measurement.begin_known,
         end_known=measurement.end_known,
     )
+    # The text is not needed here, but a trace that a scenario would refuse raises an error now.
     format_trace(trace.points)
     return trace
 
 
 def _read_irtt(text: str, way: str, *_: object) -> _Measurement:
-    """Returns the samples in the JSON of `irtt client -o`.
+    """Returns the messages in the JSON text of `irtt client -o`.
 
-    Its times are nanoseconds, a lost sample has a status in words, and `stats` counts the
-    packets that were sent.
+    The times in this text are nanoseconds. The entry `lost` of a message is a word; only
+    "false" means that the answer arrived. The entry `stats` contains the number of sent
+    packets; if it is larger than the number of messages, the last messages are missing.
+
+    Args:
+        text: The JSON text.
+        way: How the delay is computed, one of `WAYS` or empty.
     """
-    key = "rtt" if way in ("", "half", "whole") else way
-    share = 0.5 if way in ("", "half") else 1.0
+    delay_key = "rtt" if way in ("", "half", "whole") else way
+    factor = 0.5 if way in ("", "half") else 1.0
     samples: list[TracePoint] = []
     document = json.loads(text)
     for trip in document["round_trips"]:
@@ -392,45 +473,65 @@ def _read_irtt(text: str, way: str, *_: object) -> _Measurement:
         sent_s = times.get("monotonic", times.get("wall")) * 1e-9
         delay_ms = math.inf
         if trip["lost"] == "false":
-            delay_ms = share * trip["delay"][key] * 1e-6
+            delay_ms = factor * trip["delay"][delay_key] * 1e-6
         samples.append((sent_s, delay_ms))
-    packets = document.get("stats", {}).get("packets_sent", len(samples))
-    return _Measurement(samples, end_known=packets <= len(samples))
+    sent_packets = document.get("stats", {}).get("packets_sent", len(samples))
+    return _Measurement(samples, end_known=sent_packets <= len(samples))
 
 
 def _read_ping(text: str, way: str, _: str, every_s: float) -> _Measurement:
-    """Returns the samples in the output of `ping`, see `ping_output`."""
-    share = 1.0 if way == "whole" else 0.5
+    """Returns the messages in the output of `ping` or `fping`, see `ping_output`.
+
+    Args:
+        text: The output.
+        way: "whole" for the round trip. Otherwise half of it is the delay.
+        every_s: Interval between the messages if the output contains no times, in s.
+    """
+    factor = 1.0 if way == "whole" else 0.5
     probes = read_ping(text, every_s)
     samples = [
-        (sent_s, share * rtt_ms)
+        (sent_s, factor * rtt_ms)
         for sent_s, rtt_ms in zip(probes.sent_s, probes.rtt_ms, strict=True)
     ]
     return _Measurement(samples, probes.begin_known, probes.end_known)
 
 
 def _read_table(text: str, way: str, column: str, _: float) -> _Measurement:
-    """Returns the samples of a table whose head names columns with units.
+    """Returns the messages of a table whose header line names columns with units.
 
-    Examples of heads are "pub_time(ms) delay(ms)" and "t_s,delay_ms".
+    Examples of header lines are "pub_time(ms) delay(ms)" and "t_s,delay_ms". The columns are
+    separated by semicolons, tabs, commas or spaces.
+
+    Args:
+        text: The table.
+        way: "half" if the column contains round trips, "whole" if it contains the delays.
+            Empty: the name of the column decides.
+        column: Name of the column of delays. Empty: the first column that is named like one.
+
+    Raises:
+        ValueError: A column is missing, or a line does not contain numbers.
     """
     numbered_lines = [
         (number, line)
         for number, line in enumerate(text.splitlines(), start=1)
         if line.strip() and not line.startswith("#")
     ]
-    (_, head), *lines = numbered_lines
-    separator = next((mark for mark in (";", "\t", ",") if mark in head), None)
-    names = _split_cells(head, separator)
+    (_, header), *lines = numbered_lines
+    separator = next((mark for mark in (";", "\t", ",") if mark in header), None)
+    names = _split_cells(header, separator)
     time_index, time_unit_s = _find_column(names, _TIME_NAMES, "")
     delay_index, delay_unit_s = _find_column(names, _DELAY_NAMES, column)
+
     is_round_trip = not way and "rtt" in names[delay_index].lower()
     is_half = way == "half" or is_round_trip
+    # factor from a number in the table to a delay in ms
     unit_ms = delay_unit_s * (500.0 if is_half else 1e3)
+
     samples: list[TracePoint] = []
     for number, line in lines:
         # If commas do not separate the cells, a comma is a decimal comma.
-        cells = _split_cells(line if separator == "," else line.replace(",", "."), separator)
+        decimal_line = line if separator == "," else line.replace(",", ".")
+        cells = _split_cells(decimal_line, separator)
         try:
             delay_text = cells[delay_index]
             delay_ms = math.inf
@@ -443,19 +544,23 @@ def _read_table(text: str, way: str, column: str, _: float) -> _Measurement:
 
 
 def _split_cells(line: str, separator: str | None) -> list[str]:
+    """Returns the cells of a line. Without a separator, white space separates them."""
     return [cell.strip() for cell in line.split(separator)]
 
 
 def _find_column(cells: list[str], names: tuple[str, ...], wanted: str) -> tuple[int, float]:
-    """Returns the index of a column and its unit, s.
+    """Finds a column by the header line of a table.
 
     Args:
-        cells: the head of the table.
-        names: names of the quantity.
-        wanted: the column; "": the first column that has one of the names.
+        cells: Cells of the header line.
+        names: Names that the quantity may have.
+        wanted: Cell of the column. Empty: the first column that has one of the names.
+
+    Returns:
+        The index of the column, and its unit in s.
 
     Raises:
-        ValueError: there is no such column, or it has no unit.
+        ValueError: There is no such column, or it has no unit.
     """
     for index, cell in enumerate(cells):
         match = _COLUMN.match(cell)
@@ -475,4 +580,7 @@ _READERS: dict[str, Callable[[str, str, str, float], _Measurement]] = {
     "ping": _read_ping,
     "csv": _read_table,
 }
-"""The function that reads each form of files."""
+"""Function that reads each format.
+
+Its arguments are the text, the way, the column and the interval in s, see `import_trace`.
+"""

@@ -1,16 +1,19 @@
-"""Import users' classes from outside of the program: laws, hands and plants.
+"""Imports classes that users write: control laws, operators who move an arm, and plants.
 
-A user's law is named `law = "package.module:Law"`.
+A scenario names a class by its module and its name, for example
+`law = "package.module:Law"`. Importing a module runs its code, and a scenario may come from a
+stranger. Therefore code runs only if a person has permitted it before. A permission applies to
+one class in one file, which is identified by its SHA-256 hash.
 
 Invariant:
-    - A scenario holds the hash of the file that defines a class, so that a log shows if the
-      code that is executed again is the code that ran.
-    - Naming a class runs no code, not even that of the package that contains it.
-    - `import_class` is the only way to run code from outside. It imports a class only if
-      `allowed_code` permits it, and if its file still has the permitted hash and defines a
-      class of that name.
-    - A permission covers the arguments of the class as well: harmless code with other arguments
-      may open another file.
+    - A scenario contains the hash of the file that defines a class. If a run is repeated from
+      its log, the hash shows whether the code is still the code that ran.
+    - Looking up a class by its name runs no code, not even that of the packages around it.
+    - `import_class` is the only way to run code of users. It imports a class only if
+      `allowed_code` contains a permission, and if the file still has the permitted hash and
+      defines a class of that name.
+    - A permission includes the arguments of the class. Harmless code may do harm with other
+      arguments, for example if an argument is the name of a file that it overwrites.
 """
 
 import ast
@@ -37,45 +40,61 @@ from ..laws.sent_vectors import SentVectorSpecs, convert_sends, parse_classes
 CLASS_PATTERN = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*$"
 
 _imported: dict[str, str] = {}
-"""The hash of the file of each module of a law that was imported, when it was imported."""
+"""For each module that Python's import has loaded, the hash that its file had then."""
 
 
 Watch = Callable[[int, Callable[[], Any]], Any]
-"""A function that calls a user's code at a tick and returns its result."""
+"""Function that calls a user's code and returns its result, for example with a time limit.
+
+Its arguments are the tick and the call, a function without arguments.
+"""
 
 
 def call_directly(_k: int, function: Callable[[], Any]) -> Any:
-    """Calls a user's code without a time limit, as in virtual time, where nobody waits."""
+    """Calls a user's code without a time limit.
+
+    This is the `Watch` for virtual time, in which no other process waits for the result.
+
+    Args:
+        _k: Tick. It is not used.
+        function: The call.
+    """
     return function()
 
 
 class NamedCode(Protocol):
-    """A class from outside as a scenario names it: a law, a hand or a plant."""
+    """Class of a user as a scenario names it: a control law, an operator or a plant."""
 
     @property
     def code(self) -> str:
-        """The module and the class, as in "package.module:Law"."""
+        """Module and class, for example "package.module:Law"."""
 
     @property
     def source_sha256(self) -> str:
-        """The hash of the file of that module."""
+        """SHA-256 hash of the file of the module."""
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The arguments of the class, by name."""
+        """Arguments of the class, by name."""
 
 
 ANY_SETTINGS = "*"
-"""Stands for any settings. Only the workers of a study may be given such a permission."""
+"""In place of settings: the permission applies to all arguments.
+
+Only the worker processes of a study receive such a permission, because a study varies the
+arguments itself.
+"""
 
 
 class CodeKey(NamedTuple):
-    """The code that a permission covers.
+    """Identification of code: a class, the hash of its file and its arguments.
+
+    Permissions are stored under these keys.
 
     Attributes:
-        code: the module and the class, as in "package.module:Law".
-        sha256: the hash of its file, as the scenario names it.
-        settings: the arguments of the class, as JSON with sorted keys; or `ANY_SETTINGS`.
+        code: Module and class, for example "package.module:Law".
+        sha256: SHA-256 hash of the file, as the scenario states it.
+        settings: Arguments of the class as a JSON text with sorted keys, or `ANY_SETTINGS`.
     """
 
     code: str
@@ -84,7 +103,7 @@ class CodeKey(NamedTuple):
 
     @classmethod
     def of(cls, named: NamedCode) -> "CodeKey":
-        """Returns the key of a law, hand or plant of a scenario."""
+        """Returns the key of a control law, an operator or a plant of a scenario."""
         return cls(
             named.code,
             named.source_sha256,
@@ -93,11 +112,11 @@ class CodeKey(NamedTuple):
 
 
 class CodeConsent(NamedTuple):
-    """A file that may run.
+    """Permission to run a file.
 
     Attributes:
-        file: the path of the file; None: the file that Python finds for the module.
-        sha256: the SHA-256 of the file.
+        file: Path of the file. None: the file that Python's import finds for the module.
+        sha256: SHA-256 hash that the file must have.
     """
 
     file: Path | None
@@ -106,22 +125,28 @@ class CodeConsent(NamedTuple):
 
 CodeConsents = dict[CodeKey, CodeConsent]
 allowed_code: CodeConsents = {}
-"""The code that may run in this process. Worker processes get a copy."""
+"""Permissions for this process. Worker processes receive a copy."""
 remembered_settings: dict[tuple[str, str], list[str]] = {}
-"""The remembered settings, as in a `CodeKey`, by the hash of a file and the name of a class."""
+"""Arguments that were permitted in earlier sessions, as the JSON text of `CodeKey.settings`.
+
+The keys are the hash of the file and the name of the class. The texts serve only to explain
+what differs if code is refused; they permit nothing.
+"""
 
 
 def find_consent(key: CodeKey) -> CodeConsent | None:
-    """Returns the permission for code with its settings; None if it may not run."""
+    """Returns the permission for code with its arguments. None if the code may not run."""
     return allowed_code.get(key) or allowed_code.get(key._replace(settings=ANY_SETTINGS))
 
 
 @contextmanager
 def allowing_any_settings(allowed: CodeConsents) -> Iterator[None]:
-    """Allows code with any settings inside the block, because a study chooses settings itself.
+    """Widens permissions to all arguments of the same code, inside the `with` block.
+
+    A study uses it, because it varies the arguments of a class itself.
 
     Args:
-        allowed: the permissions that are widened.
+        allowed: Permissions to widen.
     """
     widened = {key._replace(settings=ANY_SETTINGS): consent for key, consent in allowed.items()}
     added = {key: consent for key, consent in widened.items() if key not in allowed_code}
@@ -134,9 +159,13 @@ def allowing_any_settings(allowed: CodeConsents) -> Iterator[None]:
 
 
 def describe_new_settings(key: CodeKey) -> str:
-    """Returns how the settings of withheld code differ from the nearest allowed settings.
+    """Describes how the arguments of refused code differ from arguments that were permitted.
 
-    The result is "" if the code may not run with any settings.
+    A user who has permitted a class may wonder why it is refused now. If several sets of
+    arguments were permitted, those with the fewest differences are compared.
+
+    Returns:
+        Part of a sentence. Empty if the code was not permitted with any arguments.
     """
     allowed_settings = {
         allowed.settings
@@ -146,36 +175,41 @@ def describe_new_settings(key: CodeKey) -> str:
     }
     class_name = key.code.partition(":")[2]
     allowed_settings |= set(remembered_settings.get((key.sha256, class_name), ()))
+
     settings = json.loads(key.settings)
     differences = [
         _list_differences(json.loads(text), settings) for text in sorted(allowed_settings)
     ]
-    nearest = min(differences, key=len, default=[])
-    if not nearest:
+    smallest_difference = min(differences, key=len, default=[])
+    if not smallest_difference:
         return ""
-    return f"it was allowed with other settings, and here {', '.join(nearest)}"
+    return f"it was allowed with other settings, and here {', '.join(smallest_difference)}"
 
 
 def _list_differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """Returns a text on each setting whose description changed."""
-    old = {key: describe_setting(value) for key, value in before.items()}
-    new = {key: describe_setting(value) for key, value in now.items()}
-    default = "its default"
-    return [
-        f"{key} = {new.get(key, default)} (was {old.get(key, default)})"
-        for key in sorted({*old, *new})
-        if old.get(key) != new.get(key)
-    ]
+    """Returns a text for each argument whose value differs, such as "gain = 5 (was 3)".
+
+    An argument that is missing on one side has its default there.
+    """
+    old_texts = {key: describe_setting(value) for key, value in before.items()}
+    new_texts = {key: describe_setting(value) for key, value in now.items()}
+    differences = []
+    for key in sorted({*old_texts, *new_texts}):
+        old = old_texts.get(key, "its default")
+        new = new_texts.get(key, "its default")
+        if old_texts.get(key) != new_texts.get(key):
+            differences.append(f"{key} = {new} (was {old})")
+    return differences
 
 
 LONGEST_SETTING = 300
-"""Largest length of a setting that is shown completely; paths of files are shorter."""
+"""Largest length up to which an argument is shown completely. Paths are usually shorter."""
 
 
 def describe_setting(value: Any) -> str:
-    """Returns the value of a setting as a text without control characters.
+    """Returns the value of an argument as a JSON text, which contains no control characters.
 
-    A long value is shortened in the middle, because paths of files differ at their ends.
+    A long text is shortened in the middle, because paths of files differ at their ends.
     """
     text = json.dumps(value, default=str)
     if len(text) <= LONGEST_SETTING:
@@ -185,17 +219,17 @@ def describe_setting(value: Any) -> str:
 
 
 _executed: dict["CodeSource", Any] = {}
-"""The modules of the files that were executed."""
+"""Modules that were executed from a file that a person named, by the content of the file."""
 
 
 class ImportedLaw(LawSettings, frozen=True, tag_field="law", tag="own"):
-    """A user's law.
+    """Control law that is a class of a user.
 
     Attributes:
-        code: the module and the class, as in "package.module:Law".
-        source_sha256: the hash of the file of that module.
-        settings: the arguments of the class, by name.
-        sends: the vectors that the law sends to its peers, as its class declares them.
+        code: Module and class, for example "package.module:Law".
+        source_sha256: SHA-256 hash of the file of the module.
+        settings: Arguments of the class, by name.
+        sends: Vectors that the law sends to its peers, as the class declares them.
     """
 
     method: ClassVar[str] = "torque"
@@ -206,11 +240,13 @@ class ImportedLaw(LawSettings, frozen=True, tag_field="law", tag="own"):
     sends: SentVectorSpecs = field(default_factory=dict)
 
     def build_factory(self, sites: int, scheme: str) -> UserLawFactory:
-        """Returns the factory of the law for a site.
+        """Returns a function that creates the law for a site.
+
+        The class is imported only when this function is called.
 
         Args:
-            sites: the number of sites of the experiment.
-            scheme: the scheme of the experiment.
+            sites: Number of sites of the experiment.
+            scheme: Integration scheme of the experiment.
         """
 
         def make(context: LawContext) -> UserLaw:
@@ -221,7 +257,7 @@ class ImportedLaw(LawSettings, frozen=True, tag_field="law", tag="own"):
                 kind=kind, code=self.code, context=context, sites=sites, scheme=scheme
             )
             declared = convert_sends(getattr(kind, "sends", {}), self.code, path)
-            # The order of the vectors counts, too.
+            # The order is compared too, because it is the order of the vectors in a message.
             if list(declared.items()) != list(self.sends.items()):
                 raise ScenarioError(
                     f"{self.code} sends other vectors than the scenario names: write sends out "
@@ -236,12 +272,12 @@ class ImportedLaw(LawSettings, frozen=True, tag_field="law", tag="own"):
 
 
 class CodeSource(NamedTuple):
-    """The file of a class from outside.
+    """File that defines a class of a user.
 
     Attributes:
-        file: its path.
-        content: its content.
-        sha256: the SHA-256 of the content.
+        file: Path of the file.
+        content: Content of the file.
+        sha256: SHA-256 hash of the content.
     """
 
     file: Path
@@ -250,15 +286,15 @@ class CodeSource(NamedTuple):
 
 
 def read_code(code: str, path: str, file: Path | None = None) -> CodeSource:
-    """Returns the file of a class, without running any code of it.
+    """Reads the file that defines a class, without running any code of it.
 
     Args:
-        code: the module and the class, as in "package.module:Law".
-        path: the path of the key in errors.
-        file: the file; None: the file that Python finds for the module.
+        code: Module and class, for example "package.module:Law".
+        path: Path of the key in the scenario, for error messages.
+        file: The file. None: the file that Python's import finds for the module.
 
     Raises:
-        ScenarioError: there is no such file, or it cannot be read.
+        ScenarioError: There is no such file, or it cannot be read.
     """
     source_file = file or _find_file(code, path)
     try:
@@ -272,7 +308,11 @@ def read_code(code: str, path: str, file: Path | None = None) -> CodeSource:
 
 
 def _find_file(code: str, path: str) -> Path:
-    """Returns the file that Python finds for the module of a class."""
+    """Returns the file that Python's import finds for the module of a class.
+
+    Raises:
+        ScenarioError: There is no such module, or it is not a file.
+    """
     module = code.partition(":")[0]
     with _searching(None):
         spec = _find_spec(module)
@@ -286,10 +326,16 @@ def _find_file(code: str, path: str) -> Path:
 
 
 def _find_spec(module: str) -> ModuleSpec | None:
-    """Returns the spec of a module as an import finds it, without importing its packages.
+    """Finds a module in the same way as an import does, but without importing its packages.
 
-    Only Python's path finder and the finders of editable installations are used. Other finders
+    Only Python's path finder and the finders of editable installations are asked. Other finders
     may run code: that of `distutils` imports the nearest setuptools.
+
+    Args:
+        module: Name of the module, with dots.
+
+    Returns:
+        The spec of the module, which contains its file. None if it is not found.
     """
     finders = [
         finder
@@ -309,23 +355,25 @@ def _find_spec(module: str) -> ModuleSpec | None:
         if spec is None:
             return None
         search_folders = spec.submodule_search_locations
-        if search_folders is None and name != module:
+        is_package = search_folders is not None
+        if not is_package and name != module:
             return None
     return spec
 
 
 def import_class(key: CodeKey, path: str, method: str = "torque") -> Any:
-    """Returns the class of a key, from the file that may run for it.
+    """Imports a class of a user from the file that may run for it.
 
     Args:
-        key: the class, with the hash of its file and its settings.
-        path: the path of the key in errors.
-        method: the method that the class must have.
+        key: The class, with the hash of its file and its arguments.
+        path: Path of the key in the scenario, for error messages.
+        method: Method that the class must have.
 
     Raises:
-        CodeWithheld: no file may run for the class.
-        ScenarioError: the file differs from the one that was allowed, or does not define such a
-            class, and no code of it has run; or it cannot be imported.
+        CodeWithheld: There is no permission.
+        ScenarioError: The file differs from the permitted one, or does not define such a class.
+            In these cases, none of its code has run. Or the code raises an error while it is
+            imported.
     """
     code = key.code
     module, _, name = code.partition(":")
@@ -338,6 +386,7 @@ def import_class(key: CodeKey, path: str, method: str = "torque") -> Any:
             "(in Python tn.open_log(..., law=FILE))",
             path=path,
         )
+
     source = read_code(code, path, consent.file)
     if source.sha256 != consent.sha256:
         raise ScenarioError(
@@ -346,12 +395,16 @@ def import_class(key: CodeKey, path: str, method: str = "torque") -> Any:
             path=path,
         )
     check_class(source, code, path, method)
-    search_folder = consent.file and _find_import_folder(module, source.file)
+
+    search_folder = None
+    if consent.file is not None:
+        search_folder = _find_import_folder(module, source.file)
     with _searching(search_folder):
         try:
-            imported = (
-                _execute(module, source) if consent.file else _import(module, source.sha256)
-            )
+            if consent.file is not None:
+                imported = _execute(module, source)
+            else:
+                imported = _import(module, source.sha256)
         # The user's code may raise anything.
         except (Exception, SystemExit) as error:
             problem = f"{module} cannot be imported: {type(error).__name__}: {error}"
@@ -360,9 +413,10 @@ def import_class(key: CodeKey, path: str, method: str = "torque") -> Any:
 
 
 def _find_import_folder(module: str, file: Path) -> Path:
-    """Returns the folder from which a module and its neighbours are imported.
+    """Returns the folder that must be on Python's search path to import a module from a file.
 
-    It is the folder of the file, or for a module of a package that of the outermost package.
+    For a plain module, it is the folder of the file. For a module in packages, it is the folder
+    that contains the outermost package.
     """
     depth = module.count(".") + (file.stem == "__init__")
     return file.parents[min(depth, len(file.parents) - 1)]
@@ -373,17 +427,23 @@ PAGES = {
     "act": ("hand", "policies.md"),
     "step": ("plant", "policies.md"),
 }
-"""The name of a class that has such a method, and the page that describes it."""
+"""For each required method: the name of such a class, and its page in the docs."""
 
 
 def check_class(source: CodeSource, code: str, path: str, method: str = "torque") -> None:
-    """Refuses a file that does not define a class with a method.
+    """Refuses a file that does not define a certain class with a certain method.
 
-    The check reads the syntax of the file and runs no code of it.
+    The check reads the syntax of the file, and runs no code of it.
+
+    Args:
+        source: The file.
+        code: Module and class, for example "package.module:Law".
+        path: Path of the key in the scenario, for error messages.
+        method: Method that the class must have.
 
     Raises:
-        ScenarioError: the file is not Python, has no such class, or the class has neither the
-            method nor a base class that may have it.
+        ScenarioError: The file is not valid Python, has no such class, or the class has neither
+            the method nor a base class or decorator that may add it.
     """
     kind, page = PAGES[method]
     name = code.partition(":")[2]
@@ -401,7 +461,12 @@ def check_class(source: CodeSource, code: str, path: str, method: str = "torque"
 
 
 def _import(module: str, sha256: str) -> Any:
-    """Returns a module as Python imports it; a file that was edited meanwhile is reloaded."""
+    """Imports a module in Python's usual way, and reloads it if its file has changed.
+
+    Args:
+        module: Name of the module.
+        sha256: Hash of its file now.
+    """
     imported = importlib.import_module(module)
     if _imported.setdefault(module, sha256) != sha256:
         imported = importlib.reload(imported)
@@ -410,12 +475,18 @@ def _import(module: str, sha256: str) -> Any:
 
 
 def _execute(module: str, source: CodeSource) -> Any:
-    """Returns a module of the content that was checked.
+    """Executes the content of a file as a module, and returns the module.
 
-    Python's own import could take a compiled file that lies beside the source.
+    Exactly the content that was checked is executed. Python's own import might read the file
+    again, or load a compiled version of it from `__pycache__`.
+
+    Args:
+        module: Name that the module gets.
+        source: The file and its content.
     """
     if source in _executed:
         return _executed[source]
+
     file = str(source.file)
     previous_module = sys.modules.get(module)
     spec = spec_from_file_location(module, file, loader=SourceFileLoader(module, file))
@@ -433,14 +504,16 @@ def _execute(module: str, source: CodeSource) -> Any:
 
 
 def name_law_class(kind: type) -> str:
-    """Returns the name of a class in a scenario, as in "mylaws:Spring".
+    """Returns the name with which a scenario names a class, for example "mylaws:Spring".
 
     Raises:
-        ScenarioError: the class is not in a file, or not at the top level of its module.
+        ScenarioError: The class is not defined in a file, or not at the top level of its
+            module.
     """
     module = kind.__module__
     name = kind.__qualname__
     if module == "__main__":
+        # The script that runs is a module under the name of its file.
         module = Path(getattr(sys.modules[module], "__file__", None) or "").stem
     if not module or not name.isidentifier():
         raise ScenarioError(
@@ -452,10 +525,10 @@ def name_law_class(kind: type) -> str:
 
 
 def name_law_classes(value: Any) -> Any:
-    """Returns a value of a scenario in plain types.
+    """Converts a value for a scenario to types that TOML supports.
 
-    A class becomes its name by `name_law_class`, and a number or an array of NumPy a number or
-    a list.
+    A class becomes its name (`name_law_class`), and a number or an array of NumPy becomes a
+    number or a list. Tables are converted entry by entry.
     """
     if isinstance(value, type):
         return name_law_class(value)
@@ -466,10 +539,10 @@ def name_law_classes(value: Any) -> Any:
 
 @contextmanager
 def _searching(folder: Path | None) -> Iterator[None]:
-    """Makes Python find modules in a folder before all others, inside the block.
+    """Makes Python search a folder for modules before all others, inside the `with` block.
 
     Args:
-        folder: the folder; None: the working directory, unless Python searches it already.
+        folder: The folder. None: the working directory, unless Python searches it already.
     """
     search_path = str(folder or Path.cwd())
     if folder is None and search_path in sys.path:

@@ -1,16 +1,20 @@
-"""The delay models of links, and the keys that all links share, such as loss and order.
+"""Defines what all delay models have in common: loss, duplicates, outages and order of samples.
 
-A model is one class, found by its file in this folder; nothing else lists the models. The
-models that the kernel computes name a `DelayKind`; any other model has a function of its own.
+A link is the directed connection between two sites. Its delay model computes the delay of each
+sample. A model is one class in a file of this folder, and is found by its file; there is no
+list of models. Models that the simulation kernel computes itself name a `DelayKind`. Any other
+model has a function of its own, which is compiled.
 
 Invariant:
-    - Each model states the mean and the deviation of its delay in closed form, and the core
-      draws from exactly that distribution.
-    - Loss is stated by its share and the mean length of its bursts, as it is measured. The
-      two-state chain that draws the losses follows from these in closed form.
-    - Keys end in their unit.
+    - Each model states the mean and the standard deviation of its delay in closed form. The
+      kernel draws from exactly the distribution that has these moments.
+    - The loss of samples is described by two measurable quantities: the fraction of lost
+      samples and the mean length of bursts. The parameters of the two-state Markov chain that
+      draws the losses follow from them in closed form.
+    - The name of a key ends in its unit.
 """
 
+import math
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Union
 
 import numpy as np
@@ -22,10 +26,10 @@ from ...core.vectors import Points
 from ...fields import Frozen, KeyProblem, TomlTable, find_kinds
 
 MAX_DELAY_MS = MAX_DELAY_US / 1000
-"""The longest delay."""
+"""Longest delay of a link, in ms."""
 
 MAX_OUTAGES = 1000
-"""Largest number of outages of a link: each sample is compared with all of them."""
+"""Largest number of outages of a link, because each sample is compared with all of them."""
 
 Milliseconds = Annotated[float, Meta(ge=0.0, le=MAX_DELAY_MS)]
 Probability = Annotated[float, Meta(ge=0.0, le=1.0)]
@@ -33,14 +37,14 @@ OutageTime = Annotated[float, Meta(ge=0.0, le=1e9)]
 
 
 class DelayMoments(NamedTuple):
-    """Mean and standard deviation of a delay, ms."""
+    """Mean and standard deviation of a delay, in ms."""
 
     mean_ms: float
     deviation_ms: float
 
 
 def ms_to_us(milliseconds: float) -> int:
-    """Returns a time in whole microseconds (L4)."""
+    """Converts a time in milliseconds to whole microseconds (L4)."""
     return round(milliseconds * 1_000)
 
 
@@ -50,16 +54,17 @@ _DETERMINISTIC_KINDS = (
     DelayKind.TRACE,
     DelayKind.MEASURED,
 )
+"""Delays that are not drawn at random."""
 
 
 class _LossChain(NamedTuple):
-    """The two-state Markov chain of losses (Gilbert's model).
+    """Markov chain with two states that decides which samples are lost (Gilbert's model).
 
     Attributes:
-        loss_good: probability of a loss in the good state.
-        loss_bad: probability of a loss in the bad state.
-        enter: probability to enter the bad state, per sample.
-        leave: probability to leave the bad state, per sample.
+        loss_good: Probability that a sample is lost in the good state.
+        loss_bad: Probability that a sample is lost in the bad state.
+        enter: Probability per sample to change from the good to the bad state.
+        leave: Probability per sample to change from the bad to the good state.
     """
 
     loss_good: float
@@ -69,20 +74,22 @@ class _LossChain(NamedTuple):
 
 
 class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
-    """A directed link.
+    """Directed link between two sites, with everything except the delay itself.
 
-    A subclass states its delay in the methods that begin with an underscore.
+    A subclass defines the delay by overriding the methods whose names begin with an underscore.
 
     Attributes:
-        loss: share of samples that are lost in the long run.
-        loss_burst: mean number of samples that are lost in a row; 0: losses are independent.
-        loss_bad: share of the samples of a burst that are lost; below 1 bursts have holes.
-        duplicate: share of samples that arrive twice; the copy has a delay of its own.
-        outages_s: intervals of stamps in which all samples are lost, s.
-        order: "newest": a newer sample replaces an older one; "in_order": a sample does not
-            overtake an older one.
-        playout_ms: shortest time for which every sample is held, ms; jitter below it becomes a
-            constant delay.
+        loss: Fraction of samples that are lost in the long run.
+        loss_burst: Mean number of consecutive lost samples. 0 means that losses are
+            independent.
+        loss_bad: Fraction of the samples of a burst that are lost. Below 1, bursts have gaps.
+        duplicate: Fraction of samples that arrive twice. The copy has a delay of its own.
+        outages_s: Intervals in which all samples are lost, in s. A sample belongs to an
+            interval by its send time.
+        order: "newest": A newer sample replaces an older one that arrives later. "in_order": A
+            sample does not overtake an older one.
+        playout_ms: Shortest time for which every sample is held, in ms. Delays below this time
+            all become equal, so jitter disappears.
     """
 
     loss: Probability = 0.0
@@ -97,59 +104,69 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
 
     @classmethod
     def derive_keys(cls, table: TomlTable) -> TomlTable:  # noqa: ARG003 - subclasses use it
-        """Returns the keys that an author may leave out because they follow from the others.
+        """Returns the keys that an author may leave out because they follow from other keys.
 
         Args:
-            table: the table of the link.
+            table: Table of the link as its author wrote it.
         """
         return {}
 
     def _delay(self) -> LinkModel:
-        """Returns the core's model of the delay alone, without loss."""
+        """Returns the kernel's model of the delay, without loss."""
         raise NotImplementedError
 
     def _moments(self) -> tuple[float, float]:
-        """Returns the mean and the standard deviation of the delay, ms."""
+        """Returns the mean and the standard deviation of the delay, in ms."""
         raise NotImplementedError
 
     def _reach_ms(self) -> float:
-        """Returns the longest delay, ms; three deviations above the mean if it is unbounded."""
+        """Returns the longest delay, in ms.
+
+        An unbounded distribution is cut at three standard deviations above the mean.
+        """
         mean_ms, deviation_ms = self._moments()
         return mean_ms + 3.0 * deviation_ms
 
     def _find_delay_problem(self) -> KeyProblem | None:
-        """Returns a problem of the keys of the delay that no range of a single key shows."""
+        """Returns a problem of the delay that involves several keys, or None."""
         return None
 
     def _describe_delay(self) -> str:
+        """Returns the delay as a short text with its mean and standard deviation."""
         mean_ms, deviation_ms = self._moments()
         return f"{self.__struct_config__.tag} {mean_ms:.4g} +- {deviation_ms:.3g} ms"
 
     def moments(self) -> DelayMoments:
         """Returns the moments of the stated delay.
 
-        Play-out, order and the cut at `MAX_DELAY_MS` do not enter them.
+        They do not include the effects of `playout_ms`, of `order`, and of the cut at
+        `MAX_DELAY_MS`.
         """
         return DelayMoments(*self._moments())
 
     @property
     def random(self) -> bool:
-        """True if the delay, the loss or the duplicates are drawn."""
+        """True if the delay, the losses or the duplicates are drawn at random."""
         is_delay_drawn = self._delay().kind not in _DETERMINISTIC_KINDS
         return is_delay_drawn or 0.0 < self.loss < 1.0 or 0.0 < self.duplicate < 1.0
 
     @property
     def measured(self) -> bool:
-        """True if the link injects no delay: the real network alone decides."""
+        """True if the link injects no delay, so that the real network decides."""
         return self._delay().kind == DelayKind.MEASURED
 
     @property
     def points(self) -> Points | None:
-        """The points of the link's trace; None without a trace."""
+        """Points of a recorded trace of delays. None for links of other models."""
         return None
 
     def to_core_model(self, from_ns: int = 0) -> LinkModel:
-        """Returns the core's model of the link, for stamps from `from_ns` on, ns."""
+        """Returns the link in the form that the simulation kernel uses.
+
+        Args:
+            from_ns: Send time of the first sample to which this state of the link applies, in
+                ns after the epoch.
+        """
         chain = self._loss_chain()
         return self._delay()._replace(
             from_ns=from_ns,
@@ -163,25 +180,30 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         )
 
     def _loss_chain(self) -> _LossChain:
-        """Returns the chain of losses.
+        """Computes the Markov chain that produces the stated losses.
 
-        In the bad state a sample is lost with the probability h = `loss_bad`, in the good state
-        never. A run of losses continues with the probability (1 - leave) h, so its mean length
-        is B = 1 / (1 - (1 - leave) h), and leave = 1 - (1 - 1 / B) / h. The share of samples in
-        the bad state is loss / h = enter / (enter + leave).
+        In the bad state, a sample is lost with the probability h = `loss_bad`; in the good
+        state, never. A run of lost samples continues with the probability (1 - leave) h. Its
+        mean length is therefore
+
+            B = 1 / (1 - (1 - leave) h), so that leave = 1 - (1 - 1 / B) / h.
+
+        The fraction of samples in the bad state is loss / h = enter / (enter + leave), from
+        which the probability `enter` follows.
         """
         if self.loss_burst == 0.0 or self.loss == 0.0:
             return _LossChain(loss_good=self.loss, loss_bad=0.0, enter=0.0, leave=1.0)
         leave = 1.0 - (1.0 - 1.0 / self.loss_burst) / self.loss_bad
-        bad_share = self.loss / self.loss_bad
-        enter = leave * bad_share / (1.0 - bad_share)
+        bad_fraction = self.loss / self.loss_bad
+        enter = leave * bad_fraction / (1.0 - bad_fraction)
         return _LossChain(loss_good=0.0, loss_bad=self.loss_bad, enter=enter, leave=leave)
 
     def find_problem(self) -> KeyProblem | None:
-        """Returns a problem that no range of a single key shows, or None."""
+        """Returns a problem that involves several keys of the link, or None."""
         delay_problem = self._find_delay_problem()
         if delay_problem is not None:
             return delay_problem
+
         for n, (start_s, end_s) in enumerate(self.outages_s):
             if end_s <= start_s:
                 problem = f"must end after it begins, reads {start_s:g} to {end_s:g}"
@@ -198,7 +220,7 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         return None
 
     def _find_burst_problem(self) -> KeyProblem | None:
-        """Returns a problem of a link that loses samples in bursts, or None."""
+        """Returns a problem of losses in bursts. None if a Markov chain can produce them."""
         if self.loss_burst < 1.0:
             return KeyProblem(
                 "loss_burst", f"must be 0 or at least 1 sample, is {self.loss_burst:g}"
@@ -208,8 +230,10 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
                 "loss",
                 f"must be below loss_bad = {self.loss_bad:g} in bursts, is {self.loss:g}",
             )
+
         chain = self._loss_chain()
         if chain.leave <= 0.0:
+            # leave > 0 requires 1 / B > 1 - h, see `_loss_chain`.
             longest = 1.0 / (1.0 - self.loss_bad)
             return KeyProblem(
                 "loss_burst", f"must be below {longest:g} with loss_bad = {self.loss_bad:g}"
@@ -221,49 +245,56 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         return None
 
     def describe(self) -> str:
-        """Returns a short text on the link, with the mean and deviation of its delay."""
-        facts = [self._describe_delay()]
+        """Returns a short text about the link, with the mean and the deviation of its delay."""
+        parts = [self._describe_delay()]
         if self.loss:
             bursts = f" in bursts of {self.loss_burst:g}" if self.loss_burst else ""
-            facts.append(f"loss {100 * self.loss:g} %{bursts}")
+            parts.append(f"loss {100 * self.loss:g} %{bursts}")
         if self.duplicate:
-            facts.append(f"duplicates {100 * self.duplicate:g} %")
-        facts += [f"cut {start:g}-{end:g} s" for start, end in self.outages_s]
+            parts.append(f"duplicates {100 * self.duplicate:g} %")
+        for start_s, end_s in self.outages_s:
+            parts.append(f"cut {start_s:g}-{end_s:g} s")
         if self.order == "in_order":
-            facts.append("in order")
+            parts.append("in order")
         if self.playout_ms:
-            facts.append(f"play-out {self.playout_ms:g} ms")
-        return ", ".join(facts)
+            parts.append(f"play-out {self.playout_ms:g} ms")
+        return ", ".join(parts)
 
 
 class OwnDelay(LinkBase, frozen=True, kw_only=True):
-    """A delay that is a function in a file of this folder; its keys are numbers.
+    """Delay model with a function of its own, in a file of this folder.
 
-    A subclass states `_moments`, and `_reach_ms` unless its longest delay is three deviations
-    above the mean.
+    The keys of the model are numbers. A subclass defines `draw` and `_moments`. It also defines
+    `_reach_ms` if its longest delay is not three standard deviations above the mean.
     """
 
     def draw(self, now: Any) -> None:
-        """Writes the delay of a sample to `now.drawn_us`, us, from its number and stamp.
+        """Computes the delay of a sample, and stores it in `now.drawn_us`, in microseconds.
 
-        The function is compiled. It sees `now.sample` and `now.stamp_ns`. Random numbers come
-        from `core.delay.draw_pair` of `now` alone: a function of the link's key and an index
-        (L4).
+        This method is compiled. It may use `now.sample`, the number of the sample, and
+        `now.stamp_ns`, its send time. Random numbers must come from `core.delay.draw_pair`:
+        they are a function of the key of the link and an index, so that a repeated run draws
+        the same numbers (L4).
         """
         raise NotImplementedError
 
     @property
     def points(self) -> Points:
-        """The numbers of the keys, bit for bit, two per row, where a trace has its points."""
+        """Numbers of the keys, stored where a trace has its points, with two numbers per row.
+
+        The kernel has one array per link for such data. The floating-point numbers are stored
+        bit by bit in its integers.
+        """
         numbers = list_numbers(self)
-        rows = -(-max(len(numbers), 1) // 2)
+        rows = math.ceil(max(len(numbers), 1) / 2)
         return np.resize(numbers, (rows, 2)).view(np.int64)
 
     def _delay(self) -> LinkModel:
+        """Returns the kernel's model. Its location is the longest delay, in microseconds."""
         return LinkModel(kind=DelayKind.CUSTOM, location=1e3 * self._reach_ms())
 
     def to_core_model(self, from_ns: int = 0) -> LinkModel:
-        """Returns the core's model of the link, with the address of the compiled `draw`."""
+        """Returns the kernel's model of the link, with the address of the compiled `draw`."""
         model = super().to_core_model(from_ns)
         return model._replace(call=compile_to_address(self, "draw", LINK_MODEL_DTYPE))
 
@@ -271,7 +302,7 @@ class OwnDelay(LinkBase, frozen=True, kw_only=True):
 DELAY_MODELS = {
     str(kind.__struct_config__.tag): kind for kind in find_kinds(__name__, LinkBase)
 }
-"""The models by name."""
+"""Classes of all delay models, by the name of the model."""
 if TYPE_CHECKING:
     Link = LinkBase
 else:

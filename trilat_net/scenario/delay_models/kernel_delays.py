@@ -1,8 +1,11 @@
-"""The delay models that the kernel itself computes.
+"""Defines the delay models that the simulation kernel computes itself.
+
+Each class translates the keys of a scenario to the parameters of a distribution or of a
+function of time, and states the mean and the standard deviation of the delay.
 
 Invariant:
-    - Each model is a `DelayKind`, and the core draws from exactly the distribution that the
-      model states.
+    - Each model has a `DelayKind`. The kernel draws from exactly the distribution whose moments
+      the model states.
 """
 
 import math
@@ -19,26 +22,27 @@ from ..delay_traces import parse_trace
 
 PositiveMilliseconds = Annotated[float, Meta(gt=0.0, le=MAX_DELAY_MS)]
 Deviation = Annotated[float, Meta(ge=0.001, le=MAX_DELAY_MS)]
-"""At least a microsecond, because every draw is rounded to microseconds."""
+"""Standard deviation. It is at least a microsecond, because delays are whole microseconds."""
 Correlation = Annotated[float, Meta(ge=0.0, lt=1.0)]
 
 
 def _normal_density(x: float) -> float:
+    """Returns the density of the standard normal distribution at `x`."""
     return math.exp(-0.5 * x * x) / math.sqrt(2.0 * math.pi)
 
 
 def _normal_probability(x: float) -> float:
-    """Returns the probability that a standard normal number is below `x`."""
+    """Returns the probability that a standard normal random number is below `x`."""
     return 0.5 * math.erfc(-x / math.sqrt(2.0))
 
 
 class UniformDelay(LinkBase, frozen=True, kw_only=True, tag="uniform"):
-    """A delay with a uniform distribution.
+    """Delay with a uniform distribution.
 
     Attributes:
-        delay_ms: its mean, ms.
-        half_width_ms: half of its width, ms; at most the mean. If an author leaves it out, it
-            is half of the mean.
+        delay_ms: Mean delay, in ms.
+        half_width_ms: Half of the width of the distribution, in ms. At most the mean. By
+            default, half of the mean.
     """
 
     delay_ms: Milliseconds
@@ -46,40 +50,44 @@ class UniformDelay(LinkBase, frozen=True, kw_only=True, tag="uniform"):
 
     @classmethod
     def derive_keys(cls, table: TomlTable) -> TomlTable:
-        """Returns the default of the half width, so that naming the model suffices."""
+        """Returns the default of the half width, so that an author may state the mean alone."""
         delay_ms = table.get("delay_ms")
         return {"half_width_ms": 0.5 * delay_ms} if is_number(delay_ms) else {}
 
     def _delay(self) -> LinkModel:
+        """Returns the kernel's model: the mean and the half width, in microseconds."""
         return LinkModel(
             kind=DelayKind.UNIFORM, location=1e3 * self.delay_ms, scale=1e3 * self.half_width_ms
         )
 
     def _moments(self) -> tuple[float, float]:
-        """Returns the moments; the deviation is half_width / sqrt(3)."""
+        """Returns the moments. The standard deviation is half_width / sqrt(3)."""
         return self.delay_ms, self.half_width_ms / math.sqrt(3.0)
 
     def _reach_ms(self) -> float:
+        """Returns the upper end of the distribution, in ms."""
         return self.delay_ms + self.half_width_ms
 
     def _find_delay_problem(self) -> KeyProblem | None:
+        """Returns a problem if the distribution would include negative delays."""
         if self.half_width_ms > self.delay_ms:
             return KeyProblem("half_width_ms", f"must be at most delay_ms = {self.delay_ms:g}")
         return None
 
 
 class NormalDelay(LinkBase, frozen=True, kw_only=True, tag="normal"):
-    """A delay with a normal distribution; a delay below zero is drawn again.
+    """Delay with a normal distribution. A negative delay is drawn again.
 
     Attributes:
-        delay_ms: mean of the normal distribution before the cut at zero, ms.
-        deviation_ms: its standard deviation before the cut, ms.
+        delay_ms: Mean of the normal distribution, before negative delays are excluded, in ms.
+        deviation_ms: Standard deviation of this distribution, in ms.
     """
 
     delay_ms: Milliseconds
     deviation_ms: Deviation
 
     def _delay(self) -> LinkModel:
+        """Returns the kernel's model: the mean and the standard deviation, in microseconds."""
         return LinkModel(
             kind=DelayKind.NORMAL, location=1e3 * self.delay_ms, scale=1e3 * self.deviation_ms
         )
@@ -87,8 +95,9 @@ class NormalDelay(LinkBase, frozen=True, kw_only=True, tag="normal"):
     def _moments(self) -> tuple[float, float]:
         """Returns the moments of the normal distribution truncated at zero.
 
-        With a = -m / s and the hazard H = phi(a) / Phi(-a) the mean is m + s H and the
-        deviation s sqrt(1 + a H - H^2).
+        Let m and s be the mean and the standard deviation before the truncation, a = -m / s,
+        phi the standard normal density, Phi its integral, and H = phi(a) / Phi(-a) the hazard.
+        Then the mean is m + s H, and the standard deviation is s sqrt(1 + a H - H^2).
         """
         a = -self.delay_ms / self.deviation_ms
         hazard = _normal_density(a) / _normal_probability(-a)
@@ -97,20 +106,25 @@ class NormalDelay(LinkBase, frozen=True, kw_only=True, tag="normal"):
 
 
 class MeanDeviationDelay(LinkBase, frozen=True, kw_only=True):
-    """A delay whose distribution is given by its moments.
+    """Base of delay models whose keys are the mean and the standard deviation.
 
     Attributes:
-        delay_ms: its mean, ms.
-        deviation_ms: its standard deviation, ms.
+        delay_ms: Mean delay, in ms.
+        deviation_ms: Standard deviation of the delay, in ms.
     """
 
     delay_ms: PositiveMilliseconds
     deviation_ms: Deviation
 
     def _moments(self) -> tuple[float, float]:
+        """Returns the two keys, which are the moments."""
         return self.delay_ms, self.deviation_ms
 
     def _find_delay_problem(self) -> KeyProblem | None:
+        """Returns a problem if the ratio of deviation and mean is extreme.
+
+        The deviation must be between 1/1000 of the mean and 10 times the mean.
+        """
         delay_ms, deviation_ms = self._moments()
         if 1e-3 * delay_ms <= deviation_ms <= 10.0 * delay_ms:
             return None
@@ -121,19 +135,27 @@ class MeanDeviationDelay(LinkBase, frozen=True, kw_only=True):
 
 
 class GammaDelay(MeanDeviationDelay, frozen=True, kw_only=True, tag="gamma"):
-    """A delay with a gamma distribution."""
+    """Delay with a gamma distribution."""
 
     def _delay(self) -> LinkModel:
-        """Returns the core's model: shape m^2 / s^2, scale s^2 / m (mean m, deviation s)."""
+        """Returns the kernel's model.
+
+        For the mean m and the standard deviation s, the shape of the gamma distribution is m^2
+        / s^2, and its scale is s^2 / m.
+        """
         shape = (self.delay_ms / self.deviation_ms) ** 2
         return LinkModel(kind=DelayKind.GAMMA, extra=shape, scale=1e3 * self.delay_ms / shape)
 
 
 class LogNormalDelay(MeanDeviationDelay, frozen=True, kw_only=True, tag="lognormal"):
-    """A delay with a log-normal distribution."""
+    """Delay with a log-normal distribution."""
 
     def _delay(self) -> LinkModel:
-        """Returns the core's model: sigma^2 = ln(1 + s^2 / m^2), mu = ln m - sigma^2 / 2."""
+        """Returns the kernel's model.
+
+        For the mean m and the standard deviation s, the logarithm of the delay is normal with
+        the variance sigma^2 = ln(1 + s^2 / m^2) and the mean mu = ln m - sigma^2 / 2.
+        """
         variance = math.log1p((self.deviation_ms / self.delay_ms) ** 2)
         location = math.log(1e3 * self.delay_ms) - 0.5 * variance
         return LinkModel(
@@ -142,13 +164,15 @@ class LogNormalDelay(MeanDeviationDelay, frozen=True, kw_only=True, tag="lognorm
 
 
 class HyperExponentialDelay(LinkBase, frozen=True, kw_only=True, tag="hyperexponential"):
-    """A floor plus a draw from one of two exponential distributions, as in mobile networks.
+    """Fixed delay plus a random part from one of two exponential distributions.
+
+    Mobile networks have such delays: most samples are fast, and some wait much longer.
 
     Attributes:
-        floor_ms: least delay, ms.
-        fast_ms: mean of the frequent part above the floor, ms.
-        slow_ms: mean of the rare part above the floor, ms.
-        slow_share: probability of the rare part.
+        floor_ms: Fixed part of the delay, in ms.
+        fast_ms: Mean of the frequent random part, in ms.
+        slow_ms: Mean of the rare random part, in ms.
+        slow_share: Probability of the rare part.
     """
 
     floor_ms: Milliseconds
@@ -157,6 +181,7 @@ class HyperExponentialDelay(LinkBase, frozen=True, kw_only=True, tag="hyperexpon
     slow_share: Probability
 
     def _delay(self) -> LinkModel:
+        """Returns the kernel's model, with times in microseconds."""
         return LinkModel(
             kind=DelayKind.HYPER_EXPONENTIAL,
             location=1e3 * self.floor_ms,
@@ -166,10 +191,10 @@ class HyperExponentialDelay(LinkBase, frozen=True, kw_only=True, tag="hyperexpon
         )
 
     def _moments(self) -> tuple[float, float]:
-        """Returns the moments of the mixture above the floor, plus the floor.
+        """Returns the moments of the mixture, plus the fixed delay.
 
-        The second moment of a mixture is the mixture of the second moments, here 2 a^2 and
-        2 b^2 of exponential distributions with the means a and b.
+        The second moment of a mixture is the mixture of the second moments. Exponential
+        distributions with the means a and b have the second moments 2 a^2 and 2 b^2.
         """
         fast = self.fast_ms
         slow = self.slow_ms
@@ -180,21 +205,23 @@ class HyperExponentialDelay(LinkBase, frozen=True, kw_only=True, tag="hyperexpon
 
 
 class CorrelatedDelay(NormalDelay, frozen=True, kw_only=True, tag="ar1"):
-    """A normal delay that is correlated from sample to sample; below zero it becomes zero.
+    """Normal delay that is correlated from sample to sample. Negative delays become zero.
 
     Attributes:
-        correlation: correlation of a sample's delay with that of the previous sample.
+        correlation: Correlation between the delays of two consecutive samples, before negative
+            delays become zero.
     """
 
     correlation: Correlation
 
     def _delay(self) -> LinkModel:
+        """Returns the kernel's model: a normal delay with the correlation as weight."""
         return NormalDelay._delay(self)._replace(kind=DelayKind.AR1, weight=self.correlation)
 
     def _moments(self) -> tuple[float, float]:
-        """Returns the moments of max(0, x) for a normal x.
+        """Returns the moments of max(0, x) for a normal random number x.
 
-        The variance is written in a form in which large terms do not cancel.
+        The variance is written as a sum in which large terms do not cancel each other.
         """
         m = self.delay_ms
         s = self.deviation_ms
@@ -209,46 +236,54 @@ class CorrelatedDelay(NormalDelay, frozen=True, kw_only=True, tag="ar1"):
 
 
 class NoDelay(LinkBase, frozen=True, kw_only=True, tag="none"):
-    """A link without delay: a sample is in use from the next tick on."""
+    """Link without delay: the receiver uses a sample from its next tick on."""
 
     def _delay(self) -> LinkModel:
+        """Returns the kernel's model of a link without delay, which is its default."""
         return LinkModel()
 
     def _moments(self) -> tuple[float, float]:
+        """Returns zero for the mean and the standard deviation."""
         return 0.0, 0.0
 
     def _describe_delay(self) -> str:
+        """Returns the text for links without delay."""
         return "no delay"
 
 
 class ConstantDelay(LinkBase, frozen=True, kw_only=True, tag="constant"):
-    """The same delay for every sample.
+    """Link with the same delay for every sample.
 
     Attributes:
-        delay_ms: the delay, ms; 0 means one period.
+        delay_ms: Delay, in ms. A delay of 0 still means one period, because the receiver uses a
+            sample from its next tick on.
     """
 
     delay_ms: Milliseconds
 
     def _delay(self) -> LinkModel:
-        """Returns the core's model, in whole microseconds (L4)."""
+        """Returns the kernel's model, with the delay in whole microseconds (L4)."""
         return LinkModel(kind=DelayKind.CONSTANT, location=float(ms_to_us(self.delay_ms)))
 
     def _moments(self) -> tuple[float, float]:
+        """Returns the delay, and zero for the standard deviation."""
         return self.delay_ms, 0.0
 
     def _describe_delay(self) -> str:
+        """Returns the delay as a text."""
         return f"{self.delay_ms:g} ms"
 
 
 class SineDelay(LinkBase, frozen=True, kw_only=True, tag="sine"):
-    """T(t) = delay + amplitude sin(2 pi t / period + phase), t being a sample's stamp.
+    """Delay that varies sinusoidally with the send time t of a sample.
+
+        T(t) = delay + amplitude sin(2 pi t / period + phase)
 
     Attributes:
-        delay_ms: its mean, ms.
-        amplitude_ms: its amplitude, ms; at most the mean.
-        period_s: its period, s.
-        phase_rad: its phase at t = 0, rad.
+        delay_ms: Mean delay, in ms.
+        amplitude_ms: Amplitude, in ms. At most the mean.
+        period_s: Period, in s.
+        phase_rad: Phase at t = 0, in rad.
     """
 
     delay_ms: Milliseconds
@@ -257,6 +292,7 @@ class SineDelay(LinkBase, frozen=True, kw_only=True, tag="sine"):
     phase_rad: Annotated[float, Meta(ge=-1e3, le=1e3)] = 0.0
 
     def _delay(self) -> LinkModel:
+        """Returns the kernel's model, with times in microseconds."""
         return LinkModel(
             kind=DelayKind.SINE,
             location=1e3 * self.delay_ms,
@@ -270,23 +306,26 @@ class SineDelay(LinkBase, frozen=True, kw_only=True, tag="sine"):
         return self.delay_ms, self.amplitude_ms / math.sqrt(2.0)
 
     def _reach_ms(self) -> float:
+        """Returns the longest delay, in ms."""
         return self.delay_ms + self.amplitude_ms
 
     def _find_delay_problem(self) -> KeyProblem | None:
+        """Returns a problem if the delay would become negative."""
         if self.amplitude_ms > self.delay_ms:
             return KeyProblem("amplitude_ms", f"must be at most delay_ms = {self.delay_ms:g}")
         return None
 
 
 class TraceDelay(LinkBase, frozen=True, kw_only=True, tag="trace"):
-    """A delay that follows a recorded table of delays over time.
+    """Delay that follows a recorded table of send times and delays.
 
-    The table comes from a file; a resolved scenario holds the table itself.
+    An author names a file with the table. A resolved scenario contains the table itself.
 
     Attributes:
-        trace: the points of the table, "t_us delay_us, ...", with "lost" in place of the delay
-            of a lost sample.
-        at_end: "hold": the last delay continues; "loop": the table repeats.
+        trace: Points of the table as the text "t_us delay_us, t_us delay_us, ...". A lost
+            sample has "lost" in place of its delay.
+        at_end: What happens after the last point. "hold": The last delay continues. "loop": The
+            table is repeated.
     """
 
     trace: str
@@ -294,14 +333,19 @@ class TraceDelay(LinkBase, frozen=True, kw_only=True, tag="trace"):
 
     @property
     def points(self) -> Points:
-        """The points of the trace."""
+        """Points of the table, in microseconds, shape (n, 2)."""
         return parse_trace(self.trace)
 
     def _delay(self) -> LinkModel:
+        """Returns the kernel's model. The points themselves are in a separate array."""
         return LinkModel(kind=DelayKind.TRACE, at_end=TraceEnd[self.at_end.upper()])
 
     def _moments(self) -> tuple[float, float]:
-        """Returns the moments over one pass, weighted by time, without lost samples."""
+        """Returns the moments over one pass of the table, without lost samples.
+
+        The delay of each point is weighted by the time until the next point. NaN if all samples
+        of the table are lost.
+        """
         t_us, delay_us = self.points.T
         # The last point lasts as long as the point before it.
         end_us = t_us[-1] + 1
@@ -316,10 +360,11 @@ class TraceDelay(LinkBase, frozen=True, kw_only=True, tag="trace"):
         return mean_us / 1e3, math.sqrt(variance) / 1e3
 
     def _reach_ms(self) -> float:
-        """Returns the longest delay of the points, ms."""
+        """Returns the longest delay of the table, in ms."""
         return float(self.points[:, 1].max()) / 1e3
 
     def _find_delay_problem(self) -> KeyProblem | None:
+        """Returns a problem if the text does not contain a table."""
         try:
             parse_trace(self.trace)
         except ValueError as error:
@@ -328,14 +373,19 @@ class TraceDelay(LinkBase, frozen=True, kw_only=True, tag="trace"):
 
 
 class NoInjectedDelay(LinkBase, frozen=True, kw_only=True, tag="measured"):
-    """No injected delay: a sample is in use as soon as it arrives over the real network."""
+    """Link of a live session without an injected delay.
+
+    The receiver uses a sample as soon as it has arrived over the real network.
+    """
 
     def _delay(self) -> LinkModel:
+        """Returns the kernel's model."""
         return LinkModel(kind=DelayKind.MEASURED)
 
     def _moments(self) -> tuple[float, float]:
-        """Returns NaN: the delay of the real network is not known beforehand."""
+        """Returns NaN, because the delay of the real network is not known beforehand."""
         return math.nan, math.nan
 
     def _describe_delay(self) -> str:
+        """Returns the name of the model."""
         return "measured"

@@ -1,4 +1,4 @@
-"""A satellite network in low orbit, which assigns paths anew in slots of time."""
+"""Models the delay of low-orbit satellite networks, which reassign paths at fixed intervals."""
 
 import math
 from typing import Annotated, Any
@@ -10,17 +10,19 @@ from ..delay_models import Milliseconds, OwnDelay
 
 
 class LowOrbit(OwnDelay, frozen=True, kw_only=True, tag="low_orbit"):
-    """A floor, an exponential part per slot of time, and an exponential part per sample.
+    """Delay of a network of low-orbit satellites.
 
-    Low-orbit networks assign terminals to satellites anew every 15 s, all at once, and delay
-    and jitter step at these times: Mohan et al., "A Multifaceted Look at Starlink Performance",
-    WWW (2024).
+    Such networks assign terminals to satellites again every 15 s, all terminals at once. Delay
+    and jitter change abruptly at these times: Mohan et al., "A Multifaceted Look at Starlink
+    Performance", WWW (2024). The model is the sum of a fixed delay, an exponential random part
+    that is drawn once per interval, and an exponential random part that is drawn for every
+    sample.
 
     Attributes:
-        floor_ms: least delay, ms.
-        path_ms: mean of the part that is drawn for the path of a slot, ms.
-        jitter_ms: mean of the part that is drawn for a sample, ms.
-        slot_s: duration of a slot, s.
+        floor_ms: Fixed part of the delay, in ms.
+        path_ms: Mean of the part that is drawn once per interval, in ms.
+        jitter_ms: Mean of the part that is drawn for every sample, in ms.
+        slot_s: Duration of an interval, in s.
     """
 
     floor_ms: Milliseconds = 20.0
@@ -29,11 +31,14 @@ class LowOrbit(OwnDelay, frozen=True, kw_only=True, tag="low_orbit"):
     slot_s: Annotated[float, Meta(gt=0.0, le=1e4)] = 15.0
 
     def draw(self, now: Any) -> None:
-        """Writes the delay of a sample, us."""
+        """Computes the delay of a sample, in microseconds.
+
+        If x is uniform between 0 and 1, then -log(x) has an exponential distribution with mean
+        1.
+        """
         slot = now.stamp_ns // int(1e9 * self.slot_s)
         _, path_share = draw_pair(now, slot, 0)
         _, sample_share = draw_pair(now, now.sample, 1)
-        # The logarithm of a uniform number is a negative exponential draw.
         now.drawn_us = 1e3 * (
             self.floor_ms
             - self.path_ms * math.log(path_share)
@@ -41,10 +46,16 @@ class LowOrbit(OwnDelay, frozen=True, kw_only=True, tag="low_orbit"):
         )
 
     def _moments(self) -> tuple[float, float]:
-        """Returns the moments over many slots: those of a sum of independent parts."""
+        """Returns the moments over many intervals.
+
+        The variances of the two independent random parts add up.
+        """
         mean_ms = self.floor_ms + self.path_ms + self.jitter_ms
         return mean_ms, math.hypot(self.path_ms, self.jitter_ms)
 
     def _reach_ms(self) -> float:
-        """Returns the delay for the largest draws of both parts, -log 2^-53 = 36.8, ms."""
+        """Returns the longest delay that can be drawn, in ms.
+
+        The smallest random number is 2^-53, and -log(2^-53) = 36.8.
+        """
         return self.floor_ms + 36.8 * (self.path_ms + self.jitter_ms)
