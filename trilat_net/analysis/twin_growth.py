@@ -1,18 +1,21 @@
-"""Measures how small pushes grew or died in a run, by twins of the run that were pushed.
+"""Measures whether small disturbances of a run grow or die away, by repeating the run.
 
-The amplitude A of a difference d between a twin and its run, at 20 Hz, is
+A twin is a repeated execution of a run in which a joint received a small push. This module
+judges the difference d between a twin and the run, which is sampled at 20 Hz. The amplitude A
+of the difference is
 
     A^2 = sum over joints of d^2 + (d' / w)^2,
 
-with w the frequency that makes both parts equal on average. For a single mode, A goes as
-exp(rate t) without the mode's oscillation. The rate is the slope of log A over the judged
-part, with the bounds and classes of `envelope_trend`.
+where d' is the time derivative of d. The frequency w, in rad/s, is chosen so that both parts
+are equal on average. For a single mode, A is proportional to exp(rate t), without the
+oscillation of the mode. The rate is the slope of log A over the judged part of the run, with
+the bounds and the classes of trends of `envelope_trend`.
 
 Invariant:
-    - A push is judged by the velocities of its twin minus those of the run. A shift of all
-      arms to another rest leaves these at zero.
-    - Sites that no shares connect are judged separately: growth at one does not hide the
-      others.
+    - Differences are those of the joint velocities. If a push merely shifts all arms to another
+      rest position, its difference becomes zero.
+    - Groups of sites that do not follow each other are judged separately, so that growth in one
+      group does not hide the other groups.
 """
 
 import math
@@ -49,14 +52,18 @@ from .run_end import EndBehaviour, RunEnd, Stability, find_coupled_sites
 from .site_signals import SETTLED_ERROR_RAD
 
 TWINS = 8
-"""Number of twins of a run by default."""
+"""Default number of twins of a run."""
 LEAST_LEFT_S = 5.0
-"""Least time for which a run that departs from a rest moves away, s."""
+"""Shortest departure from a rest position that counts, in s."""
 DOUBLES = 2.0
-"""Least factor by which a run that departs from a rest gets faster in that time."""
+"""Least growth of the speed during a departure from a rest, as a factor.
+
+Pushes of runs with random delays must grow by the same factor, to exclude chance.
+"""
 CLEAR_GROWTH = 100.0
-"""Growth by this factor shows in a push of any direction, even if the push dies away
-otherwise.
+"""Growth of an unstable mode, as a factor, that shows in a push of any direction.
+
+A push excites all modes. Growth of one of them by this factor outweighs the decay of the rest.
 """
 _TRENDS_FROM_BEST = (
     EnvelopeTrend.DECAYS,
@@ -67,28 +74,33 @@ _TRENDS_FROM_BEST = (
 )
 _FALLING = (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY)
 _AMPLITUDE_FLOOR = 1e-300
-"""Floor of a fit to scaled amplitudes, in place of that of angles."""
+"""Smallest amplitude in a fit. The amplitudes are scaled, so that no unit applies."""
 SAME_SCALED = math.log(1.1)
-"""Logarithm of the largest ratio of two scaled twins that count as equal: 10 %."""
+"""Largest difference of the logarithms of two scaled twins that count as equal: 10 %."""
 MOST_LOG = 700.0
-"""Largest logarithm of a number; the exponential of a larger one overflows."""
+"""Largest argument of the exponential function that certainly does not overflow."""
 
 
 class PushGrowth(NamedTuple):
-    """Growth of one push in sites that shares connect, over the judged part of a run.
+    """How one push developed over the judged part of a run.
+
+    If a run has several groups of sites that do not follow each other, a push has one such
+    object for each group.
 
     Attributes:
-        push: the push.
-        trend: trend of the difference.
-        rate_per_s: rate of the difference, which goes as exp(rate t), 1/s; NaN if the part is
-            too short.
-        factor: factor by which the difference changed over the part; 0 if it died down to the
-            rounding of the numbers.
-        joint: joint at which the difference is largest at the end.
-        group: index of these sites among the groups of connected sites.
-        becomes_rad_s: largest difference of the last second, rad/s, with all scalings undone.
-        ended_s: time at which the twin ended before the run, in s: the difference died down to
-            the rounding, or it grew and diverged; None if the twin did not end early.
+        push: The push.
+        trend: Class of the trend of the difference between the twin and the run.
+        rate_per_s: Rate of the difference, which is proportional to exp(rate t), in 1/s. NaN if
+            the judged part is too short.
+        factor: Factor by which the difference changed over the judged part. 0 if it died down
+            to the rounding errors.
+        joint: Name of the joint at which the difference is largest at the end.
+        group: Index of the group of sites.
+        becomes_rad_s: Largest difference in the last second, in rad/s, with all scalings
+            undone.
+        ended_s: Time at which the twin ended before the run, in s, because the difference died
+            down to the rounding errors or the twin diverged. None if the twin did not end
+            early.
     """
 
     push: Push
@@ -102,13 +114,15 @@ class PushGrowth(NamedTuple):
 
 
 class RestDeparture(NamedTuple):
-    """A time in which a run moved away from a rest, and from its twins, without any action.
+    """A stretch of time in which a run and its twins moved away from a rest by themselves.
+
+    Nobody acts on the arms during this time, so that the rest position is unstable.
 
     Attributes:
-        from_s: start, in s.
-        to_s: end, in s.
-        rate_per_s: rate at which the speed grew, 1/s.
-        joint: the fastest joint.
+        from_s: Start, in s.
+        to_s: End, in s.
+        rate_per_s: Rate at which the speed of the run grew, in 1/s.
+        joint: Name of the fastest joint.
     """
 
     from_s: float
@@ -118,18 +132,19 @@ class RestDeparture(NamedTuple):
 
 
 class TwinGrowth(NamedTuple):
-    """Growth of all pushes of a run.
+    """How all pushes of a run developed, computed by `judge_twins`.
 
     Attributes:
-        why: the reason why there are no twins; "" if there are.
-        from_s: start of the judged part, in s.
-        to_s: end of the judged part, in s.
-        pushes: growth of every push in every group of connected sites.
-        departure: departure of the run from a rest; None if there was none.
-        same_platform: False if the run was repeated on another platform, whose last bits
-            differ.
-        links_random: True if some link draws its delays: slow trends may be due to chance then.
-        twins: the twins themselves, for figures.
+        why: The reason why there are no twins. Empty if there are.
+        from_s: Start of the judged part, in s.
+        to_s: End of the judged part, in s.
+        pushes: Growth of every push, in every group of sites that follow each other.
+        departure: Fastest departure of the run from a rest. None if there was none.
+        same_platform: False if the run was recorded on another platform, so that the last bits
+            of the repeated run may differ from the log.
+        links_random: True if some link draws its delays at random. Slow trends may then be
+            chance.
+        twins: The twins themselves, for figures. None if there are none.
     """
 
     why: str
@@ -143,7 +158,7 @@ class TwinGrowth(NamedTuple):
 
     @property
     def worst(self) -> PushGrowth | None:
-        """The push that grew most, or died most slowly; None without pushes."""
+        """The push that grew most or died away most slowly. None without pushes."""
         return max(
             self.pushes,
             key=lambda push: (_TRENDS_FROM_BEST.index(push.trend), push.rate_per_s),
@@ -152,23 +167,23 @@ class TwinGrowth(NamedTuple):
 
     @property
     def trend(self) -> EnvelopeTrend:
-        """Trend of the worst push; undecided without twins."""
+        """Class of the trend of the worst push. Undecided without pushes."""
         return EnvelopeTrend.UNDECIDED if self.worst is None else self.worst.trend
 
     @property
     def grows(self) -> bool:
-        """True if at least half of the pushes of some group of connected sites grow.
+        """True if at least half of the pushes of some group of sites grow throughout.
 
-        If links are random, they must grow by a factor of two.
+        If links are random, the pushes must also grow by a factor of two over the judged part.
         """
         return self.grows_by(DOUBLES if self.links_random else 1.0, always=True)
 
     def grows_by(self, factor: float, *, always: bool) -> bool:
-        """True if at least half of the pushes of some group of sites grow by a factor.
+        """Returns True if at least half of the pushes of some group of sites grow by a factor.
 
         Args:
-            factor: least factor over the judged part.
-            always: count only pushes with a trend that grows throughout.
+            factor: Least factor over the judged part.
+            always: True to count only pushes whose trend is a growth throughout.
         """
         for group in {push.group for push in self.pushes}:
             pushes = [push for push in self.pushes if push.group == group]
@@ -181,7 +196,11 @@ class TwinGrowth(NamedTuple):
 
     @property
     def needs_s(self) -> float | None:
-        """Length of a run in which a fall at this rate is clear, in s; None without a fall."""
+        """Length of a run that would show clearly that the pushes die away, in s.
+
+        Four halvings at the rate of the worst push are added to the end of the judged part.
+        None if the pushes do not fall, or if it is clear already that they die away.
+        """
         worst = self.worst
         if worst is None or not worst.rate_per_s < 0.0 or self.trend is EnvelopeTrend.DECAYS:
             return None
@@ -189,16 +208,17 @@ class TwinGrowth(NamedTuple):
 
     @property
     def excluded_rate_per_s(self) -> float:
-        """Rate above which growth is excluded, 1/s; infinite unless every push dies away.
+        """Rate above which the twins exclude growth, in 1/s.
 
-        A push at a larger rate would have grown by `CLEAR_GROWTH` in the judged part.
+        A mode with a larger rate would have grown by `CLEAR_GROWTH` in the judged part, and
+        would have been seen. Infinite unless every push dies away.
         """
         judged_s = self.to_s - self.from_s
         dies = self.trend is EnvelopeTrend.DECAYS and judged_s > 0.0
         return math.log(CLEAR_GROWTH) / judged_s if dies else math.inf
 
     def to_json(self) -> dict[str, Any]:
-        """Returns the growth of all pushes, ready for JSON."""
+        """Returns the growth of all pushes as plain values, with the keys of the JSON file."""
         pushes = [
             {
                 "push": growth.push.name,
@@ -224,7 +244,10 @@ class TwinGrowth(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The growth of the pushes, in one sentence."""
+        """A sentence on the worst push or on a departure from a rest.
+
+        It is the reason why there are no twins if there are none.
+        """
         worst = self.worst
         departure = self.departure
         if worst is None:
@@ -252,11 +275,15 @@ class TwinGrowth(NamedTuple):
 
 
 class TwinVerdict(NamedTuple):
-    """Judgement of a run by its end and its twins.
+    """Stability judgement of a run that takes its pushed twins into account.
+
+    A twin is a repeated execution of the run with a small push. Twins show whether small
+    disturbances grow or die away, which the run alone may not show.
 
     Attributes:
-        stability: the judgement.
-        reason: a sentence, if the twins change or doubt the judgement by the end; "" otherwise.
+        stability: The judgement.
+        reason: Why the twins contradict, or cast doubt on, the judgement that follows from the
+            end of the run alone. Empty if they agree with it.
     """
 
     stability: Stability
@@ -270,32 +297,35 @@ def judge_end_by_twins(
     settles: bool | None,
     rises: bool,
 ) -> TwinVerdict:
-    """Returns the judgement of a run by its end and by its twins.
+    """Judges a run by its end and by the growth of small pushes in its twins.
 
-    - A run that grows away from its twins is not stable, wherever it is. A run that approaches
+    - A run that grows away from its twins is not stable, however it ends. A run that approaches
       its twins is not said to grow.
-    - A stable run needs pushes that die away. If small motions are known to settle, it needs
-      pushes that do not grow.
-    - Arms that are too slow to get anywhere, all of whose pushes die away, need no trend of the
-      remaining motion.
+    - A run with a stable end is stable only if pushes die away. If small motions are known to
+      settle, it is enough that the pushes do not grow.
+    - A run whose end shows no trend is stable if all of its pushes die away, and its arms are
+      too slow to get anywhere or are known to settle.
 
     Args:
-        end: the end of the run.
-        twins: growth of small pushes.
-        settles: whether small motions settle, by exact roots or by the theorem; None if
-            unknown.
-        rises: True if V rose by energy that was not supplied.
+        end: The end of the run.
+        twins: Growth of the pushes.
+        settles: Whether small motions settle, according to exact roots or to the stability
+            theorem. None if unknown.
+        rises: True if the energy function V rose by energy that nobody supplied.
     """
     by_end = TwinVerdict(end.stability)
     trend = twins.trend
     if not twins.pushes or end.behaviour is EndBehaviour.DIVERGED:
         return by_end
+
+    # Growth of pushes, or a departure from a rest, refutes stability.
     is_slowing = end.speed.trend in _FALLING and end.end_speed_rad_s > FLOOR_RAD
     has_growth = twins.grows
     if settles is False and not has_growth:
         has_growth = twins.grows_by(DOUBLES, always=False)
     departs = twins.departure is not None and end.behaviour is not EndBehaviour.COASTS
-    if ((has_growth and not is_slowing) or departs) and not end.operator_acts:
+    moves_away = (has_growth and not is_slowing) or departs
+    if moves_away and not end.operator_acts:
         return TwinVerdict(Stability.NOT_STABLE, twins.text)
 
     hardly = trend is EnvelopeTrend.HARDLY
@@ -304,7 +334,7 @@ def judge_end_by_twins(
         is_doubtful = trend is EnvelopeTrend.GROWS or not settles
         return TwinVerdict(Stability.OPEN, twins.text) if is_doubtful else by_end
     if end.stability is Stability.NOT_STABLE:
-        # growth that neither the twins nor V confirm
+        # Growth is doubtful if neither the twins nor V confirm it.
         is_unconfirmed = (
             end.behaviour is EndBehaviour.GROWS
             and trend is not EnvelopeTrend.GROWS
@@ -313,6 +343,8 @@ def judge_end_by_twins(
         if dies or is_unconfirmed:
             return TwinVerdict(Stability.OPEN, twins.text)
         return by_end
+
+    # The end alone shows no trend, but the pushes may decide.
     has_no_trend = end.behaviour in (EndBehaviour.HARDLY, EndBehaviour.UNDECIDED)
     judged_s = twins.to_s - twins.from_s
     rests = end.end_speed_rad_s * judged_s <= SETTLED_ERROR_RAD
@@ -330,16 +362,19 @@ def measure_twins(
     *,
     own_laws: bool = False,
 ) -> TwinGrowth:
-    """Returns the growth of small pushes in a run.
+    """Repeats a recorded run with small pushes, and returns how the pushes develop.
 
     Args:
-        log: the log of the run.
-        end: the end of the run.
-        count: number of twins.
-        own_laws: run the code of laws from outside the program.
+        log: The log of the run.
+        end: The end of the run, which states from when on the run is judged.
+        count: Number of twins.
+        own_laws: True to run the code of control laws that are not part of this program.
+
+    Returns:
+        The growth of the pushes. Without pushes if the run cannot be repeated, with the reason.
 
     Raises:
-        LogError: a record cannot be read.
+        LogError: A record cannot be read.
     """
     try:
         twins = run_twins(log, choose_pushes(log.scenario, count), own_laws=own_laws)
@@ -354,16 +389,18 @@ def measure_virtual_twins(
     duration_s: float,
     count: int,
 ) -> TwinGrowth:
-    """Returns the growth of small pushes in a run in virtual time, without a log.
+    """Simulates a scenario with small pushes, and returns how the pushes develop.
+
+    This needs no log: the run and its twins are executed in virtual time.
 
     Args:
-        scenario: scenario of the run.
-        end: the end of the run.
-        duration_s: length of the run, in s.
-        count: number of twins.
+        scenario: Scenario of the run.
+        end: The end of the run, which states from when on the run is judged.
+        duration_s: Length of the run, in s.
+        count: Number of twins.
 
     Raises:
-        ScenarioError: the scenario cannot run in virtual time.
+        ScenarioError: The scenario cannot run in virtual time.
     """
     twins = run_virtual_twins(scenario, choose_pushes(scenario, count), duration_s)
     return judge_twins(scenario, twins, end.counts_from_s, end.quiet_from_s)
@@ -375,15 +412,15 @@ def judge_twins(
     counts_from_s: float,
     quiet_from_s: float,
 ) -> TwinGrowth:
-    """Returns the growth of the pushes of a run's twins.
+    """Returns how the pushes of a run's twins developed.
 
     Args:
-        scenario: scenario of the run.
-        twins: the twins.
-        counts_from_s: time from which the run counts, in s: the second half from there on is
-            judged.
-        quiet_from_s: time from which nobody acts on the run, and its loop does not change, in
-            s.
+        scenario: Scenario of the run.
+        twins: The twins.
+        counts_from_s: Time from which the run counts, in s. The second half of the time after
+            it is judged.
+        quiet_from_s: Time from which nobody acts on the run, and its loop does not change, in
+            s. Departures from a rest are searched from there on.
     """
     t_s = twins.paths[0].t_s
     has_motion = twins.speed.any(axis=1) | np.isfinite(twins.paths[0].largest).any(axis=1)
@@ -391,6 +428,7 @@ def judge_twins(
     end = int(rows[-1]) if len(rows) else 0  # without the last interval, which may be one tick
     first = min(int(np.searchsorted(t_s, counts_from_s)), end)
     quiet = slice(int(np.searchsorted(t_s, quiet_from_s)), end)
+
     joint_counts = [scenario.layout(site).joints for site in scenario.names]
     first_joints = np.cumsum([0, *joint_counts]).tolist()
     pushes = []
@@ -401,7 +439,8 @@ def judge_twins(
             joints += range(first_joints[site], first_joints[site + 1])
         amplitudes = [measure_amplitude(path, joints) for path in twins.paths]
         for path, amplitude in zip(twins.paths, amplitudes, strict=True):
-            if np.isfinite(amplitude[first:end]).any():
+            is_affected = np.isfinite(amplitude[first:end]).any()
+            if is_affected:
                 growth = _judge_push(
                     path=path,
                     amplitude=amplitude,
@@ -411,6 +450,7 @@ def judge_twins(
                 )
                 pushes.append(growth._replace(group=group))
         departures += list(_find_departures(twins, amplitudes, joints, quiet))
+
     return TwinGrowth(
         "" if pushes else "no push moved anything",
         from_s=0.5 * float(t_s[first] + t_s[end]),
@@ -424,17 +464,23 @@ def judge_twins(
 
 
 def measure_amplitude(path: TwinPath, group: Sequence[int]) -> Array:
-    """Returns the logarithm of a difference's amplitude, shape (K,); -inf where it is zero.
+    """Returns the amplitude of the difference between a twin and its run, as a logarithm.
+
+    A push that died down to the rounding errors is repeated. Each stretch from one push to the
+    next (a leg) is evaluated by itself.
 
     Args:
-        path: a twin's difference from its run.
-        group: the joints that count.
+        path: The twin's difference from its run.
+        group: Indices of the joints that count.
+
+    Returns:
+        log A as the module's docstring defines it, shape (K,). It is -inf where the difference
+        is zero, and at least the logarithm of the largest difference of a joint.
     """
     amplitude: Array = path.largest[:, group].max(axis=1)
-    # from one push to the next
     leg_ends = [*path.pushed[1:], len(amplitude)]
     for leg in map(slice, path.pushed, leg_ends):
-        if leg.stop - leg.start > 2:
+        if leg.stop - leg.start > 2:  # too short for a derivative otherwise
             largest = amplitude[leg]
             whole = _measure_leg(path.last[leg][:, group], path.scale[leg], largest)
             larger = np.maximum(whole, largest)
@@ -443,12 +489,18 @@ def measure_amplitude(path: TwinPath, group: Sequence[int]) -> Array:
 
 
 def _measure_leg(last: Array, scale: Array, largest: Array) -> Array:
-    """Returns log A between two pushes, shape (K,), see the module's docstring.
+    """Returns log A of the differences between two pushes, as the module's docstring defines A.
+
+    Twins store their differences scaled, because these may become too small or too large for
+    floating-point numbers. Therefore the differences are first scaled by their largest value.
 
     Args:
-        last: scaled differences, shape (K, n).
-        scale: logarithm of their scale, shape (K,).
-        largest: logarithm of the largest difference of a joint, shape (K,).
+        last: Scaled differences of the joints, shape (K, n).
+        scale: Logarithm of the scale of each row, shape (K,).
+        largest: Logarithm of the largest difference of a joint, shape (K,).
+
+    Returns:
+        log A, shape (K,). Not finite where the difference is zero or unknown.
     """
     with np.errstate(
         divide="ignore",
@@ -460,7 +512,8 @@ def _measure_leg(last: Array, scale: Array, largest: Array) -> Array:
         peak = np.max(largest, where=is_finite, initial=-np.inf)
         d = last * np.exp(scale - peak)[:, np.newaxis]
         d_rate = np.gradient(d, 1.0 / BUCKETS_PER_S, axis=0)
-        # weighting by the local size lets all times count alike for the frequency
+        # w is the ratio of d' to d over the whole leg. Each row is divided by the local size
+        # of the difference, so that the rows where the difference is large do not dominate.
         size = np.exp(2.0 * (_running_maximum(largest) - peak))
         is_weighted = np.isfinite(largest) & (size > 0.0)
         weights = np.where(is_weighted, 1.0 / size, 0.0)[:, np.newaxis]
@@ -479,7 +532,16 @@ def _running_maximum(values: Array) -> Array:
 
 
 def _fit_trend(t_s: Array, amplitude: Array) -> EnvelopeFit:
-    """Returns the trend of an amplitude, given by its logarithm, shape (K,)."""
+    """Returns the trend of an amplitude.
+
+    Args:
+        t_s: Times, shape (K,), in s.
+        amplitude: Logarithm of the amplitude, shape (K,). Values that are not finite are
+            treated as an amplitude of zero.
+
+    Returns:
+        The trend. Undecided with fewer than two finite values.
+    """
     known = np.isfinite(amplitude)
     if known.sum() < 2:
         return EnvelopeFit(EnvelopeTrend.UNDECIDED, float("nan"))
@@ -494,17 +556,17 @@ def _judge_push(
     part: slice,
     joint_names: Sequence[str],
 ) -> PushGrowth:
-    """Returns the growth of a push, without its group.
+    """Returns how a push developed. The group is set by the caller.
 
-    A push that died down and was repeated counts from its last repetition, if that is long
-    enough ago.
+    A push that died down to the rounding errors was repeated. It is judged from its last
+    repetition on, if that is long enough ago.
 
     Args:
-        path: the twin's difference from its run.
-        amplitude: logarithm of the amplitude, shape (K,).
-        joints: the joints that count.
-        part: rows of the judged part, and of the part before it.
-        joint_names: names of all joints.
+        path: The twin's difference from its run.
+        amplitude: Logarithm of the amplitude of the difference, shape (K,).
+        joints: Indices of the joints that count.
+        part: Rows of the judged part, and of the part before it.
+        joint_names: Names of all joints.
     """
     t_s = path.t_s
     first = part.start
@@ -526,22 +588,27 @@ def _judge_push(
         group=0,
         becomes_rad_s=_exp(float(largest.max())),
     )
-    if path.died is not None or end < part.stop - BUCKETS_PER_S:
+
+    ended_early = path.died is not None or end < part.stop - BUCKETS_PER_S
+    if ended_early:
         trend = EnvelopeTrend.GROWS if path.died is None else EnvelopeTrend.DECAYS
         return growth._replace(trend=trend, ended_s=float(t_s[end - 1]))
+
     died_in_judged_part = len(leg_edges) > 1 and last_push > (first + end) // 2
     is_too_recent = end - last_push < (end - first) // 4
     if died_in_judged_part and (fit.trend is not EnvelopeTrend.GROWS or is_too_recent):
-        # the leg in which it died: the leg since then is too short
+        # The leg since the last repetition is too short to show the rate. Therefore the rate is
+        # that of the leg before, at the end of which the push had died.
         before = slice(leg_edges[-2], last_push)
         rate_per_s = _fit_trend(t_s[before], amplitude[before]).rate_per_s
         return growth._replace(trend=EnvelopeTrend.DECAYS, rate_per_s=rate_per_s)
+
     half_s = 0.5 * float(t_s[end - 1] - t_s[start])
     return growth._replace(factor=_exp(fit.rate_per_s * half_s))
 
 
 def _exp(logarithm: float) -> float:
-    """Returns the exponential of a number; infinity instead of an overflow."""
+    """Returns the exponential of a number, or infinity if it would overflow."""
     return math.exp(logarithm) if not logarithm > MOST_LOG else math.inf
 
 
@@ -551,16 +618,17 @@ def _find_departures(
     joints: Sequence[int],
     quiet: slice,
 ) -> Iterator[RestDeparture]:
-    """Yields the times in which the run departs from a rest, and its twins from the run.
+    """Yields the stretches of time in which a run departs from a rest by itself.
 
-    Windows of several lengths are tried, from the whole quiet part to a quarter of it. Of each
-    window the second half is judged.
+    The speed of the run and the differences from at least half of its twins must grow. Windows
+    of several lengths are tried, from the whole quiet part to a quarter of it. The second half
+    of each window is judged.
 
     Args:
-        twins: the run and its twins.
-        amplitudes: logarithms of the twins' amplitudes, shape (K,) each.
-        joints: the joints that count.
-        quiet: rows in which nobody acts on the run.
+        twins: The run and its twins.
+        amplitudes: Logarithm of the amplitude of each twin's difference, shape (K,) each.
+        joints: Indices of the joints that count.
+        quiet: Rows in which nobody acts on the run.
     """
     t_s = twins.paths[0].t_s
     with np.errstate(divide="ignore"):
@@ -570,13 +638,14 @@ def _find_departures(
         half = length // divisor
         if half < LEAST_LEFT_S * BUCKETS_PER_S:
             return
+        # Consecutive windows overlap by three quarters.
         for start in range(quiet.start, quiet.stop - 2 * half + 1, max(1, half // 2)):
             rows = slice(start, start + 2 * half)
             run_fit = _fit_trend(t_s[rows], log_speed[rows])
             if run_fit.trend is not EnvelopeTrend.GROWS:
                 continue
             if run_fit.rate_per_s * half < math.log(DOUBLES) * BUCKETS_PER_S:
-                continue
+                continue  # the speed does not double within the half
             twin_fits = [_fit_trend(t_s[rows], amplitude[rows]) for amplitude in amplitudes]
             growing = sum(fit.trend is EnvelopeTrend.GROWS for fit in twin_fits)
             if 2 * growing >= len(twin_fits):
@@ -591,12 +660,12 @@ def _find_departures(
 
 
 class LinearSizes(NamedTuple):
-    """The sizes of a push between which its twins are equal up to their scale.
+    """The range of sizes for which the effect of a push is proportional to its size.
 
     Attributes:
-        smallest: the smallest size.
-        largest: the largest size.
-        text: a sentence on these sizes, and on larger ones.
+        smallest: The smallest size.
+        largest: The largest size.
+        text: A sentence on this range, and on the effect of a larger push.
     """
 
     smallest: float
@@ -606,13 +675,14 @@ class LinearSizes(NamedTuple):
 
 @dataclass(frozen=True, repr=False)
 class PushedTwins(Result):
-    """Twins of a log that were pushed at an instant.
+    """Result of `trilat twin`: how pushes at a given time of a recorded run develop.
 
     Attributes:
-        log: the log.
-        at_s: time of the pushes, in s.
-        growth: growth of the pushes.
-        linear: sizes for which a push is linear; None if not requested.
+        log: The log of the run.
+        at_s: Time of the pushes, in s.
+        growth: Growth of the pushes.
+        linear: Sizes for which the effect of a push is proportional to its size. None if the
+            user did not ask for several sizes.
     """
 
     log: Log
@@ -621,7 +691,11 @@ class PushedTwins(Result):
     linear: LinearSizes | None = None
 
     def describe(self, pushed: PushGrowth) -> str:
-        """Returns a sentence on the growth of a push."""
+        """Returns a sentence on how a push developed.
+
+        Args:
+            pushed: Growth of the push.
+        """
         rate = "" if math.isnan(pushed.rate_per_s) else f" ({pushed.rate_per_s:+.3g} /s)"
         push = f"a push of {pushed.push.name} at {self.at_s:.4g} s"
         to_s = self.growth.to_s
@@ -638,14 +712,14 @@ class PushedTwins(Result):
         return text if pushed.trend in _FALLING else f"{text}; it shows no clear trend"
 
     def headline(self) -> str:
-        """Returns the sizes for which a push is linear, or the growth of the worst push."""
+        """Returns a sentence on the linear range if requested, else on the worst push."""
         if self.linear:
             return self.linear.text
         worst = self.growth.worst
         return self.describe(worst) if worst else self.growth.text
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a row per push."""
+        """Returns a row of plain values for each push."""
         rows = self.growth.to_json()["pushes"]
         return [
             {**row, "text": self.describe(push)}
@@ -653,7 +727,7 @@ class PushedTwins(Result):
         ]
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns plain values, with the keys of `trilat twin --json`."""
+        """Returns the result as plain values, with the keys of `trilat twin --json`."""
         growth = self.growth.to_json()
         return {
             "log": self.log.source,
@@ -724,7 +798,14 @@ def twin(
 
 
 def _parse_push(text: str) -> tuple[str, float]:
-    """Returns target and size of a push such as "m1.q1=1e-6"; the size has a default."""
+    """Parses a push such as "m1.q1=1e-6".
+
+    Returns:
+        The target and the size. The size may be missing and then has a default value.
+
+    Raises:
+        UsageError: The size is not a number.
+    """
     target, has_size, size = text.partition("=")
     try:
         return target.strip(), float(size) if has_size else PUSH_RAD
@@ -735,7 +816,14 @@ def _parse_push(text: str) -> tuple[str, float]:
 
 
 def _parse_sizes(text: str) -> list[float]:
-    """Returns sizes of pushes, a decade apart, of a range such as "1e-9:1e-3"."""
+    """Parses a range of push sizes such as "1e-9:1e-3".
+
+    Returns:
+        The sizes from the lower to the upper end of the range, each ten times the one before.
+
+    Raises:
+        UsageError: The text is no range, or the range is too short or too large.
+    """
     try:
         low, high = map(float, text.split(":"))
     except ValueError:
@@ -752,12 +840,15 @@ def _find_linear_sizes(
     growth: TwinGrowth,
     sizes: Sequence[float],
 ) -> LinearSizes:
-    """Returns the sizes of a push up to which its effect is proportional to its size.
+    """Finds the sizes of a push up to which its effect is proportional to its size.
+
+    Two pushes of neighbouring sizes are compared at all times. Their effect is proportional if
+    the ratio of their amplitudes differs from the ratio of their sizes by at most 10 %.
 
     Args:
-        scenario: scenario of the run.
-        growth: growth of the pushes, whose twins are in the order of the sizes.
-        sizes: rising sizes of the push.
+        scenario: Scenario of the run.
+        growth: Growth of the pushes, whose twins are in the order of the sizes.
+        sizes: Increasing sizes of the push.
     """
     assert growth.twins is not None
     paths = growth.twins.paths
@@ -768,6 +859,7 @@ def _find_linear_sizes(
     beyond = ""
     for n, (smaller, larger) in enumerate(pairwise(envelopes)):
         log_scale = np.full(len(larger), math.log(sizes[n + 1] / sizes[n]))
+        # Rounding errors decide on amplitudes below this limit: they count as proportional.
         known = (smaller > math.log(10.0 * SMALLEST)) & np.isfinite(larger)
         log_ratio = np.subtract(larger, smaller, out=log_scale.copy(), where=known)
         deviation = log_ratio - log_scale
@@ -781,18 +873,23 @@ def _find_linear_sizes(
             outcome = "goes another way"
             if grows and deviation[row] < 0.0:
                 outcome = "saturates"
-            kinds = {
-                environment.actor.kind
-                for site in scenario.sites.values()
-                for environment in site.environment
-            }
-            if TorqueKind.WALL in kinds:
+            if _has_wall(scenario):
                 outcome += " (there is a wall)"
             ratio = _exp(float(deviation[row]))
             times = f"x {ratio:.3g} of that at {paths[0].t_s[row]:.4g} s"
             beyond = f"; a push of {sizes[n + 1]:g} {outcome}: {times}"
             break
+
     text = f"not linear, from {largest_linear:g} {unit} on"
     if largest_linear > sizes[0]:
         text = f"linear from {sizes[0]:g} to {largest_linear:g} {unit}"
     return LinearSizes(sizes[0], largest_linear, text + beyond)
+
+
+def _has_wall(scenario: Scenario) -> bool:
+    """Returns True if a wall stands at some site, whose contact makes the run nonlinear."""
+    for site in scenario.sites.values():
+        for environment in site.environment:
+            if environment.actor.kind == TorqueKind.WALL:
+                return True
+    return False

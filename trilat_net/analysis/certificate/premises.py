@@ -1,19 +1,23 @@
-"""Checks the premises of the stability theorem against a log, and collects the evidence.
+"""Checks whether a recorded run meets the conditions of the stability theorem.
 
-The theorem is the paper's, with the weights and the repaired proof of docs/errata.md. The
-theorem requires:
+The theorem says that an energy function V of all arms never rises, unless an operator supplies
+energy. It is the paper's theorem, with the weights and the repaired proof of docs/errata.md. It
+holds only under certain conditions, which this package calls premises:
 
-- constant delays;
-- constant dominance factors under which every site reaches every other;
-- the same Kd at every site, up to a scalar per site;
-- the adaptive law at every site;
-- no operator, or operators that are passive with respect to r.
+- The delays are constant.
+- The dominance factors, with which the sites follow each other, are constant, and every site
+  reaches every other site through them.
+- The gain Kd is the same at every site, up to a scalar per site.
+- Every site uses the adaptive law, which estimates the parameters theta of its arm.
+- No operator moves an arm, or the operators are passive with respect to the filtered error r.
+
+A certificate also states on how many records it rests. This module collects that evidence.
 
 Invariant:
-    - Missing information never counts as stable: if too little of the run or too few periods
-      of V can be judged, or if a rerun took sites over as recorded, the run is left open.
-    - A log that was changed passes nothing.
     - A premise holds, fails, or cannot be decided, and always states its evidence.
+    - Missing information never makes a run stable. The run is left open if too few of its
+      ticks or periods of V can be judged, or if a rerun took some sites over as recorded.
+    - A log that was changed after it was written does not pass.
 """
 
 from collections.abc import Mapping, Sequence
@@ -50,19 +54,31 @@ from .energy_balance import (
 from .energy_terms import SiteConstants, derive_site_constants
 
 CONSTANT_DELAY_TOLERANCE_S = 1e-7
-"""Ages that differ by less than this count as equal, s: stamps are whole nanoseconds."""
+"""Ages of samples that differ by less than this count as equal, in s.
+
+Time stamps are whole nanoseconds, so that constant delays differ by rounding.
+"""
 SAMPLING_RISE_SHARE = 1e-4
-"""Rises of V up to this share of the scale count as sampling, if the residual is as large."""
+"""Largest rise of V that may be an effect of sampling, as a share of the scale of V.
+
+The rise is excused only up to the residual of the energy balance.
+"""
 MIN_FREE_S = 1.0
-"""Shortest free motion at the end of a run about which the theorem says anything, s."""
+"""Shortest motion without operators at the end of a run to which the theorem applies, in s."""
 MIN_FREE_AGES = 5.0
-"""The free motion must also last this many times the largest age of a sample in use."""
+"""Least length of that motion as a multiple of the largest age of a sample in use."""
 LEAST_ABSENCE_S = 0.1
-"""Sites end within this time of each other; shorter stretches of a run are ignored, s."""
+"""Shortest absence of a site that counts, in s.
+
+The records of sites that are present also end at times that differ by up to this much.
+"""
 LEAST_SPEED_M_S = 1e-9
-"""Rounding error of the speed along an axis along which an end effector cannot move, m/s."""
+"""Smallest speed of an end effector that counts as motion along an axis, in m/s.
+
+Slower speeds are the rounding error of an axis along which the end effector cannot move.
+"""
 MAX_LISTED_NAMES = 4
-"""Most links or sites that a sentence names."""
+"""Largest number of links or sites that a sentence names."""
 
 
 NO_COMMON_TIME = "there is no time at which every site has records"
@@ -73,12 +89,13 @@ _ORIENTATIONS_TEXT = (
 
 
 class Premise(NamedTuple):
-    """A premise of the theorem, and whether it holds in a run.
+    """A condition of the stability theorem, and whether a run meets it.
 
     Attributes:
-        name: key of the premise.
-        holds: True if it holds, False if it fails, None if the log does not decide it.
-        text: the evidence, as a sentence.
+        name: Key of the premise, as in "delays".
+        holds: True if the run meets the condition, False if not, None if the log does not show
+            it.
+        text: The evidence, as a sentence.
     """
 
     name: str
@@ -87,7 +104,14 @@ class Premise(NamedTuple):
 
 
 def explain_no_functional(scenario: Scenario) -> str:
-    """Returns the reasons why some sites have no functional V, or "" if every site has one."""
+    """Explains why the energy function V of the stability proof does not exist for some sites.
+
+    V needs the true parameters theta of the arm, a control law for which V is defined, and a
+    task other than following orientations.
+
+    Returns:
+        The sites and the reasons, separated by semicolons. Empty if V exists for every site.
+    """
     sites_by_reason: dict[str, list[str]] = {}
     for site, spec in scenario.sites.items():
         if not spec.arm.known:
@@ -105,7 +129,13 @@ def explain_no_functional(scenario: Scenario) -> str:
 
 
 class AbsentSpan(NamedTuple):
-    """A span of time during which a site was absent from the session, in s."""
+    """A span of time during which a site was absent from the session.
+
+    Attributes:
+        site: Name of the site.
+        from_s: Start, in s after the start of the session.
+        to_s: End, in s.
+    """
 
     site: str
     from_s: float
@@ -113,17 +143,21 @@ class AbsentSpan(NamedTuple):
 
 
 class FunctionalFacts(NamedTuple):
-    """Everything a log shows about the functional V of a run.
+    """What a log shows about the energy function V of its run.
+
+    `gather_facts` computes this object, and the checks of the premises read it.
 
     Attributes:
-        log: the log of the run.
-        energies: energies of every site.
-        balance: energy balance of all sites together.
-        groups: closed groups of sites at the first time at which beta is not unique; () if beta
-            is always unique.
-        absent: spans during which a site was absent.
-        unjudged: spans in which records are missing although all sites were present, in s.
-        tolerance: size that a rise of V must exceed to count, in J.
+        log: The log of the run.
+        energies: Energies of every site, by name.
+        balance: Energy balance of all sites together.
+        groups: Closed groups of sites, which follow nobody outside their group, at the first
+            time at which there are several. The weights beta of the sites in V are not unique
+            then. Empty if they are always unique.
+        absent: Spans during which a site was absent.
+        unjudged: Spans, as (start, end) in s, in which records are missing although all sites
+            were present.
+        tolerance: Size that a rise of V must exceed to count, in J.
     """
 
     log: Log
@@ -136,13 +170,15 @@ class FunctionalFacts(NamedTuple):
 
 
 class RunFacts(NamedTuple):
-    """Everything a log shows about a run, computed once.
+    """What a log shows about its run: the constants of the sites, and V if it exists.
+
+    V is the energy function of the stability proof.
 
     Attributes:
-        log: the log of the run.
-        constants: constants of every site; {} if some law or arm has no V.
-        functional: facts about V, or None if V cannot be computed.
-        unknown: the reason why `functional` is None; "" otherwise.
+        log: The log of the run.
+        constants: Constants of every site, by name. Empty if V does not exist for some site.
+        functional: Facts about V. None if V cannot be computed.
+        unknown: The reason why V cannot be computed. Empty if it can.
     """
 
     log: Log
@@ -152,14 +188,18 @@ class RunFacts(NamedTuple):
 
 
 def gather_facts(log: Log) -> RunFacts:
-    """Returns everything that a log shows about the run and its functional V.
+    """Computes everything from a log on which the checks of the premises are based.
+
+    The result states a reason instead of the facts about V if V does not exist for some site,
+    or if too few records overlap to compute it.
 
     Raises:
-        LogError: a record names a change that is not valid.
+        LogError: A record names a change that is not valid.
     """
     lacking = explain_no_functional(log.scenario)
     if lacking:
         return RunFacts(log, {}, unknown=lacking)
+
     constants = {site: derive_site_constants(log.scenario, site) for site in log.sites}
     energies = compute_site_energies(log)
     if not energies:
@@ -168,14 +208,15 @@ def gather_facts(log: Log) -> RunFacts:
     absent = find_absent_spans(log)
     if not balance.judged.any():
         return RunFacts(log, constants, unknown=NO_PERIOD)
+
     closed_groups = map(find_closed_groups, find_dominance_matrices(energies))
     ambiguous = next((groups for groups in closed_groups if len(groups) > 1), ())
     group_names = tuple(tuple(log.sites[n] for n in group) for group in ambiguous)
-    unjudged_while_present = [
-        (from_s, to_s)
-        for from_s, to_s in find_unjudged_spans(balance)
-        if not any(span.from_s < to_s and from_s < span.to_s for span in absent)
-    ]
+    unjudged_while_present = []
+    for from_s, to_s in find_unjudged_spans(balance):
+        if not any(span.from_s < to_s and from_s < span.to_s for span in absent):
+            unjudged_while_present.append((from_s, to_s))
+
     sampling_j = min(float(np.ptp(balance.residual)), SAMPLING_RISE_SHARE * balance.scale)
     facts = FunctionalFacts(
         log=log,
@@ -190,21 +231,37 @@ def gather_facts(log: Log) -> RunFacts:
 
 
 def check_premises(run: RunFacts) -> list[Premise]:
-    """Returns the premises of the theorem and the premise on sampled walls, each checked."""
-    law = "adaptive at every site, of arms whose theta is known"
-    premises: list[Premise | None] = [
-        Premise("law", bool(run.constants), law if run.constants else run.unknown)
-    ]
+    """Checks all premises of the theorem, and that sampled walls generate no energy.
+
+    Without the energy function V only the premises on the laws and on the walls can be checked.
+
+    Args:
+        run: Facts of the run, from `gather_facts`.
+
+    Returns:
+        The premises that concern this run, in the order in which a certificate lists them.
+    """
+    law_text = run.unknown
+    if run.constants:
+        law_text = "adaptive at every site, of arms whose theta is known"
+    premises: list[Premise | None] = [Premise("law", bool(run.constants), law_text)]
+
     if run.constants:
         premises += [_check_parameters(run), _check_gains(run)]
     premises.append(_check_walls(run.log))
     if run.functional is not None:
         premises += [check(run.functional) for check in FUNCTIONAL_CHECKS]
+
+    # A check returns None if its premise does not concern the run.
     return [premise for premise in premises if premise is not None]
 
 
 def _check_parameters(run: RunFacts) -> Premise:
-    """Checks that theta is in its box, and that parameters that are not adapted are known."""
+    """Checks that the adaptive laws can learn the parameters theta of their arms.
+
+    A law keeps its estimates within a box, so theta must lie in that box. Parameters that a law
+    does not adapt must be known from the start, and the law must compensate all friction.
+    """
     faults = []
     for site, constants in run.constants.items():
         theta = constants.theta
@@ -212,28 +269,37 @@ def _check_parameters(run: RunFacts) -> Premise:
         high = constants.high
         if ((theta < low) | (theta > high)).any():
             faults.append(f"{site}: theta is outside the box that its estimates are held in")
+
         gains = run.log.scenario.sites[site].control.gains(theta)
         first_estimate = np.clip(gains.theta_hat0, low, high)
-        if (~constants.adapts & (first_estimate != theta)).any():
+        is_wrong_forever = ~constants.adapts & (first_estimate != theta)
+        if is_wrong_forever.any():
             faults.append(f"{site}: a parameter is neither learnt nor known")
         if constants.unknown_friction.any():
             faults.append(f"{site}: its law does not compensate all friction of the joints")
+
+    if faults:
+        return Premise("parameters", False, _join_limited(faults))
     text = "every parameter is learnt or known, and no box excludes it"
-    return Premise("parameters", not faults, _join_limited(faults) or text)
+    return Premise("parameters", True, text)
 
 
 def _check_gains(run: RunFacts) -> Premise:
-    """Checks that the Kd of all sites are positive and equal up to a scalar per site."""
+    """Checks that the gains Kd of all sites are positive and equal up to a scalar per site.
+
+    Only then do weights beta exist with which the exchanged energies of all sites cancel in V.
+    """
     constants = run.constants
     Kd = np.array([site_constants.weighing_Kd for site_constants in constants.values()])
     scales = find_kd_scales(Kd)
     if scales is None:
         rows = []
         for site, site_constants in constants.items():
-            numbers = ", ".join(f"{value:g}" for value in site_constants.Kd)
-            rows.append(f"{site} ({numbers})")
+            values = ", ".join(f"{value:g}" for value in site_constants.Kd)
+            rows.append(f"{site} ({values})")
         text = f"Kd differs in shape between sites, so that no beta exists: {', '.join(rows)}"
         return Premise("Kd", False, text)
+
     if not Kd.all():  # NaN (an axis that is not followed) counts as positive
         return Premise("Kd", False, "some Kd is zero, but the theorem requires positive Kd")
     if np.ptp(scales) == 0.0:
@@ -243,27 +309,43 @@ def _check_gains(run: RunFacts) -> Premise:
 
 
 def _check_walls(log: Log) -> Premise | None:
-    """Checks that no sampled wall generates energy; None if no wall is sampled."""
+    """Checks that the simulated walls do not generate energy.
+
+    A simulated wall computes its torque once per tick and holds it for the tick period h. A
+    wall of stiffness K and damping B thereby generates energy in contact, unless the arm's own
+    damping exceeds K h / 2 + B.
+
+    Returns:
+        The premise. None if the scenario contains no such wall.
+    """
     if not any(map(list_sampled_walls, log.scenario.sites.values())):
         return None
     walls = find_wall_energies(log)
     if not walls:
         return Premise("walls", True, "no sampled wall was touched")
+
     active = [wall for wall in walls if wall.arm_damping_n_s_m <= wall.required_damping_n_s_m]
+    summary = "every sampled wall is passive"
+    listed_walls = walls
+    if active:
+        summary = "a sampled wall generates energy in contact"
+        listed_walls = active
     texts = [
         f"{wall.site}: K h / 2 + B is {wall.required_damping_n_s_m:.3g} N s/m, the arm's own "
         f"damping {wall.arm_damping_n_s_m:.3g}; generated {wall.generated_j:.3g} J "
         "with respect to qd"
-        for wall in active or walls
+        for wall in listed_walls
     ]
-    summary = "every sampled wall is passive"
-    if active:
-        summary = "a sampled wall generates energy in contact"
     return Premise("walls", not active, f"{summary}: {'; '.join(texts)}")
 
 
 def _check_dominance(run: FunctionalFacts) -> Premise:
-    """Checks that the dominance factors are constant and that alpha is irreducible."""
+    """Checks the dominance factors, with which the sites follow each other.
+
+    They must be constant, and their matrix alpha must be irreducible: every site follows every
+    other site, directly or through further sites. Otherwise some site has the weight zero in V,
+    or the weights are not unique.
+    """
     names = run.log.scenario.names
     energies = run.energies
     changing = [
@@ -275,11 +357,13 @@ def _check_dominance(run: FunctionalFacts) -> Premise:
         if losses:
             text += f": {_join_limited(losses)}; the remaining sites follow each other"
         return Premise("shares", False, text)
+
     Kd = np.array([energy.motion.constants.weighing_Kd for energy in energies.values()])
     weights = compute_lyapunov_weights(run.log.scenario.alpha, Kd)
     groups = [tuple(names[n] for n in group) for group in weights.groups]
     if len(groups) > 1:
         return Premise("shares", False, describe_closed_groups(groups))
+
     weightless = [site for site in names if site not in groups[0]]
     if weightless:
         followers = ", ".join(weightless)
@@ -288,6 +372,7 @@ def _check_dominance(run: FunctionalFacts) -> Premise:
             f"beta is 0, so V says nothing about {followers}, which follow as in a cascade"
         )
         return Premise("shares", False, text)
+
     text = "constant, alpha irreducible"
     if weights.scales is not None:
         beta_by_site = dict(zip(names, weights.beta, strict=True))
@@ -296,7 +381,15 @@ def _check_dominance(run: FunctionalFacts) -> Premise:
 
 
 def describe_closed_groups(groups: Sequence[Sequence[str]]) -> str:
-    """Returns a sentence on closed groups of sites, for which beta is not unique."""
+    """Returns the sentence that several groups of sites do not follow each other.
+
+    V needs a weight beta for each site. The weights of closed groups relative to each other are
+    arbitrary, so that V of all sites together means nothing.
+
+    Args:
+        groups: Names of the sites of each closed group, which follow nobody outside their
+            group.
+    """
     group_texts = " and ".join("{" + ", ".join(group) + "}" for group in groups)
     return (
         f"{group_texts} follow nobody outside: beta is not unique, certify each group by itself"
@@ -304,7 +397,11 @@ def describe_closed_groups(groups: Sequence[Sequence[str]]) -> str:
 
 
 def _check_delays(run: FunctionalFacts) -> Premise:
-    """Checks that the age of the sample in use is constant on every link."""
+    """Checks that the delay of every link is constant.
+
+    The delay is the age of the peer's sample that a site uses in a tick. It is not decided if
+    no sample of any peer came into use.
+    """
     varying = []
     constant = set()
     for site, energy in run.energies.items():
@@ -314,6 +411,7 @@ def _check_delays(run: FunctionalFacts) -> Premise:
             if not used.any():
                 continue
             age_s = (records.t_s - view.stamp_s)[used]
+            # With a constant delay the first sample in use is the first one that was sent.
             first_stamp_s = view.stamp_s[used][0]
             latest_first_s = records.h_s + CONSTANT_DELAY_TOLERANCE_S
             starts_late = records.first == 0 and first_stamp_s > latest_first_s
@@ -323,6 +421,7 @@ def _check_delays(run: FunctionalFacts) -> Premise:
                 varying.append(f"{peer}->{site} ({shortest_ms:.4g} to {longest_ms:.4g} ms)")
             else:
                 constant.add(f"{1e3 * age_s[0]:.4g} ms")
+
     if varying:
         text = f"the age of the sample in use varies: {_join_limited(varying)}"
         return Premise("delays", False, text)
@@ -333,26 +432,29 @@ def _check_delays(run: FunctionalFacts) -> Premise:
 
 
 def _check_following(run: FunctionalFacts) -> Premise:
-    """Checks that every site follows its peers all the time: it never holds, brakes or stops.
+    """Checks that every site follows its peers during the whole run.
 
-    A site whose reference moves at its largest allowed speed does not follow its peers either.
+    A site does not follow its peers while it holds its position, brakes, returns or has
+    stopped. It does not follow them either while the velocity of its reference is limited.
     """
     log = run.log
-    intervals_by_site = {site: find_mode_intervals(log[site]) for site in log.sites}
     interruptions = []
     is_halted = False
-    for site, intervals in intervals_by_site.items():
+    for site in log.sites:
+        intervals = find_mode_intervals(log[site])
         if intervals:
             from_s = intervals[0].from_s
             to_s = intervals[-1].to_s
             interruptions.append(f"{site} {from_s:.4g} to {to_s:.4g} s")
         is_halted = is_halted or any(interval.mode in HALTED_MODES for interval in intervals)
+
     for site in log.sites:
         limits = log.scenario.sites[site].limits
         limited_rows = ~find_unlimited_rows(limits, log[site].qd_des)
         if limited_rows.any():
             ticks = count_nouns(np.count_nonzero(limited_rows), "tick")
             interruptions.append(f"{site} with a reference as fast as it may be at {ticks}")
+
     if not interruptions:
         return Premise("following", True, "every site follows its peers all the time")
     modes = "hold, brake, return or stop" if is_halted else "hold, brake or return"
@@ -360,7 +462,7 @@ def _check_following(run: FunctionalFacts) -> Premise:
 
 
 def _check_torque_limits(run: FunctionalFacts) -> Premise:
-    """Checks that no torque is at its limit; names the joints of a chain that are."""
+    """Checks that no torque of a law was cut off at the limit of its actuator."""
     limited_sites = []
     for site, energy in run.energies.items():
         limited = energy.motion.limited
@@ -373,12 +475,15 @@ def _check_torque_limits(run: FunctionalFacts) -> Premise:
 
 
 def _name_joints(run: FunctionalFacts, site: str, affected: Bools) -> str:
-    """Returns the names of affected joints in parentheses; "" for the planar arm.
+    """Returns the names of affected joints in parentheses, with a space before them.
 
     Args:
-        run: facts of the run.
-        site: site of the arm.
-        affected: True for each row and joint that is affected, shape (K, n).
+        run: Facts of the run.
+        site: Site of the arm.
+        affected: True for each record and joint that is affected, shape (K, n).
+
+    Returns:
+        The text. Empty for the built-in planar arm, whose joints have no names.
     """
     model = run.log.scenario.arms[site]
     if model.chain is None:
@@ -388,9 +493,13 @@ def _name_joints(run: FunctionalFacts, site: str, affected: Bools) -> str:
 
 
 def _check_stops(run: FunctionalFacts) -> Premise | None:
-    """Checks that no joint touches its stops; None if no joint has stops.
+    """Checks that no joint touches the mechanical stops at the ends of its range.
 
-    Stops are passive with respect to qd, but not with respect to r.
+    Stops are passive with respect to the velocity qd, but not with respect to the filtered
+    error r = qd + Lambda e of the proof.
+
+    Returns:
+        The premise. None if no joint has stops.
     """
     arms = run.log.scenario.arms.values()
     chains = [model.chain for model in arms if model.chain is not None]
@@ -410,9 +519,14 @@ def _check_stops(run: FunctionalFacts) -> Premise | None:
 
 
 def _check_axes(run: FunctionalFacts) -> Premise | None:
-    """Checks that a site that is followed along an axis follows along that axis itself.
+    """Checks that each followed site follows along the same axes of the end effector.
 
-    An axis along which the followed site cannot move is exempt. None in joint space.
+    Sites that work in task space may follow their peers along some axes only. If a follower
+    uses an axis along which the followed site is free, the followed site is an operator on this
+    axis. An axis along which the followed site did not move has no effect.
+
+    Returns:
+        The premise. None if all sites work in joint space.
     """
     motions = {
         site: energy.motion
@@ -421,6 +535,7 @@ def _check_axes(run: FunctionalFacts) -> Premise | None:
     }
     if not motions:
         return None
+
     faults = []
     for site, motion in motions.items():
         free_axes = np.array(motion.constants.axes) == 0.0
@@ -432,12 +547,22 @@ def _check_axes(run: FunctionalFacts) -> Premise | None:
                 faults.append(
                     f"{follower} follows {site} along an axis that {site} does not follow"
                 )
+
+    if faults:
+        return Premise("axes", False, _join_limited(faults))
     text = "every site follows along each axis along which it moves and is followed"
-    return Premise("axes", not faults, _join_limited(faults) or text)
+    return Premise("axes", True, text)
 
 
 def _check_singular_poses(run: FunctionalFacts) -> Premise | None:
-    """Checks that no pose is damped, so that J J+ = I; None in joint space."""
+    """Checks that no arm came near a singular pose, where its inverse Jacobian is damped.
+
+    The proof needs J J+ = I, with the Jacobian J and its pseudo-inverse J+. Near a singular
+    pose the pseudo-inverse is damped to stay finite, and the product differs from I.
+
+    Returns:
+        The premise. None if all sites work in joint space.
+    """
     near = []
     least_by_site = {}
     for site, energy in run.energies.items():
@@ -449,6 +574,7 @@ def _check_singular_poses(run: FunctionalFacts) -> Premise | None:
             first_row = int(np.argmax(following.damping > 0.0))
             first_s = energy.motion.records.t_s[first_row]
             near.append(f"{site} from {first_s:.4g} s on")
+
     if not least_by_site:
         return None
     if near:
@@ -462,8 +588,10 @@ def _check_singular_poses(run: FunctionalFacts) -> Premise | None:
 def _check_operators(run: FunctionalFacts) -> Premise:
     """Checks that operators and environments are passive with respect to r.
 
-    They are passive if they supply no more energy than they absorbed before. If they do supply
-    energy, the premise still holds for a run that ends with enough free motion.
+    An operator is the person or program that moves an arm, and r is the filtered error of the
+    proof. Operators are passive if they supply no more energy than they absorbed before. If
+    they do supply energy, the premise still holds for a run that ends with enough motion
+    without operators: the theorem then applies to that motion.
     """
     energies = run.energies
     balance = run.balance
@@ -473,12 +601,15 @@ def _check_operators(run: FunctionalFacts) -> Premise:
         t_s = records.t_s[records.tau_x.any(axis=1)]
         if len(t_s):
             push_times_s[site] = t_s
+
     external = run.log.scenario.external
     if external and not push_times_s:
+        # Arms outside the program record their external torque only if they measure it.
         text = f"no record says who pushes the arm of {_join_limited(external)}"
         return Premise("hands", None, text)
     if not push_times_s:
         return Premise("hands", True, "nobody pushes")
+
     weightless = [
         site
         for n, site in enumerate(energies)
@@ -487,15 +618,17 @@ def _check_operators(run: FunctionalFacts) -> Premise:
     if weightless:
         sites = _join_limited(weightless)
         return Premise("hands", False, f"{sites}, of beta 0, is pushed: V does not show that")
+
     supplied_j = float(rise_above_minimum(balance.external_work).max())
     sources = " and ".join(balance.external)
     if supplied_j <= 1e-9 * balance.scale + ZERO_ENERGY_J:
         text = f"the {sources} only absorbed energy: passive with respect to r"
         return Premise("hands", True, text)
-    released_s = max(t_s[-1] for t_s in push_times_s.values())
+
     in_task_space = any(energy.motion.constants.axes for energy in energies.values())
     r = "qd - v" if in_task_space else "qd + Lambda e"
     text = f"the {sources} supplied up to {supplied_j:.3g} J with respect to r = {r}"
+    released_s = max(t_s[-1] for t_s in push_times_s.values())
     ages_s = [energy.largest_age_s for energy in energies.values()]
     free_s = float(balance.t_s[-1] - released_s)
     least_s = max(MIN_FREE_S, MIN_FREE_AGES * max(ages_s))
@@ -510,7 +643,10 @@ def _check_operators(run: FunctionalFacts) -> Premise:
 
 
 def _check_records(run: FunctionalFacts) -> Premise:
-    """Checks that the records are complete while all sites were present."""
+    """Checks that no records are missing while all sites were present.
+
+    Missing records leave the premise undecided, because V is unknown there.
+    """
     if not run.unjudged:
         text = "every period of every site rests on records"
         if not run.balance.judged.all():
@@ -522,7 +658,14 @@ def _check_records(run: FunctionalFacts) -> Premise:
 
 
 def find_absent_spans(log: Log) -> list[AbsentSpan]:
-    """Returns the spans during which sites were absent from the session, in order."""
+    """Returns the spans during which sites were absent from the session.
+
+    A site is absent while it has left and not yet joined again, and also from its last record
+    to the end of the run if the session reported that it left or was lost.
+
+    Returns:
+        The spans, sorted by their start.
+    """
     end_s = recorded_end_s(log)
     absent = []
     for site in log.sites:
@@ -533,20 +676,27 @@ def find_absent_spans(log: Log) -> list[AbsentSpan]:
             absent.append(AbsentSpan(site, start_s, end_s))
         last_s = (part.last_tick + 1) / part.rate_hz
         kinds = {event.kind for event in log.events if event.about == site}
-        if last_s < end_s - LEAST_ABSENCE_S and kinds & {"left", "lost"}:
+        has_left = bool(kinds & {"left", "lost"})
+        if last_s < end_s - LEAST_ABSENCE_S and has_left:
             absent.append(AbsentSpan(site, last_s, end_s))
     return sorted(absent, key=lambda span: span[1:])
 
 
 def _check_presence(run: FunctionalFacts) -> Premise | None:
-    """Checks that all sites are present all the time; None if they are.
+    """Checks that all sites are present during the whole run.
 
-    Otherwise the text describes each stretch during which all sites were present.
+    The theorem says nothing about a run in which a site is absent, but it applies to each
+    stretch of time between the absences. Therefore the evidence describes each stretch.
+
+    Returns:
+        The premise, which fails. None if all sites are present all the time.
     """
     if not run.absent:
         return None
     stretch_start_s = max(energy.begin_s for energy in run.energies.values())
     end_s = recorded_end_s(run.log)
+
+    # Empty absences at the start and at the end let the loop treat all stretches alike.
     absences = [(stretch_start_s, stretch_start_s)]
     absences += [(span.from_s, span.to_s) for span in run.absent]
     absences.append((end_s, end_s))
@@ -555,6 +705,7 @@ def _check_presence(run: FunctionalFacts) -> Premise | None:
         if from_s - stretch_start_s > LEAST_ABSENCE_S:
             stretches.append(_describe_stretch(run.energies, stretch_start_s, from_s))
         stretch_start_s = max(stretch_start_s, to_s)
+
     absent = _join_limited(
         [f"{site} {from_s:.4g} to {to_s:.4g} s" for site, from_s, to_s in run.absent]
     )
@@ -577,16 +728,20 @@ FUNCTIONAL_CHECKS = (
     _check_records,
     _check_presence,
 )
-"""Checks of the premises that only a run with a known V decides."""
+"""Checks of the premises that can be decided only if V is known, in the order of the report."""
 
 
 def _describe_stretch(energies: Mapping[str, SiteEnergy], from_s: float, to_s: float) -> str:
-    """Returns a phrase on a stretch of time: when all sites follow, and whether delays vary.
+    """Describes a stretch of time during which all sites were present.
 
     Args:
-        energies: energies of every site.
-        from_s: start of the stretch, in s.
-        to_s: end of the stretch, in s.
+        energies: Energies of every site.
+        from_s: Start of the stretch, in s.
+        to_s: End of the stretch, in s.
+
+    Returns:
+        A phrase that states the time from which all sites follow their peers, and whether the
+        delays are constant from then on.
     """
     all_follow_s = from_s
     for energy in energies.values():
@@ -596,9 +751,11 @@ def _describe_stretch(energies: Mapping[str, SiteEnergy], from_s: float, to_s: f
         if not_following.any():
             last_row = np.flatnonzero(not_following)[-1]
             all_follow_s = max(all_follow_s, float(records.t_s[last_row]) + records.h_s)
+
     stretch = f"{from_s:.4g} to {to_s:.4g} s"
     if to_s - all_follow_s < LEAST_ABSENCE_S:
         return f"{stretch} not all follow"
+
     varying = []
     for site, energy in energies.items():
         records = energy.motion.records
@@ -612,34 +769,46 @@ def _describe_stretch(energies: Mapping[str, SiteEnergy], from_s: float, to_s: f
 
 
 def find_unjudged_spans(balance: EnergyBalance) -> list[tuple[float, float]]:
-    """Returns the (start, end) of every span in which records are missing, in s."""
+    """Returns the spans in which V cannot be judged because records are missing.
+
+    Args:
+        balance: Energy balance of all sites.
+
+    Returns:
+        The (start, end) of each span, in s.
+    """
+    # Judged periods before and after the run give each span a start and an end.
     padded = np.concatenate([[True], balance.judged, [True]])
     edges = np.flatnonzero(np.diff(padded.astype(np.int8)))
     times = balance.t_s[edges]
-    return list(zip(times[::2].tolist(), times[1::2].tolist(), strict=True))
+    starts_s = times[::2].tolist()
+    ends_s = times[1::2].tolist()
+    return list(zip(starts_s, ends_s, strict=True))
 
 
 def _join_limited(items: Sequence[str]) -> str:
-    """Returns items separated by commas; beyond `MAX_LISTED_NAMES`, how many more there are."""
+    """Joins texts with commas. Counts the texts beyond `MAX_LISTED_NAMES` instead."""
     text = ", ".join(items[:MAX_LISTED_NAMES])
     hidden = len(items) - MAX_LISTED_NAMES
     return f"{text} and {hidden} more" if hidden > 0 else text
 
 
 def _format_by_site(values: Mapping[str, float]) -> str:
+    """Returns a text such as "m1 0.5, s 2" of a value per site."""
     return ", ".join(f"{site} {value:.4g}" for site, value in values.items())
 
 
 class Evidence(NamedTuple):
-    """The records that a certificate rests on.
+    """The records on which a certificate rests, and whether they suffice.
 
     Attributes:
-        coverage: recorded ticks and expected ticks of every site.
-        functional_share: share of the periods of V that rest on records, while no site was
-            absent; None without V.
-        min_coverage: least share, of ticks and of periods, that passes.
-        integrity: whether the log is unchanged since it was written.
-        unmet: sites that an open-loop rerun took over as recorded.
+        coverage: Recorded ticks and expected ticks of every site.
+        functional_share: Share of the periods of V that rest on records, counted only while no
+            site was absent. None if V is not judged.
+        min_coverage: Least share, of the ticks and of the periods, that suffices.
+        integrity: Whether the log is unchanged since it was written.
+        unmet: Sites that a rerun took over as recorded, so that they did not react to the
+            rerun.
     """
 
     coverage: Coverage
@@ -650,7 +819,7 @@ class Evidence(NamedTuple):
 
     @property
     def reasons(self) -> list[str]:
-        """Sentences on everything in the evidence that leaves the run open."""
+        """Sentences on everything in the evidence that leaves the judgement of the run open."""
         reasons = []
         if not self.integrity.passed:
             reasons.append(f"the log is not as it was made: {self.integrity.text}")
@@ -666,11 +835,11 @@ class Evidence(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The evidence in one sentence."""
+        """The coverage and the integrity of the log in one sentence."""
         return f"{self.coverage.describe(self.min_coverage)}; {self.integrity.text}"
 
     def to_json(self) -> dict[str, Any]:
-        """Returns the evidence, ready for JSON."""
+        """Returns the evidence as plain values, with the keys of `trilat certify --json`."""
         return {
             "coverage": self.coverage.share,
             "functional_coverage": self.functional_share,
@@ -682,11 +851,11 @@ class Evidence(NamedTuple):
 
 
 def collect_evidence(run: RunFacts, min_coverage: float) -> Evidence:
-    """Returns the evidence for a certificate: coverage, integrity, and the judged share of V.
+    """Collects on how many records a certificate rests, and whether the log is unchanged.
 
     Args:
-        run: facts of the run.
-        min_coverage: least share, of ticks and of periods of V, that passes.
+        run: Facts of the run, from `gather_facts`.
+        min_coverage: Least share, of the ticks and of the periods of V, that suffices.
     """
     log = run.log
     facts = run.functional
@@ -694,11 +863,13 @@ def collect_evidence(run: RunFacts, min_coverage: float) -> Evidence:
     if facts is not None and not facts.groups:
         t_s = facts.balance.t_s
         judged = facts.balance.judged
+        # Spans that are unjudged because a site was absent do not count against the share.
+        unjudged_in_absence = set(find_unjudged_spans(facts.balance)) - set(facts.unjudged)
         all_present = np.ones(len(judged), dtype=np.bool_)
-        # spans that are unjudged because a site was absent do not count against the share
-        for from_s, to_s in set(find_unjudged_spans(facts.balance)) - set(facts.unjudged):
+        for from_s, to_s in unjudged_in_absence:
             all_present &= (t_s[:-1] < from_s) | (t_s[:-1] >= to_s)
         functional_share = float(judged[all_present].mean()) if all_present.any() else 0.0
+
     recorded_ticks = {site: len(np.unique(log[site].tick)) for site in log.sites}
     expected_ticks = {site: log.expected_ticks(site) for site in log.sites}
     return Evidence(

@@ -1,12 +1,23 @@
-"""Issues the stability certificate of a log: premises, energy balance, end of the run, verdict.
+"""Issues the stability certificate of a recorded run.
+
+A certificate answers whether the run was stable, and why. The judgement is based on:
+
+- the conditions (premises) of the stability theorem, which `premises` checks;
+- the energy function V of the stability proof, which must not rise unless an operator or an
+  environment supplied the energy;
+- the motion at the end of the run, which `run_end` judges without any theory;
+- small pushes in repeated executions (twins) of the run, if they were computed;
+- the energies that control laws declare, which `observed_energy` checks;
+- how complete the records are, and whether the log was changed.
 
 Invariant:
-    - By the theorem V does not rise except by supplied energy. A rise beyond the work of
-      operators and environments is reported with its time, amount and sources.
-    - Energy without a source means that the log's equations did not produce the records.
-    - Anything that a log cannot decide is stated. Without a functional V the end of the run
+    - A rise of V beyond the work of operators and environments is reported with its time, its
+      amount and the sources of the energy, because the theorem excludes it.
+    - Energy without any source means that the equations stated in the log did not produce the
+      records. The energy balance is then called broken.
+    - Anything that a log cannot decide is stated. If V does not exist, the end of the run
       alone decides.
-    - JSON keys end in their unit, and unknown values are null.
+    - Keys of the JSON output end in their unit, and unknown values are null.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -45,17 +56,21 @@ from .premises import (
 )
 
 BROKEN_BALANCE_SHARE = 2e-4
-"""Largest unexplained energy as a share of the scale, beyond the error of the trapezoid
-rule.
+"""Largest energy without a source that counts as rounding, as a share of the scale of V.
+
+The error of the trapezoid rule, with which the energies are integrated, is added to it.
 """
 CLEAR_BREAK_SHARE = 1e-3
-"""A larger share than this, with a smaller uncertainty, cannot be due to a long period."""
+"""Unexplained energy above this share of the scale shows that records are false.
+
+Below it, a tick period that is long for the gains may be the cause.
+"""
 TORQUE_TOLERANCE = 1e-6
-"""Largest difference of a recorded torque from Eq. (13), relative to 1 + |tau|."""
+"""Largest difference of a recorded torque from the law, Eq. (13), relative to 1 + |tau|."""
 COARSE_TOLERANCE_SHARE = 1e-2
-"""A tolerance above this share of the scale decides nothing about a rise."""
+"""Largest tolerance of a rise, as a share of the scale of V, with which V is still judged."""
 NOTABLE_CAUSE_SHARE = 0.05
-"""A source is named as a cause of a rise if it supplied more than this share of the rise."""
+"""Least share of a rise of V that a source must supply to be named as a cause."""
 
 FALSE_RECORDS_TEXT = "these records were not made by the equations that the log claims"
 _PERIOD_OR_FALSE = (
@@ -63,12 +78,11 @@ _PERIOD_OR_FALSE = (
     "`trilat verify` tells which"
 )
 
-
 _REFUTING_FINDINGS = (ObservedFinding.NEGATIVE, ObservedFinding.BROKEN)
 
 
 class StabilityFinding(StrEnum):
-    """Class of a verdict on V; the value is the text for people."""
+    """What the energy function V shows about a run. The value is the text for people."""
 
     COVERED = "covered by the theorem"
     DID_NOT_RISE = "outside the theorem, yet V did not rise"
@@ -81,11 +95,11 @@ class FunctionalRise(NamedTuple):
     """The largest rise of V that operators and environments did not supply.
 
     Attributes:
-        from_s: time of the minimum of V before the rise, in s.
-        at_s: time of the highest V, in s.
-        amount: size of the rise, in J.
-        causes: work of each source during the rise, in J, largest first; only sources of more
-            than 5 % of the rise.
+        from_s: Time of the minimum of V before the rise, in s.
+        at_s: Time of the highest V, in s.
+        amount: Size of the rise, in J.
+        causes: Energy that each source supplied during the rise, in J, largest first. Only
+            sources of more than 5 % of the rise are listed.
     """
 
     from_s: float
@@ -95,13 +109,13 @@ class FunctionalRise(NamedTuple):
 
 
 class StabilityVerdict(NamedTuple):
-    """Verdict on V.
+    """What the energy function V shows about a run, with the numbers.
 
     Attributes:
-        finding: class of the verdict.
-        text: the verdict as a sentence.
-        rise: the largest rise beyond the tolerance; None if V did not rise.
-        tolerance: size that a rise must exceed to count, in J.
+        finding: The finding.
+        text: The finding as a sentence.
+        rise: The largest rise of V beyond the tolerance. None if V did not rise.
+        tolerance: Size that a rise must exceed to count, in J.
     """
 
     finding: StabilityFinding
@@ -111,16 +125,19 @@ class StabilityVerdict(NamedTuple):
 
 
 class EndPoseRoots(NamedTuple):
-    """Characteristic roots of the loop, linearised at the pose at which a run ended.
+    """Characteristic roots of the control loop, linearised at the pose at which a run ended.
+
+    The roots show whether small motions about this pose die away. They are computed by
+    `theory.linear_analysis` and added to a certificate there.
 
     Attributes:
-        verdict: "stable", "unstable" or "at the edge", for small motions; "" if no such loop
-            exists.
-        rate_per_s: the largest real part of all roots that are not zero by structure, 1/s; None
-            if there is no such root.
-        exact: True if the roots are those of the sampled loop with repeating delays; otherwise
-            they may raise a doubt, but prove nothing.
-        text: the pose and its roots, or the reason why there are none.
+        verdict: "stable", "unstable" or "at the edge", for small motions. Empty if the loop
+            cannot be linearised.
+        rate_per_s: Largest real part of the roots, in 1/s, without those that are zero because
+            of the structure of the loop. None if there is no such root.
+        exact: True if the loop was analysed with its ticks and its repeating delays. Otherwise
+            the roots may cast doubt on a run, but prove nothing.
+        text: The pose and its roots, or the reason why there are no roots.
     """
 
     verdict: str
@@ -131,22 +148,23 @@ class EndPoseRoots(NamedTuple):
 
 @dataclass(frozen=True, repr=False)
 class Certificate(Result):
-    """Stability certificate of a log.
+    """Stability certificate of a recorded run, created by `certify`.
 
     Attributes:
-        premises: the premises of the theorem, each checked.
-        verdict: verdict on V.
-        end: end of the run, judged from e and qd alone.
-        evidence: coverage of the run by records, and integrity of the log.
-        balance: energy balance of all sites; None without a functional, or if beta is not
-            unique.
-        paper_balance: balance with the paper's weights, ones; None if these are the right
-            weights, or if there is no balance.
-        groups: closed groups of sites, if there are several: beta is not unique then.
-        energies: energies of every site; {} without a functional.
-        roots: roots of the loop at the pose where the run ended; None if not computed.
-        observed: verdict on the energies that laws declare; None if no law declares any.
-        twins: growth of small pushes; None if not computed.
+        premises: The conditions of the stability theorem, each checked.
+        verdict: What the energy function V shows.
+        end: The end of the run, judged from the errors e and the velocities qd alone.
+        evidence: On how many records the certificate rests, and whether the log was changed.
+        balance: Energy balance of all sites. None if V does not exist, or if the weights beta
+            of the sites in V are not unique.
+        paper_balance: Energy balance with the weights of the paper, which are 1 for every site.
+            None if these are the right weights, or if there is no balance.
+        groups: Closed groups of sites, which follow nobody outside their group. Empty unless
+            there are several, so that beta is not unique.
+        energies: Energies of every site, by name. Empty if V does not exist.
+        roots: Roots of the loop at the pose where the run ended. None if not computed.
+        observed: Check of the energies that control laws declare. None if no law declares any.
+        twins: Growth of small pushes in repeated runs. None if not computed.
     """
 
     premises: list[Premise]
@@ -163,17 +181,19 @@ class Certificate(Result):
 
     @property
     def paper_weights_rise(self) -> FunctionalRise | None:
-        """The largest rise of V with the paper's weights; None if V does not rise with them."""
+        """The largest rise of V with the weights of the paper. None if V does not rise."""
         if self.paper_balance is None:
             return None
         return _find_largest_rise(self.paper_balance, self.verdict.tolerance)
 
     @property
     def bounded_by_v(self) -> bool:
-        """True if V bounds every site: V did not rise, and no site's weight is zero.
+        """True if V bounds the motion of every site.
 
-        A site of zero weight is bounded as well if the premise on dominance factors is the only
-        one that fails: the site converges after the sites that it follows (docs/errata.md, 11).
+        V must not have risen, and must depend on every site: no site has the weight zero. A
+        site with the weight zero is bounded as well if only the premise on the dominance
+        factors fails, because the site then converges after the sites that it follows
+        (docs/errata.md, 11).
         """
         did_not_rise = (StabilityFinding.COVERED, StabilityFinding.DID_NOT_RISE)
         if self.balance is None or self.verdict.finding not in did_not_rise:
@@ -186,10 +206,10 @@ class Certificate(Result):
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Sentences on everything that leaves the run open or refutes it.
+        """Sentences on everything that prevents a stable judgement or refutes it.
 
         They concern the end of the run, its twins, V, the roots at the end pose, the energies
-        that laws declare, and the log.
+        that control laws declare, and the completeness of the log, in this order.
         """
         reasons = [*self.end.reasons]
         twin_reason = self._twin_verdict.reason
@@ -199,16 +219,17 @@ class Certificate(Result):
             reasons.append(self.verdict.text)
         elif self.balance is not None:
             reasons += describe_unsupplied_growth(self.balance, self.verdict.tolerance)
-        if self.roots is not None and self.roots.verdict == "unstable":
-            doubtful_rate = None if self.roots.exact else self.roots.rate_per_s
-            twins = self.twins
-            # roots that are not exact give way to twins, which rerun the recorded ticks
-            if (
-                doubtful_rate is None
-                or twins is None
-                or doubtful_rate <= twins.excluded_rate_per_s
-            ):
-                reasons.append(self.roots.text)
+
+        roots = self.roots
+        if roots is not None and roots.verdict == "unstable":
+            # Twins repeat the recorded ticks. Therefore roots that are not exact do not count
+            # if the twins exclude growth at the rate of the roots.
+            is_disproved = False
+            if self.twins is not None and not roots.exact and roots.rate_per_s is not None:
+                is_disproved = not roots.rate_per_s <= self.twins.excluded_rate_per_s
+            if not is_disproved:
+                reasons.append(roots.text)
+
         if self.observed is not None and self.observed.finding in _REFUTING_FINDINGS:
             reasons.append(self.observed.text)
         reasons += self.evidence.reasons
@@ -216,6 +237,7 @@ class Certificate(Result):
 
     @property
     def _twin_verdict(self) -> TwinVerdict:
+        """Judgement of the run by its end and, if they were computed, by its twins."""
         if self.twins is None:
             return TwinVerdict(self.end.stability)
         settles = None
@@ -228,7 +250,11 @@ class Certificate(Result):
 
     @property
     def stability(self) -> Stability:
-        """Judgement by the end of the run and its twins; reasons leave a stable run open."""
+        """The judgement of the run.
+
+        The end of the run and its twins decide. If they say "stable" but there are `reasons`
+        against it, the run is left open.
+        """
         stability = self._twin_verdict.stability
         if stability is Stability.STABLE and self.reasons:
             return Stability.OPEN
@@ -236,18 +262,18 @@ class Certificate(Result):
 
     @property
     def passed(self) -> bool:
-        """True if the run is stable; decides the exit code."""
+        """True if the run is stable. This decides the exit code of `trilat certify`."""
         return self.accepts(())
 
     def headline(self) -> str:
-        """Returns the judgement, and how the run ended."""
+        """Returns the judgement and the behaviour at the end of the run, in one line."""
         text = f"{self.stability}: {self.end.behaviour}"
         if self.stability is Stability.STABLE and self.end.stability is not Stability.STABLE:
             text += ", yet every push dies away"
         return text
 
     def to_dict(self) -> JsonObject:
-        """Returns plain values, with the keys of `trilat certify --json`."""
+        """Returns the certificate as plain values, with the keys of `trilat certify --json`."""
         verdict = self.verdict
         end = self.end
         balance = self.balance
@@ -278,13 +304,17 @@ class Certificate(Result):
         }
 
     def to_rows(self) -> list[JsonObject]:
-        """Returns a row per premise."""
+        """Returns a row of plain values for each premise."""
         return [premise._asdict() for premise in self.premises]
 
     def accepts(self, accepted: Collection[str]) -> bool:
-        """True if the run is stable, or "bounded" or "open" and that is accepted.
+        """Returns True if the run is stable, or has another judgement that the user accepts.
 
         A run with a broken energy balance or a changed log is never accepted.
+
+        Args:
+            accepted: Further judgements to accept: "bounded" for a bounded oscillation, "open"
+                for a run that cannot be decided.
         """
         if self.verdict.finding is StabilityFinding.BROKEN:
             return False
@@ -303,20 +333,24 @@ def certify(
     min_coverage: float = MIN_COVERAGE,
     own_laws: bool = False,
 ) -> Certificate:
-    """Returns the certificate of a log, which may be torn, short or empty.
+    """Issues the stability certificate of a recorded run.
+
+    The log may be torn, short or empty. Twins and roots at the end pose are not computed.
 
     Args:
-        log: the log of a run.
-        min_coverage: share of every site's ticks that must be judged; with less, a run with a
-            stable end is open.
-        own_laws: run the code of laws from outside the program, if they declare energies.
+        log: The log of the run.
+        min_coverage: Least share of the ticks of each site that must be recorded. With less, a
+            run that would be stable is left open.
+        own_laws: True to run the code of control laws that are not part of this program, which
+            is necessary to check the energies that they declare.
 
     Raises:
-        LogError: a record cannot be read, or names a change that is not valid.
+        LogError: A record cannot be read, or names a change that is not valid.
     """
     run = gather_facts(log)
     facts = run.functional
     premises = check_premises(run)
+
     verdict = StabilityVerdict(StabilityFinding.NOT_JUDGED, run.unknown)
     if facts is not None:
         verdicts = (judge(facts, premises) for judge in JUDGEMENTS)
@@ -325,6 +359,7 @@ def certify(
             verdict = verdict._replace(tolerance=facts.tolerance)
     if verdict.finding in (StabilityFinding.BROKEN, StabilityFinding.NOT_JUDGED):
         verdict = verdict._replace(text=f"{verdict.finding}: {verdict.text}")
+
     certificate = Certificate(
         premises=premises,
         verdict=verdict,
@@ -334,8 +369,9 @@ def certify(
     )
     if facts is None:
         return certificate
-    if facts.groups:
+    if facts.groups:  # without unique weights there is no balance of all sites
         return replace(certificate, groups=facts.groups, energies=facts.energies)
+
     paper_balance = None
     if not np.allclose(facts.balance.beta, 1.0):
         paper_balance = compute_energy_balance(facts.energies, paper_weights=True)
@@ -350,9 +386,10 @@ def certify(
 def _judge_site_balances(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdict | None:
     """Returns a verdict if the energy balance of some site does not close.
 
-    Each site is judged by itself. The arm of an external site need not follow its theta, and
-    its angles and velocities are not measured at the same instant: V cannot be judged then. The
-    records of any other site are false, unless a long period may be the cause.
+    Each site is judged by itself. If energy appears or disappears without a source, the records
+    are false, unless a tick period that is too long for the gains may be the cause. V cannot be
+    judged if only external arms are concerned, which run outside this program: such an arm need
+    not follow its theta, and its angles and velocities are not measured at the same instant.
     """
     energies = run.energies
     scale = run.balance.scale
@@ -364,6 +401,7 @@ def _judge_site_balances(run: FunctionalFacts, _: Sequence[Premise]) -> Stabilit
     wrong = [site for site in energies if error_j[site] > compute_bound_j(site)]
     if not wrong:
         return None
+
     external = run.log.scenario.external
     simulated = []
     for site in wrong:
@@ -376,6 +414,7 @@ def _judge_site_balances(run: FunctionalFacts, _: Sequence[Premise]) -> Stabilit
     from_s = energy.motion.records.t_s[int(np.argmax(exceeds))]
     amount = f"{error_j[site]:.3g} J of {scale:.4g} J"
     text = f"the energy of {site} does not add up from {from_s:.4g} s on, by {amount}"
+
     if not simulated:
         arms = f"the external arm of {', '.join(external)}"
         text += f": {arms} does not move as its theta says, or somebody pushes it"
@@ -387,7 +426,7 @@ def _judge_site_balances(run: FunctionalFacts, _: Sequence[Premise]) -> Stabilit
 
 
 def _judge_torques(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdict | None:
-    """Returns a verdict if recorded torques differ from those of Eq. (13)."""
+    """Returns a verdict if recorded torques differ from the control law, Eq. (13)."""
     for site, energy in run.energies.items():
         records = energy.motion.records
         error_nm = energy_terms.measure_torque_error(energy.motion)
@@ -403,15 +442,14 @@ def _judge_torques(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdi
     return None
 
 
-def _judge_weights(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdict | None:
-    """Returns a verdict if beta is not unique."""
-    if not run.groups:
-        return None
-    return StabilityVerdict(StabilityFinding.NOT_JUDGED, describe_closed_groups(run.groups))
+def _judge_decidability(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdict | None:
+    """Returns a verdict if V cannot be judged.
 
-
-def _judge_precision(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdict | None:
-    """Returns a verdict if the energies are not known precisely enough."""
+    This is the case if the weights beta of the sites in V are not unique, or if the energies
+    are not known precisely enough to decide whether V rose.
+    """
+    if run.groups:
+        return StabilityVerdict(StabilityFinding.NOT_JUDGED, describe_closed_groups(run.groups))
     scale = run.balance.scale
     if run.tolerance <= COARSE_TOLERANCE_SHARE * scale + 2.0 * ZERO_ENERGY_J:
         return None
@@ -423,7 +461,11 @@ def _judge_precision(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVer
 
 
 def _judge_course(run: FunctionalFacts, premises: Sequence[Premise]) -> StabilityVerdict:
-    """Returns the verdict by the premises, and by whether V rose."""
+    """Returns the verdict of a run whose V can be judged.
+
+    The verdict depends on whether V rose beyond the supplied energy, and on whether the
+    premises of the theorem hold.
+    """
     balance = run.balance
     failed = [premise.name for premise in premises if premise.holds is False]
     outside = f"outside the theorem ({', '.join(failed)})"
@@ -441,6 +483,8 @@ def _judge_course(run: FunctionalFacts, premises: Sequence[Premise]) -> Stabilit
         )
         text += f"; given by {causes}" if causes else "; nobody gave it"
         return StabilityVerdict(StabilityFinding.ROSE, text, rise)
+
+    # Energies that are rounding errors are written as zero.
     first, last = (x if x > ZERO_ENERGY_J else 0.0 for x in (balance.V[0], balance.V[-1]))
     text = "V did not rise"
     if balance.external:
@@ -450,6 +494,7 @@ def _judge_course(run: FunctionalFacts, premises: Sequence[Premise]) -> Stabilit
     text += f": {first:.4g} J at {from_s:.4g} s, {last:.4g} J at {to_s:.4g} s"
     undecided = [premise.text for premise in premises if premise.holds is None]
     text = "; ".join([text, *undecided])
+
     if failed:
         return StabilityVerdict(StabilityFinding.DID_NOT_RISE, f"{outside}, yet {text}")
     covered = StabilityFinding.COVERED.value
@@ -461,22 +506,26 @@ def _judge_course(run: FunctionalFacts, premises: Sequence[Premise]) -> Stabilit
 JUDGEMENTS = (
     _judge_site_balances,
     _judge_torques,
-    _judge_weights,
-    _judge_precision,
+    _judge_decidability,
     _judge_course,
 )
-"""Judgements in order: whether the records are false, whether V can be judged, how V moved.
+"""Judgements of V, in order. The first one that returns a verdict decides.
 
-The first judgement that returns a verdict decides.
+They decide whether the records are false, whether V can be judged, and whether V rose.
 """
 
 
 def _find_largest_rise(balance: EnergyBalance, tolerance: float) -> FunctionalRise | None:
-    """Returns the largest rise of V that was not supplied, or None if below the tolerance.
+    """Finds the largest rise of V above an earlier minimum, and the sources of its energy.
+
+    The work of operators and environments is subtracted from V before.
 
     Args:
-        balance: energy balance of all sites.
-        tolerance: size that the rise must exceed, in J.
+        balance: Energy balance of all sites.
+        tolerance: Size that the rise must exceed, in J.
+
+    Returns:
+        The rise. None if it does not exceed the tolerance.
     """
     V = balance.unsupplied
     rise = rise_above_minimum(V)
@@ -484,6 +533,7 @@ def _find_largest_rise(balance: EnergyBalance, tolerance: float) -> FunctionalRi
     if rise[last] <= tolerance:
         return None
     first = int(V[: last + 1].argmin())
+
     work_by_source = {}
     for name, work in balance.work.items():
         if name not in EXTERNAL_SOURCES:
@@ -491,6 +541,7 @@ def _find_largest_rise(balance: EnergyBalance, tolerance: float) -> FunctionalRi
             work_by_source[name if is_link else f"the {name}"] = work
     work_by_source["sampling"] = balance.sampling
     work_by_source["what beta does not cancel"] = -balance.transfer
+
     causes = {}
     for name, work in work_by_source.items():
         causes[name] = float(work[last] - work[first])
@@ -508,15 +559,18 @@ def _find_largest_rise(balance: EnergyBalance, tolerance: float) -> FunctionalRi
 
 
 def describe_unsupplied_growth(balance: EnergyBalance, tolerance: float) -> list[str]:
-    """Returns sentences on growth of V against a run that looks stable.
+    """Returns sentences on a growth of V that contradicts a run that looks stable.
 
-    V, less the work of operators and environments, must not end above its beginning. Nor may it
-    rise at the end of the judged half: above its minimum there, by more than half of the amount
-    by which it fell within that half.
+    The work of operators and environments is subtracted from V. The rest must not end above its
+    beginning. In the second half of the run it must not end higher above its minimum than half
+    of the amount by which it fell from the middle of the run to that minimum.
 
     Args:
-        balance: energy balance of all sites.
-        tolerance: size that a rise must exceed to count, in J.
+        balance: Energy balance of all sites.
+        tolerance: Size that a rise must exceed to count, in J.
+
+    Returns:
+        A sentence for each rule that is violated.
     """
     V = balance.unsupplied
     half = len(V) // 2
@@ -524,6 +578,7 @@ def describe_unsupplied_growth(balance: EnergyBalance, tolerance: float) -> list
     gained = float(V[-1] - V[0])
     if gained > tolerance:
         sentences.append(f"V ends {gained:.3g} J above its beginning, and nobody gave that")
+
     judged = V[half:]
     lowest = int(judged.argmin())
     risen = float(judged[-1] - judged[lowest])
@@ -537,6 +592,12 @@ def describe_unsupplied_growth(balance: EnergyBalance, tolerance: float) -> list
 
 
 def _functional_to_json(certificate: Certificate, balance: EnergyBalance) -> JsonObject:
+    """Returns the part of the JSON output about V, as plain values.
+
+    Args:
+        certificate: The certificate.
+        balance: Its energy balance, which must exist.
+    """
     V = balance.V
     sites = certificate.energies
     paper_balance = certificate.paper_balance
@@ -570,6 +631,7 @@ def _functional_to_json(certificate: Certificate, balance: EnergyBalance) -> Jso
 
 
 def _rise_to_json(rise: FunctionalRise | None) -> JsonObject | None:
+    """Returns a rise of V as plain values, with the keys of the JSON output."""
     if rise is None:
         return None
     return {
@@ -581,8 +643,10 @@ def _rise_to_json(rise: FunctionalRise | None) -> JsonObject | None:
 
 
 def _last_values(columns: dict[str, Array]) -> dict[str, float]:
+    """Returns the value at the end of the run of each curve, by the name of the curve."""
     return {name: float(values[-1]) for name, values in columns.items()}
 
 
 def _largest(values: Array) -> float:
+    """Returns the largest absolute value."""
     return float(np.abs(values).max())
