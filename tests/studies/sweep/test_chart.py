@@ -71,8 +71,8 @@ def test_lines_depend_on_neither_runs_nor_processes() -> None:
         for some, jobs in ((everything, 1), (one, 2))
     )
     assert (closed.rank, rooted.rank) == (0, 1)
-    assert np.array_equal(closed.spare, again.spare)
-    assert np.array_equal(rooted.spare, other.spare)
+    assert np.array_equal(closed.excess, again.excess)
+    assert np.array_equal(rooted.excess, other.excess)
 
 
 def test_for_short_delays_p_d_has_its_condition_as_line() -> None:
@@ -169,8 +169,8 @@ def test_line_of_p_d_is_half_of_stiffness_times_delay() -> None:
     found = [line.crossings(column, DAMPING) for column in range(6)]
     assert [len(some) for some in found] == [0, 1, 1, 1, 1, 0]
     assert np.allclose([some[0] for some in found[1:5]], [0.5, 1.0, 1.5, 2.0], rtol=1e-9)
-    assert (line.spare > 0.0)[-1, 0]
-    assert not (line.spare > 0.0)[0, -1]
+    assert (line.excess > 0.0)[-1, 0]
+    assert not (line.excess > 0.0)[0, -1]
 
 
 def test_a_law_without_a_condition_has_no_line() -> None:

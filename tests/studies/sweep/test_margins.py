@@ -23,7 +23,7 @@ from trilat_net.studies.sweep.margin_search import (
     search_key_margin,
     search_margins,
 )
-from trilat_net.studies.sweep.stability_map import StableInterval
+from trilat_net.studies.sweep.stability_map import StabilityEdge
 from trilat_net.studies.sweep.sweep_cell import CellClass, CellResult
 from trilat_net.studies.sweep.sweep_plan import SweepPlan, plan_sweep
 
@@ -99,7 +99,7 @@ def test_a_key_of_whole_numbers_is_searched_in_them() -> None:
     assert [one.margin.stable for one in search_margins(wanted, within, 1)] == [True, True]
 
 
-def found(*spans: StableInterval, stable: bool | None = None) -> GridPointMargin:
+def found(*spans: StabilityEdge, stable: bool | None = None) -> GridPointMargin:
     cell = asked().cell(0)
     return GridPointMargin(
         cell._replace(values=(100.0,)), 1, KeyMargin(spans, stable, 0, 12), (0.5, 2.0), "", 0.51
@@ -107,7 +107,7 @@ def found(*spans: StableInterval, stable: bool | None = None) -> GridPointMargin
 
 
 def test_table_tells_edges_islands_and_what_there_is_none_of() -> None:
-    edges = (StableInterval(0.49, 0.492, False, True), StableInterval(1.8, 2.1, True, False))
+    edges = (StabilityEdge(0.49, 0.492, False, True), StabilityEdge(1.8, 2.1, True, False))
     every = [found(*edges), found(stable=True), found(stable=False), found()]
     grid = SweepMargins(asked(), WITHIN, every).table()
     edge = grid.headers.index("edge of d (N m s/rad)")
@@ -128,7 +128,7 @@ def test_table_tells_edges_islands_and_what_there_is_none_of() -> None:
 
 
 def test_the_facts_are_json_and_name_the_command() -> None:
-    margins = SweepMargins(asked(), WITHIN, [found(StableInterval(0.49, 0.492, False, True))])
+    margins = SweepMargins(asked(), WITHIN, [found(StabilityEdge(0.49, 0.492, False, True))])
     told = json.loads(json.dumps(margins.to_dict(), allow_nan=False))
     assert told["command"] == margins.command
     assert told["command"].endswith(

@@ -101,7 +101,7 @@ def test_an_edge_stands_beside_each_line_with_its_difference() -> None:
 def test_a_line_that_is_not_there_has_no_difference() -> None:
     plane = drawn()
     table = tabulate_edges(
-        plane, plane.panels[0], (EXACT._replace(spare=np.full((5, 5), np.nan)),)
+        plane, plane.panels[0], (EXACT._replace(excess=np.full((5, 5), np.nan)),)
     )
     assert all(row[-2:] == ("-", "-") for row in table.rows)
 

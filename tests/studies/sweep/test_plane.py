@@ -13,7 +13,7 @@ from trilat_net.scenario.scenario_reader import list_shipped
 from trilat_net.studies.sweep.stability_map import (
     CELL_CLASSES,
     PlaneAxis,
-    StableInterval,
+    StabilityEdge,
     build_plane,
     find_map_edges,
 )
@@ -93,7 +93,7 @@ def test_whole_numbers_stay_whole() -> None:
 )
 def test_uneven_values_are_drawn_one_apart(values: tuple[float, ...], even: bool) -> None:
     side = PlaneAxis("k", values, "k")
-    assert side.even is even
+    assert side.is_evenly_spaced is even
     assert side.positions.tolist() == list(values if even else range(len(values)))
 
 
@@ -101,7 +101,7 @@ def test_no_runs_no_numbers_and_too_many_panels_are_refused() -> None:
     with pytest.raises(UsageError, match="no cell has run"):
         build_plane([], KEYS, P_D)
     with pytest.raises(
-        UsageError, match=r"needs an axis of numbers, and link\.order has words only"
+        UsageError, match=r"needs a numeric axis, and link\.order has no numbers"
     ):
         build_plane(list(rows(link__order=("newest", "in_order"))), ["link.order"], P_D)
     with pytest.raises(UsageError, match=r"at most 12 panels, and rate_hz would make 13"):
@@ -111,7 +111,7 @@ def test_no_runs_no_numbers_and_too_many_panels_are_refused() -> None:
 YES, NO, UNKNOWN = CellClass.CONVERGED, CellClass.DIVERGED, CellClass.UNDECIDED
 
 
-def up(column: tuple[CellClass, ...]) -> list[StableInterval]:
+def up(column: tuple[CellClass, ...]) -> list[StabilityEdge]:
     """The edges of the first column of a map in which all are like this one."""
     found = drawn(lambda _, d, *__: column[DAMPINGS.index(d)])
     return [edge for x, edge in find_map_edges(found, found.panels[0]) if x == DELAYS_MS[0]]

@@ -42,8 +42,8 @@ from .stability_map import (
     MapPanel,
     MapPlane,
     PlaneAxis,
+    StabilityEdge,
     StabilityMap,
-    StableInterval,
     find_map_edges,
 )
 from .sweep_cell import CellClass
@@ -301,17 +301,17 @@ def _draw_line(axes: Axes, plane: MapPlane, line: MapLine) -> None:
     """Draws a line as the zero contour of its quantity, extrapolated to the panel's borders."""
     x = _extend_positions(plane.x)
     y = _extend_positions(plane.y)
-    spare = _extrapolate_rows(line.spare, y)
-    spare = _extrapolate_rows(spare.T, x).T
+    excess = _extrapolate_rows(line.excess, y)
+    excess = _extrapolate_rows(excess.T, x).T
     # a border at zero may coincide with the first position: only one of the two is kept
     keep_x = np.diff(x, append=np.inf) > 0.0
     keep_y = np.diff(y, append=np.inf) > 0.0
-    kept_spare = np.ma.masked_invalid(spare[np.ix_(keep_y, keep_x)])
+    kept_excess = np.ma.masked_invalid(excess[np.ix_(keep_y, keep_x)])
     look = _LINE_STYLES[line.rank % len(_LINE_STYLES)]
     contour = axes.contour(
         x[keep_x],
         y[keep_y],
-        kept_spare,
+        kept_excess,
         levels=[0.0],
         colors=look["color"],
         linewidths=look["linewidth"],
@@ -375,7 +375,7 @@ def _compute_borders(axis: PlaneAxis) -> Array:
     ends = 1.5 * positions[[0, -1]] - 0.5 * positions[[1, -2]]
     middles = 0.5 * (positions[1:] + positions[:-1])
     borders: Array = np.concatenate([ends[:1], middles, ends[1:]])
-    if axis.even and positions[0] >= 0.0:
+    if axis.is_evenly_spaced and positions[0] >= 0.0:
         return np.maximum(borders, 0.0)
     return borders
 
@@ -399,7 +399,7 @@ def _set_scale(axes: Axes, plane: MapPlane) -> None:
 
 def _set_ticks(axis: Axis, plane_axis: PlaneAxis) -> None:
     """Sets the ticks of one axis of a panel."""
-    if plane_axis.even:
+    if plane_axis.is_evenly_spaced:
         axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 2.5, 4, 5, 10]))
         return
     texts = [f"{value:g}" for value in plane_axis.values]
@@ -621,23 +621,23 @@ def tabulate_edges(plane: MapPlane, panel: MapPanel, lines: Sequence[MapLine]) -
     return TextTable(tuple(heads), rows)
 
 
-def _list_crossings(line: MapLine, plane: MapPlane) -> Iterator[tuple[float, StableInterval]]:
+def _list_crossings(line: MapLine, plane: MapPlane) -> Iterator[tuple[float, StabilityEdge]]:
     """Yields the crossings of a line with the columns, as edges of zero width."""
     for column, x in enumerate(plane.x.values):
         for value in line.crossings(column, plane.y):
             above = int(np.searchsorted(plane.y.values, value))
             below = max(above - 1, 0)
-            stable_below = bool(line.spare[below, column] > 0.0)
-            yield x, StableInterval(value, value, stable_below)
+            stable_below = bool(line.excess[below, column] > 0.0)
+            yield x, StabilityEdge(value, value, stable_below)
 
 
-def _format_edge(edge: StableInterval) -> str:
+def _format_edge(edge: StabilityEdge) -> str:
     if edge.low == edge.high:
         return f"{edge.low:.4g}"
     return f"{edge.low:g} to {edge.high:g}"
 
 
-def _format_nearest_edge(value: float, edges: Sequence[StableInterval]) -> str:
+def _format_nearest_edge(value: float, edges: Sequence[StabilityEdge]) -> str:
     """Returns the text of the edge nearest to a value, or "-" without edges."""
     if not edges:
         return "-"
@@ -645,7 +645,7 @@ def _format_nearest_edge(value: float, edges: Sequence[StableInterval]) -> str:
     return _format_edge(nearest)
 
 
-def _compare_with_line(edge: StableInterval, values: Sequence[float]) -> list[str]:
+def _compare_with_line(edge: StabilityEdge, values: Sequence[float]) -> list[str]:
     """Returns the table cells of a line's nearest crossing and of its relative difference."""
     if not values:
         return ["-", "-"]

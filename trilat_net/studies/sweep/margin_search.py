@@ -29,7 +29,7 @@ from ...theory.linear_edge import find_root_crossings
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
 from . import sweep_cell
 from .fixed_gains import FAIR_COMPARISON, describe_fixed_gains
-from .stability_map import StableInterval, evaluate_criterion, find_criterion_edge
+from .stability_map import StabilityEdge, evaluate_criterion, find_criterion_edge
 from .sweep_plan import (
     SweepCell,
     SweepPlan,
@@ -60,7 +60,7 @@ class KeyMargin(NamedTuple):
         runs: number of values that were run.
     """
 
-    spans: tuple[StableInterval, ...]
+    spans: tuple[StabilityEdge, ...]
     stable: bool | None
     undecided: int
     runs: int
@@ -95,7 +95,7 @@ def search_key_margin(
         scan = np.round(scan)
     values = list(dict.fromkeys(scan.tolist()))
     decided = [value for value in values if classify(value) is not None]
-    spans = list[StableInterval]()
+    spans = list[StabilityEdge]()
     for below, above in pairwise(decided):
         if results[below] != results[above]:
             spans.append(_narrow_edge(classify, below, above, tolerance=tolerance, whole=whole))
@@ -106,7 +106,7 @@ def search_key_margin(
 
 def _narrow_edge(
     classify: StabilityTest, low: float, high: float, *, tolerance: float, whole: bool
-) -> StableInterval:
+) -> StabilityEdge:
     """Returns the edge between two values that were decided differently."""
     low_stable = classify(low)
     high_stable = classify(high)
@@ -123,7 +123,7 @@ def _narrow_edge(
         high = above
     else:  # an undecided zone: its upper end is searched by itself
         _, high = _bisect(is_not_high_side, above, high, tolerance=tolerance, whole=whole)
-    return StableInterval(low, high, low_stable is True, sharp)
+    return StabilityEdge(low, high, low_stable is True, sharp)
 
 
 def _bisect(
@@ -444,7 +444,7 @@ class SweepMargins(Result):
         return [json_path, page_path]
 
 
-def _format_edge(margin: KeyMargin, span: StableInterval | None) -> list[str]:
+def _format_edge(margin: KeyMargin, span: StabilityEdge | None) -> list[str]:
     """Returns the table cells of an edge and of its stable side."""
     if span is None:
         texts = {
@@ -460,7 +460,7 @@ def _format_edge(margin: KeyMargin, span: StableInterval | None) -> list[str]:
     return [interval, "below" if span.stable_below else "above"]
 
 
-def _format_theory(span: StableInterval | None, value: float | None) -> list[str]:
+def _format_theory(span: StabilityEdge | None, value: float | None) -> list[str]:
     """Returns the table cells of an edge of theory and of its relative difference."""
     if value is None:
         return ["-", "-"]

@@ -1,23 +1,29 @@
-"""Builds a stability map: the results of a sweep on a plane, with the limits of theory.
+"""Builds a stability map, which shows for which parameters a scenario is stable.
 
-The plane has two numeric axes with their labels, a panel per setting of the other axes, class
-counts per grid point, and the measured edges. The lines show where a closed-form stability
-criterion, or the dominant root of the linear loop, is marginal.
+A sweep runs one scenario at every point of a grid of parameters, usually with several seeds of
+the random numbers. The map draws the first two numeric parameters as axes x and y. Every other
+swept parameter, and the control law, has one panel per setting. Each grid point of a panel
+shows how many of its runs were stable. A column is the set of grid points with the same x.
+
+On top of these measurements the map draws limits from theory as lines: the limit of a stability
+criterion in closed form, and the values at which the rightmost root of the linearised loop
+crosses the imaginary axis.
 
 Invariant:
-    - The runs come from the results alone, the lines from the plan alone.
-    - Every run is in exactly one grid point of one panel.
-    - A label takes its words from the scenario key and its unit from the key's suffix; a gain
+    - The measurements come from the results alone, and the lines from the plan alone.
+    - Every run is counted at exactly one grid point of one panel.
+    - The label of an axis names the scenario key, with the unit in which the key ends. A gain
       has the unit that its control law states.
-    - A measured edge lies between two decided grid points of a column, one stable and one not.
-      The majority of the runs decides a grid point; a draw leaves it undecided. Undecided grid
-      points widen an edge.
-    - A line is the zero set of a quantity of theory. It is located between two neighbouring
-      grid points of a column of which exactly one is stable.
-    - A criterion applies only if all of its hypotheses hold; its excess is positive if it is
-      met.
-    - The criterion of P+d covers the law as computed from tick to tick. The line of the roots
-      does so only under scheme `digital`.
+    - The majority of the decided runs decides whether a grid point is stable. A draw leaves the
+      grid point undecided.
+    - A measured edge lies between two decided grid points of a column, one of them stable and
+      the other not. If undecided grid points lie between the two, the edge is wider.
+    - A line is the zero set of a quantity from theory. The crossing of a line with a column
+      lies between two neighbouring grid points, of which the theory calls exactly one stable.
+    - A criterion is used only if all of its hypotheses hold. Its excess, the margin by which
+      its inequality is met, is positive if the criterion promises stability.
+    - The criterion of the law P+d accounts for the computation in ticks. The line of the roots
+      does so only under the integration scheme `digital`.
 """
 
 import math
@@ -49,21 +55,22 @@ from .sweep_results import SweepResults
 
 RunCounts = NDArray[np.int64]
 PanelSettings = tuple[tuple[str, Any], ...]
-"""The setting of the axes that are not drawn, as pairs of key and value."""
+"""Values of the axes that are not drawn, as pairs of a key and a value."""
 
 CELL_CLASSES = tuple(CellClass)
-"""The order of the last axis of `MapPanel.counts`."""
+"""Classes of a run, in the order of the last dimension of `MapPanel.counts`."""
 MAX_PANELS = 12
-"""Largest number of panels of a map."""
+"""Largest number of panels of a map, so that the panels remain legible."""
 
 
 class PlaneAxis(NamedTuple):
-    """One axis of a plane.
+    """One axis of a map: the values of a scenario key.
 
     Attributes:
-        key: the scenario key of the axis.
-        values: the values of the axis in the unit of the key, in rising order.
-        label: the text at the axis.
+        key: Scenario key that varies along the axis, such as "link.delay_ms". Empty for the
+            vertical axis of a map with a single numeric axis.
+        values: Values of the key in rising order, in the unit of the key.
+        label: Text at the axis, with the unit.
     """
 
     key: str
@@ -71,8 +78,8 @@ class PlaneAxis(NamedTuple):
     label: str
 
     @property
-    def even(self) -> bool:
-        """True if the values are equally spaced."""
+    def is_evenly_spaced(self) -> bool:
+        """True if the values are equally spaced, up to rounding."""
         steps = np.diff(self.values)
         if len(steps) < 2:
             return True
@@ -81,22 +88,28 @@ class PlaneAxis(NamedTuple):
 
     @property
     def positions(self) -> Array:
-        """Drawing positions of the values: the values if equally spaced, else indices."""
-        if self.even:
+        """Positions at which the values are drawn.
+
+        Equally spaced values are drawn at their own positions. Other values, as in 1, 10, 100,
+        are drawn at equal distances, at their indices.
+        """
+        if self.is_evenly_spaced:
             return np.array(self.values)
         return np.arange(len(self.values), dtype=np.float64)
 
 
 class MapPanel(NamedTuple):
-    """The runs with one setting of the axes that are not drawn.
+    """One panel of a map: the runs with the same setting of the axes that are not drawn.
 
     Attributes:
-        title: the setting of the axes that are not drawn, in words; "" without such axes.
-        settings: the same setting as pairs; with the key "law" if laws are swept.
-        counts: number of runs per grid point and class, shape (y, x, 4), in the order of
-            `CELL_CLASSES`.
-        exponents_per_s: mean growth exponents over the seeds, in 1/s, shape (y, x); NaN without
-            an exponent.
+        title: The setting as a text, such as "p d, delay 200 ms". Empty if there are no such
+            axes.
+        settings: The setting as pairs of a key and a value. The key of a swept law is "law".
+        counts: Number of runs for each grid point and class, shape (y, x, 4). The classes are
+            in the order of `CELL_CLASSES`.
+        exponents_per_s: Growth exponent of each grid point, the mean over its seeds, in 1/s,
+            shape (y, x). It is the rate at which a small disturbance grows; NaN if it was not
+            measured.
     """
 
     title: str
@@ -106,7 +119,7 @@ class MapPanel(NamedTuple):
 
     @property
     def runs(self) -> RunCounts:
-        """Number of runs per grid point, shape (y, x)."""
+        """Number of all runs at each grid point, shape (y, x)."""
         total: RunCounts = self.counts.sum(axis=2)
         return total
 
@@ -119,13 +132,19 @@ class MapPanel(NamedTuple):
 
     @property
     def decided(self) -> RunCounts:
-        """Number of decided runs per grid point, shape (y, x)."""
+        """Number of runs at each grid point that are stable or not stable, shape (y, x).
+
+        An undecided run shows neither, for example because it was too short.
+        """
         undecided = self.counts[:, :, CELL_CLASSES.index(CellClass.UNDECIDED)]
         return self.runs - undecided
 
     @property
     def share(self) -> Array:
-        """Share of the decided runs that are stable, shape (y, x); NaN without decided runs."""
+        """Fraction of the decided runs that are stable, shape (y, x).
+
+        NaN at grid points without decided runs.
+        """
         stable = self.stable
         decided = self.decided
         share: Array = np.full(decided.shape, np.nan)
@@ -134,10 +153,15 @@ class MapPanel(NamedTuple):
 
 
 class MapPlane(NamedTuple):
-    """The results of a sweep, on panels with the same two axes.
+    """The measured part of a map: panels that have the same two axes.
 
-    There is a panel per setting of the axes that are not drawn. If only one axis is drawn, y
-    has an empty key and a single value.
+    If only one swept axis is numeric, the vertical axis y has an empty key and a single value.
+
+    Attributes:
+        scenario: Name of the swept scenario.
+        x: Horizontal axis.
+        y: Vertical axis.
+        panels: One panel per setting of the axes that are not drawn.
     """
 
     scenario: str
@@ -147,56 +171,60 @@ class MapPlane(NamedTuple):
 
     @property
     def judged_by_twins(self) -> bool:
-        """True if a panel has growth exponents."""
+        """True if the sweep measured growth exponents, by runs repeated with a small push."""
         return any(np.isfinite(panel.exponents_per_s).any() for panel in self.panels)
 
     @property
     def seeds(self) -> int:
-        """Largest number of runs at a grid point."""
+        """Number of runs at the grid point with the most runs."""
         return max(int(panel.runs.max()) for panel in self.panels)
 
 
 def build_plane(
     rows: Sequence[Mapping[str, Any]], axes: Sequence[str], scenario: Scenario
 ) -> MapPlane:
-    """Returns the plane of the results over the first two numeric axes.
+    """Arranges the runs of a sweep on panels over the first two numeric axes.
 
     Args:
-        rows: one mapping per run, with a value per axis and the text of its "verdict".
-        axes: the keys of the axes, in their given order; with "law" if laws are swept.
-        scenario: the swept experiment, for the labels.
+        rows: One mapping per run, with a value for each axis, the class of the run under the
+            key "verdict", and possibly the growth exponent under "exponent_per_s".
+        axes: Keys of the swept axes, in the order of the sweep. The key "law" stands for the
+            control law, if several laws were swept.
+        scenario: The swept scenario, from which the labels are taken.
 
     Raises:
-        UsageError: there is nothing to draw, or there would be more than `MAX_PANELS` panels.
+        UsageError: There are no runs, no axis is numeric, or there would be more than
+            `MAX_PANELS` panels.
     """
     if not rows:
         raise UsageError("no cell has run: there is nothing to draw")
-    numeric = [key for key in axes if all(is_number(row[key]) for row in rows)]
-    drawn = numeric[:2]
-    if not drawn:
-        raise UsageError(
-            f"a map needs an axis of numbers, and {', '.join(axes)} has words only"
-        )
+    numeric_keys = [key for key in axes if all(is_number(row[key]) for row in rows)]
+    drawn_keys = numeric_keys[:2]
+    if not drawn_keys:
+        raise UsageError(f"a map needs a numeric axis, and {', '.join(axes)} has no numbers")
+
     values = {key: {row[key] for row in rows} for key in axes}
-    plane_axes = [
-        PlaneAxis(key, tuple(sorted(values[key])), label_axis(key, scenario)) for key in drawn
-    ]
+    plane_axes = []
+    for key in drawn_keys:
+        axis = PlaneAxis(key, tuple(sorted(values[key])), label_axis(key, scenario))
+        plane_axes.append(axis)
     if len(plane_axes) == 1:
         plane_axes.append(PlaneAxis("", (0.0,), ""))
     x, y = plane_axes
 
-    panel_keys = [key for key in axes if key not in drawn and len(values[key]) > 1]
-    rows_of: dict[PanelSettings, list[Mapping[str, Any]]] = {}
+    panel_keys = [key for key in axes if key not in drawn_keys and len(values[key]) > 1]
+    rows_of_panel: dict[PanelSettings, list[Mapping[str, Any]]] = {}
     for row in rows:
         settings = tuple((key, row[key]) for key in panel_keys)
-        rows_of.setdefault(settings, []).append(row)
-    if len(rows_of) > MAX_PANELS:
+        rows_of_panel.setdefault(settings, []).append(row)
+    if len(rows_of_panel) > MAX_PANELS:
         raise UsageError(
             f"a map has at most {MAX_PANELS} panels, and {', '.join(panel_keys)} would make "
-            f"{len(rows_of)}: sweep fewer values of the axes that are not drawn"
+            f"{len(rows_of_panel)}: sweep fewer values of the axes that are not drawn"
         )
+
     panels = []
-    for settings, panel_rows in rows_of.items():
+    for settings, panel_rows in rows_of_panel.items():
         title = _format_panel_title(settings, scenario)
         counts, exponents_per_s = _collect_runs(panel_rows, x, y)
         panels.append(MapPanel(title, settings, counts, exponents_per_s))
@@ -206,25 +234,31 @@ def build_plane(
 def _collect_runs(
     rows: Sequence[Mapping[str, Any]], x: PlaneAxis, y: PlaneAxis
 ) -> tuple[RunCounts, Array]:
-    """Returns the class counts and the mean exponents of a panel, see `MapPanel`.
+    """Counts the runs of a panel by grid point and class, and averages their growth exponents.
 
     Args:
-        rows: the runs of the panel.
-        x: the horizontal axis.
-        y: the vertical axis; with an empty key if only one axis is drawn.
+        rows: Runs of the panel, as for `build_plane`.
+        x: Horizontal axis.
+        y: Vertical axis. Its key is empty if only one axis is drawn.
+
+    Returns:
+        The fields `counts` and `exponents_per_s` of `MapPanel`.
     """
     shape = (len(y.values), len(x.values))
     counts: RunCounts = np.zeros((*shape, len(CELL_CLASSES)), dtype=np.int64)
     exponents_per_s: Array = np.zeros(shape)
-    index_of_x = {value: index for index, value in enumerate(x.values)}
-    index_of_y = {value: index for index, value in enumerate(y.values)}
+    column_of_x = {value: column for column, value in enumerate(x.values)}
+    row_of_y = {value: row for row, value in enumerate(y.values)}
     index_of_class = {verdict.value: index for index, verdict in enumerate(CELL_CLASSES)}
-    for row in rows:
-        i = index_of_y[row[y.key]] if y.key else 0
-        j = index_of_x[row[x.key]]
-        counts[i, j, index_of_class[row["verdict"]]] += 1
-        exponent = row.get("exponent_per_s")
+
+    for run in rows:
+        i = row_of_y[run[y.key]] if y.key else 0
+        j = column_of_x[run[x.key]]
+        counts[i, j, index_of_class[run["verdict"]]] += 1
+        exponent = run.get("exponent_per_s")
+        # A run without an exponent makes the mean of its grid point NaN.
         exponents_per_s[i, j] += np.nan if exponent is None else exponent
+
     runs = counts.sum(axis=2)
     exponents_per_s /= np.maximum(runs, 1)
     exponents_per_s[runs == 0] = np.nan
@@ -232,7 +266,11 @@ def _collect_runs(
 
 
 def _format_panel_title(settings: PanelSettings, scenario: Scenario) -> str:
-    """Returns the settings of a panel in words, as in "p d, delay 200 ms"."""
+    """Returns the title of a panel, such as "p d, delay 200 ms".
+
+    Numbers are given with the name and unit of their key. Other values are given alone, with
+    spaces for underscores, except for the name of a law, which stays as it is.
+    """
     texts = []
     for key, value in settings:
         if not isinstance(value, str):
@@ -244,14 +282,17 @@ def _format_panel_title(settings: PanelSettings, scenario: Scenario) -> str:
     return ", ".join(texts)
 
 
-class StableInterval(NamedTuple):
-    """An edge of stability along one key.
+class StabilityEdge(NamedTuple):
+    """An edge of stability along one parameter: where stable and unstable values meet.
+
+    The edge is known only up to an interval, because the parameter has a finite number of
+    values.
 
     Attributes:
-        low: the largest decided value below the edge.
-        high: the smallest decided value above the edge.
-        stable_below: True if the values below the edge are stable.
-        sharp: True if no value between `low` and `high` is undecided.
+        low: Largest decided value below the edge.
+        high: Smallest decided value above the edge.
+        stable_below: True if the values below the edge are stable, False if those above are.
+        sharp: True if the interval contains no undecided value.
     """
 
     low: float
@@ -261,26 +302,32 @@ class StableInterval(NamedTuple):
 
     @property
     def middle(self) -> float:
-        """The value halfway between `low` and `high`."""
+        """Centre of the interval."""
         return 0.5 * (self.low + self.high)
 
 
-def find_map_edges(plane: MapPlane, panel: MapPanel) -> list[tuple[float, StableInterval]]:
-    """Returns the measured edges of a panel, each with the x value of its column.
+def find_map_edges(plane: MapPlane, panel: MapPanel) -> list[tuple[float, StabilityEdge]]:
+    """Finds the measured edges of stability in each column of a panel.
 
-    The edges of a column are in rising order.
+    A column has an edge wherever the majority of the runs changes between stable and not
+    stable from one decided grid point to the next.
+
+    Returns:
+        Pairs of the x value of a column and an edge along y. The edges of a column are in
+        rising order.
     """
     edges = []
     y = plane.y.values
-    for x, share in zip(plane.x.values, panel.share.T, strict=True):
-        decided = np.flatnonzero(np.isfinite(share) & (share != 0.5))
-        stable = share[decided] > 0.5
-        for n in np.flatnonzero(stable[1:] != stable[:-1]):
+    for x, stable_share in zip(plane.x.values, panel.share.T, strict=True):
+        is_decided = np.isfinite(stable_share) & (stable_share != 0.5)
+        decided = np.flatnonzero(is_decided)
+        is_stable = stable_share[decided] > 0.5
+        for n in np.flatnonzero(is_stable[1:] != is_stable[:-1]):
             below, above = decided[n : n + 2].tolist()
-            edge = StableInterval(
+            edge = StabilityEdge(
                 low=y[below],
                 high=y[above],
-                stable_below=bool(stable[n]),
+                stable_below=bool(is_stable[n]),
                 sharp=above == below + 1,
             )
             edges.append((x, edge))
@@ -288,20 +335,20 @@ def find_map_edges(plane: MapPlane, panel: MapPanel) -> list[tuple[float, Stable
 
 
 _GRAVITY = slice(3, 5)
-"""The parameters of Eq. (24) in the gravity torque."""
+"""Indices of the arm parameters of Eq. (24) that appear in the gravity torque."""
 _ROUNDING = 1e-6
-"""Tolerance of delays, in ticks, and of the position of an edge, as a share of an interval."""
+"""Tolerance of rounding errors, of delays in ticks and of the relative position of an edge."""
 
 
 class StabilityCriterion(NamedTuple):
-    """A stability condition in closed form, evaluated at one scenario.
+    """A stability condition in closed form, evaluated for one scenario.
 
     Attributes:
-        symbol: the equation of the condition's limit, for a legend.
-        text: the same equation as plain text.
-        source: the origin of the condition, and whether it is necessary or sufficient.
-        excess: margin by which the condition is met, in the unit of the condition; positive if
-            it is met.
+        symbol: Equation of the limit of the condition, in TeX, for the legend of a figure.
+        text: The same equation as plain text.
+        source: Origin of the condition, and whether it is necessary or sufficient.
+        excess: Difference of the two sides of the inequality, in its unit. Positive if the
+            condition is met.
     """
 
     symbol: str
@@ -311,32 +358,49 @@ class StabilityCriterion(NamedTuple):
 
 
 def evaluate_criterion(scenario: Scenario) -> StabilityCriterion | None:
-    """Returns the stability condition in closed form that covers a scenario, or None."""
-    holds_stale = any(spec.on_stale.action != "use" for spec in scenario.sites.values())
-    if scenario.timeline or holds_stale:
+    """Evaluates the stability condition in closed form that covers a scenario.
+
+    Returns:
+        The condition. None if the scenario violates a hypothesis of every known condition, for
+        example because it changes while it runs, or because a site stops following a peer
+        whose samples are too old.
+    """
+    stops_following = any(spec.on_stale.action != "use" for spec in scenario.sites.values())
+    if scenario.timeline or stops_following:
         return None
     if any(arm.shares_pose for arm in scenario.arms.values()):
         return None
+
     criterion = _evaluate_damping_criterion(scenario)
     if criterion is not None:
         return criterion
     if any(arm.chain is not None for arm in scenario.arms.values()):
-        return None
+        return None  # the other criterion holds only for the planar arm with two joints
     return _evaluate_sampling_criterion(scenario)
 
 
 def _evaluate_damping_criterion(scenario: Scenario) -> StabilityCriterion | None:
-    """Returns the condition on the damping of P+d, or None if it does not cover the scenario.
+    """Evaluates the condition on the damping of the law P+d, which has gains K and d.
 
-    For two sites: 4 d1 d2 > (T1 + T2)^2 K1 K2. For N equal sites with reversible shares:
-    d > max(abs(lambda_min), 0.2172) K T.
+    For two sites with delays T1 and T2, the loop is stable if
 
-    Under this condition the loop has no root on the unit circle for all masses down to d h. No
-    damping stabilises lighter arms at this tick rate (docs/errata.md, 13).
+        4 d1 d2 > (T1 + T2)^2 K1 K2.
+
+    For N equal sites with delay T, whose matrix of dominance factors alpha is reversible and
+    has the least eigenvalue lambda_min, the loop is stable if
+
+        d > max(abs(lambda_min), 0.2172) K T.
+
+    Under these conditions the loop has no root on the unit circle for all masses down to d h,
+    where h is the period of a tick. No damping stabilises lighter arms at this tick rate
+    (docs/errata.md, 13).
+
+    Returns:
+        The condition. None if it does not cover the scenario.
     """
     if scenario.scheme != "second_order":
         return None
-    delays_s = _delays_s(scenario)
+    delays_s = _list_delays_s(scenario)
     rates_hz = {spec.rate_hz for spec in scenario.sites.values()}
     if delays_s is None or len(rates_hz) > 1:
         return None
@@ -344,32 +408,35 @@ def _evaluate_damping_criterion(scenario: Scenario) -> StabilityCriterion | None
     K = []
     d = []
     for spec in scenario.sites.values():
-        gains = _scalar_gains(spec)
+        gains = _find_scalar_gains(spec)
         if gains is None:
             return None
         K.append(gains[0])
         d.append(gains[1])
-    if max(d) / rate_hz >= min(map(_least_inertia, scenario.arms.values())):
-        return None
-    ticks = []
+    least_inertia = min(map(_bound_least_inertia, scenario.arms.values()))
+    if max(d) / rate_hz >= least_inertia:
+        return None  # an arm is lighter than d h
+
+    delays_ticks = []
     for delay_s in delays_s:
         delay_ticks = math.ceil(delay_s * rate_hz - _ROUNDING)
-        ticks.append(max(1, delay_ticks))
+        delays_ticks.append(max(1, delay_ticks))  # a sample is used in the next tick at best
     if len(K) == 2:
         return StabilityCriterion(
             symbol=r"$4\,d_1 d_2 = (T_1 + T_2)^2 K_1 K_2$",
             text="4 d1 d2 = (T1 + T2)² K1 K2",
             source=_DAMPING_SOURCE,
-            excess=_excess_of_two(K, d, 0.5 * sum(ticks), rate_hz),
+            excess=_compute_pair_excess(K, d, 0.5 * sum(delays_ticks), rate_hz),
         )
-    are_equal = len({*K}) == len({*d}) == len({*ticks}) == 1
-    least = find_least_reversible(scenario.alpha)
-    if not are_equal or least is None:
+
+    are_equal = len({*K}) == len({*d}) == len({*delays_ticks}) == 1
+    least_eigenvalue = find_least_reversible(scenario.alpha)
+    if not are_equal or least_eigenvalue is None:
         return None
-    share = _compute_required_share(least, ticks[0])
-    required_d = K[0] * share * ticks[0] / rate_hz
+    ratio = _compute_required_ratio(least_eigenvalue, delays_ticks[0])
+    required_d = K[0] * ratio * delays_ticks[0] / rate_hz
     excess = d[0] - required_d
-    if -least < COMMON_MOTION_SHARE:
+    if -least_eigenvalue < COMMON_MOTION_SHARE:
         return StabilityCriterion(
             symbol=r"$d = 0.2172\,K\,T$",
             text="d = 0.2172 K T",
@@ -387,10 +454,14 @@ def _evaluate_damping_criterion(scenario: Scenario) -> StabilityCriterion | None
 _DAMPING_SOURCE = "P+d: sufficient whatever the arms weigh, and necessary for the worst masses"
 
 
-def _scalar_gains(spec: SiteSpec) -> tuple[float, float] | None:
-    """Returns K and d of P+d with full gravity compensation, or None.
+def _find_scalar_gains(spec: SiteSpec) -> tuple[float, float] | None:
+    """Returns the gains K and d of a site's P+d law, if they are the same for all joints.
 
-    None unless all joints have the same gains: the arm couples its joints.
+    Different gains are not covered by the criteria, because the arm couples its joints.
+
+    Returns:
+        K in N m/rad and d in N m s/rad. None if the site has another law, no full gravity
+        compensation, or joints with different gains.
     """
     law: Any = spec.control
     if law.kind is not PD or law.gravity != 1.0:
@@ -400,59 +471,73 @@ def _scalar_gains(spec: SiteSpec) -> tuple[float, float] | None:
     return law.K[0], law.d[0]
 
 
-def _tick_angles(ticks: float) -> tuple[Array, Array, Array]:
-    """Returns angles phi = w h of z on the unit circle, 2 tan(phi / 2), and the scheme's lag.
+def _sample_unit_circle(delay_ticks: float) -> tuple[Array, Array, Array]:
+    """Returns points z = exp(i phi) of the unit circle at which a criterion is evaluated.
 
-    The angles go from almost 0 to almost pi. They are denser over the first turn of a delay of
-    `ticks`, up to phi = 2 pi / `ticks`.
+    The angles phi = w h go from almost 0 to almost pi, where w is the frequency and h the
+    period of a tick. They are denser over the first turn of the delay, up to
+    phi = 2 pi / `delay_ticks`.
+
+    Returns:
+        The angles phi, the values 2 tan(phi / 2), and the lag of the integration scheme, by
+        which the scheme reduces the damping.
     """
-    full_turn = min(2.0 * np.pi / ticks, 3.0)
+    full_turn = min(2.0 * np.pi / delay_ticks, 3.0)
     first_turn = np.linspace(0.0, full_turn, 400)[1:]
     half_circle = np.linspace(0.0, np.pi, 400)[1:-1]
-    phi = np.concatenate([[1e-7 / ticks], first_turn, half_circle])
+    phi = np.concatenate([[1e-7 / delay_ticks], first_turn, half_circle])
     t = np.tan(0.5 * phi)
     lag = 2.0 * t**3 / (1.0 + 3.0 * t**2)
     return phi, 2.0 * t, lag
 
 
-def _compute_required_share(least: float, ticks: int) -> float:
-    """Returns the least stable d / (K T) of equal sites with reversible shares.
+def _compute_required_ratio(least_eigenvalue: float, delay_ticks: int) -> float:
+    """Returns the least stable d / (K T) of equal sites with reversible dominance factors.
 
     Args:
-        least: the least eigenvalue of the share matrix; its largest eigenvalue is 1.
-        ticks: the delay T, in ticks.
+        least_eigenvalue: Least eigenvalue of the matrix of dominance factors. The largest
+            eigenvalue of this matrix is 1.
+        delay_ticks: Delay T, in ticks.
     """
-    phi, w, lag = _tick_angles(ticks)
-    cosine = np.cos(ticks * phi)
-    sine = np.sin(ticks * phi)
-    shares = []
-    for eigenvalue in (least, 1.0):
+    phi, w, lag = _sample_unit_circle(delay_ticks)
+    cosine = np.cos(delay_ticks * phi)
+    sine = np.sin(delay_ticks * phi)
+    ratios = []
+    for eigenvalue in (least_eigenvalue, 1.0):
         damping = lag * (1.0 - eigenvalue * cosine) - eigenvalue * sine
-        shares.append(damping / (w * ticks))
-    return float(np.max(shares))
+        ratios.append(damping / (w * delay_ticks))
+    return float(np.max(ratios))
 
 
-def _excess_of_two(K: list[float], d: list[float], ticks: float, rate_hz: float) -> float:
+def _compute_pair_excess(
+    K: list[float], d: list[float], mean_delay_ticks: float, rate_hz: float
+) -> float:
     """Returns the least of 2 sqrt(d1 d2) - (T1 + T2) sqrt(K1 K2) over all frequencies.
 
-    The scheme's lag reduces each damping, and T1 + T2 is 2 `ticks`.
+    The lag of the integration scheme reduces each damping, depending on the frequency.
+
+    Args:
+        K: Stiffnesses of the two sites, in N m/rad.
+        d: Dampings of the two sites, in N m s/rad.
+        mean_delay_ticks: Half of T1 + T2, in ticks.
+        rate_hz: Tick rate of both sites.
     """
-    phi, w, lag = _tick_angles(ticks)
+    phi, w, lag = _sample_unit_circle(mean_delay_ticks)
     w_rad_s = w * rate_hz
     damping_1 = np.maximum(d[0] - K[0] * lag / w_rad_s, 0.0)
     damping_2 = np.maximum(d[1] - K[1] * lag / w_rad_s, 0.0)
-    delayed = np.sin(ticks * phi) + lag * np.cos(ticks * phi)
+    delayed = np.sin(mean_delay_ticks * phi) + lag * np.cos(mean_delay_ticks * phi)
     delay_s = np.abs(delayed) / w_rad_s
     stiffness = math.sqrt(K[0] * K[1])
     excess = np.sqrt(damping_1 * damping_2) - stiffness * delay_s
     return float(2.0 * np.min(excess))
 
 
-def _least_inertia(arm: ArmModel) -> float:
-    """Returns a lower bound of the least eigenvalue of M(q) over all poses, in kg m^2.
+def _bound_least_inertia(arm: ArmModel) -> float:
+    """Returns a lower bound of the eigenvalues of the inertia matrix M(q), in kg m^2.
 
-    The planar arm has its least eigenvalue at cos q2 = 1 or -1. A chain has at least the
-    inertia of its drives.
+    The bound holds for all poses q. The planar arm with two joints has its least eigenvalue at
+    cos q2 = 1 or -1. Any other arm has at least the inertia of its drives.
     """
     if arm.chain is not None:
         return min(joint.armature_kg_m2 for joint in arm.chain.joints)
@@ -463,22 +548,28 @@ def _least_inertia(arm: ArmModel) -> float:
 
 
 def _evaluate_sampling_criterion(scenario: Scenario) -> StabilityCriterion | None:
-    """Returns the condition on the tick of the adaptive law, or None if it does not apply.
+    """Evaluates the condition on the tick period of the adaptive law.
 
-    Without delay and under scheme `digital`, the arms come to rest if Gamma g^2 h < Kp,
-    approximately.
+    The adaptive law estimates the parameters of its arm with the adaptation gain Gamma. Without
+    delay and under the integration scheme `digital`, the arms come to rest if
+    Gamma g^2 h < Kp, approximately, where g is gravity, h the period of a tick and Kp the
+    damping gain of the law.
+
+    Returns:
+        The condition. None if it does not cover the scenario.
     """
-    delays_s = _delays_s(scenario)
+    delays_s = _list_delays_s(scenario)
     if scenario.scheme != "digital" or delays_s is None:
         return None
-    excess = []
+
+    site_excess = []
     for spec in scenario.sites.values():
         law: Any = spec.control
         h_s = 1.0 / spec.rate_hz
         if law.kind is not Adaptive or max(delays_s) > h_s:
             return None
         required_kp = max(law.Gamma[_GRAVITY]) * spec.arm.g_m_s2**2 * h_s
-        excess.append(min(law.Kp) - required_kp)
+        site_excess.append(min(law.Kp) - required_kp)
     return StabilityCriterion(
         symbol=r"$\Gamma g^2 h = K_p$",
         text="Gamma g² h = Kp",
@@ -486,22 +577,25 @@ def _evaluate_sampling_criterion(scenario: Scenario) -> StabilityCriterion | Non
             "a rule for arms of about 1 m and no delay: "
             "the estimate of gravity against the lag of a tick"
         ),
-        excess=min(excess),
+        excess=min(site_excess),
     )
 
 
-def _delays_s(scenario: Scenario) -> list[float] | None:
-    """Returns the delays of all links that carry a share, in s.
+def _list_delays_s(scenario: Scenario) -> list[float] | None:
+    """Returns the constant delays of all links whose samples influence an arm, in s.
 
-    None if a delay is not constant, or if a link loses messages.
+    Links with a dominance factor of 0 are left out: their samples have no effect.
+
+    Returns:
+        The delays. None if a delay is not constant, or if a link loses messages.
     """
     delays_s = []
-    for name in scenario.names:
-        shares = scenario.dominance[name]
-        for peer in scenario.peers(name):
-            if shares.get(peer, 0.0) == 0.0:
+    for site in scenario.names:
+        dominance_factors = scenario.dominance[site]
+        for peer in scenario.peers(site):
+            if dominance_factors.get(peer, 0.0) == 0.0:
                 continue
-            link: LinkBase = scenario.links[f"{peer}->{name}"]
+            link: LinkBase = scenario.links[f"{peer}->{site}"]
             if not isinstance(link, ConstantDelay | NoDelay):
                 return None
             if link.random or link.loss or link.outages_s:
@@ -512,29 +606,35 @@ def _delays_s(scenario: Scenario) -> list[float] | None:
 
 
 PanelLoader = Callable[[float, float], Scenario]
-"""Loads the scenario of a panel at values of x and y."""
+"""Function that returns the scenario of a panel at any values of x and y."""
 
 _MAX_ROOT_STEPS = 500
+"""Largest number of iterations of Brent's method."""
 LINEAR_ANALYSIS = "linear analysis"
-_ABOUT = "where the rightmost root of the loop, linearised, crosses the imaginary axis"
+"""Name of the line of the linear analysis in the legend."""
+_ABOUT_ROOTS = "where the rightmost root of the linearised loop crosses the imaginary axis"
+"""Explanation of this line on the page of the map."""
 
 
 class MapLine(NamedTuple):
-    """One stability limit on a panel: the zero set of a quantity.
+    """A line on a panel that separates stable from unstable parameters.
+
+    The line is the zero set of a quantity that is known at the grid points and interpolated
+    linearly between the grid points of a column.
 
     Attributes:
-        label: the name of the line, for a legend.
-        text: the same name as plain text.
-        about: the origin of the line.
-        spare: quantity that is zero on the line and positive on its stable side, shape (y, x);
-            linear between the grid points of a column, NaN where theory makes no statement.
-        rank: index of the line style; -1 is the style of measured lines.
+        label: Name of the line for a legend, possibly with TeX.
+        text: The same name as plain text.
+        about: Explanation of the origin of the line.
+        excess: The quantity at the grid points, shape (y, x). It is positive on the stable side
+            of the line, and NaN where the theory makes no statement.
+        rank: Index of the line style. The style -1 is that of measured lines.
     """
 
     label: str
     text: str
     about: str
-    spare: Array
+    excess: Array
     rank: int
 
     @property
@@ -544,9 +644,9 @@ class MapLine(NamedTuple):
         This is so if four neighbouring grid points all have a value, and only some of them are
         on the stable side of the line.
         """
-        spare = self.spare
-        lower = spare[:-1]
-        upper = spare[1:]
+        excess = self.excess
+        lower = excess[:-1]
+        upper = excess[1:]
         corners = np.array([lower[:, :-1], lower[:, 1:], upper[:, :-1], upper[:, 1:]])
         has_values = np.isfinite(corners).all(axis=0)
         stable = (corners > 0.0).sum(axis=0)
@@ -554,42 +654,61 @@ class MapLine(NamedTuple):
         return bool(crossed.any())
 
     def crossings(self, column: int, y: PlaneAxis) -> list[float]:
-        """Returns the values of y at which the line crosses a column, in rising order."""
+        """Returns the values of y at which the line crosses a column, in rising order.
+
+        Args:
+            column: Index of the column, which is the index of its value of x.
+            y: Vertical axis.
+        """
         values = y.values
-        spare = self.spare[:, column].tolist()
+        excess = self.excess[:, column].tolist()
         crossings = list[float]()
-        for n in _find_sign_changes(spare):
+        for n in _find_sign_changes(excess):
             step = values[n + 1] - values[n]
-            change = spare[n] - spare[n + 1]
-            crossings.append(values[n] + step * spare[n] / change)
+            change = excess[n] - excess[n + 1]
+            crossings.append(values[n] + step * excess[n] / change)
         return crossings
 
 
 ZERO_EXPONENT = "exponent = 0"
-_TWINS = "where a small push of the run neither grows nor dies away, straight from cell to cell"
+"""Name of the measured line of zero growth exponents."""
+_ABOUT_TWINS = (
+    "where a small push of the run neither grows nor dies away, straight from cell to cell"
+)
+"""Explanation of this line on the page of the map."""
 
 
 def trace_zero_exponent(panel: MapPanel) -> MapLine | None:
-    """Returns the line of zero growth exponents of a panel; None if no line crosses the map."""
+    """Returns the measured line on which small disturbances neither grow nor die away.
+
+    Returns:
+        The line of zero growth exponents. None if it does not cross the panel.
+    """
     line = MapLine(
         label=ZERO_EXPONENT,
         text=ZERO_EXPONENT,
-        about=_TWINS,
-        spare=-panel.exponents_per_s,
+        about=_ABOUT_TWINS,
+        excess=-panel.exponents_per_s,
         rank=-1,
     )
     return line if line.crosses_map else None
 
 
 def trace_closed_form(load: PanelLoader, x: PlaneAxis, y: PlaneAxis) -> MapLine | None:
-    """Returns the line of the closed-form criterion; None if no line crosses the map.
+    """Returns the line on which the closed-form criterion of a panel is marginal.
+
+    Between two grid points of a column on different sides of the line, the crossing is located
+    with Brent's method, because the criterion may be nonlinear in y.
 
     Args:
-        load: loads the scenario at values of x and y.
-        x: the horizontal axis.
-        y: the vertical axis.
+        load: Function that returns the scenario of the panel at values of x and y.
+        x: Horizontal axis.
+        y: Vertical axis.
+
+    Returns:
+        The line. None if no criterion applies, or if the line does not cross the panel.
     """
-    first: StabilityCriterion | None = None
+    first_criterion: StabilityCriterion | None = None
     columns = []
     for x_value in x.values:
 
@@ -598,22 +717,24 @@ def trace_closed_form(load: PanelLoader, x: PlaneAxis, y: PlaneAxis) -> MapLine 
 
         criteria = [evaluate(y_value) for y_value in y.values]
         applicable = [criterion for criterion in criteria if criterion is not None]
-        if first is None and applicable:
-            first = applicable[0]
+        if first_criterion is None and applicable:
+            first_criterion = applicable[0]
         excess = [np.nan if criterion is None else criterion.excess for criterion in criteria]
         edges: dict[int, float] = {}
         for n in _find_sign_changes(excess):
             edge = find_criterion_edge(evaluate, y.values[n], y.values[n + 1])
             if edge is not None:
                 edges[n] = edge
-        columns.append(_straighten(y.values, excess, edges))
-    if first is None:
+        columns.append(_place_zeros(y.values, excess, edges))
+    if first_criterion is None:
         return None
+
+    # Labels and source are the same in the whole panel; take those of the first criterion.
     line = MapLine(
-        label=first.symbol,
-        text=first.text,
-        about=first.source,
-        spare=np.array(columns).T,
+        label=first_criterion.symbol,
+        text=first_criterion.text,
+        about=first_criterion.source,
+        excess=np.array(columns).T,
         rank=0,
     )
     return line if line.crosses_map else None
@@ -622,34 +743,39 @@ def trace_closed_form(load: PanelLoader, x: PlaneAxis, y: PlaneAxis) -> MapLine 
 def trace_linear_analysis(
     columns: Sequence[GrowthColumn], y: PlaneAxis
 ) -> tuple[MapLine | None, list[str]]:
-    """Returns the line of the linear analysis, and remarks on the analysis.
-
-    The line is None if it does not cross the map.
+    """Returns the line on which the rightmost root of the linearised loop is marginal.
 
     Args:
-        columns: the analysis of each column of the map.
-        y: the axis along the columns.
+        columns: Linear analysis of each column of the panel, in the order of x.
+        y: Vertical axis.
+
+    Returns:
+        The line, or None if it does not cross the panel; and remarks of the analysis for the
+        reader of the map, without duplicates.
     """
-    spare = []
+    excess_columns = []
     all_remarks = list[str]()
     for column in columns:
-        # a rate of -infinity means that nothing moves: the grid point is on neither side
+        # A growth rate of -infinity means that nothing moves: the grid point is on no side.
         decay_per_s = [np.nan if np.isinf(rate) else -rate for rate in column.growth_per_s]
-        spare.append(_straighten(y.values, decay_per_s, column.edges))
+        excess_columns.append(_place_zeros(y.values, decay_per_s, column.edges))
         all_remarks.extend(column.remarks)
     remarks = list(dict.fromkeys(all_remarks))
     line = MapLine(
         label=LINEAR_ANALYSIS,
         text=LINEAR_ANALYSIS,
-        about=_ABOUT,
-        spare=np.array(spare).T,
+        about=_ABOUT_ROOTS,
+        excess=np.array(excess_columns).T,
         rank=1,
     )
     return line if line.crosses_map else None, remarks
 
 
 def _find_sign_changes(values: Sequence[float]) -> list[int]:
-    """Returns each index n at which finite values n and n + 1 differ in being positive."""
+    """Returns the indices n at which the values n and n + 1 have different signs.
+
+    Zero counts as negative. Values that are not finite take part in no change of sign.
+    """
     indices = list[int]()
     for n, (value, following) in enumerate(pairwise(values)):
         finite = np.isfinite([value, following]).all()
@@ -658,46 +784,53 @@ def _find_sign_changes(values: Sequence[float]) -> list[int]:
     return indices
 
 
-def _straighten(
-    values: Sequence[float], spare: Sequence[float], edges: Mapping[int, float]
+def _place_zeros(
+    values: Sequence[float], excess: Sequence[float], edges: Mapping[int, float]
 ) -> Array:
-    """Returns a column of `MapLine.spare`: linear interpolation of it is zero at the edges.
+    """Changes a quantity along a column so that its linear interpolation is zero at the edges.
 
-    Away from the edges the result is `spare`, which steers a steep line between two columns.
+    The quantity may be nonlinear between two grid points, so that the zero of its linear
+    interpolation would differ from its true zero, the edge. Therefore the value above each edge
+    is scaled so that the interpolated zero lies on the edge. All other values stay, because
+    they determine the course of a steep line between two columns.
 
     Args:
-        values: the values of the axis along the column, shape (y,).
-        spare: the quantity at these values, shape (y,).
-        edges: the edge in the interval from value n to value n + 1, by n; an edge that is
-            missing is the zero of the linear interpolation of `spare`.
+        values: Values of the axis along the column, shape (y,).
+        excess: The quantity at these values, shape (y,).
+        edges: Position of each edge, by the index n of the interval from value n to n + 1. An
+            edge that is missing is placed at the zero of the linear interpolation.
+
+    Returns:
+        The changed quantity, a column of `MapLine.excess`.
     """
-    straight: Array = np.where(np.isfinite(spare), spare, np.nan)
-    straight[straight == 0.0] = -_ROUNDING
-    for n in _find_sign_changes(spare):
+    placed: Array = np.where(np.isfinite(excess), excess, np.nan)
+    placed[placed == 0.0] = -_ROUNDING  # zero counts as negative
+    for n in _find_sign_changes(excess):
         if n in edges:
             low = values[n]
             high = values[n + 1]
-            share = (edges[n] - low) / (high - low)
+            fraction = (edges[n] - low) / (high - low)
         else:
-            share = spare[n] / (spare[n] - spare[n + 1])
-        share = min(max(share, _ROUNDING), 1.0 - _ROUNDING)
-        straight[n + 1] = straight[n] * (1.0 - 1.0 / share)
-    return straight
+            fraction = excess[n] / (excess[n] - excess[n + 1])
+        fraction = min(max(fraction, _ROUNDING), 1.0 - _ROUNDING)
+        placed[n + 1] = placed[n] * (1.0 - 1.0 / fraction)
+    return placed
 
 
 def find_criterion_edge(
     criterion: Callable[[float], StabilityCriterion | None], low: float, high: float
 ) -> float | None:
-    """Returns the value at which a criterion is marginal, found by Brent's method.
-
-    None if the criterion does not change between `low` and `high`, or does not apply to a value
-    between them.
+    """Finds the value at which a criterion is marginal, with Brent's method.
 
     Args:
-        criterion: evaluates the criterion at a value; may raise ScenarioError for a value that
-            is not valid, as between whole numbers.
-        low: the first value of the interval.
-        high: the last value of the interval.
+        criterion: Function that evaluates the criterion at a value. It may raise ScenarioError
+            for a value that is not valid, such as a fraction where a whole number is needed.
+        low: Lower end of the searched interval.
+        high: Upper end of the searched interval.
+
+    Returns:
+        The value. None if the criterion has the same sign at both ends, or if it does not apply
+        to a value between them.
     """
     # imported late: SciPy costs half a second, and most commands do not need it
     from scipy.optimize import brentq
@@ -718,18 +851,19 @@ def find_criterion_edge(
 
 
 LAW_AXIS = "law"
+"""Key of the axis of control laws."""
 
 
 class StabilityMap(NamedTuple):
-    """A stability map: measured results with the lines of theory.
+    """A complete stability map: the measurements and the lines from theory.
 
     Attributes:
-        plane: the results.
-        lines: the lines of each panel.
-        remarks: remarks on the lines.
-        commands: the commands that make the map.
-        title: the title of the map's page.
-        fixed: the gains that were not swept, a text per law.
+        plane: The measurements, as panels.
+        lines: Lines of each panel, in the order of the panels.
+        remarks: Remarks on the lines for the reader of the map.
+        commands: Commands that make the map again.
+        title: Title of the map's page.
+        fixed: Gains that were not swept, one text per control law.
     """
 
     plane: MapPlane
@@ -749,18 +883,20 @@ def build_stability_map(
     linearly: bool = True,
     on: Workers = None,
 ) -> StabilityMap:
-    """Returns the stability map of a sweep's results.
+    """Returns the stability map of the results of a sweep.
+
+    Lines are drawn only if the map has two numeric axes.
 
     Args:
-        results: the results of the sweep.
-        commands: the commands that make the map.
-        jobs: number of worker processes; None: as many as there are cores.
-        progress: called while the linear analysis runs.
-        linearly: True to add the line of the linear analysis.
-        on: the workers to use; None: processes of this computer.
+        results: Results of the sweep.
+        commands: Commands that make the map, which its page shows.
+        jobs: Number of worker processes for the linear analysis. None uses all cores.
+        progress: Function that is called while the linear analysis runs.
+        linearly: True to add the line of the linear analysis, which takes longest.
+        on: Workers that compute the linear analysis. None starts processes on this computer.
 
     Raises:
-        UsageError: there is nothing to draw, or there are too many panels.
+        UsageError: There is nothing to draw, or there would be too many panels.
     """
     plan = results.plan
     keys = [axis.key for axis in plan.axes]
@@ -779,6 +915,7 @@ def build_stability_map(
     y = plane.y
     if not y.key or len(y.values) < 2:
         return stability_map
+
     loaders = [make_panel_loader(plan, panel, x.key, y.key) for panel in plane.panels]
     panel_lines = [
         [trace_zero_exponent(panel), trace_closed_form(load, x, y)]
@@ -789,37 +926,45 @@ def build_stability_map(
         tasks = [(load, x_value, y) for load in loaders for x_value in x.values]
         with open_worker_pool(jobs, on, most=len(tasks)) as pool:
             columns = iter(pool.map(_analyse_column, tasks, progress))
+        # The results come in the order of the tasks, panel by panel and column by column.
         for lines in panel_lines:
             panel_columns = [next(columns) for _ in x.values]
             line, line_remarks = trace_linear_analysis(panel_columns, y)
             lines.append(line)
             remarks += line_remarks
-    crossing = [tuple(line for line in lines if line is not None) for lines in panel_lines]
+
+    crossing_lines = [tuple(filter(None, lines)) for lines in panel_lines]
     distinct_remarks = tuple(dict.fromkeys(remarks))
-    return stability_map._replace(lines=tuple(crossing), remarks=distinct_remarks)
+    return stability_map._replace(lines=tuple(crossing_lines), remarks=distinct_remarks)
 
 
 def _analyse_column(task: tuple[PanelLoader, float, PlaneAxis]) -> GrowthColumn:
-    """Returns the linear analysis of one column of a panel; any worker can do it."""
+    """Computes the linear analysis of one column of a panel, in any worker process.
+
+    Args:
+        task: Function that loads scenarios of the panel, the column's value of x, and the
+            vertical axis.
+    """
     load, x, y = task
     scenarios = [load(x, y_value) for y_value in y.values]
     return compute_growth_column(scenarios, y.key, y.values)
 
 
 def make_panel_loader(plan: SweepPlan, panel: MapPanel, x: str, y: str) -> PanelLoader:
-    """Returns the function that loads the scenario at any point of a panel; it is picklable.
+    """Returns a function that loads the scenario at any point of a panel.
+
+    The function can be pickled, so that other processes can call it.
 
     Args:
-        plan: the sweep.
-        panel: the panel.
-        x: the key of the horizontal axis.
-        y: the key of the vertical axis.
+        plan: The sweep.
+        panel: The panel.
+        x: Scenario key of the horizontal axis.
+        y: Scenario key of the vertical axis.
     """
     settings = dict(panel.settings)
     only_law = next(iter(plan.laws), "")
     law = settings.pop(LAW_AXIS, only_law)
-    law_overrides = plan.laws.get(law, ())
-    overrides = [*law_overrides]
+    overrides = [*plan.laws.get(law, ())]
     overrides += [format_override(key, value) for key, value in settings.items()]
     return partial(load_grid_scenario, plan, tuple(overrides), x, y)
 
@@ -827,14 +972,17 @@ def make_panel_loader(plan: SweepPlan, panel: MapPanel, x: str, y: str) -> Panel
 def load_grid_scenario(
     plan: SweepPlan, fixed: Sequence[str], x: str, y: str, x_value: float, y_value: float
 ) -> Scenario:
-    """Returns the scenario at a point of a panel, which may lie between its cells.
+    """Returns the scenario at a point of a panel, which may lie between the swept grid points.
 
     Args:
-        plan: the sweep.
-        fixed: the overrides that are common to the panel.
-        x: the key of the horizontal axis.
-        y: the key of the vertical axis.
-        x_value: the value of `x`.
-        y_value: the value of `y`.
+        plan: The sweep.
+        fixed: Overrides KEY=VALUE that all points of the panel have in common.
+        x: Scenario key of the horizontal axis.
+        y: Scenario key of the vertical axis.
+        x_value: Value of the key `x`.
+        y_value: Value of the key `y`.
+
+    Raises:
+        ScenarioError: The scenario is not valid with these values.
     """
     return plan.scenario(*fixed, format_override(x, x_value), format_override(y, y_value))

@@ -1,12 +1,17 @@
-"""Plans a sweep: a grid of runs of one scenario over axes, control laws and seeds.
+"""Plans a sweep: the runs of one scenario over a grid of parameters, control laws and seeds.
 
-The axes, laws and seeds are parsed, combined with the scenario, and checked.
+A scenario is the description of an experiment. An axis is a key of the scenario together with
+the values that the key shall have, such as "link.delay_ms=0:400:50". A cell is one combination
+of the values of all axes and of a control law. Each cell is run once per seed of the random
+numbers. This module parses the axes, laws and seeds, combines them with the scenario, and
+checks the result before anything runs.
 
 Invariant:
     - A plan that cannot run is refused before the first run.
-    - Cells are numbered row by row; a cell is a function of the plan and its number.
-    - The value of an axis is the text of an override.
-    - Steps are counted in decimals: 0.2:3:0.1 contains 0.3, not 0.30000000000000004.
+    - Cells are numbered row by row. A cell is a function of the plan and of its number, so that
+      a large grid need not be stored.
+    - The value of an axis is the text of an override, as a user would write it.
+    - Ranges are counted in decimal numbers: 0.2:3:0.1 contains 0.3, not 0.30000000000000004.
 """
 
 import math
@@ -32,7 +37,7 @@ from ..study_folder import format_command, format_toml_value, set_options
 from . import sweep_cell
 
 _ON_GRID = Decimal("1e-9")
-"""Largest distance from the grid, in steps, at which the end of a range is included."""
+"""Tolerance, in steps, within which the end of a range counts as its last value."""
 _KEYS_WITH_OPTIONS = {
     "seed": "seeds have their own option, as in --seeds 1..20",
     "duration_s": "the duration of a cell depends on its verdict: --duration sets the first "
@@ -40,11 +45,21 @@ _KEYS_WITH_OPTIONS = {
 }
 """Keys that cannot be swept, each with the option that sets the key instead."""
 _MAX_AXIS_VALUES = 10**12
+"""Largest number of values of an axis."""
 _VALUES_EXAMPLE = "as in KEY=0:1600:50 (from, to, step) or KEY=1,2,5"
+"""Example of an axis for error messages."""
 
 
 class _Steps:
-    """Sequence of the values `first` + n `step` as texts, each formatted on access."""
+    """Sequence of equally spaced numbers as texts, each of which is formatted when it is accessed.
+
+    A range may have so many values that a list of them would not fit into memory.
+
+    Args:
+        first: First value.
+        step: Difference of neighbouring values.
+        count: Number of values.
+    """
 
     def __init__(self, first: Decimal, step: Decimal, count: int) -> None:
         self._first = first
@@ -60,12 +75,12 @@ class _Steps:
 
 
 class SweepAxis(NamedTuple):
-    """One axis of a sweep.
+    """One axis of a sweep: a scenario key and its values.
 
     Attributes:
-        description: the axis as a text: "KEY=a:b:step" or "KEY=v1,v2,v3".
-        key: the scenario key that the axis varies.
-        texts: the values of the axis, as texts of overrides.
+        description: The axis as the user wrote it, as "KEY=a:b:step" or "KEY=v1,v2,v3".
+        key: Scenario key that the axis varies.
+        texts: Values of the axis, as texts that follow "KEY=" in an override.
     """
 
     description: str
@@ -73,7 +88,7 @@ class SweepAxis(NamedTuple):
     texts: tuple[str, ...] | _Steps
 
     def value(self, number: int) -> float | str:
-        """Returns value `number` of the axis: a float if it is a number, else its text."""
+        """Returns the value with index `number`: a float if it is a number, and its text otherwise."""
         text = self.texts[number]
         value = _parse_value(text)
         return float(value) if is_number(value) else text
@@ -86,25 +101,26 @@ class SweepAxis(NamedTuple):
         return all(is_number(_parse_value(text)) for text in self.texts)
 
     def override(self, number: int) -> str:
-        """Returns the override that sets value `number` of the axis."""
+        """Returns the override KEY=VALUE that sets the value with index `number`."""
         return f"{self.key}={self.texts[number]}"
 
 
 def parse_axis(description: str) -> SweepAxis:
-    """Returns the axis that a text describes.
+    """Parses the text of an axis.
 
     Args:
-        description: "KEY=a:b:step", where b is included if it lies on the grid, or
-            "KEY=v1,v2,v3" with numbers, words or other TOML values.
+        description: Either "KEY=a:b:step", a range that includes b if a whole number of steps
+            leads to it; or "KEY=v1,v2,v3", a list of numbers, words or other TOML values.
 
     Raises:
-        ScenarioError: the text has no key or no values, or its values form no grid.
+        ScenarioError: The key or the values are missing, or the values are not valid.
     """
     key, equals, text = (part.strip() for part in str(description).partition("="))
     if not equals or not key:
         raise ScenarioError(f"--over reads KEY=VALUES, {_VALUES_EXAMPLE}, not {description!r}")
     if key in _KEYS_WITH_OPTIONS:
         raise ScenarioError(f"is no axis: {_KEYS_WITH_OPTIONS[key]}", path=key)
+
     parts = _split_outside_brackets(text, ":")
     if len(parts) not in (1, 3):
         example = _VALUES_EXAMPLE.removeprefix("as in ")
@@ -119,11 +135,14 @@ def parse_axis(description: str) -> SweepAxis:
 
 
 def list_axes(over: str | Sequence[str] | Mapping[str, Any]) -> list[str]:
-    """Returns the descriptions of the axes, as texts for `parse_axis`.
+    """Returns the texts of the axes, from any of the forms in which a user can give them.
 
     Args:
-        over: one description, a list of descriptions, or a mapping from keys to values: a list,
-            an array, or the text after "KEY=".
+        over: One text, a list of texts, or a mapping from keys to values. The values are a
+            list, an array, or the text after "KEY=".
+
+    Returns:
+        Texts for `parse_axis`.
     """
     if isinstance(over, Mapping):
         return [f"{key}={_join_values(values)}" for key, values in over.items()]
@@ -131,6 +150,12 @@ def list_axes(over: str | Sequence[str] | Mapping[str, Any]) -> list[str]:
 
 
 def _join_values(values: Any) -> str:
+    """Returns the values of an axis as the text that follows "KEY=".
+
+    Args:
+        values: Finished text, a list, an array or a single value. A string that is a word, such
+            as in_order, stays without quotation marks.
+    """
     if isinstance(values, str):
         return values
     entries = values if isinstance(values, list | tuple) else np.atleast_1d(values)
@@ -142,12 +167,24 @@ def _join_values(values: Any) -> str:
 
 
 def _build_range(key: str, first: Decimal, last: Decimal, step: Decimal) -> _Steps:
+    """Returns the values of a range "first:last:step".
+
+    Args:
+        key: Scenario key of the axis, for error messages.
+        first: First value.
+        last: Largest possible value, or the smallest one if the step is negative.
+        step: Difference of neighbouring values.
+
+    Raises:
+        ScenarioError: The step is 0 or has the wrong sign, or there are too many values.
+    """
     if step == 0:
         raise ScenarioError(f"a step of 0 does not lead from {first:f} to {last:f}", path=key)
-    if (last - first) * step < 0:
-        right = f"{min(first, last):f}:{max(first, last):f}:{abs(step):f}"
+    has_wrong_sign = (last - first) * step < 0
+    if has_wrong_sign:
+        suggestion = f"{min(first, last):f}:{max(first, last):f}:{abs(step):f}"
         problem = f"a step of {step:f} does not lead from {first:f} to {last:f}"
-        raise ScenarioError(f"is empty: {problem}; did you mean {right}?", path=key)
+        raise ScenarioError(f"is empty: {problem}; did you mean {suggestion}?", path=key)
     count = int((last - first) / step + _ON_GRID) + 1
     if count > _MAX_AXIS_VALUES:
         raise ScenarioError(f"has {Decimal(count):.3g} values: take a larger step", path=key)
@@ -155,6 +192,15 @@ def _build_range(key: str, first: Decimal, last: Decimal, step: Decimal) -> _Ste
 
 
 def _parse_decimal(key: str, text: str) -> Decimal:
+    """Returns a number of a range as an exact decimal number.
+
+    Args:
+        key: Scenario key of the axis, for error messages.
+        text: Text of the number.
+
+    Raises:
+        ScenarioError: The text is not a number, or the number is not finite or out of range.
+    """
     text = text.strip()
     try:
         number = Decimal(text)
@@ -175,8 +221,12 @@ def _parse_decimal(key: str, text: str) -> Decimal:
 def _parse_list(key: str, text: str) -> tuple[str, ...]:
     """Returns the values of a list "v1,v2,v3" as texts.
 
+    Args:
+        key: Scenario key of the axis, for error messages.
+        text: Text of the list.
+
     Raises:
-        ScenarioError: a value is empty, not finite, or appears twice.
+        ScenarioError: A value is empty, is not finite, or appears twice.
     """
     texts = tuple(part.strip() for part in _split_outside_brackets(text, ","))
     if "" in texts:
@@ -192,18 +242,24 @@ def _parse_list(key: str, text: str) -> tuple[str, ...]:
     return texts
 
 
-def _split_outside_brackets(text: str, mark: str) -> list[str]:
-    """Returns the parts of a text between the marks that stand outside brackets and quotes."""
+def _split_outside_brackets(text: str, separator: str) -> list[str]:
+    """Splits a text at the separators that stand outside of brackets and quotation marks.
+
+    A value of a list may itself be a list or a text that contains the separator.
+    """
     parts = [""]
-    depth = 0
-    quote = ""
+    depth = 0  # number of brackets that are open
+    quote = ""  # quotation mark that is open; empty outside of quotation marks
     for letter in text:
         if quote:
             quote = "" if letter == quote else quote
         elif letter in "\"'":
             quote = letter
-        depth += (letter in "[{") - (letter in "]}") if not quote else 0
-        if letter == mark and not depth and not quote:
+        if not quote:
+            depth += (letter in "[{") - (letter in "]}")
+
+        is_separator = letter == separator and not depth and not quote
+        if is_separator:
             parts.append("")
         else:
             parts[-1] += letter
@@ -219,25 +275,29 @@ def _parse_value(text: str) -> Any:
 
 
 MAX_SEEDS = 100_000
+"""Largest number of seeds of a sweep."""
 MAX_EXTENSION = 8.0
-"""Default limit of an undecided cell's duration, in durations of the scenario."""
+"""Default limit of the duration of an undecided run, as a multiple of the scenario's duration.
+"""
 MAX_SCENARIO_S = 86_400.0
 """Longest duration that a scenario may have, in s."""
 JUDGES = ("verdict", "twins")
-"""Quantities that can colour a map: the cells' classes, or the growth exponents of twins."""
+"""Ways to judge a run. "verdict" classifies the end of the run. "twins" repeats the run with a
+small push and measures the growth exponent, the rate at which the disturbance grows.
+"""
 _CHECKED_VALUES = 32
 """Largest number of values of an axis that are checked before the first run."""
 
 
 class SweepCell(NamedTuple):
-    """One point of a sweep's grid.
+    """One cell of a sweep: a combination of the values of all axes and of a control law.
 
     Attributes:
-        number: the number of the cell, row by row from 0; laws change slowest, the last axis
-            fastest.
-        law: the swept law of the cell, or "" if the sweep has no laws.
-        values: the cell's value on each axis: a float if the value is a number, else a text.
-        overrides: the overrides, as texts KEY=VALUE, that turn the experiment into the cell.
+        number: Number of the cell, counted row by row from 0. The law changes slowest, and the
+            value of the last axis changes fastest.
+        law: Control law of the cell. Empty if the sweep does not vary the law.
+        values: Value of the cell on each axis: a float if it is a number, and else a text.
+        overrides: Overrides KEY=VALUE that turn the scenario of the sweep into the cell's.
     """
 
     number: int
@@ -247,20 +307,20 @@ class SweepCell(NamedTuple):
 
 
 class SweepPlan(NamedTuple):
-    """A sweep, checked and ready to run.
+    """A sweep that was checked and is ready to run.
 
     Attributes:
-        written: the experiment as its author wrote it.
-        overrides: the overrides of all cells, as texts KEY=VALUE.
-        base: the experiment with `overrides`, resolved.
-        axes: the swept axes; the last changes fastest.
-        laws: the overrides that select each swept law, by the name of the law; laws change
-            slowest. If empty, all cells keep the experiment's laws.
-        seeds: the seeds of a cell that draws random numbers; other cells run with the first
-            seed only.
-        longest_s: longest duration to which an undecided cell is extended, in s.
-        judge: a name of `JUDGES`.
-        metrics: keys of `docs/metrics.md` that are measured in each run in addition.
+        written: Scenario as its author wrote it.
+        overrides: Overrides KEY=VALUE that apply to all cells.
+        base: Scenario with `overrides`, with all default values filled in.
+        axes: Swept axes. The last one changes fastest from cell to cell.
+        laws: For each swept control law, the overrides that select it. The law changes slowest.
+            If there are no swept laws, all cells have the laws of the scenario.
+        seeds: Seeds with which each cell is run. A cell in which nothing is random is run with
+            the first seed only, since all others would give the same run.
+        longest_s: Longest duration to which an undecided run is extended, in s.
+        judge: Way to judge a run, a name of `JUDGES`.
+        metrics: Keys of further metrics from `docs/metrics.md` that are measured in each run.
     """
 
     written: ExperimentText
@@ -275,13 +335,19 @@ class SweepPlan(NamedTuple):
 
     @property
     def default_longest_s(self) -> float:
-        """Default of `longest_s`, in s: growth exponents need no extension."""
+        """Default of `longest_s`, in s.
+
+        Runs that are judged by growth exponents are not extended.
+        """
         extension = 1.0 if self.judge == "twins" else MAX_EXTENSION
         return min(MAX_SCENARIO_S, extension * self.base.duration_s)
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Number of laws (1 if no laws are swept), then the number of values of each axis."""
+        """Size of the grid: the number of laws, then the number of values of each axis.
+
+        The number of laws is 1 if the sweep does not vary the law.
+        """
         return (max(1, len(self.laws)), *(len(axis.texts) for axis in self.axes))
 
     @property
@@ -293,18 +359,21 @@ class SweepPlan(NamedTuple):
         """Returns the cell with a number.
 
         Raises:
-            UsageError: the grid has no cell with this number.
+            UsageError: The grid has no cell with this number.
         """
         if not 0 <= number < self.cells:
             raise UsageError(
                 f"there is no cell {number}: cells are numbered from 0 to {self.cells - 1}"
             )
+
+        # The number has one digit per dimension of the grid, and the last one changes fastest.
         rest = number
         indices = list[int]()
         for count in reversed(self.shape):
             rest, index = divmod(rest, count)
             indices.insert(0, index)
         law_index, *axis_indices = indices
+
         law = ""
         overrides = list[str]()
         if self.laws:
@@ -317,19 +386,23 @@ class SweepPlan(NamedTuple):
         return SweepCell(number, law, tuple(values), tuple(overrides))
 
     def scenario(self, *more: str) -> Scenario:
-        """Returns the experiment with further overrides.
+        """Returns the scenario of the sweep with further overrides.
 
         Args:
-            more: the further overrides, as texts KEY=VALUE.
+            more: Further overrides KEY=VALUE.
 
         Raises:
-            ScenarioError: the experiment is not valid with these overrides.
+            ScenarioError: The scenario is not valid with these overrides.
         """
         return self.written.load([*self.overrides, *more])
 
     def facts(self) -> dict[str, Any]:
-        """Returns the plan as plain JSON values, which `plan_from_json` reads."""
-        return {
+        """Returns the plan as plain values for a JSON file, which `plan_from_json` reads.
+
+        A judge or metrics are stored only if they differ from the default, so that the files of
+        older versions keep their content.
+        """
+        plan: dict[str, Any] = {
             "source": self.written.label,
             "folder": None if self.written.folder is None else str(self.written.folder),
             "overrides": list(self.overrides),
@@ -340,9 +413,12 @@ class SweepPlan(NamedTuple):
             "name": self.base.name,
             "scenario_sha256": self.base.sha256,
             "text": self.written.text,
-            **({} if self.judge == "verdict" else {"judge": self.judge}),
-            **({"metrics": list(self.metrics)} if self.metrics else {}),
         }
+        if self.judge != "verdict":
+            plan["judge"] = self.judge
+        if self.metrics:
+            plan["metrics"] = list(self.metrics)
+        return plan
 
 
 def plan_sweep(
@@ -356,16 +432,17 @@ def plan_sweep(
     judge: str = "verdict",
     metrics: Sequence[str] = (),
 ) -> SweepPlan:
-    """Returns the plan of a sweep, checked and ready to run.
+    """Plans a sweep and checks that it can run.
 
-    A swept law that all sites already have keeps the gains of the scenario. Any other swept law
-    replaces the law of every site and has its default gains. Overrides of gains apply to both.
+    If all sites of the scenario already have a swept law, that law keeps the gains of the
+    scenario. Any other swept law replaces the law of every site and has its default gains.
+    Overrides of gains apply in both cases.
 
-    The arguments are those of `trilat_net.sweep`; overrides are texts KEY=VALUE.
+    The arguments are those of `trilat_net.sweep`. Overrides are texts KEY=VALUE.
 
     Raises:
-        ScenarioError: the scenario, an axis or a value of an axis is not valid or cannot run.
-        UsageError: another argument is not valid.
+        ScenarioError: The scenario, an axis or a value of an axis is not valid or cannot run.
+        UsageError: Another argument is not valid.
     """
     written = read_experiment(source)
     texts = tuple(overrides)
@@ -376,6 +453,7 @@ def plan_sweep(
         _check_law_name(law)
     loaded = _load_base(written, texts, axes, law_names)
     base = loaded.scenario
+
     keys = Counter(axis.key for axis in axes)
     for key, count in keys.items():
         if count > 1:
@@ -384,9 +462,10 @@ def plan_sweep(
         raise ScenarioError(
             "is swept twice: give either --law or --over control.law", path="control.law"
         )
-    law_overrides = {law: _law_overrides(written, texts, loaded, law) for law in law_names}
+    law_overrides = {law: _list_law_overrides(written, texts, loaded, law) for law in law_names}
     if judge not in JUDGES:
         raise UsageError(f"--judge is one of {', '.join(JUDGES)}, not {judge!r}")
+
     plan = SweepPlan(
         written=written,
         overrides=texts,
@@ -394,7 +473,7 @@ def plan_sweep(
         axes=axes,
         laws=law_overrides,
         seeds=_resolve_seeds(seeds, base.seed),
-        longest_s=0.0,  # set below: the default depends on the plan
+        longest_s=0.0,  # set below, because the default depends on the plan
         judge=judge,
         metrics=_list_metrics(metrics),
     )
@@ -406,18 +485,19 @@ def plan_sweep(
             f"{base.duration_s:g} s to {MAX_SCENARIO_S:g} s, not {longest_s:g}"
         )
     plan = plan._replace(longest_s=longest_s)
+
     for law_index in range(plan.shape[0]):
         _check_axes(plan, law_index)
     return plan
 
 
 def plan_from_json(facts: dict[str, Any]) -> SweepPlan:
-    """Returns the plan that `SweepPlan.facts` stored as JSON values.
+    """Restores a plan from the plain values that `SweepPlan.facts` returned.
 
-    The scenario is parsed from its stored text; files that the scenario names are read again.
+    The scenario is parsed from its stored text. Files that the scenario names are read again.
 
     Raises:
-        ScenarioError: the plan cannot run here.
+        ScenarioError: The plan cannot run on this machine.
     """
     folder = None if facts["folder"] is None else Path(facts["folder"])
     written = ExperimentText(facts["source"], facts["text"], folder)
@@ -425,7 +505,7 @@ def plan_from_json(facts: dict[str, Any]) -> SweepPlan:
     axes = tuple(map(parse_axis, facts["over"]))
     loaded = _load_base(written, texts, axes, facts["laws"])
     base = allow_own_code(loaded.scenario)
-    laws = {law: _law_overrides(written, texts, loaded, law) for law in facts["laws"]}
+    laws = {law: _list_law_overrides(written, texts, loaded, law) for law in facts["laws"]}
     return SweepPlan(
         written=written,
         overrides=texts,
@@ -442,8 +522,11 @@ def plan_from_json(facts: dict[str, Any]) -> SweepPlan:
 def _list_metrics(names: Sequence[str]) -> tuple[str, ...]:
     """Returns the keys of the requested metrics, without duplicates.
 
+    Args:
+        names: Keys of metrics, or a single key.
+
     Raises:
-        UsageError: a metric does not exist.
+        UsageError: A metric does not exist.
     """
     keys = [names] if isinstance(names, str) else names
     try:
@@ -456,11 +539,12 @@ def _resolve_seeds(seeds: int | Sequence[int], scenario_seed: int) -> tuple[int,
     """Returns the seeds of a sweep, without duplicates.
 
     Args:
-        seeds: the seeds, or their number: then they count up from the scenario's seed.
-        scenario_seed: the scenario's seed; the only seed of the sweep if `seeds` is empty.
+        seeds: The seeds, or their number. A number n stands for n consecutive seeds that start
+            with the seed of the scenario.
+        scenario_seed: Seed of the scenario. It is the only seed if `seeds` is empty.
 
     Raises:
-        UsageError: a seed or the number of seeds is out of range.
+        UsageError: A seed or the number of seeds is out of range.
     """
     if isinstance(seeds, int | str):
         if isinstance(seeds, str) or not 1 <= seeds <= MAX_SEEDS:
@@ -479,12 +563,12 @@ def _resolve_seeds(seeds: int | Sequence[int], scenario_seed: int) -> tuple[int,
 
 
 class _Base(NamedTuple):
-    """The experiment without its swept axes and laws, as far as it is valid without them.
+    """The scenario of a sweep before its axes and laws are applied.
 
     Attributes:
-        scenario: the experiment.
-        forced: True if the experiment is valid only under a swept law; the scenario then has
-            the first of the swept laws.
+        scenario: The scenario.
+        forced: True if the scenario is valid only under a swept law. In this case `scenario`
+            has the first of the swept laws.
     """
 
     scenario: Scenario
@@ -497,14 +581,21 @@ def _load_base(
     axes: Sequence[SweepAxis],
     laws: Sequence[str],
 ) -> _Base:
-    """Returns the experiment without its swept axes and laws.
+    """Loads the scenario of a sweep before its axes and laws are applied.
 
-    Overrides may need a swept axis or law: a link of another model needs the delay that an axis
-    sets, and a gain may belong to a swept law. In this case the experiment takes the first
-    value of each axis, and the first law.
+    The scenario may not be valid by itself. A link of another model may need the delay that an
+    axis sets, and an override may set a gain that only a swept law has. Therefore the scenario
+    is tried alone, then with the first value of each axis, then with the first law, and then
+    with both.
+
+    Args:
+        written: Scenario as its author wrote it.
+        overrides: Overrides KEY=VALUE that apply to all cells.
+        axes: Swept axes.
+        laws: Names of the swept laws.
 
     Raises:
-        ScenarioError: the experiment is not valid even with the first values and law.
+        ScenarioError: The scenario is not valid in any of these cases.
     """
     first_values = [axis.override(0) for axis in axes]
     problem: ScenarioError | None = None
@@ -517,18 +608,18 @@ def _load_base(
                 problem = error
             else:
                 return _Base(scenario, forced=bool(law))
-        # An experiment that is not valid as written is refused with that error: it says more
-        # than an error of the sweep's overrides.
+        # If the scenario is not valid even as written, this call raises that error, which helps
+        # the user more than an error of the overrides.
         written.load()
     assert problem is not None
     raise problem
 
 
 def _check_law_name(law: str) -> None:
-    """Refuses a law that does not exist.
+    """Refuses the name of a law that does not exist.
 
     Raises:
-        UsageError: the name is neither a built-in law nor a class, as in mylaws:Law.
+        UsageError: The name is neither that of a built-in law nor a class, as in mylaws:Law.
     """
     built_in = [name for name in LAWS if name != "own"]
     if law not in built_in and ":" not in law:
@@ -539,20 +630,31 @@ def _check_law_name(law: str) -> None:
 
 
 def _force_law(written: ExperimentText, overrides: Sequence[str], law: str) -> tuple[str, ...]:
-    """Returns the overrides that give a law to every site."""
+    """Returns the overrides that give a control law to every site.
+
+    Args:
+        written: Scenario as its author wrote it.
+        overrides: Overrides that apply to all cells, which may contain a table of a site.
+        law: Name of the law.
+    """
     tables = tomllib.loads(written.text)
     apply_overrides(tables, overrides)
     law_overrides = [f"control.law={law}"]
     for name, site in tables.get("sites", {}).items():
-        if "control" in site:  # the site's table would win over the common one
+        # The table of a site takes precedence over the common one.
+        if "control" in site:
             law_overrides.append(f"sites.{name}.control.law={law}")
     return tuple(law_overrides)
 
 
-def _law_overrides(
+def _list_law_overrides(
     written: ExperimentText, overrides: Sequence[str], base: _Base, law: str
 ) -> tuple[str, ...]:
-    """Returns the overrides that select a swept law; empty if all sites already have it."""
+    """Returns the overrides that select a swept law.
+
+    Returns:
+        The overrides. Empty if all sites already have the law, so that they keep its gains.
+    """
     sites = base.scenario.sites.values()
     if not base.forced and all(identify_law(spec.control) == law for spec in sites):
         return ()
@@ -560,19 +662,24 @@ def _law_overrides(
 
 
 def _check_axes(plan: SweepPlan, law_index: int) -> None:
-    """Refuses a plan if a sample of its cells under one law cannot run.
+    """Checks that a sample of the cells under one law can run.
 
-    The sample has up to `_CHECKED_VALUES` evenly spread values of each axis, the other axes at
-    their first values, and the corners of the grid.
+    Checking all cells of a large grid would take too long. The sample has up to
+    `_CHECKED_VALUES` evenly spread values of each axis, with the other axes at their first
+    values, and the corners of the grid.
+
+    Args:
+        plan: The sweep.
+        law_index: Index of the law.
 
     Raises:
-        ScenarioError: a cell cannot run, or two values of an axis give the same scenario.
+        ScenarioError: A cell cannot run, or two values of an axis give the same scenario.
     """
-    origin = [law_index] + [0] * len(plan.axes)
+    first_cell = [law_index] + [0] * len(plan.axes)
     for dimension, axis in enumerate(plan.axes, 1):
         value_of_digest: dict[str, str] = {}
         for index in _spread_indices(len(axis.texts)):
-            indices = origin.copy()
+            indices = first_cell.copy()
             indices[dimension] = index
             digest = _load_cell(plan, indices).sha256
             text = axis.texts[index]
@@ -585,24 +692,32 @@ def _check_axes(plan: SweepPlan, law_index: int) -> None:
                     source=plan.written.label,
                 )
             value_of_digest[digest] = text
+
     axis_ends = [sorted({0, len(axis.texts) - 1}) for axis in plan.axes]
     for corner in product([law_index], *axis_ends):
         _load_cell(plan, corner)
 
 
 def _spread_indices(count: int) -> list[int]:
-    """Returns indices of `count` values: the first, the last, and some between them."""
+    """Returns at most `_CHECKED_VALUES` indices, evenly spread over `count` values.
+
+    The first and the last value are always included.
+    """
     checked = min(count, _CHECKED_VALUES)
     intervals = max(1, checked - 1)
     return [k * (count - 1) // intervals for k in range(checked)]
 
 
 def _load_cell(plan: SweepPlan, indices: Sequence[int]) -> Scenario:
-    """Returns the scenario of the cell with these indices of the law and of each axis.
+    """Loads the scenario of a cell.
+
+    Args:
+        plan: The sweep.
+        indices: Index of the law and of the value on each axis.
 
     Raises:
-        ScenarioError: the scenario is not valid or cannot run here; the message names the law
-            if laws are swept.
+        ScenarioError: The scenario is not valid or cannot run on this machine. The message
+            names the law if laws are swept.
     """
     number = 0
     for count, index in zip(plan.shape, indices, strict=True):
@@ -628,13 +743,24 @@ _GAINS = {
 
 
 def label_axis(key: str, scenario: Scenario | None = None) -> str:
-    """Returns the label of an axis, as "delay (ms)" for link.delay_ms."""
+    """Returns the label of an axis in a figure, such as "delay (ms)" for link.delay_ms.
+
+    Args:
+        key: Scenario key of the axis.
+        scenario: Scenario in which the names of operators and walls are looked up.
+    """
     quantity, unit = describe_key(key, scenario)
     return f"{quantity} ({unit})" if unit else quantity
 
 
 def label_setting(key: str, value: Any, scenario: Scenario | None = None) -> str:
-    """Returns a key with its value, as "delay 200 ms" for link.delay_ms = 200."""
+    """Returns a key with its value, such as "delay 200 ms" for link.delay_ms = 200.
+
+    Args:
+        key: Scenario key.
+        value: Value of the key.
+        scenario: Scenario in which the names of operators and walls are looked up.
+    """
     quantity, unit = describe_key(key, scenario)
     if isinstance(value, bool):
         text = str(value).lower()
@@ -646,22 +772,39 @@ def label_setting(key: str, value: Any, scenario: Scenario | None = None) -> str
 
 
 def describe_key(key: str, scenario: Scenario | None = None) -> tuple[str, str]:
-    """Returns the name of a key's quantity, in words, and its unit, or "" without a unit."""
-    *folders, last = key.split(".")
-    number = ""
-    if last.isdigit() and folders:  # an element of a list over joints or parameters
-        number = f"[{last}]"
-        last = folders.pop()
+    """Splits a scenario key into the name and the unit of its quantity, for labels.
+
+    Args:
+        key: Scenario key, such as "sites.s.control.K" or "link.delay_ms".
+        scenario: Scenario in which the names of operators and walls are looked up.
+
+    Returns:
+        The name in words, such as "K of s", and the unit, which is empty if there is none.
+    """
+    *tables, last = key.split(".")
+    element = ""
+    if last.isdigit() and tables:  # an element of a list over joints or parameters
+        element = f"[{last}]"
+        last = tables.pop()
     quantity, unit = split_unit(last)
-    if not unit and len(last) <= 3:  # a symbol
-        quantity = last
-    owner = _describe_owner(folders, scenario)
-    return f"{quantity}{number}{owner}", _GAINS.get(last) or unit.replace("^2", "²")
+    is_symbol = not unit and len(last) <= 3
+    if is_symbol:
+        quantity = last  # symbols such as Kp keep their capital letters
+    owner = _describe_owner(tables, scenario)
+    return f"{quantity}{element}{owner}", _GAINS.get(last) or unit.replace("^2", "²")
 
 
-def _describe_owner(folders: list[str], scenario: Scenario | None) -> str:
-    """Returns the site, link or actor of a key, in words, or "" for a common key."""
-    match folders:
+def _describe_owner(tables: list[str], scenario: Scenario | None) -> str:
+    """Returns the site, link or actor to which a key belongs, as the end of a label.
+
+    Args:
+        tables: Names of the tables that contain the key, from the outermost one.
+        scenario: Scenario in which the kind of an operator or a wall is looked up.
+
+    Returns:
+        A text such as " of s". Empty if the key is common to all sites or links.
+    """
+    match tables:
         case ["sites", site, ("hands" | "environment") as group, number]:
             kind = "hand" if group == "hands" else "environment"
             if scenario is not None and site in scenario.sites and number.isdigit():
@@ -681,23 +824,26 @@ def _describe_owner(folders: list[str], scenario: Scenario | None) -> str:
 
 
 def build_sweep_command(plan: SweepPlan, *more: str) -> str:
-    """Returns the command that runs a sweep.
+    """Returns the command that runs a sweep. Options with default values are left out.
 
     Args:
-        plan: the sweep.
-        more: further arguments of the command.
+        plan: The sweep.
+        more: Further arguments of the command.
     """
     arguments = set_options(plan.overrides)
     for axis in plan.axes:
         arguments += ["--over", axis.description]
-    scenario_seed = plan.base.seed
+
     count = len(plan.seeds)
-    if plan.seeds != tuple(range(scenario_seed, scenario_seed + count)):
+    first_seed = plan.base.seed
+    consecutive_seeds = tuple(range(first_seed, first_seed + count))
+    if plan.seeds != consecutive_seeds:
         seeds = ",".join(map(str, plan.seeds))
-        # a lone seed needs a comma: a number alone is a number of seeds
+        # A single seed needs a comma, because a number alone is the number of seeds.
         arguments += ["--seeds", f"{seeds}," if count == 1 else seeds]
     elif count > 1:
         arguments += ["--seeds", str(count)]
+
     if plan.laws:
         arguments += ["--law", ",".join(plan.laws)]
     if plan.judge != "verdict":
@@ -710,7 +856,12 @@ def build_sweep_command(plan: SweepPlan, *more: str) -> str:
 
 
 def format_override(key: str, value: Any) -> str:
-    """Returns the override that sets a key; whole numbers without a decimal point."""
+    """Returns the override KEY=VALUE that sets a key.
+
+    Args:
+        key: Scenario key.
+        value: A number, which parses back to exactly this number, or a text.
+    """
     text = format_override_value(value) if is_number(value) else value
     return f"{key}={text}"
 

@@ -1,13 +1,21 @@
-"""Holds the results of a sweep: a CSV table of runs, the grid points, and a summary of both.
+"""Stores and summarises the results of a sweep.
+
+A sweep runs one scenario, the description of an experiment, on a grid of parameters. A cell is
+one combination of the swept parameters and the control law; it is run once per seed of the
+random numbers. This module turns the finished runs into a table with one row per run and writes
+it as CSV. It also combines the runs of a cell to a grid point, prints a summary, and finds the
+command that repeats a run.
 
 Invariant:
-    - Results are a function of the plan; the bytes of their files depend on the runs alone.
-    - Reading the table restores all numbers bit for bit.
-    - The scenario of a row, run again, reproduces the row.
-    - A grid point counts each run once. Its stable share is taken over the decided runs and
-      has a 95 % Wilson interval within [0, 1].
-    - All commands that are shown work: a reproduced run has the scenario hash of its row. If
-      the swept scenario has changed since, the command runs a file with the row's scenario.
+    - The results are a function of the plan. The bytes of the result files depend on the runs
+      alone, and not on the time or the number of worker processes.
+    - Reading the CSV table restores all numbers bit for bit.
+    - Running the scenario of a row again reproduces the row.
+    - A grid point counts each of its runs once. The stable share is the fraction of the decided
+      runs that are stable. Its 95 % Wilson interval lies within [0, 1].
+    - Every printed command reproduces the run, with the same hash of the scenario as its row.
+      If the source of the scenario has changed since the sweep, the command names a file to
+      which the scenario of the row was written.
 """
 
 import csv
@@ -32,77 +40,94 @@ from .sweep_cell import CellClass, CellResult, CellRun, apply_diff, diff_lines
 from .sweep_plan import SweepPlan, plan_from_json
 
 RESULTS_FILE = "results.csv"
+"""Name of the table of runs in the folder of a sweep."""
 PLAN_FILE = "plan.json"
-"""The plan of a sweep in its folder, which is needed to read `results.csv`."""
+"""Name of the file with the plan of the sweep, which is needed to read `results.csv`."""
 
 
 ResultRow = Mapping[str, Any]
-"""A run: `cell`, the value of each axis by key, `law`, `seed`, `random`, the further metrics by
-key, all fields of `CellResult`, `scenario_sha256`, `command` and `scenario`.
-Verdict and motion are texts; `scenario` is the canonical text of the scenario.
+"""One run, as a mapping with these keys: `cell`, the value of each axis under the key of the
+axis, `law`, `seed`, `random`, the further metrics under their keys, all fields of `CellResult`,
+`scenario_sha256`, `command` and `scenario`. The classes of the run are texts. `scenario` is the
+canonical text of the scenario that was run.
 """
 
 
 @dataclass(frozen=True, repr=False)
 class SweepResults(Result):
-    """Results of a sweep.
+    """Results of a finished sweep.
 
     Attributes:
-        plan: the sweep.
-        rows: a row per run, ordered by cell and then by seed.
+        plan: The sweep.
+        rows: One row per run, ordered by cell and then by seed.
     """
 
     plan: SweepPlan
     rows: Sequence[ResultRow]
 
     def blocks(self) -> Iterator[str]:
-        """Yields the lines of the plan and of the summary."""
+        """Yields the lines that describe the sweep, and then the lines of its summary."""
         yield from (*describe_sweep_plan(self.plan), *summarize_sweep(self))
 
     def to_rows(self) -> Sequence[ResultRow]:
-        """Returns a row per run."""
+        """Returns one row per run, ordered by cell and then by seed."""
         return self.rows
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns plain values, with the keys of `trilat sweep --json`."""
+        """Returns the results as plain values, with the keys of `trilat sweep --json`."""
         runs = [dict(row) for row in self.rows]
         return {"plan": self.plan.facts(), "runs": runs}
 
     def of_cell(self, number: int) -> list[ResultRow]:
         """Returns the runs of a cell, one per seed.
 
+        Args:
+            number: Number of the cell.
+
         Raises:
-            UsageError: the sweep has no cell with this number.
+            UsageError: The sweep has no cell with this number.
         """
         self.plan.cell(number)
         return [row for row in self.rows if row["cell"] == number]
 
     def outcome(self, row: ResultRow) -> CellResult:
-        """Returns the result of a run."""
-        # the defaults of CellResult fill in fields that older files lack
+        """Returns the result of a run as an object.
+
+        Fields that are missing from the row, because an older version wrote it, have the
+        default values of `CellResult`.
+        """
         return msgspec.convert(row, CellResult)
 
 
 def build_result_rows(plan: SweepPlan, entries: Sequence[CellRun]) -> list[ResultRow]:
-    """Returns the rows of finished runs, ordered by cell and then by seed."""
+    """Builds the table of finished runs.
+
+    Args:
+        plan: The sweep.
+        entries: The runs, in any order.
+
+    Returns:
+        One row per run, ordered by cell and then by seed.
+    """
     seed_rank = {seed: rank for rank, seed in enumerate(plan.seeds)}
     runs_of_cell = Counter(entry.cell for entry in entries)
     ordered = sorted(entries, key=lambda entry: (entry.cell, seed_rank[entry.seed]))
     rows: list[ResultRow] = []
     for entry in ordered:
-        has_seeds = runs_of_cell[entry.cell] > 1
-        suffix = f"-seed-{entry.seed}" if has_seeds else ""
+        # The log of a cell with a single run needs no seed in its name.
+        has_several_runs = runs_of_cell[entry.cell] > 1
+        suffix = f"-seed-{entry.seed}" if has_several_runs else ""
         rows.append(_build_row(plan, entry, f"cell-{entry.cell}{suffix}.mcap"))
     return rows
 
 
 def _build_row(plan: SweepPlan, entry: CellRun, log: str) -> ResultRow:
-    """Returns the row of a finished run.
+    """Builds the row of a finished run.
 
     Args:
-        plan: the sweep.
-        entry: the run.
-        log: file name of the log that the row's command records.
+        plan: The sweep.
+        entry: The run.
+        log: Name of the log that the command in the row records.
     """
     cell = plan.cell(entry.cell)
     command = build_sim_command(
@@ -130,20 +155,31 @@ def _build_row(plan: SweepPlan, entry: CellRun, log: str) -> ResultRow:
 def build_sim_command(
     plan: SweepPlan, overrides: Sequence[str], seed: int, duration_s: float, log: str
 ) -> str:
-    """Returns the command that records the log of a run."""
+    """Returns the command that simulates a run again and records its log.
+
+    Args:
+        plan: The sweep.
+        overrides: Overrides KEY=VALUE that turn the swept scenario into that of the run.
+        seed: Seed of the run.
+        duration_s: Duration of the run, in s.
+        log: Name of the log.
+    """
     kept_overrides = list[str]()
     for override in (*plan.overrides, *overrides):
         key = override.partition("=")[0].strip()
-        if key not in ("seed", "duration_s"):  # these have options of their own
+        # Seed and duration have their own options in the command.
+        if key not in ("seed", "duration_s"):
             kept_overrides.append(override)
     options = ["--seed", str(seed), "--duration", f"{duration_s:.12g}", "-o", log]
     return format_command("sim", plan.written.label, *set_options(kept_overrides), *options)
 
 
 def reproduction_duration_s(plan: SweepPlan, outcome: CellResult) -> float:
-    """Returns a duration that reproduces a run, in s.
+    """Returns the duration with which a run must be started to reproduce its row, in s.
 
-    A run that diverged gets the duration it was planned for, and ends by diverging again.
+    A run that diverged, that is, left the limits of its arms, ended before its planned
+    duration. It is started with the planned duration, and will end early again. Every
+    extension of an undecided run doubles the planned duration.
     """
     if outcome.diverged_s is None:
         return outcome.ran_s
@@ -153,44 +189,58 @@ def reproduction_duration_s(plan: SweepPlan, outcome: CellResult) -> float:
 
 
 _SCENARIO_COLUMN = "scenario_changes"
-"""Column of the table with the row's scenario, as a JSON diff against the swept scenario."""
+"""Column of the CSV table with the scenario of the row. To save space it contains only the
+differences from the swept scenario, as JSON.
+"""
 
 _LONGEST_CELL = 2**26
-"""Largest number of characters in a table cell: a scenario with a trace exceeds the default
-limit of the csv module, 131 072.
+"""Largest number of characters in a cell of the CSV table. A scenario that contains a delay
+trace exceeds the default limit of the csv module, 131 072 characters.
 """
 
 
 def encode_results(plan: SweepPlan, rows: Sequence[ResultRow]) -> str:
-    """Returns the results as CSV, with a line per run."""
-    kinds = _list_result_columns(plan)
+    """Returns the results as CSV text, with one line per run.
+
+    Args:
+        plan: The sweep.
+        rows: The runs.
+    """
+    column_types = _list_result_columns(plan)
     lines = []
     for row in rows:
-        line = {name: _format_cell(row[name], kind) for name, kind in kinds.items()}
+        line = {name: _format_cell(row[name], kind) for name, kind in column_types.items()}
         changes = diff_lines(row["scenario"], plan.base.text)
         line[_SCENARIO_COLUMN] = json.dumps(changes, ensure_ascii=False)
         lines.append(line)
-    return encode_csv(lines, [*kinds, _SCENARIO_COLUMN])
+    return encode_csv(lines, [*column_types, _SCENARIO_COLUMN])
 
 
 def _list_result_columns(plan: SweepPlan) -> dict[str, type]:
-    """Returns the type of each column of the table, except that of the scenarios."""
-    kinds = {**_list_axis_columns(plan), "seed": int, "random": bool}
-    kinds |= dict.fromkeys((*plan.metrics, *CellResult.__struct_fields__), float)
-    kinds |= dict.fromkeys(("verdict", "motion", "reasons", "scenario_sha256", "command"), str)
-    return kinds | {"extended": int}
+    """Returns the columns of the CSV table in their order, each with the type of its values.
+
+    The column with the scenario is not listed, because it needs special treatment.
+    """
+    column_types = {**_list_axis_columns(plan), "seed": int, "random": bool}
+    # All fields of a result are numbers, except those whose types are corrected below.
+    column_types |= dict.fromkeys((*plan.metrics, *CellResult.__struct_fields__), float)
+    text_columns = ("verdict", "motion", "reasons", "scenario_sha256", "command")
+    column_types |= dict.fromkeys(text_columns, str)
+    return column_types | {"extended": int}
 
 
 def _list_axis_columns(plan: SweepPlan) -> dict[str, type]:
-    """Returns the type of each column that locates a cell."""
-    axes = {axis.key: float if axis.numeric else str for axis in plan.axes}
-    return {"cell": int, **axes, "law": str}
+    """Returns the columns that identify a cell: its number, its axis values and its law."""
+    axis_types = {axis.key: float if axis.numeric else str for axis in plan.axes}
+    return {"cell": int, **axis_types, "law": str}
 
 
 def _format_cell(value: Any, kind: type) -> str:
-    """Returns the text of a table cell, from which numbers parse back bit for bit.
+    """Returns the text of a cell of the CSV table, from which numbers parse back bit for bit.
 
-    None becomes an empty text.
+    Args:
+        value: The value. None becomes an empty text.
+        kind: Type of the column.
     """
     if value is None:
         return ""
@@ -200,11 +250,15 @@ def _format_cell(value: Any, kind: type) -> str:
 
 
 def _parse_cell(text: str, kind: type) -> Any:
-    """Returns the value of a table cell.
+    """Returns the value of a cell of the CSV table; the inverse of `_format_cell`.
+
+    Args:
+        text: Text of the cell.
+        kind: Type of the column.
 
     Raises:
-        ValueError: the text is not an integer or a float.
-        KeyError: the text is not a bool.
+        ValueError: The text is not a number although the column contains numbers.
+        KeyError: The text is neither "true" nor "false" although the column contains bools.
     """
     if kind is str:
         return text
@@ -214,13 +268,13 @@ def _parse_cell(text: str, kind: type) -> Any:
 
 
 def read_results(path: Path) -> SweepResults:
-    """Returns the results of a sweep.
+    """Reads the results of a finished sweep.
 
     Args:
-        path: the folder of the sweep, or its table.
+        path: Folder of the sweep, or its CSV table.
 
     Raises:
-        UsageError: there are no results, they cannot be read, or the sweep has not finished.
+        UsageError: There are no results, they cannot be read, or the sweep has not finished.
     """
     file = path / RESULTS_FILE if path.is_dir() else path
     if not file.is_file():
@@ -235,6 +289,7 @@ def read_results(path: Path) -> SweepResults:
         plan = plan_from_json(json.loads(plan_file.read_text(encoding="utf-8")))
     except (OSError, ValueError, KeyError, TypeError):
         raise UsageError(f"{plan_file}: cannot be read as the plan of a sweep") from None
+
     csv.field_size_limit(_LONGEST_CELL)
     try:
         with file.open(encoding="utf-8", newline="") as stream:
@@ -248,26 +303,32 @@ def read_results(path: Path) -> SweepResults:
 
 
 def _read_row(line: Mapping[str, str], plan: SweepPlan) -> ResultRow:
-    """Returns a line of the table as a row, with its scenario as text."""
-    kinds = _list_result_columns(plan)
-    row = {name: _parse_cell(line[name], kind) for name, kind in kinds.items()}
+    """Returns the row of a line of the CSV table, with the complete text of its scenario.
+
+    Args:
+        line: Texts of the line, by column.
+        plan: The sweep.
+    """
+    column_types = _list_result_columns(plan)
+    row = {name: _parse_cell(line[name], kind) for name, kind in column_types.items()}
     changes = json.loads(line[_SCENARIO_COLUMN])
     return {**row, "scenario": apply_diff(changes, plan.base.text)}
 
 
 GRID_POINTS_FILE = "places.csv"
+"""Name of the table of grid points in the folder of a sweep."""
 
 
 class GridPoint(NamedTuple):
-    """One cell with all its seeds.
+    """The combined results of one cell over all its seeds.
 
     Attributes:
-        cell: the number of the cell.
-        law: the laws of its sites.
-        values: the value on each axis.
-        counts: number of runs of each class, in the order of `CellClass`.
-        means: the mean of each quantity of `list_totals` over the runs that stayed within
-            their limits; None for fewer than two runs.
+        cell: Number of the cell.
+        law: Control laws of the sites.
+        values: Value of the cell on each axis.
+        counts: Number of runs of each class, in the order of `CellClass`.
+        means: Mean, with interval, of each quantity of `list_totals` over the runs that stayed
+            within the limits of their arms. None for fewer than two runs.
     """
 
     cell: int
@@ -278,7 +339,7 @@ class GridPoint(NamedTuple):
 
     @property
     def decided(self) -> int:
-        """Number of decided runs."""
+        """Number of runs that are stable or not stable, without the undecided ones."""
         classes = zip(self.counts, CellClass, strict=True)
         return sum(count for count, verdict in classes if verdict.stable is not None)
 
@@ -290,7 +351,7 @@ class GridPoint(NamedTuple):
 
     @property
     def doubtful(self) -> bool:
-        """True if some of the decided runs are stable and some are not."""
+        """True if the cell is stable with some seeds and not stable with others."""
         return 0 < self.stable < self.decided
 
     @property
@@ -300,24 +361,33 @@ class GridPoint(NamedTuple):
 
 
 def list_totals(plan: SweepPlan) -> list[str]:
-    """Returns the keys of the quantities that are averaged over the seeds of a cell."""
+    """Lists the keys of the quantities that are averaged over the seeds of a cell.
+
+    These are the totals that every run computes, and the metrics that the sweep requested.
+    """
     return list(dict.fromkeys((*RunTotals._fields, *plan.metrics)))
 
 
 def collect_grid_points(results: SweepResults) -> list[GridPoint]:
-    """Returns the grid points of a sweep, in the order of the cells."""
-    rows_of: dict[tuple[int, str], list[ResultRow]] = {}
+    """Combines the runs of each cell to a grid point.
+
+    Returns:
+        The grid points in the order of the cells.
+    """
+    rows_of_cell: dict[tuple[int, str], list[ResultRow]] = {}
     for row in results.rows:
-        position = (row["cell"], row["law"])
-        rows_of.setdefault(position, []).append(row)
+        cell_and_law = (row["cell"], row["law"])
+        rows_of_cell.setdefault(cell_and_law, []).append(row)
+
     points = []
     totals = list_totals(results.plan)
-    for (cell, law), rows in rows_of.items():
+    for (cell, law), rows in rows_of_cell.items():
         counts = Counter(row["verdict"] for row in rows)
-        within_limits = [row for row in rows if row["diverged_s"] is None]
+        # The totals of a run that diverged describe a shorter time, so they are not averaged.
+        rows_within_limits = [row for row in rows if row["diverged_s"] is None]
         means = []
         for key in totals:
-            values = [row.get(key) for row in within_limits]
+            values = [row.get(key) for row in rows_within_limits]
             means.append(mean_interval(values))
         point = GridPoint(
             cell=cell,
@@ -331,24 +401,35 @@ def collect_grid_points(results: SweepResults) -> list[GridPoint]:
 
 
 def encode_grid_points(plan: SweepPlan, points: Sequence[GridPoint]) -> str:
-    """Returns grid points as CSV: counts, stable share with its interval, and means."""
-    kinds = _list_axis_columns(plan)
-    kinds["runs"] = int
-    kinds |= {verdict.value: int for verdict in CellClass}
-    kinds |= dict.fromkeys(("stable_share", "stable_share_low", "stable_share_high"), float)
+    """Returns grid points as CSV text, with one line per point.
+
+    A line contains the number of the cell, its axis values and law, the number of runs of each
+    class, the stable share with its interval, and the means with their intervals.
+
+    Args:
+        plan: The sweep.
+        points: The grid points.
+    """
+    column_types = _list_axis_columns(plan)
+    column_types["runs"] = int
+    column_types |= {verdict.value: int for verdict in CellClass}
+    share_columns = ("stable_share", "stable_share_low", "stable_share_high")
+    column_types |= dict.fromkeys(share_columns, float)
     for key in list_totals(plan):
-        kinds |= {f"{key}_{field}": float for field in MeanInterval._fields}
-    rows = []
+        column_types |= {f"{key}_{field}": float for field in MeanInterval._fields}
+
+    lines = []
     for point in points:
-        share = point.stable / point.decided if point.decided else None
-        cells: list[Any] = [point.cell, *point.values, point.law]
-        cells += [sum(point.counts), *point.counts]
-        cells += [share, *point.interval]
+        stable_share = point.stable / point.decided if point.decided else None
+        # The values must stand in the order of the columns above.
+        values: list[Any] = [point.cell, *point.values, point.law]
+        values += [sum(point.counts), *point.counts]
+        values += [stable_share, *point.interval]
         for mean in point.means:
-            cells += mean or (None, None)
-        columns = zip(kinds.items(), cells, strict=True)
-        rows.append({name: _format_cell(cell, kind) for (name, kind), cell in columns})
-    return encode_csv(rows, list(kinds))
+            values += mean or (None, None)
+        columns = zip(column_types.items(), values, strict=True)
+        lines.append({name: _format_cell(value, kind) for (name, kind), value in columns})
+    return encode_csv(lines, list(column_types))
 
 
 _TOTALS = {
@@ -357,22 +438,23 @@ _TOTALS = {
     "force_peak_n": ("peak force", "N"),
     "walls_j": ("work of the walls", "J"),
 }
+"""Quantities whose range over the runs is printed: the key, the name and the unit."""
 
 
 _MAX_DOUBTFUL_SHOWN = 8
-"""Largest number of doubtful grid points in the summary; the file has all of them."""
+"""Largest number of doubtful grid points in the summary. The CSV file has all of them."""
 
 
 def describe_sweep_plan(plan: SweepPlan) -> list[str]:
-    """Returns the lines that describe a sweep before it runs."""
-    counts = [str(len(axis.texts)) for axis in plan.axes]
-    sizes = " x ".join(counts) or "1"
+    """Returns lines that tell the user how many runs a sweep has, and over which values."""
+    sizes = " x ".join(str(len(axis.texts)) for axis in plan.axes) or "1"
     laws = f" x laws {', '.join(plan.laws)}" if plan.laws else ""
     if len(plan.seeds) == 1:
         seeds = f"seed {plan.seeds[0]}"
     else:
         seeds = f"{count_nouns(len(plan.seeds), 'seed')} each where anything is random"
     lines = [f"{plan.base.name}: {count_nouns(plan.cells, 'cell')} ({sizes}{laws}), {seeds}"]
+
     for axis in plan.axes:
         texts = axis.texts
         count = len(texts)
@@ -381,6 +463,7 @@ def describe_sweep_plan(plan: SweepPlan) -> list[str]:
         else:
             values = [texts[n] for n in range(count)]
         lines.append(f"  over {axis.description}: {', '.join(values)}")
+
     first_s = plan.base.duration_s
     longest_s = plan.longest_s
     extended = f", an undecided one up to {longest_s:g} s" if longest_s > first_s else ""
@@ -389,7 +472,11 @@ def describe_sweep_plan(plan: SweepPlan) -> list[str]:
 
 
 def summarize_sweep(results: SweepResults) -> Iterator[str]:
-    """Yields the lines of a summary: verdicts, extensions, ranges, exponents and seeds."""
+    """Yields the lines of the summary that is printed after a sweep.
+
+    The lines state how many runs each class has, how many runs were extended, the ranges of
+    the measured quantities, the growth exponents, and the differences between seeds.
+    """
     rows = results.rows
     counts = Counter(row["verdict"] for row in rows)
     verdicts = ", ".join(f"{counts[verdict.value]} {verdict.value}" for verdict in CellClass)
@@ -421,7 +508,15 @@ def summarize_sweep(results: SweepResults) -> Iterator[str]:
 
 
 def _list_ranges(plan: SweepPlan, rows: Sequence[ResultRow]) -> list[str]:
-    """Returns the range of each quantity over runs, as texts; metrics of the plan first."""
+    """Returns texts with the smallest and largest value of each quantity over some runs.
+
+    Args:
+        plan: The sweep, whose requested metrics come first.
+        rows: The runs.
+
+    Returns:
+        Texts such as "RMS e 0.012 to 0.4 rad", without the quantities that no run has.
+    """
     metrics = map(find_quantity, plan.metrics)
     quantities = {metric.key: (metric.name, metric.unit) for metric in metrics}
     ranges = []
@@ -434,25 +529,32 @@ def _list_ranges(plan: SweepPlan, rows: Sequence[ResultRow]) -> list[str]:
 
 
 def _list_values(rows: Sequence[ResultRow], key: str) -> list[float]:
-    """Returns the values of a column, without missing values."""
+    """Returns the values of one column, without the rows in which the value is missing."""
     return [row[key] for row in rows if row.get(key) is not None]
 
 
 def _summarize_seeds(results: SweepResults) -> Iterator[str]:
-    """Yields the lines on cells without random numbers, and on doubtful grid points."""
-    fixed = sum(not row["random"] for row in results.rows)
-    if fixed:
-        yield f"in {_cells(fixed)} nothing is random: one seed was run there, for all"
+    """Yields the lines of the summary that concern the seeds.
+
+    The first line counts the cells in which nothing is random, which run only once. The others
+    list the cells that are stable with some seeds and not stable with others.
+    """
+    not_random = sum(not row["random"] for row in results.rows)
+    if not_random:
+        cells = count_nouns(not_random, "cell")
+        yield f"in {cells} nothing is random: one seed was run there, for all"
+
     doubtful = [point for point in collect_grid_points(results) if point.doubtful]
     if doubtful:
-        yield f"stable with some seeds and not with others, {_cells(len(doubtful))}:"
+        cells = count_nouns(len(doubtful), "cell")
+        yield f"stable with some seeds and not with others, {cells}:"
     for point in doubtful[:_MAX_DOUBTFUL_SHOWN]:
-        position = [point.law] if results.plan.laws else []
+        setting = [point.law] if results.plan.laws else []
         for axis, value in zip(results.plan.axes, point.values, strict=True):
-            position.append(f"{axis.key} {value}")
+            setting.append(f"{axis.key} {value}")
         low, high = (100.0 * end for end in point.interval)
         yield (
-            f"  cell {point.cell} ({', '.join(position)}): "
+            f"  cell {point.cell} ({', '.join(setting)}): "
             f"{point.stable} of {point.decided} stable, "
             f"95 % interval {low:.0f} to {high:.0f} %"
         )
@@ -460,12 +562,12 @@ def _summarize_seeds(results: SweepResults) -> Iterator[str]:
         yield f"  and {len(doubtful) - _MAX_DOUBTFUL_SHOWN} more, all in {GRID_POINTS_FILE}"
 
 
-def _cells(count: int) -> str:
-    return count_nouns(count, "cell")
-
-
 def list_next_commands(folder: Path) -> list[str]:
-    """Returns commands that use the results."""
+    """Returns commands that a user may want to run after a sweep.
+
+    Args:
+        folder: Folder of the sweep.
+    """
     command = format_command("sweep", str(folder))
     return [
         f"{command} --cell 0      # the command that makes a log of a cell",
@@ -476,10 +578,20 @@ def list_next_commands(folder: Path) -> list[str]:
 def build_reproduce_command(
     results: SweepResults, row: ResultRow, folder: Path
 ) -> tuple[str, str]:
-    """Returns the command that repeats the run of a row, and a note on the command, or "".
+    """Returns the command that repeats the run of a row.
 
-    If the scenario's source has changed since the sweep, the row's scenario is written to a
-    file in `folder`, which the command names.
+    If the source of the scenario has changed since the sweep, the command in the row would run
+    something else. In this case the scenario of the row is written to a file, and the command
+    runs that file.
+
+    Args:
+        results: Results of the sweep.
+        row: The run.
+        folder: Folder in which the file is written, if necessary.
+
+    Returns:
+        The command, and a note on a changed scenario. The note is empty if the scenario has
+        not changed.
     """
     plan = results.plan
     source = plan.written.label
@@ -490,9 +602,10 @@ def build_reproduce_command(
         current_plan = plan._replace(written=written)
         digest = current_plan.scenario(*overrides, f"seed={row['seed']}").sha256
     except ScenarioError:
-        digest = ""
+        digest = ""  # the source is missing or is no longer valid
     if digest == row["scenario_sha256"]:
         return row["command"], ""
+
     name = f"cell-{row['cell']}-seed-{row['seed']}"
     file = folder / f"{name}.toml"
     write_whole(file, row["scenario"])
