@@ -1,14 +1,20 @@
-"""Build the data of the interactive charts on a report's page.
+"""Computes the data of the interactive charts on the page of a report.
 
-`ChartBuilder` decimates the signals of a log to tables of columns, and describes charts whose
-lines refer to these columns by index. The scripts of the page draw the charts; the types of the
-data are those of `page_data`.
+A report is a web page about a recorded run. Scripts in the page draw its charts. For this they
+need the signals of the run, such as joint angles and torques. A log has a value per tick of
+1 ms, which is far too much for a page. `ChartBuilder` therefore decimates each signal: it
+divides the ticks into buckets, and keeps the least and the largest value of each bucket.
+
+The result consists of tables of columns, and of charts whose lines refer to these columns by
+index. `page_data` defines the types of the data.
 
 Invariant:
-    - Every spike of the log is on the page: decimation keeps the least and the largest value.
+    - Every spike of the log is on the page, because decimation keeps the least and the largest
+      value of a bucket.
     - Every line of a chart has a value to draw. A chart without any line is left out, and
-      `PageCharts.missing` names it.
-    - Numbers are base64 of little-endian int32 and float32, a third of their length as text.
+      `PageCharts.missing` names it, so that the page can say so.
+    - Numbers are base64 text of little-endian int32 and float32. This is a third of their
+      length as decimal text.
 """
 
 import base64
@@ -56,10 +62,12 @@ Values = NDArray[Any]
 """Numbers of any type."""
 
 BUCKET_BUDGET = 48_000
-"""Buckets of all columns together, which keep a page near 1 MB for any number of sites."""
+"""Number of buckets of all columns together. It keeps a page near 1 MB for any number of sites.
+"""
 _MIN_BUCKETS = 100
+"""Smallest number of buckets of a column, whatever the budget."""
 _MAX_BUCKETS = 1200
-"""Smallest and largest number of buckets of a column."""
+"""Largest number of buckets of a column."""
 _BOX_INSTANTS = 60
 """Number of instants at which the box around the motion of the arms is measured."""
 _CHAIN_INSTANTS = 400
@@ -69,12 +77,12 @@ PICTURE_SIDE = 4.0
 
 
 class PageCharts(NamedTuple):
-    """The charts of a page.
+    """The charts of a page, as `ChartBuilder.build` returns them.
 
     Attributes:
-        data: the data that the scripts of the page draw.
-        missing: by section, the titles of charts that are left out because the log has no value
-            for them.
+        data: Data that the scripts of the page draw.
+        missing: Titles of the charts that are left out because the log has no value for them,
+            by section of the page.
     """
 
     data: PageData
@@ -82,16 +90,18 @@ class PageCharts(NamedTuple):
 
 
 class ChartBuilder:
-    """Builds the charts of a log.
+    """Computes the charts of the page of one log.
 
     Args:
-        log: the log.
-        twin: the log of the same run without operators, or None.
+        log: Log of the run.
+        twin: Log of the same run without operators, the people or programs that move the arms.
+            None if there is no such log. Then the chart of the motion due to operators is left
+            out.
 
     Attributes:
-        bounds_m: left, right, bottom and top of a box around the motion of all arms, m.
-        units_per_m: scale of the pictures of the arms, in units of the picture per m; 1 for
-            planar arms of any size.
+        bounds_m: Left, right, bottom and top of a box around the motion of all arms, in m.
+        units_per_m: Scale of the pictures of the arms, in units of the picture per m. It is 1
+            for planar arms. Pictures with a chain are scaled to the size `PICTURE_SIDE`.
     """
 
     def __init__(self, log: Log, twin: Log | None) -> None:
@@ -117,19 +127,25 @@ class ChartBuilder:
             self._joint_titles.append(f"joint {title.removeprefix('joint ')}")
 
         counts = max(arm.counts for arm in arms)
-        # a bucket keeps the rows of the extremes of all columns of its table, so that a table
-        # of many columns is larger than a table per column
+        # Each bucket of a table keeps the rows with the extremes of all its columns. Therefore
+        # one table with many columns is larger than many tables with one column.
         self._has_table_per_column = counts.joints > 2
+        # Nine signals have a column per joint. The ages of samples have a column per peer.
         columns_per_site = 9 * counts.joints + counts.parameters + len(log.sites)
         buckets = BUCKET_BUDGET // (columns_per_site * len(log.sites))
         self._buckets = max(_MIN_BUCKETS, min(_MAX_BUCKETS, buckets))
 
     def build(self) -> PageCharts:
-        """Returns the data of the page, and the titles of the charts that are left out."""
+        """Computes all charts of the page.
+
+        Returns:
+            The data of the page, and the titles of the charts that are left out.
+        """
         log = self._log
         charts: list[Chart] = []
         missing: dict[str, list[str]] = {}
-        for chart in [*self._build_motion_charts(), *self._build_timing_charts()]:
+        candidates = [*self._build_motion_charts(), *self._build_timing_charts()]
+        for chart in candidates:
             if chart.series:
                 charts.append(chart)
             else:
@@ -142,10 +158,12 @@ class ChartBuilder:
                 arms.append(self._build_arm(index, site))
             intervals = find_mode_intervals(log[site])
             spans[site] = [ModeSpan(index, *interval) for interval in intervals]
+
         changes = []
         for number, applied in enumerate(self._changes, 1):
             change = applied.change
             changes.append(MarkedChange(number, change.at_s, applied.site, change.link))
+
         light = list_site_colours(log.scenario)
         dark = list_site_colours(log.scenario, DARK_SITE_COLOURS)
         data = PageData(
@@ -161,7 +179,11 @@ class ChartBuilder:
         return PageCharts(data, missing)
 
     def _build_motion_charts(self) -> Iterator[TimeChart]:
-        """Yields the charts of torques, positions, errors, estimates and displacements."""
+        """Yields the charts of torques, positions, errors, estimates and displacements.
+
+        Some of them are yielded only if the run has the quantity, such as the operator's
+        torque.
+        """
         log = self._log
         operated = site_signals.sites_with_operator(log)
         if operated:
@@ -194,7 +216,11 @@ class ChartBuilder:
         yield from self._chart_joints("control", "control torque", "N m", torques)
 
     def _build_timing_charts(self) -> Iterator[Chart]:
-        """Yields the charts of ages, delays, lateness and computing time."""
+        """Yields the charts of sample ages, delays, lateness of ticks and computing time.
+
+        Charts of delays need a delay that varies, and charts of the loop need a run in real
+        time.
+        """
         log = self._log
         yield from self._chart_ages()
         if age_and_lateness.has_varying_delay(log):
@@ -211,7 +237,16 @@ class ChartBuilder:
             yield from self._chart_histograms()
 
     def _add_table(self, site: str, tick: Ints, values: Values) -> int:
-        """Adds a table of values, shape (P, C), at ticks, shape (P,), and returns its index."""
+        """Adds a table of values to the page.
+
+        Args:
+            site: Name of the site, whose tick rate converts ticks to times.
+            tick: Ticks of the values, shape (P,).
+            values: The values, shape (P, C), a column per quantity.
+
+        Returns:
+            The index of the table.
+        """
         columns = [_encode(column, "<f4") for column in values.T]
         rate_hz = self._log.scenario.sites[site].rate_hz
         table = ColumnTable(rate_hz=rate_hz, tick=_encode(tick, "<i4"), columns=columns)
@@ -221,30 +256,45 @@ class ChartBuilder:
         return len(self._tables) - 1
 
     def _add_decimated(self, site: str, tick: Ints, t_s: Array, values: Values) -> int:
-        """Adds a table of decimated values, and returns its index.
+        """Decimates values, and adds them to the page as a table.
 
         Args:
-            site: name of the site.
-            tick: ticks of the values, shape (K,).
-            t_s: times of the values, s, shape (K,).
-            values: the values, shape (K, C).
+            site: Name of the site.
+            tick: Ticks of the values, shape (K,).
+            t_s: Times of the values, in s, shape (K,).
+            values: The values, shape (K, C).
+
+        Returns:
+            The index of the table.
         """
         trace = decimate(tick, t_s, values, self._buckets)
         return self._add_table(site, trace.tick, trace.values)
 
     def _add_records(self, site: str, values: Values) -> int:
-        """Adds a table of decimated values over all records of a site; returns its index."""
+        """Decimates values that belong to the records of a site, and adds them as a table.
+
+        Args:
+            site: Name of the site.
+            values: A row of values for each record of the site, shape (K, C).
+
+        Returns:
+            The index of the table.
+        """
         records = self._log[site]
         return self._add_decimated(site, records.tick, records.t_s, values)
 
     def _add_signal(
         self, signal: Callable[[SiteLog], Values], sites: Sequence[str] = ()
     ) -> dict[str, list[TableSeries]]:
-        """Adds tables of a signal, and returns by site a line per column.
+        """Adds the tables of a signal of several sites.
 
         Args:
-            signal: function of a site's records that returns values, shape (K, C).
-            sites: the sites of the signal; by default all sites.
+            signal: Function that computes the values of the signal, shape (K, C), from the K
+                records of a site.
+            sites: Names of the sites. Empty for all sites.
+
+        Returns:
+            The lines of each site, one line per column of the signal.
         """
         series = {}
         for site in sites or self._log.sites:
@@ -256,7 +306,20 @@ class ChartBuilder:
     def _add_columns(
         self, site: str, tick: Ints, t_s: Array, values: Values
     ) -> list[TableSeries]:
-        """Adds tables of values, shape (K, C), and returns a line per column."""
+        """Decimates the values of one site, and adds them to the page.
+
+        All columns share one table if there are few of them. Otherwise each column has its own
+        table, which is smaller in total, see `__init__`.
+
+        Args:
+            site: Name of the site.
+            tick: Ticks of the values, shape (K,).
+            t_s: Times of the values, in s, shape (K,).
+            values: The values, shape (K, C).
+
+        Returns:
+            A line per column.
+        """
         if self._has_table_per_column:
             tables = [
                 self._add_decimated(site, tick, t_s, column[:, np.newaxis])
@@ -268,7 +331,14 @@ class ChartBuilder:
         return [self._make_series(site, table, column) for column in columns]
 
     def _make_series(self, site: str, table: int, column: int, label: str = "") -> TableSeries:
-        """Returns a line in the colour of a site; by default its label is the site's name."""
+        """Returns a line in the colour of a site.
+
+        Args:
+            site: Name of the site.
+            table: Index of the table with the values of the line.
+            column: Index of the column in this table.
+            label: Text in the legend. Empty for the name of the site.
+        """
         colour = self._log.sites.index(site)
         return TableSeries(label=label or site, colour=colour, table=table, column=column)
 
@@ -284,12 +354,13 @@ class ChartBuilder:
         """Returns a chart over time, without the lines that have no value to draw.
 
         Args:
-            section: key of the section in `report.toml`.
-            title: title of the chart.
-            unit: unit of the values.
-            series: the lines.
-            sites: the sites whose events are marked; by default all sites.
-            **options: further fields of `TimeChart`.
+            section: Key of the section of the page, as in `report.toml`.
+            title: Title of the chart.
+            unit: Unit of the values.
+            series: The lines.
+            sites: Names of the sites whose changes and modes are marked in the chart. Empty for
+                all sites.
+            **options: Further fields of `TimeChart`.
         """
         drawable = [line for line in series if self._has_values[line.table][line.column]]
         return TimeChart(
@@ -309,14 +380,16 @@ class ChartBuilder:
         series_by_site: dict[str, list[TableSeries]],
         titles: Sequence[str] = (),
     ) -> Iterator[TimeChart]:
-        """Yields a chart per joint, with a line per site.
+        """Yields a chart per joint, each with a line per site.
 
         Args:
-            section: key of the section in `report.toml`.
-            title: name of the quantity.
-            unit: unit of the quantity.
-            series_by_site: for each site a line per joint.
-            titles: names of the joints, or of the axes of the task; by default the joints.
+            section: Key of the section of the page, as in `report.toml`.
+            title: Name of the quantity.
+            unit: Unit of the quantity.
+            series_by_site: For each site, a line per joint. Sites may have different numbers of
+                joints.
+            titles: Names of the joints, or of the axes of the task. Empty for the joints'
+                names.
         """
         for joint, name in enumerate(titles or self._joint_titles):
             series = [lines[joint] for lines in series_by_site.values() if joint < len(lines)]
@@ -344,7 +417,11 @@ class ChartBuilder:
                 )
 
     def _chart_estimates(self) -> Iterator[TimeChart]:
-        """Yields a chart per inertial parameter, with dashed lines at the true values."""
+        """Yields a chart per inertial parameter of the arms.
+
+        Adaptive control laws estimate the inertial parameters of their arm while it moves. Each
+        chart has a line per site, and dashed lines at the true values of the scenario.
+        """
         log = self._log
         estimates = self._add_signal(site_signals.parameter_estimates)
         arms = log.scenario.arms
@@ -363,7 +440,15 @@ class ChartBuilder:
             )
 
     def _draw_truths(self, truths: Sequence[float]) -> list[StatedLine]:
-        """Returns a line at each true value of a parameter; a single line for equal values."""
+        """Returns lines at the true values of a parameter over the whole run.
+
+        Args:
+            truths: The true value for each site.
+
+        Returns:
+            A line per site in its colour. If all values are equal, a single line in a neutral
+            colour.
+        """
         if len(set(truths)) == 1:
             return [self._draw_limit(truths[0])]
         lines = []
@@ -372,11 +457,16 @@ class ChartBuilder:
         return lines
 
     def _draw_limit(self, value: float) -> StatedLine:
-        """Returns a line at a value over the whole run, in the colour of no site."""
+        """Returns a line at a value over the whole run, in a neutral colour."""
         return StatedLine(value=value, colour="limit", from_s=0.0, to_s=self._end_s)
 
     def _chart_ages(self) -> Iterator[TimeChart]:
-        """Yields a chart per site of the ages of its samples, with the stated delays."""
+        """Yields a chart per site with the age of the samples that it uses.
+
+        A sample is the state that a peer, another site, publishes in one tick. Its age is the
+        time since it was sent. Lines at the delays that the scenario states serve for
+        comparison.
+        """
         log = self._log
         for site in log.sites:
             ages_ms = site_signals.sample_ages_ms(log, site)
@@ -401,9 +491,14 @@ class ChartBuilder:
             )
 
     def _list_stated_delays(self, site: str) -> list[StatedLine]:
-        """Returns the stated mean delays to a site, ms: a line per peer and link model.
+        """Returns lines at the mean delays that the scenario states for the links to a site.
 
-        A single line stands for all of them if the delays are equal.
+        Args:
+            site: Name of the receiving site.
+
+        Returns:
+            A line per peer and link model, from the start to the end of the model. If all
+            delays are equal, a single line in a neutral colour.
         """
         log = self._log
         lines: list[StatedLine] = []
@@ -411,7 +506,7 @@ class ChartBuilder:
             colour = log.sites.index(peer)
             states = list_stated_models(log, f"{peer}->{site}", self._changes)
             t_s, mean_ms = age_and_lateness.trace_stated_delay(log, states)
-            # each model has three points: its start, its end, and a gap
+            # The trace has three points per model: its start, its end, and a gap.
             models = zip(t_s[::3], t_s[1::3], mean_ms[::3], strict=True)
             for start_s, end_s, delay_ms in models:
                 if np.isfinite(delay_ms):
@@ -428,7 +523,10 @@ class ChartBuilder:
         return lines
 
     def _chart_distributions(self) -> Iterator[DistributionChart]:
-        """Yields a chart per receiver with the distributions of ages and delays."""
+        """Yields a chart per receiving site with the distributions of ages and delays.
+
+        A curve at x shows the percentage of ages, or of delays, that are at most x ms.
+        """
         measured = age_and_lateness.measure_delay_distributions(self._log)
         x_ms = age_and_lateness.choose_delay_axis_ms(measured)
         for site in self._log.sites:
@@ -459,7 +557,7 @@ class ChartBuilder:
             )
 
     def _chart_histograms(self) -> Iterator[HistogramChart]:
-        """Yields the histograms of the loops' lateness and computing time."""
+        """Yields the histograms of the lateness of ticks and of their computing time."""
         log = self._log
         edges_us = age_and_lateness.choose_bin_edges_us(log)
         rates_hz = {log.scenario.sites[site].rate_hz for site in log.sites}
@@ -485,11 +583,17 @@ class ChartBuilder:
             )
 
     def _build_arm(self, index: int, site: str) -> PlanarArm | ChainArm:
-        """Adds the motion of a site's arm and of its bodies, and returns the arm.
+        """Adds the motion of a site's arm and of the bodies that it touches.
+
+        The script of the page draws planar arms from their joint angles and link lengths. Other
+        arms, called chains, are handled by `_build_chain`.
 
         Args:
-            index: index of the site.
-            site: name of the site, which has at least one record.
+            index: Index of the site, which is also that of its colour.
+            site: Name of the site, which must have at least one record.
+
+        Returns:
+            Description of the arm, which refers to the table of its motion.
         """
         arm = self._log.scenario.arms[site]
         if arm.chain is not None:
@@ -508,16 +612,24 @@ class ChartBuilder:
         )
 
     def _build_chain(self, index: int, site: str) -> ChainArm:
-        """Adds the motion of a chain as points of its picture, and returns the chain.
+        """Adds the motion of a chain, an arm of any number of joints in space.
 
-        The page cannot compute forward kinematics of chains. It gets the joint positions of the
-        actual arm, of the reference and of the shadow at `_CHAIN_INSTANTS` records.
+        The page cannot compute the forward kinematics of chains. Its table therefore contains
+        the joint positions in the picture, of the actual arm, of the reference and of the arm's
+        shadow on the floor, at up to `_CHAIN_INSTANTS` records.
+
+        Args:
+            index: Index of the site, which is also that of its colour.
+            site: Name of the site, which must have at least one record.
+
+        Returns:
+            Description of the chain, which refers to the table of its motion.
         """
         records = self._log[site]
         arm = self._log.scenario.arms[site]
         last = len(records) - 1
         instants = np.linspace(0, last, _CHAIN_INSTANTS).astype(np.int64)
-        rows = np.unique(instants)
+        rows = np.unique(instants)  # short logs have fewer records than instants
 
         desired_q = site_signals.reference_angles(records)
         actual_m = joint_positions_m(arm, records.q[rows])
@@ -527,7 +639,7 @@ class ChartBuilder:
             arm_poses.project_arm_m(arm, desired_m),
             arm_poses.project_arm_m(arm, actual_m, onto_floor=True),
         )
-        # the first point is the base, which does not move
+        # The first point is the base, which does not move.
         moving_points_m = [picture[:, 1:] for picture in pictures]
         points = np.stack(moving_points_m, axis=1) * self.units_per_m
         bodies = self._trace_bodies(site, rows)
@@ -542,15 +654,15 @@ class ChartBuilder:
         )
 
     def _trace_bodies(self, site: str, rows: NDArray[np.int64]) -> list[NDArray[np.float64]]:
-        """Returns the edges of each body of a site's plant in the picture.
+        """Returns the edges of each body that a site's arm can touch, in the picture.
 
         Args:
-            site: name of the site.
-            rows: indices of K records.
+            site: Name of the site.
+            rows: Indices of K records.
 
         Returns:
-            Per body the coordinates of its P corners along all edges, shape (K, 2 P), in units
-            of the picture.
+            For each body the coordinates of its P corners along all edges, shape (K, 2 P), in
+            units of the picture. Empty if the site has no bodies.
         """
         sizes_m = self._log.scenario.bodies_m(site).values()
         if not sizes_m:
@@ -567,6 +679,11 @@ def _lateness_ms(records: SiteLog) -> Values:
 
 
 def _encode(column: Values, kind: str) -> str:
-    """Returns numbers as base64 of a NumPy type, such as "<f4"."""
+    """Returns numbers as base64 text.
+
+    Args:
+        column: The numbers, shape (P,).
+        kind: NumPy type of each number, such as "<f4" for little-endian float32.
+    """
     numbers = np.ascontiguousarray(column.astype(kind))
     return base64.b64encode(numbers.tobytes()).decode()

@@ -1,14 +1,21 @@
-"""Write the report of a log: the page `report.html` and the numbers `summary.json`.
+"""Writes the report of a recorded run: a web page and a file with the numbers of the run.
 
-`write_report` collects the numbers of the run, draws the pictures of its certificate and writes
-both files. `render_report` fills the template `assets/report.html` with sections, each of which
-one function of this module renders as HTML. The interactive charts are drawn in the browser
-from data of `charts`.
+A run is a session of two or more sites, each of which is a process that controls one arm. The
+log of the run is an MCAP file. `write_report` computes the numbers of the run from the log,
+draws the figures that explain whether the run was stable, and writes two files:
+
+- `report.html`, a page for people. `render_report` fills the template `assets/report.html`.
+  Each section of the page comes from one function of this module.
+- `summary.json`, the same numbers for programs.
+
+The interactive charts are drawn in the browser by scripts. `charts.ChartBuilder` computes their
+data, which the page contains as JSON.
 
 Invariant:
-    - The page is a single file that holds its images, styles and scripts. It loads nothing from
-      a network.
-    - Every text of a scenario or of a log is escaped in this module, cell by cell.
+    - The page is a single file that contains its images, styles and scripts. It loads nothing
+      from a network, so that it can be sent by mail and read offline.
+    - Every text that comes from a scenario or from a log is escaped in this module, where the
+      cell of the table is made. Such a text therefore cannot add HTML to the page.
     - Empty tables are left out.
 """
 
@@ -59,12 +66,15 @@ _PAGE_TEXTS: dict[str, dict[str, Any]] = tomllib.loads(
 )
 """Headings and notes of the page: `charts` by section, and `notes` by table."""
 _CODE = re.compile(r"`([^`]+)`")
+"""Text in backticks, which the page shows as code."""
 _MAX_MODES = 200
-"""Largest number of listed intervals of a site in a mode; summary.json has all."""
+"""Largest number of listed mode intervals per site. summary.json has all of them."""
 _MAX_ALARMS = 8
 """Largest number of alarms at the top of the page."""
 _SEVERE_ALARMS = ("FAULT", "STOPPED")
+"""Words of the alarms of sites that can no longer move."""
 _NO_VALUE = "the log has no value to draw"
+"""Reason why a chart is left out."""
 _NO_NUMBER = "–"
 """Cell of a missing number."""
 _PREMISE_MARKS = {
@@ -82,16 +92,20 @@ def write_report(
     twin: Log | None = None,
     verdicts: Iterable[Finding] = (),
 ) -> list[Path]:
-    """Writes report.html and summary.json, and returns their paths.
+    """Writes report.html and summary.json into a folder.
 
     Args:
-        log: the log of the run.
-        folder: the folder of both files, created if it does not exist.
-        certificate: the stability certificate of the log.
-        twin: the log of the same run without operators. Without `twin` the page does not show
-            the motion due to operators.
-        verdicts: the checks of the log. They are read last, because the process that checks
-            the log may still run while the pictures of the certificate are drawn.
+        log: Log of the run.
+        folder: Folder of both files. It is created if it does not exist.
+        certificate: Judgement whether the run was stable, with its reasons.
+        twin: Log of the same run, simulated without the people or programs that move the arms.
+            The page shows the difference, which is the motion due to these operators. None
+            leaves this section out.
+        verdicts: Results of the checks of the log. They are read only after the figures of the
+            certificate are drawn, because another process may still check the log until then.
+
+    Returns:
+        The paths of the page and of the summary.
     """
     make_folder(folder)
     facts = summarise_run(log, twin)
@@ -128,17 +142,19 @@ def render_report(
     """Returns the page of a log as HTML.
 
     Args:
-        log: the log of the run.
-        twin: the log of the same run without operators, or None.
-        verdicts: the checks of the log.
-        facts: the numbers of the log, from `summarise_run`.
-        certificate: the section on the certificate, as HTML.
-        verdict: the verdict on stability, as HTML; the page begins with this verdict.
+        log: Log of the run.
+        twin: Log of the same run without operators, or None, see `write_report`.
+        verdicts: Results of the checks of the log.
+        facts: Numbers of the run, from `summarise_run`.
+        certificate: HTML of the section about stability. Empty for no such section.
+        verdict: HTML of the judgement about stability, with which the page begins. Empty for
+            none.
     """
     scenario = log.scenario
     builder = ChartBuilder(log, twin)
     data, missing = builder.build()
-    # "<" could end the script element that holds the data; in JSON, "\u003c" means the same
+    # A "<" in a text could end the script element that contains the data. In JSON, "\u003c"
+    # means the same character.
     data_json = _to_json(data.to_builtins()).replace("<", "\\u003c")
     return Template(_read_asset("report.html")).substitute(
         name=escape(scenario.name),
@@ -165,21 +181,32 @@ def render_report(
 
 
 def _read_asset(name: str) -> str:
+    """Returns the text of a file of the page, such as its template, its style or a script."""
     return (_ASSETS / name).read_text(encoding="utf-8")
 
 
 def _to_json(value: Any, indent: int | None = None) -> str:
+    """Returns a value as JSON text. Raises ValueError for NaN and infinity."""
     return json.dumps(value, allow_nan=False, ensure_ascii=False, indent=indent)
 
 
 def _render_site_css(log: Log) -> str:
-    """Returns the style rules of the sites' colours, for light and for dark screens."""
+    """Returns the CSS rules for the colours of the sites, for light and for dark screens."""
     light = _render_site_rules(log, SITE_COLOURS)
     dark = _render_site_rules(log, DARK_SITE_COLOURS)
     return f"{light}@media screen and (prefers-color-scheme: dark) {{\n{dark}}}"
 
 
 def _render_site_rules(log: Log, colours: Sequence[str]) -> str:
+    """Returns the CSS rules of one palette.
+
+    The site with index i has the classes `site-i`, for lines in its colour, and `fill-i`, for
+    areas in its colour. Colours repeat if there are more sites than colours.
+
+    Args:
+        log: Log with the sites.
+        colours: Palette from which the colours of the sites are chosen.
+    """
     palette = list_site_colours(log.scenario, colours)
     rules = ""
     for index in range(len(log.sites)):
@@ -190,7 +217,7 @@ def _render_site_rules(log: Log, colours: Sequence[str]) -> str:
 
 
 def _render_stability_verdict(certificate: Certificate) -> str:
-    """Returns the judgement of the certificate as a list of one item."""
+    """Returns the judgement about stability as an HTML list with one item."""
     judgement = describe_certificate(certificate)[0]
     css_class = {"ok": "passed", "FAIL": "failed"}.get(judgement.mark, "open")
     sign = {"ok": "✓", "FAIL": "✗"}.get(judgement.mark, "?")
@@ -200,7 +227,11 @@ def _render_stability_verdict(certificate: Certificate) -> str:
 
 
 def _render_certificate_section(log: Log, certificate: Certificate) -> str:
-    """Returns the certificate as text, tables and pictures."""
+    """Returns the section that explains whether the run was stable.
+
+    It consists of sentences, tables and figures. The figures are embedded as PNG data, because
+    the page must be a single file.
+    """
     html = _render_certificate(certificate)
     for title, figure in _draw_certificate(log, certificate):
         drawing = io.BytesIO()
@@ -212,7 +243,15 @@ def _render_certificate_section(log: Log, certificate: Certificate) -> str:
 
 
 def _draw_certificate(log: Log, certificate: Certificate) -> list[tuple[str, Figure]]:
-    """Returns the figures of a certificate with their titles."""
+    """Draws the figures of a certificate.
+
+    Which figures exist depends on the evidence of the certificate: the energy function of the
+    stability proof and its energies, the energies that the control laws declare, and twins,
+    which are repeated runs with a small push that grows or decays.
+
+    Returns:
+        Title and figure of each.
+    """
     observed = certificate.observed
     twins = certificate.twins
     figures = []
@@ -228,7 +267,11 @@ def _draw_certificate(log: Log, certificate: Certificate) -> list[tuple[str, Fig
 
 
 def _render_certificate(certificate: Certificate) -> str:
-    """Returns the sentences of a certificate, and its tables of premises and energies."""
+    """Returns the sentences of a certificate, and its tables of premises and energies, as HTML.
+
+    A premise is a condition of the stability theorem. The table says whether each one held in
+    the run. The table of energies exists only if the energies could be computed.
+    """
     judgement, *grounds = (escape(line.text) for line in describe_certificate(certificate))
     html = f"<p><strong>{judgement}</strong></p>"
     html += "".join(f"<p>{text}</p>" for text in grounds)
@@ -250,24 +293,31 @@ def _render_certificate(certificate: Certificate) -> str:
 
 
 def render_alarms(log: Log) -> str:
-    """Returns the alarms of the sites in large type; "" if there were none.
+    """Returns the alarms of the sites as a list in large type.
 
-    Faults and stops are shown first. Other alarms are shown only if no site was in fault or
-    stopped.
+    Faults and stops are the severe alarms. If there are any, only these are listed, because
+    other alarms usually follow from them. At most `_MAX_ALARMS` alarms are listed, and the rest
+    is counted.
+
+    Returns:
+        HTML of the list. Empty if there were no alarms.
     """
     alarms = list_alarms(log)
-    severe = [alarm for alarm in alarms if alarm.word in _SEVERE_ALARMS]
-    listed = (severe or alarms)[:_MAX_ALARMS]
-    if not listed:
+    if not alarms:
         return ""
+    severe = [alarm for alarm in alarms if alarm.word in _SEVERE_ALARMS]
+    candidates = severe if severe else alarms
+    listed = candidates[:_MAX_ALARMS]
+
     items = "".join(_render_alarm(alarm) for alarm in listed)
-    more = len(alarms) - len(listed)
-    if more:
-        items += f"<li class='mild'>and {more} more: see the table of modes</li>"
+    not_listed = len(alarms) - len(listed)
+    if not_listed:
+        items += f"<li class='mild'>and {not_listed} more: see the table of modes</li>"
     return f'<ul class="alarms">{items}</ul>'
 
 
 def _render_alarm(alarm: RaisedAlarm) -> str:
+    """Returns an alarm as a list item: its site, kind, time and reason."""
     css_class = "" if alarm.word in _SEVERE_ALARMS else "mild"
     period = f"{alarm.from_s:.3f} s to {alarm.to_s:.3f} s"
     heading = f"<strong>{escape(alarm.site)} {alarm.word}</strong>"
@@ -275,7 +325,15 @@ def _render_alarm(alarm: RaisedAlarm) -> str:
 
 
 def _render_checks(findings: Sequence[Finding]) -> str:
-    """Returns the list of checks; "" if nothing was checked."""
+    """Returns the results of the checks of the log as an HTML list.
+
+    Args:
+        findings: Results of the checks. A check that failed may also be one that could not be
+            judged, for example because the code of a user's law may not run here.
+
+    Returns:
+        HTML of the list. Empty if nothing was checked.
+    """
     items = ""
     for finding in findings:
         css_class = "passed" if finding.passed else "failed"
@@ -288,7 +346,7 @@ def _render_checks(findings: Sequence[Finding]) -> str:
 
 
 def _render_description(scenario: Scenario) -> str:
-    """Returns the scenario's description as paragraphs, with text in backticks as code."""
+    """Returns the description of a scenario as paragraphs, with text in backticks as code."""
     text = _CODE.sub(r"<code>\1</code>", escape(scenario.about.strip()))
     return "".join(f"<p>{paragraph}</p>" for paragraph in text.split("\n\n") if paragraph)
 
@@ -306,7 +364,15 @@ until then.</p>
 
 
 def _render_arms(log: Log, builder: ChartBuilder) -> str:
-    """Returns the player and pictures of the arms, and the names of sites without records."""
+    """Returns the part of the page on which the arms move.
+
+    It consists of a player with a slider, whose script draws the arms at any time, and of
+    pictures of a few instants. A note names the sites that have no records and cannot be drawn.
+
+    Args:
+        log: Log of the run.
+        builder: Builder of the charts, which knows the box around the motion and the scale.
+    """
     html = ""
     if any(len(log[site]) for site in log.sites):
         html = _ARM_PLAYER + render_arms_svg(log, builder.bounds_m, builder.units_per_m)
@@ -319,12 +385,14 @@ def _render_arms(log: Log, builder: ChartBuilder) -> str:
 def _render_chart_sections(
     log: Log, charts: Sequence[Chart], missing: Mapping[str, Sequence[str]]
 ) -> str:
-    """Returns the sections of charts, and a note on the charts that the page lacks.
+    """Returns the sections of charts, and a note about the charts that the page lacks.
+
+    The sections are empty containers. The scripts of the page draw the charts into them.
 
     Args:
-        log: the log.
-        charts: the charts of the page.
-        missing: by section, the titles of charts for which the log has no value.
+        log: Log of the run.
+        charts: Charts of the page.
+        missing: Titles of the charts for which the log has no value, by section.
     """
     sections_with_charts = {chart.section for chart in charts}
     has_chains = any(arm.chain for arm in log.scenario.arms.values())
@@ -332,28 +400,33 @@ def _render_chart_sections(
         "torques": explain_absent_operator(log),
         "timing": explain_missing_loop_times(log),
     }
+
     html = ""
     lacking: list[str] = []
     for section, (heading, note) in _PAGE_TEXTS["charts"].items():
         if section in sections_with_charts:
-            # chains have ten estimates per link, hence many small charts
-            is_small = has_chains and section == "estimates"
-            css_class = "charts small" if is_small else "charts"
-            text = _PAGE_TEXTS["notes"]["chain_estimates"] if is_small else note
-            body = f'<div class="{css_class}" data-section="{section}"></div>'
-            html += f"<section><h2>{escape(heading)}</h2>{_render_note(text)}{body}</section>"
+            css_class = "charts"
+            text = note
+            if has_chains and section == "estimates":
+                # Chains have ten estimates per link, and therefore many small charts.
+                css_class = "charts small"
+                text = _PAGE_TEXTS["notes"]["chain_estimates"]
+            container = f'<div class="{css_class}" data-section="{section}"></div>'
+            body = _render_note(text) + container
+            html += f"<section><h2>{escape(heading)}</h2>{body}</section>"
             lacking += [f"{title} ({_NO_VALUE})" for title in missing.get(section, ())]
         elif absence_reasons.get(section):
             lacking.append(f"{heading.lower()} ({absence_reasons[section]})")
         elif section in missing:
             lacking.append(f"{heading.lower()} ({_NO_VALUE})")
+
     if lacking:
         html += _render_note(f"Not on this page: {'; '.join(lacking)}.")
     return html
 
 
 def _render_run_facts(log: Log, facts: JsonObject) -> str:
-    """Returns the table of facts about the whole run."""
+    """Returns the table of facts about the whole run, such as its length and largest error."""
     scenario = log.scenario
     unit = shared_unit(log)
     records = f"{facts['records']}, {facts['missing']} missing"
@@ -383,7 +456,11 @@ def _render_run_facts(log: Log, facts: JsonObject) -> str:
 
 
 def _describe_dominance(scenario: Scenario) -> str:
-    """Returns by site the peers that the site follows, with their shares at the start."""
+    """Returns which peers each site follows at the start, as in "m1 follows s 0.7, m2 0.3".
+
+    A peer is another site whose states the site receives. The number is the dominance factor,
+    the weight with which the site follows the peer. Peers with the factor 0 are left out.
+    """
     sentences = []
     for site, shares in scenario.dominance.items():
         followed = [f"{peer} {share:g}" for peer, share in shares.items() if share]
@@ -392,7 +469,7 @@ def _describe_dominance(scenario: Scenario) -> str:
 
 
 def _describe_driver(log: Log) -> str:
-    """Returns the driver of the session: virtual time, a rerun, or a live session."""
+    """Returns how the run was executed: in virtual time, as a rerun, or as a live session."""
     session = log.session
     if log.driver == "virtual":
         return "virtual time"
@@ -405,6 +482,7 @@ def _describe_driver(log: Log) -> str:
     return f"live, session {session.get('session', '')}, epoch {epoch:%Y-%m-%d %H:%M:%S} UTC"
 
 
+# Keys of a site in the summary, in the order of the columns of its table.
 _MOTION_KEYS = (
     "max_error_rad",
     "max_error_end_rad",
@@ -415,7 +493,12 @@ _MOTION_KEYS = (
 
 
 def _render_sites(log: Log, facts: JsonObject) -> str:
-    """Returns the table of the sites' records and motion."""
+    """Returns the table with the records and the motion of each site.
+
+    Args:
+        log: Log of the run.
+        facts: Numbers of the run, from `summarise_run`.
+    """
     unit = shared_unit(log)
     headers = (
         "site",
@@ -429,7 +512,7 @@ def _render_sites(log: Log, facts: JsonObject) -> str:
         "ticks at the limit",
         "moved by operators, max (rad)",
     )
-    joint_columns = (3, 9)
+    joint_columns = (3, 9)  # columns whose cells list a number per joint
     rows = []
     has_many_joints = False
     for name in log.sites:
@@ -441,8 +524,10 @@ def _render_sites(log: Log, facts: JsonObject) -> str:
         rows.append(row)
         if len(site["q_end_rad"] or ()) > 3:
             has_many_joints = True
-    # columns of texts may wrap
-    return _render_table(headers, rows, joint_columns if has_many_joints else ())
+
+    # Lists of many joints are long. Their columns may wrap, as columns of texts do.
+    text_columns = joint_columns if has_many_joints else ()
+    return _render_table(headers, rows, text_columns)
 
 
 _LOOP_HEADERS = (
@@ -459,7 +544,18 @@ _LOOP_HEADERS = (
 
 
 def _render_loops(log: Log, facts: JsonObject) -> str:
-    """Returns the table of the loops' timing; "" for virtual time, which has no timing."""
+    """Returns the table with the timing of each site's control loop.
+
+    Late is the time between the moment at which a tick was due and its start. Busy is the
+    computing time of a tick.
+
+    Args:
+        log: Log of the run.
+        facts: Numbers of the run, from `summarise_run`.
+
+    Returns:
+        HTML of the table. Empty for a run in virtual time, which has no timing.
+    """
     if log.driver == "virtual":
         return ""
     rows = []
@@ -474,7 +570,12 @@ def _render_loops(log: Log, facts: JsonObject) -> str:
 
 
 def _render_links(log: Log, facts: JsonObject) -> str:
-    """Returns the tables of links, clocks, changes and modes, each below its note."""
+    """Returns the tables about communication, each below a note that explains it.
+
+    The tables are about the age and the number of samples on each link, the clocks, the changes
+    during the run, and the times in which sites did not follow their peers. Empty tables are
+    left out.
+    """
     tables = {
         "ages": _render_link_ages(log, facts),
         "samples": _render_link_samples(log, facts),
@@ -506,19 +607,26 @@ _AGE_KEYS = ("mean", "deviation", "p50", "p99", "min", "max")
 
 
 def _render_link_ages(log: Log, facts: JsonObject) -> str:
-    """Returns the table of stated delays, and of the ages of the samples in use."""
+    """Returns the table of each link's stated delay and of the actual ages of its samples.
+
+    The age is the time since the sample that a site uses in a tick was sent. The scenario may
+    change the delay of a link during the run. Then the cell lists all stated delays, each with
+    the time from which it applied.
+    """
     rows = []
     for name, link in facts["links"].items():
         first, *later = link["stated"]
         models = [first["link"]]
-        models += [f"from {state['from_s']:g} s: {state['link']}" for state in later]
+        models += [f"from {change['from_s']:g} s: {change['link']}" for change in later]
         stated = "<br>".join(escape(typeset(model)) for model in models)
+
         values = [link["age_ms"][key] for key in _AGE_KEYS]
         values += [_to_percent(link["ticks_without_new"]), link["silence_ms"]]
         rows.append([_label_link(log, name), stated, *map(_format_cell, values)])
     return _render_table(_AGE_HEADERS, rows, text_columns=[1])
 
 
+# Keys of a link's counts in the summary, and the headers of their columns.
 _SAMPLE_COLUMNS = {
     "sent": "samples sent",
     "missing": "missing on the way",
@@ -532,7 +640,10 @@ _ONE_WAY_HEADERS = ("one way, min (µs)", "p50", "p99", "max", "known to, p50 (�
 
 
 def _render_link_samples(log: Log, facts: JsonObject) -> str:
-    """Returns the table of the delivery of samples, with one-way delays if measured."""
+    """Returns the table that counts the delivered and the lost samples of each link.
+
+    The columns with measured one-way delays are added only if at least one link has them.
+    """
     links: dict[str, JsonObject] = facts["links"]
     is_measured = any(link["one_way_us"] for link in links.values())
     headers = ["link", *_SAMPLE_COLUMNS.values(), "lost in all (%)", "in a row"]
@@ -552,6 +663,7 @@ def _render_link_samples(log: Log, facts: JsonObject) -> str:
     return _render_table(headers, rows)
 
 
+# Keys of a sender's clock in the summary, and the headers of their columns.
 _CLOCK_COLUMNS = {
     "offset_us": "ahead at the end (µs)",
     "offset_first_us": "at the start",
@@ -566,11 +678,17 @@ _CLOCK_COLUMNS = {
 
 
 def _render_clocks(log: Log, facts: JsonObject) -> str:
-    """Returns the table of the senders' clocks; "" if all sites read the same clock."""
+    """Returns the table that compares the clock of each sender with that of the receiver.
+
+    Returns:
+        HTML of the table. Empty if all sites read the same clock.
+    """
     rows = []
     for name, link in facts["links"].items():
         clock: JsonObject = link["clock"] or {}
-        if clock and (clock["bound_max_us"] or clock["offset_us"]):
+        # Two sites that read the same clock know its offset exactly: it is zero.
+        is_other_clock = clock and (clock["bound_max_us"] or clock["offset_us"])
+        if is_other_clock:
             cells = [_format_cell(clock[key]) for key in _CLOCK_COLUMNS]
             rows.append([_label_link(log, name), *cells])
     if not rows:
@@ -579,11 +697,16 @@ def _render_clocks(log: Log, facts: JsonObject) -> str:
 
 
 def _render_changes(facts: JsonObject) -> str:
-    """Returns the table of the changes during the run; "" if there were none."""
+    """Returns the table of the changes during the run, such as another delay of a link.
+
+    Returns:
+        HTML of the table. Empty if there were no changes.
+    """
     rows = []
     for number, change in enumerate(facts["changes"], 1):
         tick = change["taken_at_tick"]
         origin = "scenario"
+        # Changes of the scenario have a time only. Commands are applied at a tick.
         if tick is not None:
             origin = f"command, applied at tick {tick} of {change['site']}"
         sentence = escape(typeset(change["sentence"]))
@@ -595,7 +718,11 @@ def _render_changes(facts: JsonObject) -> str:
 
 
 def _render_modes(log: Log, facts: JsonObject) -> str:
-    """Returns the table of the times in which sites held, braked or returned; or ""."""
+    """Returns the table of the times in which sites held, braked or returned to their peers.
+
+    Returns:
+        HTML of the table. Empty if all sites followed their peers all the time.
+    """
     rows = []
     for name, site in facts["sites"].items():
         label = _render_swatch(log, name) + escape(name)
@@ -617,17 +744,23 @@ def _render_assumptions(scenario: Scenario) -> str:
 
 
 def _render_commands(log: Log) -> str:
-    """Returns the commands that check and repeat the run, and the resolved scenario."""
+    """Returns the commands that verify and repeat the run, and the text of the scenario.
+
+    If the scenario is one that is shipped with this program, the command names it. Otherwise
+    the reader must save the scenario text as a file first.
+    """
     scenario = log.scenario
     file_name = Path(log.source).name
     if not file_name.endswith(".mcap"):
-        file_name = "FILE"
-    is_shipped = (
-        scenario.name in list_shipped()
-        and load_scenario(scenario.name).sha256 == scenario.sha256
-    )
-    argument = scenario.name if is_shipped else f"./{scenario.name}.toml"
-    hint = "as shipped" if is_shipped else f"to be saved as {scenario.name}.toml"
+        file_name = "FILE"  # the log was not read from a file
+
+    argument = f"./{scenario.name}.toml"
+    hint = f"to be saved as {scenario.name}.toml"
+    has_shipped_name = scenario.name in list_shipped()
+    if has_shipped_name and load_scenario(scenario.name).sha256 == scenario.sha256:
+        argument = scenario.name
+        hint = "as shipped"
+
     commands = (
         f"trilat verify {file_name}\ntrilat verify --virtual {file_name}\ntrilat sim {argument}"
     )
@@ -639,7 +772,7 @@ def _render_commands(log: Log) -> str:
 
 
 def _render_versions(log: Log) -> str:
-    """Returns the table of the software and the platform that produced the log."""
+    """Returns the table of the software and the machine that recorded the log."""
     session = log.session
     commit = session.get("commit", "unknown")
     if session.get("commit_dirty") == "true":
@@ -659,29 +792,35 @@ def _render_versions(log: Log) -> str:
 
 
 def _format_cell(value: float | None) -> str:
-    """Returns a number as text, integers with all digits; a dash for None."""
+    """Returns a number as text: an integer with all digits, or four digits of another number.
+
+    Returns a dash for None.
+    """
     if value is None:
         return _NO_NUMBER
     return str(value) if isinstance(value, int) else f"{value:.4g}"
 
 
 def _format_numbers(values: Iterable[float] | None) -> str:
-    """Returns numbers with four decimals as one text; a dash for None."""
+    """Returns numbers with four decimals, separated by commas. Returns a dash for None."""
     if values is None:
         return _NO_NUMBER
     return ", ".join(f"{value:.4f}" for value in values)
 
 
 def _to_percent(share: float | None) -> float | None:
+    """Returns a share between 0 and 1 in percent. Returns None for None."""
     return None if share is None else 100.0 * share
 
 
 def _label_site(log: Log, name: str) -> str:
+    """Returns the name and the role of a site, behind a square in the colour of the site."""
     role = log.scenario.sites[name].role
     return f"{_render_swatch(log, name)}{escape(name)} ({escape(role)})"
 
 
 def _label_link(log: Log, link: str) -> str:
+    """Returns the name of a link, as in "m1 → s", behind a square in its sender's colour."""
     peer, site = link.split("->")
     return f"{_render_swatch(log, peer)}{escape(peer)} → {escape(site)}"
 
@@ -692,11 +831,12 @@ def _render_swatch(log: Log, site: str) -> str:
 
 
 def _render_note(text: str) -> str:
+    """Returns a text as a paragraph in small type."""
     return f'<p class="note">{escape(text)}</p>'
 
 
 def _render_facts(facts: Iterable[tuple[str, str]]) -> str:
-    """Returns a table with a row per fact: its name and its text."""
+    """Returns a table with two columns: the name and the text of each fact."""
     rows = ""
     for name, text in facts:
         rows += f"<tr><th>{escape(name)}</th><td>{escape_text(text)}</td></tr>"
@@ -706,12 +846,14 @@ def _render_facts(facts: Iterable[tuple[str, str]]) -> str:
 def _render_table(
     headers: Sequence[str], rows: Iterable[Sequence[str]], text_columns: Sequence[int] = ()
 ) -> str:
-    """Returns a table of HTML cells.
+    """Returns an HTML table.
 
     Args:
-        headers: the header of each column, as plain text.
-        rows: rows of cells as HTML, a cell per column.
-        text_columns: indices of the columns, other than the first, that hold no numbers.
+        headers: Header of each column, as plain text.
+        rows: Rows of cells, one cell per column. The cells are HTML already, so that they can
+            contain coloured squares and line breaks.
+        text_columns: Indices of the columns that hold texts, which may wrap. The first column
+            is always a text.
     """
     attributes = [
         ' class="words"' if column in text_columns else "" for column in range(len(headers))
