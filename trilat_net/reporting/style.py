@@ -1,17 +1,23 @@
-"""Style of all figures: colours per site, line styles, axes, legends and file formats.
+"""Defines the common style of all figures, and draws their common parts.
 
-Sites beyond the number of colours differ by dashes. A figure over the time of a run
-(`TimeFigure`) has panels, a line per site, event markers, a time axis and a legend. The markers
-show when a site held, braked or returned, and when changes were applied.
+A figure looks the same wherever it appears: each site, a process that controls one arm, has its
+own colour; sites beyond the number of colours are told apart by dashes. This module provides
+the lines, axes, panels and legends in this style, and writes figures to files.
+
+Most figures show signals over the time of a run. `TimeFigure` draws them: panels with a line
+per site, markers, a time axis and a legend. The markers show when a site did not follow its
+peers (it held, braked or returned), and when a change was applied, such as another delay of a
+link.
 
 Invariant:
-    - Matplotlib's global state stays unchanged.
-    - Equal figures give equal bytes: files hold no date, and fonts are embedded as TrueType.
+    - Matplotlib's global state stays unchanged, so that users' own figures keep their style.
+    - Equal figures give equal bytes: files contain no date, and fonts are embedded as TrueType.
     - Figures of a run without events have no markers.
 """
 
 import base64
 import io
+import math
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -56,9 +62,9 @@ DASHES: tuple[Any, ...] = (
 )
 """Line styles: solid, and three patterns of dashes."""
 REFERENCE = "#333333"
-"""Colour of references, limits and marks."""
+"""Dark grey, the colour of references, limits and marks."""
 FAINT = "#8c8c8c"
-"""Colour of texts in empty panels and of bands."""
+"""Light grey, the colour of texts in empty panels and of bands."""
 
 LIMIT_LINE: LineOptions = {
     "color": REFERENCE,
@@ -70,9 +76,12 @@ LIMIT_LINE: LineOptions = {
 REPORT_DPI = REPORT_SIZE.dpi
 _NOTEBOOK_DPI = 200
 _LEAST_RANGE = 1e-9
-"""Smallest range of plotted values that is not rounding alone."""
+"""Values whose range is smaller than this differ by rounding errors only."""
 BUCKETS_PER_PANEL = 700
-"""Buckets of the decimation of a panel: half a page is 700 pixels wide."""
+"""Number of intervals of time to which the signals of a panel are decimated.
+
+Half a page is 700 pixels wide, so that more points would not be visible.
+"""
 
 _STYLE_SHEET = resources.files("trilat_net.reporting") / "assets" / "figures.mplstyle"
 _RC: Any = {
@@ -89,11 +98,13 @@ _NARROW_RC: Any = {
 
 @contextmanager
 def styled_figure(form: FigureSize, height_in: float) -> Iterator[Figure]:
-    """Yields an empty figure, to be drawn within the context in the style of all figures.
+    """Yields an empty figure in the common style, for use in a `with` statement.
+
+    The style applies only to what is drawn within the statement.
 
     Args:
-        form: width of the figure and sizes of its texts.
-        height_in: height of the figure, in inches.
+        form: Width of the figure and sizes of its texts.
+        height_in: Height of the figure, in inches.
     """
     settings: Any = dict(_RC)
     settings["xtick.labelsize"] = form.tick_pt
@@ -105,20 +116,36 @@ def styled_figure(form: FigureSize, height_in: float) -> Iterator[Figure]:
 
 
 class NotebookFigure(Figure):
-    """A figure that a notebook shows as a picture instead of the text of its size."""
+    """A figure that a Jupyter notebook displays as a picture.
+
+    A plain Matplotlib figure that was made without pyplot would be displayed as its size in
+    words.
+    """
 
     def _repr_png_(self) -> bytes:
+        """Returns the picture. Jupyter calls this method by its name."""
         return _render_figure(self, "png", _NOTEBOOK_DPI)
 
     def _repr_html_(self) -> str:
-        # sharp on a screen of high density: two pixels of the picture per pixel of the page
+        """Returns the picture as HTML. Jupyter calls this method by its name."""
+        # Two pixels of the picture per pixel of the page look sharp on screens of high density.
         width = round(self.get_figwidth() * _NOTEBOOK_DPI / 2)
         picture = base64.b64encode(self._repr_png_()).decode()
         return f'<img alt="figure" width="{width}" src="data:image/png;base64,{picture}">'
 
 
 def add_panels(figure: Figure, rows: int, columns: int, **options: Any) -> AxesGrid:
-    """Adds panels to a figure, and returns them as an array, shape (rows, columns)."""
+    """Adds a grid of panels to a figure.
+
+    Args:
+        figure: The figure.
+        rows: Number of rows.
+        columns: Number of columns.
+        **options: Options of `Figure.subplots`.
+
+    Returns:
+        The panels, shape (rows, columns), even if there is only one row or column.
+    """
     grid: AxesGrid = figure.subplots(rows, columns, squeeze=False, **options)
     return grid
 
@@ -138,20 +165,19 @@ _THINNER_PT = 1.2
 def site_line(log: Log, site: str, width: float | None = None) -> LineOptions:
     """Returns the options of the line of a site.
 
-    Lines are solid until every colour is used; then the same colours return with dashes.
+    Lines are solid until every colour is used. Further sites have the same colours with dashes.
 
     Args:
-        log: the log with the site.
-        site: name of the site.
-        width: width of the line, in pt. None if all sites share a panel: later sites then have
-            thinner lines, so that equal lines all stay visible.
+        log: Log with the site.
+        site: Name of the site.
+        width: Width of the line, in pt. None for a panel that all sites share: later sites then
+            have thinner lines, so that lines that coincide all stay visible.
     """
     index = log.sites.index(site)
     last = len(log.sites) - 1
     if width is None:
         width = _WIDEST_PT
-        # a single site has no thinner lines beside it
-        if last > 0:
+        if last > 0:  # not for a single site, which would divide by zero
             width = _WIDEST_PT - _THINNER_PT * index / last
     repetitions = index // len(SITE_COLOURS)
     return {
@@ -167,21 +193,21 @@ def site_title(log: Log, site: str) -> str:
 
 
 def plot_decimated(axes: Axes, tick: Ints, t_s: Array, values: Array, **options: Any) -> None:
-    """Draws a signal over time, decimated so that all extremes stay visible.
+    """Draws a signal over time with fewer points, such that all extremes stay visible.
 
     Args:
-        axes: the panel.
-        tick: ticks of the values, shape (K,).
-        t_s: times of the values, s, shape (K,).
-        values: the values, shape (K,).
-        **options: options of the line.
+        axes: The panel.
+        tick: Ticks of the values, shape (K,).
+        t_s: Times of the values, in s, shape (K,).
+        values: The values, shape (K,).
+        **options: Options of the line.
     """
     trace = decimate(tick, t_s, values[:, np.newaxis], BUCKETS_PER_PANEL)
     axes.plot(trace.t_s, trace.values[:, 0], **options)
 
 
 def positive(values: Array) -> Array:
-    """Returns the positive values, for a logarithmic axis, and NaN in place of the others."""
+    """Returns values for a logarithmic axis: NaN instead of zero and negative values."""
     return np.where(values > 0.0, values, np.nan)
 
 
@@ -192,13 +218,17 @@ SPREAD: LineOptions = {"color": FAINT, "alpha": 0.35, "linewidth": 6.0}
 
 
 def plot_spread(axes: Axes, t_s: Array, values: Array, **options: Any) -> None:
-    """Draws a fluctuating signal as its median within a band from its least to largest value.
+    """Draws a fluctuating signal as its median in a band from least to largest value.
+
+    The time is divided into `SPREAD_BUCKETS` intervals with equal numbers of values. Each
+    interval gives a point of the median and of the edges of the band.
 
     Args:
-        axes: the panel.
-        t_s: times of the values, s, shape (K,).
-        values: the values, shape (K,).
-        **options: options of the line of the median, with a "color".
+        axes: The panel.
+        t_s: Times of the values, in s, shape (K,).
+        values: The values, shape (K,). NaN values are ignored.
+        **options: Options of the line of the median. They must include a "color", which the
+            band has too.
     """
     buckets = np.array_split(np.arange(len(values)), SPREAD_BUCKETS)
     rows = []
@@ -219,15 +249,20 @@ def plot_spread(axes: Axes, t_s: Array, values: Array, **options: Any) -> None:
 
 
 def _compute_spread(values: Array) -> tuple[float, float, float]:
-    """Returns the least, median and largest of the finite values; NaN if there is none."""
-    # numpy warns of values that are all NaN
+    """Returns the least, median and largest of the finite values, or NaN if there are none."""
+    # NumPy prints a warning if all values are NaN.
     if not np.isfinite(values).any():
         return np.nan, np.nan, np.nan
     return np.nanmin(values), np.nanmedian(values), np.nanmax(values)
 
 
 def set_plain_log_axis(axis: Axis, steps: Sequence[float] = (1.0, 2.0, 5.0)) -> None:
-    """Labels a logarithmic axis with plain numbers, at the given steps of each decade."""
+    """Labels a logarithmic axis with plain numbers, such as 20 instead of a power of 10.
+
+    Args:
+        axis: The axis.
+        steps: Multiples of each power of 10 that have a label.
+    """
     axis.set_major_locator(LogLocator(subs=steps))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_locator(LogLocator(subs=range(1, 10)))
@@ -235,7 +270,11 @@ def set_plain_log_axis(axis: Axis, steps: Sequence[float] = (1.0, 2.0, 5.0)) -> 
 
 
 def name_joints(log: Log) -> list[str]:
-    """Returns the titles of the joints: numbers, with names if all chains have equal names."""
+    """Returns the titles of the joints' panels: numbers, with names if these are unambiguous.
+
+    Names are added only if the arms are chains whose joints all have the same names. The arm
+    with the most joints decides the number of titles.
+    """
     arms = [log.scenario.arms[site] for site in log.sites]
     longest = max(arms, key=lambda arm: arm.counts.joints)
     numbers = range(1, longest.counts.joints + 1)
@@ -245,14 +284,14 @@ def name_joints(log: Log) -> list[str]:
     units = longest.joint_units("rad")
     titles = []
     for number, name, unit in zip(numbers, longest.joint_names, units, strict=True):
-        # prismatic joints have other units than the axes of the figure
+        # The axes of the figure have the units of revolute joints. Prismatic joints differ.
         quantity = " (m, N)" if unit == "m" else ""
         titles.append(f"{number}: {name}{quantity}")
     return titles
 
 
 def name_shared(log: Log) -> list[str]:
-    """Returns the titles of the shared coordinates: joints, or axes of the task."""
+    """Returns the titles of the coordinates that the sites exchange: joints, or task axes."""
     arm = log.scenario.arms[log.sites[0]]
     if arm.shares_pose:
         return list(TASK_AXES[: arm.counts.shared])
@@ -260,32 +299,51 @@ def name_shared(log: Log) -> list[str]:
 
 
 def title_joints(log: Log, row: Sequence[Axes], titles: Sequence[str] = ()) -> None:
-    """Titles a row of panels with `titles`; by default with the names of the joints."""
+    """Writes titles above a row of panels.
+
+    Args:
+        log: Log with the joints.
+        row: A panel per title.
+        titles: The titles. Empty for the names of the joints.
+    """
     for title, axes in zip(titles or name_joints(log), row, strict=True):
         axes.set_title(title)
 
 
 def label_row(axes: Axes, text: str, form: FigureSize) -> None:
-    """Labels a low row of panels beside its first panel, `axes`."""
+    """Labels a row of panels that are not high.
+
+    Args:
+        axes: First panel of the row, beside which the label is written.
+        text: The label. It is wrapped after 12 characters.
+        form: Size of the figure, which determines the size of the text.
+    """
     lines = textwrap.wrap(text, 12)
     axes.set_ylabel("\n".join(lines), fontsize=form.tick_pt)
 
 
 def flatten_rounding(axes: Axes) -> None:
-    """Widens the value axis of a panel whose values differ by rounding alone."""
+    """Widens the value axis of a panel whose curves differ only by rounding errors.
+
+    Without this, Matplotlib would scale the axis to the rounding errors, and a constant would
+    look like noise.
+
+    Args:
+        axes: The panel. Its axis is changed in place.
+    """
     low, high = axes.get_ylim()
     if high - low < _LEAST_RANGE:
         axes.set_ylim(low - 0.05, high + 0.05)
 
 
 class JointPanels(NamedTuple):
-    """Panels of a figure of joints.
+    """Panels of a figure that has a panel per joint, as `add_joint_panels` arranged them.
 
     Attributes:
-        joints: a panel per joint.
-        columns: number of panels in a row.
-        lowest: the lowest panel of each column.
-        below: a panel over the whole width below the others, or None.
+        joints: A panel per joint.
+        columns: Number of panels in a row.
+        lowest: Lowest panel of each column, which has the time axis.
+        below: Panel below the others, over the whole width. None if there is no such panel.
     """
 
     joints: list[Axes]
@@ -295,19 +353,23 @@ class JointPanels(NamedTuple):
 
 
 def arrange_joints(joints: int, narrow: bool) -> list[list[str]]:
-    """Returns the rows of a grid of panels: indices of joints, and "." for an empty cell.
+    """Arranges the panels of joints in a grid with few rows and few empty cells.
 
     Args:
-        joints: number of joints.
-        narrow: True if two panels fit beside each other; else three or four do.
+        joints: Number of joints.
+        narrow: True if only two panels fit beside each other. Otherwise three or four fit.
+
+    Returns:
+        The rows of the grid. A cell is the index of a joint as text, or "." if it is empty.
     """
 
     def count_cells(columns: int) -> tuple[int, int]:
         """Returns the number of rows, and the number of empty cells in the last row."""
-        rows = -(-joints // columns)  # rounded up
+        rows = math.ceil(joints / columns)
         return rows, rows * columns - joints
 
     choices = (2,) if narrow or joints == 2 else (3, 4)
+    # The fewest rows win. Of arrangements with as many rows, the fewest empty cells win.
     columns = min(choices, key=count_cells)
     _, empty = count_cells(columns)
     cells = [str(joint) for joint in range(joints)]
@@ -320,14 +382,14 @@ def add_joint_panels(
 ) -> JointPanels:
     """Adds a panel per joint to a figure, and optionally a wide panel below them.
 
-    Two joints share their axis of values. More joints have an axis each, because the torques
-    of wrists are smaller than those of shoulders.
+    Two joints share their value axis. More joints have an axis each, because the torques of
+    wrists are much smaller than those of shoulders.
 
     Args:
-        figure: the figure.
-        joints: number of joints.
-        form: size of the figure.
-        below: name of the wide panel; "" for no wide panel.
+        figure: The figure.
+        joints: Number of joints.
+        form: Size of the figure.
+        below: Name of the wide panel. Empty for no wide panel.
     """
     grid = arrange_joints(joints, form.narrow)
     columns = len(grid[0])
@@ -336,6 +398,8 @@ def add_joint_panels(
         rows.append([below] * columns)
     panels: dict[str, Axes] = figure.subplot_mosaic([[*row] for row in rows])
     joint_panels = [panels[str(joint)] for joint in range(joints)]
+
+    # Only the lowest panel of a column has a labelled time axis.
     for upper, lower in zip(joint_panels, joint_panels[columns:], strict=False):
         upper.sharex(lower)
         upper.tick_params(labelbottom=False)
@@ -351,7 +415,7 @@ def add_joint_panels(
 
 
 def typeset(text: str) -> str:
-    """Returns a text of the terminal with ± in place of "+-" and → in place of "->"."""
+    """Returns a text with the signs ± and → in place of "+-" and "->" of the terminal."""
     return text.replace("+-", "±").replace("->", " → ")
 
 
@@ -361,13 +425,18 @@ def typeset_unit(unit: str) -> str:
 
 
 def typeset_symbol(parameter: str) -> str:
-    """Returns an inertial parameter, such as "mc_x" or "Ixx", with its index as a subscript."""
+    """Returns the symbol of an inertial parameter, with its index as a subscript.
+
+    Args:
+        parameter: Name of the parameter: a moment of inertia such as "Ixx", a first moment such
+            as "mc_x", or the mass.
+    """
     if parameter[0] == "I":
         stem = parameter[:1]
         index = parameter[1:]
     else:
         stem = parameter[:2]
-        index = parameter[3:]
+        index = parameter[3:]  # behind the underscore
     return f"${stem.strip()}_{{{index}}}$" if index else f"${stem}$"
 
 
@@ -375,7 +444,13 @@ _MAX_LEGEND_COLUMNS = 6
 
 
 def add_legend(figure: Figure, entries: LegendEntries, **options: Any) -> None:
-    """Adds a legend of lines above the panels, see `place_legend`."""
+    """Adds a legend of lines above the panels of a figure.
+
+    Args:
+        figure: The figure.
+        entries: Text and line of each entry.
+        **options: Options of `Figure.legend`.
+    """
     handles = []
     for text, line in entries:
         handles.append(Line2D([], [], label=text, **line))
@@ -383,12 +458,12 @@ def add_legend(figure: Figure, entries: LegendEntries, **options: Any) -> None:
 
 
 def place_legend(figure: Figure, handles: Sequence[Any], **options: Any) -> None:
-    """Adds a legend above the panels, with as many columns as fit the figure.
+    """Adds a legend above the panels, with as many columns as fit the width of the figure.
 
     Args:
-        figure: the figure.
-        handles: the Matplotlib objects of the entries.
-        **options: options of the legend.
+        figure: The figure.
+        handles: Matplotlib objects of the entries, which have a label.
+        **options: Options of `Figure.legend`.
     """
     renderer = FigureCanvasAgg(figure).get_renderer()  # type: ignore[no-untyped-call]
     most_columns = min(len(handles), _MAX_LEGEND_COLUMNS)
@@ -397,13 +472,14 @@ def place_legend(figure: Figure, handles: Sequence[Any], **options: Any) -> None
             handles=handles, loc="outside upper center", ncols=columns, **options
         )
         width = legend.get_window_extent(renderer).width
-        if columns == 1 or width <= figure.bbox.width:
+        fits = width <= figure.bbox.width
+        if fits or columns == 1:
             return
-        legend.remove()
+        legend.remove()  # try again with fewer columns
 
 
 def site_legend_entries(log: Log, sites: Sequence[str]) -> list[LegendEntry]:
-    """Returns the entries of a legend of sites."""
+    """Returns the entries of a legend of sites: name and role, and line of each site."""
     return [(site_title(log, site), site_line(log, site)) for site in sites]
 
 
@@ -412,7 +488,7 @@ _EMPTY_FIGURE_CHARACTERS_PER_IN = 17
 
 
 def empty_figure(text: str, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns a figure of a text alone: the reason why there is nothing to draw."""
+    """Returns a figure that contains only a text: the reason why there is nothing to draw."""
     characters = round(_EMPTY_FIGURE_CHARACTERS_PER_IN * form.width_in)
     lines = textwrap.wrap(text, characters)
     with styled_figure(form, 1.0) as figure:
@@ -445,25 +521,25 @@ def write_figure(figure: Figure, path: Path, dpi: int) -> None:
     """Writes a figure to a file.
 
     Args:
-        figure: the figure.
-        path: the file; its suffix is the format, one of `FIGURE_FORMATS`.
-        dpi: resolution of a .png file.
+        figure: The figure.
+        path: The file. Its suffix determines the format, which is one of `FIGURE_FORMATS`.
+        dpi: Resolution of a .png file.
 
     Raises:
-        UsageError: the file cannot be created.
-        LogRefused: the disk refused the data.
+        UsageError: The file cannot be created.
+        LogRefused: The disk refused the data.
     """
     kind = path.suffix.removeprefix(".").lower()
     write_whole(path, _render_figure(figure, kind, dpi))
 
 
 def _render_figure(figure: Figure, kind: str, dpi: int) -> bytes:
-    """Returns a figure as the bytes of a file without a date.
+    """Returns a figure as the bytes of a file that contains no date.
 
     Args:
-        figure: the figure.
-        kind: format of the file, one of `FIGURE_FORMATS`.
-        dpi: resolution of a PNG file.
+        figure: The figure.
+        kind: Format of the file, one of `FIGURE_FORMATS`.
+        dpi: Resolution of a PNG file.
     """
     drawing = io.BytesIO()
     with mpl.rc_context(_FILE_RC):
@@ -504,9 +580,15 @@ _CHANGE_NUMBER: dict[str, Any] = {
 
 
 def site_records(log: Log, values: Callable[[SiteLog], Array]) -> SiteSignal:
-    """Returns the signal of the values that a function computes from a site's records."""
+    """Returns a signal for `TimeFigure.joint_row`.
+
+    Args:
+        log: Log with the records of the sites.
+        values: Function that computes values, shape (K, J), from the K records of a site.
+    """
 
     def read_signal(site: str) -> tuple[Ints, Array, Array]:
+        """Returns ticks, times and values of a site."""
         records = log[site]
         return records.tick, records.t_s, values(records)
 
@@ -515,17 +597,28 @@ def site_records(log: Log, values: Callable[[SiteLog], Array]) -> SiteSignal:
 
 @contextmanager
 def time_figure(log: Log, form: FigureSize, height_in: float) -> Iterator["TimeFigure"]:
-    """Yields an empty figure of a log over time, see `styled_figure`."""
+    """Yields an empty figure of a log over time, for use in a `with` statement.
+
+    See `styled_figure` for the arguments.
+    """
     with styled_figure(form, height_in) as figure:
         yield TimeFigure(log, form, figure)
 
 
 class TimeFigure:
-    """A figure of a log over time.
+    """A figure that shows signals of a log over the time of the run, with markers.
+
+    `time_figure` creates it. A figure function adds panels to `figure`, draws into them with
+    `trace` or `joint_row`, and calls `finish` at the end.
+
+    Args:
+        log: The log.
+        form: Width of the figure and sizes of its texts.
+        figure: Empty Matplotlib figure.
 
     Attributes:
-        log: the log.
-        figure: the Matplotlib figure.
+        log: The log.
+        figure: The Matplotlib figure.
     """
 
     def __init__(self, log: Log, form: FigureSize, figure: Figure) -> None:
@@ -541,18 +634,24 @@ class TimeFigure:
         """Draws values over the records of a site.
 
         Args:
-            axes: the panel.
-            site: name of the site.
-            values: a value per record, shape (K,).
-            width: see `site_line`.
-            **options: options of the line, which replace those of the site.
+            axes: The panel.
+            site: Name of the site.
+            values: A value per record, shape (K,).
+            width: Width of the line, see `site_line`.
+            **options: Options of the line, which take precedence over those of the site.
         """
         records = self.log[site]
         line = {**site_line(self.log, site, width), **options}
         plot_decimated(axes, records.tick, records.t_s, values, **line)
 
     def joint_row(self, row: Sequence[Axes], sites: Sequence[str], signal: SiteSignal) -> None:
-        """Draws a signal of sites with markers: a panel per joint, a line per site."""
+        """Draws a signal with a panel per joint and a line per site, and adds the markers.
+
+        Args:
+            row: A panel per joint.
+            sites: Names of the sites.
+            signal: Function that returns the signal of a site.
+        """
         for site in sites:
             tick, t_s, values = signal(site)
             line = site_line(self.log, site)
@@ -568,14 +667,15 @@ class TimeFigure:
     ) -> None:
         """Marks events in a panel.
 
-        The panel is shaded in the color of a site while the site does not follow its peers, and
+        The panel is shaded in the colour of a site while the site does not follow its peers. It
         has a vertical line at each change that the sites applied.
 
         Args:
-            axes: the panel.
-            sites: the sites whose events are marked.
-            link: a link, to mark changes of this link alone; "" for all changes.
-            numbered: True to write the number of each change.
+            axes: The panel.
+            sites: Names of the sites whose events are marked.
+            link: Link whose changes alone are marked, such as "m1->s". Empty for all changes.
+            numbered: True to write the number of each change, which the text below the panels
+                explains.
         """
         for site in sites:
             self._shade_modes(axes, site)
@@ -599,13 +699,19 @@ class TimeFigure:
             )
 
     def _mark_change(self, axes: Axes, at_s: float, number: str) -> None:
-        """Draws a vertical line at the time of a change, with its number if it is not ""."""
+        """Draws a vertical line at the time of a change.
+
+        Args:
+            axes: The panel.
+            at_s: Time of the change, in s.
+            number: Number of the change as text. Empty to write no number.
+        """
         axes.axvline(at_s, zorder=0.6, **_CHANGE_LINE)
         if number:
             axes.annotate(
                 text=number,
                 xy=(at_s, 1.0),
-                # x in s, y as a share of the height of the panel
+                # x in s, y from 0 to 1 over the height of the panel
                 xycoords=axes.get_xaxis_transform(),
                 fontsize=self._small_pt,
                 **_CHANGE_NUMBER,
@@ -619,13 +725,13 @@ class TimeFigure:
         links: bool = False,
         title: str = "",
     ) -> None:
-        """Adds the time axes, the legend, and the explanation of the markers.
+        """Adds the time axes, the legend, and the text that explains the markers.
 
         Args:
-            lowest: the lowest panels, which have a time axis.
-            entries: the entries of the legend.
-            links: True if only changes of links are marked.
-            title: a title of the legend; "" for no title.
+            lowest: Lowest panel of each column, which gets a time axis.
+            entries: Entries of the legend.
+            links: True if only changes of links are marked in the panels.
+            title: Title of the legend. Empty for no title.
         """
         for axes in lowest:
             axes.set_xlabel("time (s)")
@@ -637,7 +743,7 @@ class TimeFigure:
         self._add_footnote(self._explain_changes(links=links), self._explain_shading())
 
     def _add_footnote(self, *sentences: str) -> None:
-        """Writes sentences below the panels, each on lines of its own; "" is left out."""
+        """Writes sentences below the panels, each on new lines. Empty ones are left out."""
         letters = int(_LETTERS_PER_IN * self.figure.get_figwidth() / self._small_pt)
         lines: list[str] = []
         for sentence in sentences:
@@ -652,9 +758,13 @@ class TimeFigure:
             )
 
     def _explain_changes(self, *, links: bool) -> str:
-        """Returns a sentence on the numbered changes; with `links` on changes of links only.
+        """Returns a sentence that explains the numbered changes.
 
-        Returns "" if there are no changes.
+        Args:
+            links: True to explain changes of links only.
+
+        Returns:
+            The sentence. Empty if there are no changes.
         """
         marked = []
         for number, applied in self._changes:
@@ -669,7 +779,7 @@ class TimeFigure:
         return f"Changes: {'; '.join(parts)}"
 
     def _explain_shading(self) -> str:
-        """Returns a sentence on the modes that are shaded; "" if no mode is shaded."""
+        """Returns a sentence that explains the shaded times. Empty if nothing is shaded."""
         meanings = set()
         for intervals in self._modes.values():
             meanings |= {interval.meaning for interval in intervals}

@@ -1,15 +1,23 @@
-"""Text of the results about a run: its summary, metrics, log checks, recovery and rerun.
+"""Composes the text that commands print about a run, a session and this machine.
 
-The summary lists links, changes, modes, clocks, and messages of user laws and arms. The module
-also composes the text of the measurements of a running session (`compose_ping`,
-`compose_topic_delays`) and of this machine (`compose_doctor`, `compose_benchmark`).
+Each `compose_...` function turns the result of one command into blocks, which are lines, marked
+lines and tables that `terminal_output` prints:
+
+- results about a run: its summary, metrics, log checks, recovery and rerun;
+- measurements of a running session: `compose_ping`, `compose_topic_delays`;
+- measurements of this machine: `compose_doctor`, `compose_benchmark`.
+
+`format_run_lines` lists the notable facts of a run: alarms, links, changes, modes, clocks, and
+messages of users' control laws and arms.
 
 Invariant:
-    - A link with one constant delay and no loss gets no line.
-    - A dash stands for a missing number of a metric. If the metric applies there, the reason
-      is written below the tables.
+    - A link with one constant delay and no loss gets no line, because nothing about it is
+      notable.
+    - A dash stands for a missing number of a metric. If the metric applies to the run, the
+      reason why the number is missing is written below the tables.
 """
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import groupby
 from typing import Any
@@ -31,7 +39,7 @@ from .result_text import MARKS, Block, MarkedText, TextTable
 from .terminal_output import sanitize
 
 MOST_LINES = 12
-"""Largest number of lines of each kind; summary.json has the rest."""
+"""Largest number of lines of each kind. The file summary.json has all of them."""
 MOST_LINE_CHARACTERS = 400
 """Largest length of a message of a user law or an external arm."""
 OUTSIDE_EVENT_KINDS = ("failed", "law", "arm")
@@ -47,7 +55,7 @@ _MAX_FREQUENCIES = 16
 
 
 def compose_log(log: Log) -> Iterator[Block]:
-    """Yields the session, a table with a row per site, and the lines of `format_run_lines`."""
+    """Yields the session of a log, a table with a row per site, and the notable facts."""
     yield log.headline()
     keys = ("site", "rate_hz", "records", "missing", "last_s")
     rows = [[str(row[key]) for key in keys] for row in log.to_rows()]
@@ -56,10 +64,12 @@ def compose_log(log: Log) -> Iterator[Block]:
 
 
 def format_run_lines(log: Log) -> list[str]:
-    """Returns the lines on alarms, user laws and arms, links, changes, modes and clocks.
+    """Returns the lines about alarms, user code, links, changes, modes and clocks of a run.
+
+    Lists that are long are cut, see `_limit_lines`.
 
     Raises:
-        LogError: a record names a change that does not exist.
+        LogError: A record names a change that does not exist in the log.
     """
     return [
         *_limit_lines([f"*** {alarm}" for alarm in list_alarms(log)]),
@@ -72,7 +82,11 @@ def format_run_lines(log: Log) -> list[str]:
 
 
 def format_outside_lines(log: Log) -> list[str]:
-    """Returns the messages about user laws and external arms, as lines of bounded length."""
+    """Returns the messages of users' control laws and of external arms, as lines.
+
+    These texts come from other programs. Therefore they are cut to a bounded length, and
+    characters that could control the terminal are replaced by spaces.
+    """
     lines = []
     for event in log.events:
         if event.kind in OUTSIDE_EVENT_KINDS:
@@ -82,13 +96,18 @@ def format_outside_lines(log: Log) -> list[str]:
 
 
 def format_link_lines(log: Log) -> list[str]:
-    """Returns a line per link that was stated or observed with varying delay or loss."""
+    """Returns a line per link whose delay varies or which loses samples.
+
+    A line has the delay that the scenario states for the link, the measured one-way delay, the
+    age of the samples in use, and the losses.
+    """
     lines = []
     for use in link_summary.summarise_links(log):
         if use.plain:
             continue
         measured = any(state.link.measured for state in use.stated)
         origin = "" if measured else "stated "
+
         parts = [f"link {use.name}: {origin}{format_stated_models(use.stated)}"]
         if use.one_way_us is not None and measured:
             parts.append(f"one way {_format_spread(use.one_way_us, 1e-3)}")
@@ -103,7 +122,11 @@ def format_link_lines(log: Log) -> list[str]:
 
 
 def format_change_lines(log: Log) -> list[str]:
-    """Returns a line per command to a site and per change of a link or of a site's shares."""
+    """Returns a line per change during the run.
+
+    A change is a command to a site, or another model of a link, or other dominance factors,
+    which are the weights with which a site follows its peers.
+    """
     lines = []
     for changed in list_changes(log):
         tick = changed.taken_at_tick
@@ -113,7 +136,7 @@ def format_change_lines(log: Log) -> list[str]:
 
 
 def format_mode_lines(log: Log) -> list[str]:
-    """Returns a line per site that held, braked or returned, with the times."""
+    """Returns a line per site that held, braked or returned, with the times at which it did."""
     lines = []
     for site in log.sites:
         intervals = find_mode_intervals(log[site])
@@ -141,7 +164,12 @@ def format_clock_lines(log: Log) -> list[str]:
 
 
 def format_stated_models(states: Sequence[StatedModel]) -> str:
-    """Returns the stated models of a link as text; of three or more, the first and the last."""
+    """Returns the delay models that a scenario states for a link, in the order of their time.
+
+    Args:
+        states: The models. If there are more than three, only the first and the last one are
+            described, with the number of changes between them.
+    """
     first, *later = states
     parts = [first.link.describe()]
     if len(later) > 2:
@@ -152,7 +180,7 @@ def format_stated_models(states: Sequence[StatedModel]) -> str:
 
 
 def format_clock(use: link_summary.ClockSummary) -> str:
-    """Returns the offset, bound, drift and faults of a clock as text."""
+    """Returns a clock's offset, its bound, its drift and its faults as text."""
     known = f"known to {use.bound_us} us (p50 {use.bound_p50_us:.0f}, max {use.bound_max_us})"
     parts = [f"{use.offset_us / 1e3:+.3f} ms at the end, {known}"]
     if use.drift_ppm is not None:
@@ -168,7 +196,12 @@ def format_clock(use: link_summary.ClockSummary) -> str:
 
 
 def _format_spread(spread: link_summary.ValueStatistics, unit_ms: float = 1.0) -> str:
-    """Returns statistics of times, whose unit is `unit_ms`, in ms."""
+    """Returns the mean, deviation, 99th percentile and largest value of times, in ms.
+
+    Args:
+        spread: Statistics of the times.
+        unit_ms: Unit of the statistics, in ms.
+    """
     mean = _format_number(unit_ms * spread.mean)
     deviation = _format_number(unit_ms * spread.deviation)
     p99 = _format_number(unit_ms * spread.p99)
@@ -177,11 +210,17 @@ def _format_spread(spread: link_summary.ValueStatistics, unit_ms: float = 1.0) -
 
 
 def _format_number(value: float) -> str:
+    """Returns a number with three digits, or more if it is 100 or larger."""
     return f"{value:.0f}" if abs(value) >= 100.0 else f"{value:.3g}"
 
 
 def _describe_losses(use: link_summary.LinkSummary, counts: link_summary.SampleCounts) -> str:
-    """Returns the numbers of samples of a link that were not used, with their shares."""
+    """Returns how many samples of a link were not used, by the reason, with their percentages.
+
+    Args:
+        use: Summary of the link.
+        counts: Numbers of its samples.
+    """
     losses = {
         "missing on the way": counts.missing,
         "lost": counts.lost,
@@ -194,14 +233,14 @@ def _describe_losses(use: link_summary.LinkSummary, counts: link_summary.SampleC
     for name, count in losses.items():
         if count:
             parts.append(f"{name} {count} ({100 * count / judged:.3g} %)")
-    # shorter bursts would be shown as "1 in a row"
+    # Shorter bursts would be printed as "1 in a row", which says nothing.
     if use.burst is not None and use.burst > 1.005:
         parts.append(f"{_format_number(use.burst)} in a row")
     return ", ".join(parts) or "nothing lost"
 
 
 def _limit_lines(lines: list[str]) -> list[str]:
-    """Returns at most `MOST_LINES` lines, and a line that counts the others."""
+    """Returns at most `MOST_LINES` lines, and a line that counts the remaining ones."""
     more = len(lines) - MOST_LINES
     if more <= 0:
         return lines
@@ -209,7 +248,7 @@ def _limit_lines(lines: list[str]) -> list[str]:
 
 
 def compose_verification(report: LogCheckReport) -> Iterator[Block]:
-    """Yields a line per check; if all checks passed, also the lines of `format_run_lines`."""
+    """Yields a line per check of a log. If all passed, also the notable facts of the run."""
     for finding in report.findings:
         yield MarkedText("", f"{finding.check}: {finding.text}", failed=not finding.passed)
     if report.passed:
@@ -217,11 +256,11 @@ def compose_verification(report: LogCheckReport) -> Iterator[Block]:
 
 
 def compose_log_check(report: LogCheckResult) -> Iterator[Block]:
-    """Yields a line per check, and the locations at which the check failed."""
+    """Yields a line per check of a file, and the places in the file at which a check failed."""
     for finding in report.findings:
         mark = MARKS["ok" if finding.passed else "FAIL"]
         yield MarkedText(mark, f"{finding.check:<9}  {finding.text}")
-        # a single location that the text of the check names is not repeated
+        # The text of the check may name a single location already.
         if finding.wrong == 1 and str(finding.places[0]) in finding.text:
             continue
         for location in finding.places[:_MAX_LOCATIONS]:
@@ -234,7 +273,11 @@ def compose_log_check(report: LogCheckResult) -> Iterator[Block]:
 
 
 def compose_recovery(recovery: Recovery) -> Iterator[Block]:
-    """Yields the recovered file, and a table of the recovered and the lost records."""
+    """Yields the result of the recovery of an unfinished log.
+
+    The first line names the new file. A table lists which records were recovered, and which
+    were lost or are missing.
+    """
     state = "was finished" if recovery.finished else "was not finished"
     yield f"{recovery.output}: recovered from {recovery.path}, which {state}"
     rows = []
@@ -246,7 +289,7 @@ def compose_recovery(recovery: Recovery) -> Iterator[Block]:
         rows.append(("source", f"digest chain {recovery.chain}"))
     rows.append(("messages", f"{recovery.messages} in {recovery.duration_s:.3f} s"))
     lists = [("lost", recovery.lost)]
-    # without a number of expected records nothing can be called missing
+    # Without a number of expected records nothing can be called missing.
     if recovery.coverage.expected:
         lists.append(("missing", recovery.missing))
     for name, lines in lists:
@@ -259,7 +302,11 @@ def compose_recovery(recovery: Recovery) -> Iterator[Block]:
 
 
 def compose_rerun(rerun: Rerun) -> Iterator[Block]:
-    """Yields the executed sites, the changes, a table of the sites, and other effects."""
+    """Yields the result of a rerun, in which some sites of a log are executed again.
+
+    The text names the executed sites and the changed settings, and compares the motion of each
+    site and the ages of the samples of each link with the log.
+    """
     request = rerun.request
     recorded = f"; {', '.join(request.recorded)} as recorded" if request.recorded else ""
     yield f"{request.mode}: {', '.join(request.replaced)} executed afresh{recorded}"
@@ -295,7 +342,12 @@ def compose_rerun(rerun: Rerun) -> Iterator[Block]:
 
 
 def _describe_site_effect(effect: SiteEffect, rate_hz: int) -> list[str]:
-    """Returns lines on the differences between the rerun of a site and the log."""
+    """Returns lines on the differences between the rerun of a site and the log.
+
+    Args:
+        effect: The differences.
+        rate_hz: Tick rate of the site, which converts ticks to times.
+    """
     lines = []
     if effect.q_max_rad:
         largest = f"{effect.q_max_rad:.3g} rad off the log, at {effect.q_max_at_s:.3f} s"
@@ -312,7 +364,7 @@ def _describe_site_effect(effect: SiteEffect, rate_hz: int) -> list[str]:
 
 
 def _describe_link_effect(link: LinkEffect) -> str:
-    """Returns the ages of the samples in use on a link, in the log and in the rerun."""
+    """Returns a sentence that compares the ages of a link's samples in log and rerun."""
     mean_ms = link.age_mean_ms
     max_ms = link.age_max_ms
     before = f"{mean_ms.before:.4g} ms old on average, {max_ms.before:.4g} ms at most"
@@ -321,7 +373,10 @@ def _describe_link_effect(link: LinkEffect) -> str:
 
 
 def _format_difference(before: object, after: object) -> tuple[str, str]:
-    """Returns two different values as texts that differ: in full if six digits are equal."""
+    """Returns two different values as texts that differ.
+
+    Numbers have six digits. If these are equal, they have all digits.
+    """
     short_before = f"{before:.6g}" if isinstance(before, float) else str(before)
     short_after = f"{after:.6g}" if isinstance(after, float) else str(after)
     if short_before == short_after:
@@ -330,16 +385,21 @@ def _format_difference(before: object, after: object) -> tuple[str, str]:
 
 
 def compose_doctor(report: Result) -> Iterator[Block]:
-    """Yields a line per finding."""
+    """Yields a line per finding about this machine, with a mark for good, doubtful or bad."""
     for finding in report.to_dict()["findings"]:
         yield MarkedText(MARKS[finding["state"]], f"{finding['check']:<10}  {finding['text']}")
 
 
 def compose_ping(report: Result) -> Iterator[Block]:
-    """Yields tables of the members (round trips, clocks) and of the links between sites."""
+    """Yields tables of the round trips to the members of a session, and of the sites' links.
+
+    A member is a process that takes part in the session: a site or a recorder. The second table
+    exists only if the sites have measured delays between each other.
+    """
     facts = report.to_dict()
     members = facts["members"]
     links = facts["links"]
+
     state = "runs" if any(member["running"] for member in members) else "waits for its members"
     clock_note = "clock: the member's minus that of this machine"
     yield f"session {facts['session']} {state}; times in us; {clock_note}"
@@ -354,11 +414,13 @@ def compose_ping(report: Result) -> Iterator[Block]:
         )
     headers = ("member", "host", "answers", "rtt min", "p50", "p99", "jitter", "clock")
     yield TextTable(headers, rows, align="llrrrrrl")
+
     if links:
         yield "between the sites, in the last tenth of a second of each:"
         rows = []
         for link in links:
             delays_us = [link["delay_us"], link["delay_max_us"], link["rtt_us"]]
+            # A negative time stands for a delay that was not measured.
             delays = ["none" if delay_us < 0 else str(delay_us) for delay_us in delays_us]
             offset = [f"{link['offset_us'] / 1e6:.6f}", str(link["bound_us"])]
             rows.append([link["from"], link["to"], *delays, *offset])
@@ -368,20 +430,24 @@ def compose_ping(report: Result) -> Iterator[Block]:
 
 _BARS = " ▁▂▃▄▅▆▇█"
 """Bars of a histogram in text, by their height in eighths."""
+_DELAY_KEYS = ("min", "p50", "p99", "max")
 
 
 def compose_topic_delays(report: Result) -> Iterator[Block]:
-    """Yields a row per publisher, with a histogram from its least to its largest delay."""
-    facts = report.to_dict()
-    duration = f"{facts['lasted_s']:.3g} s"
-    yield f"/{facts['topic']}, {duration}; times in us, from sending to arrival"
+    """Yields a table of the delays of a ROS topic's messages, with a row per publisher.
+
+    The last column is a histogram of the delays, from the smallest to the largest one.
+    """
+    measurement = report.to_dict()
+    duration = f"{measurement['lasted_s']:.3g} s"
+    yield f"/{measurement['topic']}, {duration}; times in us, from sending to arrival"
+
     rows = []
-    least = 0.0
-    for publisher in facts["publishers"]:
+    has_negative_delay = False
+    for publisher in measurement["publishers"]:
         delays_us = publisher["delay_us"]
-        counts = publisher["histogram"]["counts"]
-        # rounded up, so that a single message is seen
-        bars = "".join(_BARS[-(-8 * count // max(counts))] for count in counts)
+        if delays_us["min"] < 0.0:
+            has_negative_delay = True
         cells = [
             publisher["gid"][:8],
             publisher["type"],
@@ -389,29 +455,34 @@ def compose_topic_delays(report: Result) -> Iterator[Block]:
             str(publisher["lost"]),
             f"{publisher['rate_hz']:.1f}",
         ]
-        cells += [f"{delay_us:.0f}" for delay_us in delays_us.values()]
-        rows.append([*cells, bars])
-        least = min(least, delays_us["min"])
-    headers = (
-        "publisher",
-        "type",
-        "messages",
-        "lost",
-        "Hz",
-        "min",
-        "p50",
-        "p99",
-        "max",
-        "min to max",
-    )
+        cells += [f"{delays_us[key]:.0f}" for key in _DELAY_KEYS]
+        cells.append(_draw_histogram(publisher["histogram"]["counts"]))
+        rows.append(cells)
+    headers = ("publisher", "type", "messages", "lost", "Hz", *_DELAY_KEYS, "min to max")
     yield TextTable(headers, rows, align="llrrrrrrrl")
-    if least < 0.0:
+
+    if has_negative_delay:
         yield "delays below 0: the publisher's clock is ahead of the clock of this machine"
     yield "between two machines, delays contain the offset of the clocks"
 
 
+def _draw_histogram(counts: Sequence[int]) -> str:
+    """Returns a histogram as text, with a bar of up to eight eighths per bin.
+
+    Args:
+        counts: Number of messages in each bin. At least one bin must have a message.
+    """
+    largest = max(counts)
+    bars = ""
+    for count in counts:
+        # Rounded up, so that a bin with a single message has a visible bar.
+        height_eighths = math.ceil(8 * count / largest)
+        bars += _BARS[height_eighths]
+    return bars
+
+
 def _describe_clock(member: dict[str, Any]) -> str:
-    """Returns the offset of a member's clock, in s, and its bound, in us."""
+    """Returns the offset of a member's clock in s, and the bound of its error in us."""
     if member["same_clock"]:
         return "the same clock"
     if "offset_ns" not in member:
@@ -420,7 +491,12 @@ def _describe_clock(member: dict[str, Any]) -> str:
 
 
 def compose_benchmark(benchmark: Result) -> Iterator[Block]:
-    """Yields a row per size, rate and transport, and a judgement of each transport."""
+    """Yields the delays of this machine's transports, and a judgement of each transport.
+
+    A transport is a way to send messages between two processes. The table has a row per
+    transport, size of message and rate. The judgement compares the delay with the needs of a
+    scenario.
+    """
     facts = benchmark.to_dict()
     needs = facts["needs"]
     name = facts["scenario"]
@@ -445,7 +521,13 @@ def compose_benchmark(benchmark: Result) -> Iterator[Block]:
 
 
 def _judge_transport(transport: dict[str, Any], needs: dict[str, Any]) -> str:
-    """Returns a sentence on the delay of a transport against the needs of a scenario."""
+    """Returns a sentence that compares the delay of a transport with the needs of a scenario.
+
+    Args:
+        transport: Measured delays and losses of the transport.
+        needs: Sizes, rates and time limits of the scenario. `held_ms` is the time for which its
+            links hold each sample before it is used, so that shorter delays have no effect.
+    """
     if transport["p99_ms"] is None:
         return "no message returned"
     parts = [f"p99 {transport['p99_ms']:.3g} ms"]
@@ -459,16 +541,18 @@ def _judge_transport(transport: dict[str, Any], needs: dict[str, Any]) -> str:
         parts.append("at which the loop is not stable")
     if transport["lost_share"]:
         parts.append(f"{100 * transport['lost_share']:.3g} % lost")
-    parts.append(
+    playout = (
         f"a play-out of {transport['playout_ms']} ms would hold every one of these samples"
     )
-    return ", ".join(parts[:-1]) + "; " + parts[-1]
+    return f"{', '.join(parts)}; {playout}"
 
 
 def compose_metrics(metrics: LogMetrics) -> Iterator[Block]:
-    """Yields the tables of metrics, statics and impedances, then reasons of missing numbers.
+    """Yields the tables of a run's metrics, then the reasons why numbers are missing.
 
-    There is a table per group of quantities and kind of subject: run, site, link or wall.
+    There is a table per group of quantities and kind of subject: the run, a site, a link or a
+    wall. Further tables have the forces that sites at rest feel, and the stiffness and
+    impedance that operators feel.
     """
     reasons: dict[str, list[str]] = {}
     tables = groupby(quantities(), key=lambda quantity: (quantity.group, quantity.of))
@@ -482,20 +566,22 @@ def compose_metrics(metrics: LogMetrics) -> Iterator[Block]:
 
 
 def _explain_missing(subject: str, reason: str) -> MarkedText:
-    """Returns a line on the reason why numbers are missing, behind the mark of their cells."""
+    """Returns a dash, which stands for missing numbers, and the reason why they are missing."""
     return MarkedText(f"[bold]{_NO_NUMBER}[/bold]", f"{subject}: {sanitize(reason)}")
 
 
 def _compose_group(
     group: str, members: Sequence[Quantity], metrics: LogMetrics, reasons: dict[str, list[str]]
 ) -> Iterator[Block]:
-    """Yields a table with a row per quantity and a column per subject, for those that apply.
+    """Yields a table with a row per quantity and a column per subject.
+
+    Rows and columns without any number that applies to the run are left out.
 
     Args:
-        group: the heading of the table.
-        members: the quantities of the group.
-        metrics: their values.
-        reasons: receives the names of missing numbers, by the reason.
+        group: Heading of the table.
+        members: Quantities of the group, all about the same kind of subject.
+        metrics: Metrics of the run.
+        reasons: Dictionary to which the names of missing numbers are added, by the reason.
     """
     values = {quantity: metrics.values_of(quantity) for quantity in members}
     applicable = {
@@ -503,18 +589,23 @@ def _compose_group(
         for quantity, by_subject in values.items()
         if any(metric.applies for metric in by_subject.values())
     }
+
+    # All quantities of a group have the same subjects.
+    all_subjects = next(iter(values.values()))
     subjects = [
         subject
-        for subject in next(iter(values.values()))
+        for subject in all_subjects
         if any(by_subject[subject].applies for by_subject in applicable.values())
     ]
     if not subjects:
         return
+
     rows = []
     for quantity, by_subject in applicable.items():
         numbers = [_format_metric(by_subject[subject]) for subject in subjects]
         rows.append([quantity.name, quantity.unit, *numbers])
     yield from _tabulate([group, "", *subjects], rows, text_columns=2)
+
     for quantity, by_subject in applicable.items():
         for subject in subjects:
             metric = by_subject[subject]
@@ -524,7 +615,11 @@ def _compose_group(
 
 
 def _compose_sharing(metrics: LogMetrics) -> Iterator[Block]:
-    """Yields a table of the forces that a site at rest feels while another site is pushed."""
+    """Yields a table of the forces that a site at rest feels while another site is pushed.
+
+    The expected force follows from the dominance factors, which are the weights with which the
+    sites follow each other. Yields nothing if no site was at rest while another one was pushed.
+    """
     if not metrics.sharing_ratios:
         return
     joint_header = "joint"
@@ -558,6 +653,7 @@ def _compose_sharing(metrics: LogMetrics) -> Iterator[Block]:
         "deviation",
     )
     yield from _tabulate(headers, rows, text_columns=1)
+    # Each reason is written once, in the order of the rows.
     reasons = dict.fromkeys(pair.expected_nm.why for pair in metrics.sharing_ratios)
     for reason in reasons:
         if reason:
@@ -565,7 +661,7 @@ def _compose_sharing(metrics: LogMetrics) -> Iterator[Block]:
 
 
 def _compose_stiffness(metrics: LogMetrics) -> Iterator[Block]:
-    """Yields a table of the stiffness that sites felt, if it was measured."""
+    """Yields a table of the stiffness that sites felt, or nothing if it was not measured."""
     if not metrics.stiffness:
         return
     rows = []
@@ -594,7 +690,11 @@ def _compose_stiffness(metrics: LogMetrics) -> Iterator[Block]:
 
 
 def _compose_impedance(metrics: LogMetrics) -> Iterator[Block]:
-    """Yields a table of the impedance felt, with a row per frequency, if it was measured."""
+    """Yields a table of the impedance that sites felt, with a row per frequency.
+
+    An impedance is the ratio of force to motion as a function of frequency. At most about
+    `_MAX_FREQUENCIES` frequencies are listed. Yields nothing if no impedance was measured.
+    """
     if not metrics.responses:
         return
     rows = []
@@ -606,8 +706,9 @@ def _compose_impedance(metrics: LogMetrics) -> Iterator[Block]:
         unit = metrics.unit(response.unit, response.joint)
         ratios: Sequence[FrequencyResponse] = [response.ratio]
         if len(response.spectrum) > 1:
-            # rounded up: at most _MAX_FREQUENCIES ratios are listed
-            step = -(-len(response.spectrum) // _MAX_FREQUENCIES)
+            # Every step-th ratio is listed. The step is rounded up, so that at most
+            # _MAX_FREQUENCIES ratios are listed.
+            step = math.ceil(len(response.spectrum) / _MAX_FREQUENCIES)
             ratios = response.spectrum[::step]
         for index, ratio in enumerate(ratios):
             shown_title = title if index == 0 else ""
@@ -617,7 +718,10 @@ def _compose_impedance(metrics: LogMetrics) -> Iterator[Block]:
 
 
 def _list_response_cells(ratio: FrequencyResponse) -> list[str]:
-    """Returns frequency, gain, phase, coherence and error; or the reason why there are none."""
+    """Returns the cells of one frequency: frequency, gain, phase, coherence and error.
+
+    If the ratio could not be estimated, the last cell has the reason, and the others are empty.
+    """
     if ratio.gain is None:
         return ["", "", "", "", ratio.why]
     numbers = (ratio.frequency_hz, ratio.gain, ratio.phase_rad, ratio.coherence)
@@ -627,10 +731,12 @@ def _list_response_cells(ratio: FrequencyResponse) -> list[str]:
 
 
 def _format_metric(metric: Metric) -> str:
+    """Returns the value of a metric with four digits, or a dash if there is no value."""
     return _NO_NUMBER if metric.value is None else _format_value(metric.value)
 
 
 def _format_value(value: float) -> str:
+    """Returns a number with four digits, or all digits of a whole number."""
     is_whole = value == int(value) and abs(value) < 1e6
     return f"{value:.0f}" if is_whole else f"{value:.4g}"
 
@@ -638,9 +744,13 @@ def _format_value(value: float) -> str:
 def _tabulate(
     heads: Sequence[str], rows: Iterable[Sequence[str]], text_columns: int
 ) -> Iterator[Block]:
-    """Yields a table and an empty line; the first `text_columns` columns align to the left.
+    """Yields a table and an empty line.
 
-    The other columns hold numbers, except a last column without a header.
+    Args:
+        heads: Header of each column. If the last one is empty, the last column has texts.
+        rows: Cells of each row.
+        text_columns: Number of columns at the left that have texts, and are aligned to the
+            left. The other columns have numbers, and are aligned to the right.
     """
     last = "r" if heads[-1] else "l"
     align = "l" * text_columns + "r" * (len(heads) - text_columns - 1) + last
