@@ -300,7 +300,7 @@ WRONG: dict[str, tuple[Callable[[Path], object], str]] = {
     "export": (lambda file: tn.export(file, "npz", file), "replace it with force=True$"),
     "sweep seeds": (
         lambda _: tn.sweep("free", "control.Kd=1,2", seeds="1..3"),
-        "^seeds is how many",
+        "^seeds is a number from 1",
     ),
     "sweep over": (lambda _: tn.sweep("free", 5), "^over reads KEY=VALUES"),
     "sweep law": (lambda _: tn.sweep("free", laws="pd"), "^laws: there is no law 'pd'"),
