@@ -113,9 +113,10 @@ class LawChannel(NamedTuple):
         Args:
             peers: the names of the site's peers, in scenario order.
         """
-        to_all = self.select_vectors(per_peer=False)
         to_each = self.select_vectors(per_peer=True)
-        for peer, vectors in (("", to_all), *((peer, to_each) for peer in peers)):
+        groups = [("", self.select_vectors(per_peer=False))]
+        groups += [(peer, to_each) for peer in peers]
+        for peer, vectors in groups:
             for vector in vectors:
                 for n in range(vector.length):
                     yield SentEntry(vector, peer, n)

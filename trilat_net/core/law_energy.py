@@ -61,7 +61,8 @@ class LawEnergies(NamedTuple):
 
     Attributes:
         gave: per peer, the energy that was sent to it.
-        took: per peer, the energy that was taken of the energy it sent, part by part.
+        took: per peer, the energy that the law took out of the energy that the peer sent, part
+            by part.
         port: the energy that the arm gave to the law, by the law's own account; None: the
             energy computed from the records.
         store: the energy that the law stores.
@@ -70,8 +71,8 @@ class LawEnergies(NamedTuple):
         observed: per peer, the energy that the site knows to remain of the energy sent by the
             peer; () if the law does not observe it.
         weight: weight of the arm's energy in the sum over all sites.
-        gravity: share of gravity that the law compensates; the work of gravity is not the
-            law's.
+        gravity: share of gravity that the law compensates; the work of this torque is no work
+            of the law.
     """
 
     gave: Sequence[Array]

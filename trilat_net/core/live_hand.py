@@ -391,13 +391,15 @@ def _glide_tick(
     speed_per_distance = speed / distance if distance > 0.0 else 0.0
     square = 0.0
     for i in range(size):
-        change = speed_per_distance * (goal[i] - target[i]) - rate[i]
+        desired_rate = speed_per_distance * (goal[i] - target[i])
+        change = desired_rate - rate[i]
         square += change * change
     change_norm = math.sqrt(square)
     most = acceleration * h_s
     factor = most / change_norm if change_norm > most else 1.0
     for i in range(size):
-        rate[i] += factor * (speed_per_distance * (goal[i] - target[i]) - rate[i])
+        desired_rate = speed_per_distance * (goal[i] - target[i])
+        rate[i] += factor * (desired_rate - rate[i])
 
 
 def _accept_command(
@@ -429,7 +431,10 @@ def _accept_command(
     if command.number == memory.number:
         return memory, ""
     period_ns = 1_000_000_000 // rules.rate_hz
-    glide_ns = min(max((command.sent_ns - memory.sent_ns) * 5 // 4, period_ns), GLIDE_NS)
+    between_messages_ns = command.sent_ns - memory.sent_ns
+    # A quarter more, so that the target does not stop when the next message is a little late.
+    glide_ns = between_messages_ns * 5 // 4
+    glide_ns = min(max(glide_ns, period_ns), GLIDE_NS)
     return _aim(rules, memory, command, t_ns + glide_ns), ""
 
 

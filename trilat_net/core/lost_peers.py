@@ -29,10 +29,12 @@ _RESTORED = int(LifeReason.RESTORED)
 
 @leaf
 def _can_drop(lost: int, t_ns: int, site: SiteRow, links: RowArray) -> bool:
-    """True if the remaining sites reach each other without a peer, and the site follows one.
+    """True if the site may go on without a peer.
 
-    Sets of sites are numbers with one bit per site. `forward` are the sites that this site
-    reaches, `backward` the sites that reach this site; both must be all remaining sites.
+    The remaining sites must reach each other, and this site must still follow at least one
+    peer. Sets of sites are numbers with one bit per site. `forward` are the sites that this
+    site reaches, and `backward` the sites that reach this site; both must be all remaining
+    sites.
     """
     remaining = site.bit
     followed = 0
@@ -69,13 +71,16 @@ def _is_orientation_near(back: int, site: SiteRow, links: RowArray) -> bool:
     for j in range(links.shape[0]):
         link: LinkRow = links[j]
         if link.gone == 0.0:
-            turn = relative_rotation(orientation, rotation_matrix(three(link.q[3:])))
+            peer_orientation = rotation_matrix(three(link.q[3:]))
+            turn = relative_rotation(orientation, peer_orientation)
             sum_of_turns = add(sum_of_turns, scale(link.alpha, turn))
             total += link.alpha
     link = links[back]
-    turn = relative_rotation(orientation, rotation_matrix(three(link.q[3:])))
+    peer_orientation = rotation_matrix(three(link.q[3:]))
+    turn = relative_rotation(orientation, peer_orientation)
     difference = add(turn, scale(-1.0 / total, sum_of_turns))
-    near: bool = length(difference) * link.alpha / (total + link.alpha) <= site.align_limit
+    turn_of_reference = length(difference) * link.alpha / (total + link.alpha)
+    near: bool = turn_of_reference <= site.align_limit
     return near
 
 
@@ -93,7 +98,8 @@ def _is_near(back: int, site: SiteRow, links: RowArray) -> bool:
                 weighted += link.alpha * link.q[i]
                 total += link.alpha
         link = links[back]
-        with_peer = (weighted + link.alpha * link.q[i]) / (total + link.alpha)
+        weighted_with_peer = weighted + link.alpha * link.q[i]
+        with_peer = weighted_with_peer / (total + link.alpha)
         without_peer = weighted / total
         if not abs(with_peer - without_peer) <= site.align_limit:
             return False

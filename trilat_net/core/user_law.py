@@ -208,15 +208,20 @@ def call_law(
         returned = law.torque(now)
         if returned is None and all(map(math.isnan, now.tau)):
             raise TypeError("torque returned None and did not write now.tau")
-        torque = [float(value) for value in (now.tau if returned is None else returned)]
-        estimate = [float(value) for value in getattr(law, "theta_hat", now.theta_hat)]
+        torque_numbers = now.tau if returned is None else returned
+        estimate_numbers = getattr(law, "theta_hat", now.theta_hat)
+        torque = [float(value) for value in torque_numbers]
+        estimate = [float(value) for value in estimate_numbers]
         results = LawResults(torque, estimate, read_memory(law), collect_sent(now))
     except LawFailed:  # the watchdog has stopped the law
         raise
     except (Exception, SystemExit) as error:
         raise describe_failure(law, site, now.k, error) from error
-    lengths = (("torque", torque, now.joints), ("theta_hat", estimate, len(now.theta_hat)))
-    for name, values, length in lengths:
+    required_lengths = (
+        ("torque", torque, now.joints),
+        ("theta_hat", estimate, len(now.theta_hat)),
+    )
+    for name, values, length in required_lengths:
         if len(values) != length:
             problem = f"{name} has {count_nouns(len(values), 'number')}, not {length}"
             raise _law_error(law, site, now.k, problem)
@@ -245,10 +250,12 @@ def check_results(law: UserLaw, site: str, tick: int, results: LawResults) -> No
         problem = f"memory has {numbers}, at most {MAX_LAW_MEMORY} are kept"
         raise _law_error(law, site, tick, problem)
     for name, values in zip(results._fields, results, strict=True):
-        if not all(map(math.isfinite, values)):
-            first = next(n for n, value in enumerate(values) if not math.isfinite(value))
-            problem = f"{name}[{first}] is {values[first]}, no finite number"
-            raise _law_error(law, site, tick, problem)
+        if all(map(math.isfinite, values)):
+            continue
+        for n, value in enumerate(values):
+            if not math.isfinite(value):
+                problem = f"{name}[{n}] is {value}, no finite number"
+                raise _law_error(law, site, tick, problem)
 
 
 def describe_failure(
@@ -256,8 +263,9 @@ def describe_failure(
 ) -> LawFailed:
     """Returns the failure of a law that raised an exception."""
     problem = _one_line(error)
-    hint = "; for more than + - * / make it an array, as in numpy.asarray(now.q)"
-    return _law_error(law, site, tick, problem + (hint if "LawVector" in problem else ""))
+    if "LawVector" in problem:
+        problem += "; for more than + - * / make it an array, as in numpy.asarray(now.q)"
+    return _law_error(law, site, tick, problem)
 
 
 def _flatten(value: Any) -> Iterator[float]:
@@ -325,9 +333,12 @@ def law_name(law: UserLaw) -> str:
 
 
 def _law_error(law: UserLaw, site: str, tick: int | None, problem: str) -> LawFailed:
+    """Returns the error for a problem with the results of a law."""
     return LawFailed(problem, site=site, code=law_name(law), tick=tick)
 
 
 def _one_line(error: BaseException) -> str:
+    """Returns the type of an exception and the first line of its message."""
+    kind = type(error).__name__
     lines = str(error).strip().splitlines()
-    return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
+    return f"{kind}: {lines[0]}" if lines else kind

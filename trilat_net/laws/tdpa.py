@@ -9,8 +9,9 @@ where v_j are the velocities of the peers and alpha_j are the dominance factors.
 aligns or holds, the difference between its reference and its peers is added to the goal without
 an energy cost.
 
-Names: `E_...` are sums of energy that an end has put in or taken, `W_...` are energies that an
-end observes; `led` belongs to the leader's end of a coupling, `followed` to the follower's.
+In the names below, E is a sum of energy that an end has put in or taken out, and W is an energy
+that an end observes. Names with "led" belong to the leader's end of a coupling, and names with
+"followed" to the follower's end.
 
 Invariant:
     - In each directed coupling of a follower to a leader, each end accounts cumulatively, per
