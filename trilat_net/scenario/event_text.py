@@ -1,4 +1,4 @@
-"""Render an event as a sentence for people, also from the logs of older programs."""
+"""Renders an event of a session as a sentence for people, also for logs of older versions."""
 
 from contextlib import suppress
 
@@ -9,15 +9,16 @@ from .scenario_types import Change
 
 
 def describe_event(kind: str, text: str, command: str) -> str:
-    """Returns the sentence of an event for people.
+    """Returns the sentence that describes an event to people.
 
-    Older sites quoted the JSON of a change in the text of its event. The sentence of the change
-    replaces such a text, so that pages, timelines and views of old and new logs read alike.
+    Older versions published a change of a link or site with its JSON text in place of a
+    sentence. For such an event, the sentence is composed here, so that old and new logs read
+    alike.
 
     Args:
-        kind: kind of the event.
-        text: text of the event, as a site or a recorder published it.
-        command: JSON of the change that the event reports; empty for other events.
+        kind: Kind of the event.
+        text: Text of the event, as a site or a recorder published it.
+        command: JSON of the change that the event reports. Empty for other events.
     """
     if kind == "change" and command and command in text:
         # The command of an untrusted log may lack the keys of a change: the text then stays.

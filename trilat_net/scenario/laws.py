@@ -1,8 +1,8 @@
-"""The control laws that a scenario can choose, by name.
+"""Collects the control laws that a scenario can choose, by name.
 
 Invariant:
-    - A law is found by its file in the package `trilat_net.laws` alone, whose class bears the
-      same name. Nothing else lists laws.
+    - A law is found by its file in the package `trilat_net.laws`. The class in this file has
+      the same name as the file. There is no other list of laws.
 """
 
 import pkgutil
@@ -17,7 +17,7 @@ _LAWS_PACKAGE = "trilat_net.laws"
 
 
 def _find_laws() -> Iterator[type[ControlLaw]]:
-    """Yields the law of each file that has one."""
+    """Yields the law of each file in the package of laws that contains one."""
     for file in pkgutil.iter_modules(import_module(_LAWS_PACKAGE).__path__):
         module = import_module(f"{_LAWS_PACKAGE}.{file.name}")
         kind = getattr(module, format_class_name(file.name), None)
@@ -28,20 +28,20 @@ def _find_laws() -> Iterator[type[ControlLaw]]:
 BUILT_IN: dict[str, type[ControlLaw]] = {
     str(law.Settings.__struct_config__.tag): law for law in _find_laws()
 }
-"""The built-in laws by name."""
+"""Classes of the built-in laws, by name."""
 LAWS: dict[str, type[LawSettings]] = {
     **{name: law.Settings for name, law in BUILT_IN.items()},
     str(ImportedLaw.__struct_config__.tag): ImportedLaw,
 }
-"""The type of the gains of each law, by name; the users' laws have one name together."""
+"""Type of the gains of each law, by name. All laws of users have the same type and name."""
 if TYPE_CHECKING:
     ChosenLaw = LawSettings
 else:
     # Built at run time from the laws that were found.
     ChosenLaw = Union[tuple(LAWS.values())]  # noqa: UP007
-    """The type of a site's control."""
+    """Type of the key `control` of a site."""
 
 
 def identify_law(law: Any) -> str:
-    """Returns the name of a law in a scenario; a user's law as in "package.module:Law"."""
+    """Returns the name of a law in a scenario. A user's law is named "package.module:Law"."""
     return law.code if isinstance(law, ImportedLaw) else str(law.tag)

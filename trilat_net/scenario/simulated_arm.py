@@ -1,8 +1,8 @@
-"""An arm of a scenario that a program moves: in place of a robot, or of a plant.
+"""Simulates an arm of a scenario step by step, for programs that stand in for a robot or plant.
 
 Invariant:
-    - The arm has the dynamics of the arm in the scenario, Eq. (8). A planar arm is a chain of
-      two joints.
+    - The arm has the dynamics of the arm in the scenario, Eq. (8). A planar arm is simulated as
+      a chain of two joints.
 """
 
 import numpy as np
@@ -15,7 +15,7 @@ from .arms import build_arm
 
 
 class SimulatedArm:
-    """An arm that starts in the start pose of its site and moves when its program says so.
+    """An arm that starts in the start pose of its site, and moves when a program calls `move`.
 
     >>> arm = tn.SimulatedArm(tn.load_scenario("two_sites"), "s")
     >>> arm.move([0.0, 0.0], 0.001)
@@ -23,18 +23,18 @@ class SimulatedArm:
     True
 
     Args:
-        scenario: the scenario of the arm.
-        site: the site of the arm.
-        heavier: factor by which all masses and inertias are multiplied.
+        scenario: The scenario.
+        site: Name of the site whose arm is simulated.
+        heavier: Factor by which all masses and inertias are multiplied.
 
     Attributes:
-        q: joint angles, rad, or m of a prismatic joint, shape (n,).
-        qd: joint velocities, rad/s or m/s, shape (n,).
-        chain: the joints, gravity and the end effector.
-        theta: the inertial parameters of the links, ten per link, see `core.chain`.
+        q: Joint angles in rad, or positions in m for prismatic joints, shape (n,).
+        qd: Joint velocities in rad/s or m/s, shape (n,).
+        chain: Joints, gravity and end effector of the arm.
+        theta: Inertial parameters of the links, ten per link, see `core.chain`.
 
     Raises:
-        ScenarioError: there is no such site.
+        ScenarioError: There is no such site.
     """
 
     def __init__(self, scenario: Scenario, site: str, heavier: float = 1.0) -> None:
@@ -50,12 +50,13 @@ class SimulatedArm:
         self._gravity = np.array(model.chain.gravity_m_s2)
 
     def accelerate(self, torque: ArrayLike) -> Array:
-        """Returns the joint accelerations under a torque, rad/s^2, shape (n,).
-
-        The arm does not move.
+        """Computes the joint accelerations under a torque, without moving the arm.
 
         Args:
-            torque: the torque ON the joints, N m, shape (n,).
+            torque: Torque that acts ON the joints, in N m, shape (n,).
+
+        Returns:
+            Accelerations in rad/s^2 or m/s^2, shape (n,).
         """
         acceleration = np.zeros_like(self.q)
         place_joints(self._joints, self.q)
@@ -71,10 +72,14 @@ class SimulatedArm:
         return acceleration
 
     def move(self, torque: ArrayLike, period_s: float) -> None:
-        """Moves the arm by a period under a torque ON the joints, N m.
+        """Moves the arm by one period under a constant torque.
 
-        The velocities advance first, then the angles with the new velocities (symplectic
-        Euler).
+        The integration is semi-implicit (symplectic Euler): first the velocities are advanced,
+        then the angles with the new velocities.
+
+        Args:
+            torque: Torque that acts ON the joints, in N m, shape (n,).
+            period_s: Duration of the step, in s.
         """
         self.qd += period_s * self.accelerate(torque)
         self.q += period_s * self.qd

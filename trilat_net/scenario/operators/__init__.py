@@ -1,14 +1,15 @@
-"""Operators and environments of a scenario, and the completion of their tables.
+"""Defines what operators and environments have in common, and completes their tables.
 
-An operator or environment is one class, found by its file in this folder; nothing else lists
-the classes. Its name in a scenario is the tag of the class. The kinds that the kernel computes
-name a `TorqueKind`. Any other kind has a file of its own with two functions: `act`, which is
-compiled, and `effort`, which evaluates many rows.
+An operator is a person or program who moves an arm; an environment is a wall or another body
+that acts on it. Each kind is one class in a file of this folder, and is found by its file;
+there is no list of kinds. Its name in a scenario is the tag of the class. Kinds that the
+simulation kernel computes itself name a `TorqueKind`. Any other kind has two functions of its
+own: `act`, which is compiled, and `effort`, which evaluates many rows at once.
 
 Invariant:
-    - Torques and forces are those ON the arm. Times are seconds after the epoch. Keys end in
-      their unit.
-    - A mistake is refused at the key in which it is.
+    - Torques and forces are those that act ON the arm. Times are seconds after the epoch, the
+      common start time. The name of a key ends in its unit.
+    - A wrong value is refused with the path of its key.
 """
 
 import math
@@ -26,13 +27,14 @@ from ..distributions import Draws
 
 
 class HeldArm(NamedTuple):
-    """The arm that an operator takes hold of.
+    """Facts about the arm on which an operator acts, to complete the operator's table.
 
     Attributes:
-        counts: the lengths of the arm's vectors.
-        q0_rad: the start pose of the arm, if its table has a valid one.
-        end_effector_m: returns the position of the end effector in the start pose, m.
-        draws: draws the numbers that are given as distributions.
+        counts: Lengths of the arm's vectors.
+        q0_rad: Start pose of the arm. It may be invalid if the table of the arm is wrong.
+        end_effector_m: Function that returns the position of the end effector in the start
+            pose, in m.
+        draws: Draws the numbers that are given as distributions.
     """
 
     counts: fields.VectorCounts
@@ -42,36 +44,40 @@ class HeldArm(NamedTuple):
 
 
 class ActorBase(fields.Frozen, frozen=True, tag_field="kind"):
-    """An operator or an environment."""
+    """Base of all operators and environments."""
 
     group: ClassVar[str] = "hands"
-    """The list of a site in which the actor stands: "hands" or "environment"."""
+    """List of a site to which the actor belongs: "hands" or "environment"."""
     value_texts: ClassVar[Mapping[str, str]] = {}
-    """A description of the values of each key that `VALUE_TEXTS` does not describe."""
+    """Permitted values of each key that `VALUE_TEXTS` does not describe, for error messages."""
 
     def _source(self) -> TorqueSource:
+        """Returns the actor in the form that the simulation kernel uses."""
         raise NotImplementedError
 
     @property
     def actor(self) -> TorqueSource:
-        """The actor in the form of the core."""
+        """The actor in the form that the simulation kernel uses."""
         return self._source()
 
     @classmethod
     def complete_table(
         cls, table: fields.TomlTable, entry: fields.TomlTable, held_arm: HeldArm, path: str
     ) -> None:
-        """Adds to `table` the keys that an author left out and that follow from the arm.
+        """Adds the keys that the author left out and whose values follow from the arm.
 
         Args:
-            table: the table of the actor, changed in place.
-            entry: the table as its author wrote it.
-            held_arm: the arm on which the actor acts.
-            path: the path of the table in errors.
+            table: Table of the actor. It is changed.
+            entry: Table as its author wrote it.
+            held_arm: Arm on which the actor acts.
+            path: Path of the table, for error messages.
         """
 
     def find_problem(self) -> fields.KeyProblem | None:
-        """Returns a problem that no range of a single key shows, or None."""
+        """Returns a problem that involves several keys, or None.
+
+        The keys `normal`, `start_s` and `end_s` mean the same for all kinds that have them.
+        """
         normal = getattr(self, "normal", (1.0,))
         if math.hypot(*normal) < 1e-6:
             return fields.KeyProblem("normal", "must point somewhere, is zero")
@@ -85,52 +91,61 @@ class ActorBase(fields.Frozen, frozen=True, tag_field="kind"):
 
 
 class TimedActor(ActorBase, frozen=True, kw_only=True):
-    """An actor that acts from `start_s` to `end_s`."""
+    """Actor that acts from `start_s` to `end_s`."""
 
     start_s: fields.NotNegative = 0.0
     end_s: fields.Positive = fields.MAX_QUANTITY
 
 
 class SampledActor(TimedActor, frozen=True, kw_only=True):
-    """An actor that may be sampled: evaluated once per tick and held, as a digital wall is."""
+    """Actor whose torque may be sampled.
+
+    A sampled torque is computed once per tick and held, as a real haptic device renders a wall.
+    """
 
     sampled: bool = False
 
 
 class OwnActor(SampledActor, frozen=True, kw_only=True):
-    """An operator or an environment whose torque is a function in a file of this folder.
+    """Operator or environment whose torque is a function in a file of this folder.
 
-    Its keys are numbers, or vectors with a number per joint or axis. It acts on the joints.
-    With `at_tip` it acts on the end effector: `act` and `effort` then see the position and
-    velocity of the end effector, m and m/s, and give a force, N.
+    Its keys are numbers, or vectors with one number per joint or axis. It acts on the joints.
+    If `at_tip` is True, it acts on the end effector: `act` and `effort` then receive the
+    position and velocity of the end effector in m and m/s, and return a force in N.
     """
 
     at_tip: ClassVar[bool] = False
 
     def act(self, now: Any) -> None:
-        """Writes `now.effort[i]`, N m or N, for i below `now.coordinates`.
+        """Computes the torque or force, and stores it in `now.effort`.
 
-        The function is compiled and evaluated in every stage of the integrator. It may use
-        `now.t_s`, `now.at` (angles or position) and `now.speed`. Its result depends on its keys
-        and on `now` alone, and rounds alike on every machine (`core.elementary`, sqrt).
+        The entries i below `now.coordinates` are set. The method is compiled, and is called in
+        every stage of the integrator. It may use `now.t_s`, `now.at` (angles or position) and
+        `now.speed`. The result must depend only on the keys and on `now`, and must have the
+        same bits on every machine. Therefore only functions of `core.elementary` and `sqrt` are
+        allowed.
         """
         raise NotImplementedError
 
     def effort(self, t_s: Array, position: Array, speed: Array) -> Array:
-        """Returns the efforts of `act` for many rows, shape (..., n).
+        """Computes the same torques or forces as `act`, for many rows.
 
-        The function is written independently of `act`, and a test compares the two. The
-        linearised loop differentiates it by complex steps: it accepts complex numbers, and
-        branches on real parts.
+        This method is written independently of `act`, and a test compares the two. The
+        linearisation of the control loop differentiates it by complex steps. Therefore it must
+        accept complex numbers, and its conditions must use the real parts.
 
         Args:
-            t_s: times, s.
-            position: angles, rad, or positions of the end effector, m, shape (..., n).
-            speed: the derivative of `position`, shape (..., n).
+            t_s: Times, in s.
+            position: Angles in rad, or positions of the end effector in m, shape (..., n).
+            speed: Time derivative of `position`, shape (..., n).
+
+        Returns:
+            Torques in N m or forces in N, shape (..., n).
         """
         raise NotImplementedError
 
     def _source(self) -> TorqueSource:
+        """Returns the actor for the kernel, which calls the compiled `act`."""
         kind = TorqueKind.OWN_TIP if self.at_tip else TorqueKind.OWN_JOINTS
         return TorqueSource(kind, self.start_s, self.end_s, sampled=self.sampled, model=self)
 
@@ -161,14 +176,14 @@ VALUE_TEXTS = {
     "acceleration_limit_m_s2": "an acceleration above 0 m/s^2",
     "acceleration_limit_rad_s2": "an acceleration above 0 rad/s^2",
 }
-"""The values that a key takes, for errors about a key that is missing or has another value."""
+"""Permitted values of each key, for error messages. `COUNT_TEXTS` fills the placeholders."""
 COUNT_TEXTS = {
     "joints": ("both joints or two", "all joints or one for each"),
     "axes": ("two numbers, x and y", "three numbers, x, y and z"),
     "all_axes": ("both axes or two", "all axes or three"),
     "each": ("joint 1, on joint 2", "each joint"),
 }
-"""The placeholders of these texts, for the planar arm and for any other arm."""
+"""Texts for the placeholders in `VALUE_TEXTS`: for the planar arm, and for any other arm."""
 
 
 _KINDS = {
@@ -176,7 +191,7 @@ _KINDS = {
 }
 OPERATORS = {tag: kind for tag, kind in _KINDS.items() if kind.group == "hands"}
 ENVIRONMENTS = {tag: kind for tag, kind in _KINDS.items() if kind.group == "environment"}
-"""The operators and the environments by the name of their kind."""
+"""Classes of the operators and of the environments, by the name of the kind."""
 if TYPE_CHECKING:
     Operator = ActorBase
     Environment = ActorBase
@@ -185,7 +200,7 @@ else:
     Operator = Union[tuple(OPERATORS.values())]  # noqa: UP007
     Environment = Union[tuple(ENVIRONMENTS.values())]  # noqa: UP007
 _MAX_QUOTED_LENGTH = 60
-"""Length up to which an error repeats a value."""
+"""Length up to which an error message quotes a value."""
 
 
 def resolve_operators(
@@ -194,13 +209,16 @@ def resolve_operators(
     held_arm: HeldArm,
     path: str,
 ) -> list[fields.TomlTable]:
-    """Returns a site's operators or environments as complete tables.
+    """Returns the complete tables of a site's operators or environments.
 
     Args:
-        written: the list as its author wrote it.
-        kinds: the kinds that the list may hold, by name.
-        held_arm: the arm of the site.
-        path: the path of the list in errors.
+        written: List of tables as its author wrote it.
+        kinds: Classes that the list may contain, by name.
+        held_arm: Arm of the site.
+        path: Path of the list, for error messages.
+
+    Raises:
+        ScenarioError: A table is not valid.
     """
     if not isinstance(written, list):
         raise ScenarioError(f"must be a list of tables [[{path}]]", path=path)
@@ -224,12 +242,17 @@ def resolve_operators(
 def _find_kind(
     entry: fields.TomlTable, kinds: Mapping[str, type[ActorBase]], path: str
 ) -> type[ActorBase]:
-    """Returns the class of an entry by its key `kind`."""
+    """Returns the class that a table names by its key `kind`.
+
+    Raises:
+        ScenarioError: The key is missing or wrong, or the kind belongs to the other list.
+    """
     if "kind" not in entry:
         raise ScenarioError(f"is missing: {' or '.join(map(repr, kinds))}", path=f"{path}.kind")
     kind = entry["kind"]
     for group, group_kinds in (("hands", OPERATORS), ("environment", ENVIRONMENTS)):
-        if isinstance(kind, str) and kind in group_kinds and kind not in kinds:
+        is_of_group = isinstance(kind, str) and kind in group_kinds
+        if is_of_group and kind not in kinds:
             raise ScenarioError(f"is {kind!r}, which belongs in {group}", path=f"{path}.kind")
     fields.check_choice(kind, list(kinds), f"{path}.kind")
     return kinds[kind]
@@ -242,10 +265,17 @@ def _check_values(
     path: str,
     counts: fields.VectorCounts,
 ) -> None:
-    """Refuses values of a complete table that its kind does not take.
+    """Refuses a complete table if a value has a wrong type, range or length.
 
-    A wrong value that was not written but taken over from the arm is refused later, at the
-    arm's own key.
+    A value that the author did not write was copied from the arm. If it is wrong, it is refused
+    later, at the key of the arm.
+
+    Args:
+        table: Complete table.
+        kind: Class of the table.
+        entry: Table as its author wrote it.
+        path: Path of the table, for error messages.
+        counts: Lengths of the arm's vectors.
     """
     is_planar = counts == fields.VectorCounts()
     placeholders = {
@@ -265,15 +295,17 @@ def _check_values(
     if missing is not None:
         key = missing[1]
         raise ScenarioError(f"is missing: {describe_values(key)}", path=f"{path}.{key}")
+
+    # The location is, for example, `$.points[3][1]`.
     match = re.match(r"`\$\.(\w+)(.*)`", location)
-    key, rest = (match[1], match[2]) if match else ("", location)
+    key, index_text = (match[1], match[2]) if match else ("", location)
     if key not in entry:
         return
     if key == "points":
         expected = describe_values(key)
-        if rest:
+        if index_text:
             expected = f"a row {POINTS_ROW_TEXT.format(**placeholders)}"
-        raise ScenarioError(f"must be {expected}", path=f"{path}.{key}{rest}")
+        raise ScenarioError(f"must be {expected}", path=f"{path}.{key}{index_text}")
     value = repr(entry[key])
     quoted = f", is {value}" if len(value) <= _MAX_QUOTED_LENGTH else ""
     raise ScenarioError(f"must be {describe_values(key)}{quoted}", path=f"{path}.{key}")
@@ -282,7 +314,11 @@ def _check_values(
 def _find_refusal(
     table: fields.TomlTable, kind: type[ActorBase], counts: fields.VectorCounts
 ) -> tuple[str, str] | None:
-    """Returns why a table is refused, and the location in msgspec's notation; None if valid."""
+    """Returns why a complete table is not valid, and the location of the wrong value.
+
+    The location has the notation of msgspec, for example "`$.points[3]`". The result is None if
+    the table is valid.
+    """
     try:
         msgspec.convert(table, kind)
     except msgspec.ValidationError as error:

@@ -1,4 +1,4 @@
-"""A compliant body into which the end effector presses; its damping grows with the depth."""
+"""Models a compliant body, such as tissue, into which the end effector presses."""
 
 import math
 from collections.abc import Mapping
@@ -12,19 +12,22 @@ from ..operators import OwnActor
 
 
 class HuntCrossley(OwnActor, frozen=True, kw_only=True, tag="hunt_crossley"):
-    """Tissue or rubber: F = K d^(3/2) (1 + lambda d') along its normal, never pulling.
+    """Compliant body, such as tissue or rubber, with a damping that grows with the depth.
 
-    d is the depth and d' its rate. This is the contact of a sphere after Hertz with the damping
-    of Hunt and Crossley, "Coefficient of restitution interpreted as damping in vibroimpact", J.
-    Applied Mechanics 42 (1975). The force begins and ends at zero, where a spring and a damper
-    jump and pull. The body is passive: its damping dissipates energy at every depth.
+        F = K d^(3/2) (1 + lambda d') along the normal of the surface, and never pulling
+
+    d is the depth and d' its rate of change. The elastic part is the contact of a sphere after
+    Hertz. The damping is that of Hunt and Crossley, "Coefficient of restitution interpreted as
+    damping in vibroimpact", J. Applied Mechanics 42 (1975). With it, the force begins and ends
+    at zero; the force of a linear spring and damper would jump at contact and pull at release.
+    The body is passive, because its damping dissipates energy at every depth.
 
     Attributes:
-        point_m: a point of its surface, m.
-        normal: direction of the free side; its length does not matter.
-        stiffness_n_m15: K, N/m^1.5.
-        damping_s_m: lambda, s/m: 3/2 of the rate at which the coefficient of restitution falls
-            with the speed of impact.
+        point_m: A point of the surface, in m.
+        normal: Direction of the free side. Its length does not matter.
+        stiffness_n_m15: K, in N/m^1.5.
+        damping_s_m: lambda, in s/m: 3/2 of the rate at which the coefficient of restitution
+            falls with the speed of impact.
     """
 
     group: ClassVar[str] = "environment"
@@ -40,7 +43,7 @@ class HuntCrossley(OwnActor, frozen=True, kw_only=True, tag="hunt_crossley"):
     damping_s_m: fields.NotNegative = 0.0
 
     def act(self, now: Any) -> None:
-        """Writes the force, N."""
+        """Computes the force, in N."""
         normal_squared = 0.0
         depth = 0.0
         depth_rate = 0.0
@@ -48,6 +51,7 @@ class HuntCrossley(OwnActor, frozen=True, kw_only=True, tag="hunt_crossley"):
             normal_squared += self.normal[i] * self.normal[i]
             depth += (self.point_m[i] - now.at[i]) * self.normal[i]
             depth_rate -= now.speed[i] * self.normal[i]
+        # The length of the normal is divided out only in contact, which saves the square root.
         if depth > 0.0:
             length = math.sqrt(normal_squared)
             depth = depth / length
@@ -64,7 +68,7 @@ class HuntCrossley(OwnActor, frozen=True, kw_only=True, tag="hunt_crossley"):
 
     # The force does not depend on the time.
     def effort(self, t_s: Array, position: Array, speed: Array) -> Array:  # noqa: ARG002
-        """Returns the force for many rows, N."""
+        """Returns the force for many rows, in N."""
         normal = np.array(self.normal) / np.linalg.norm(self.normal)
         depth = (np.array(self.point_m) - position) @ normal
         contact_depth = np.where(depth.real > 0.0, depth, 0.0)

@@ -1,9 +1,11 @@
-"""The operators and environments that the kernel itself computes.
+"""Defines the operators and environments that the simulation kernel computes itself.
 
-Each is a `TorqueKind`; `TorqueSource` documents the meaning of its vectors there.
+Each class translates the keys of a scenario to a `TorqueSource` of a certain `TorqueKind`. The
+documentation of `TorqueSource` defines the meaning of its vectors for each kind.
 
 Invariant:
-    - An operator without a start pose holds the arm at the arm's start pose.
+    - An operator for whom no start pose is written holds the arm at the start pose of the arm,
+      so that the run starts without a jump.
 """
 
 import math
@@ -29,11 +31,12 @@ RecordedPoint = Annotated[
     tuple[fields.Real, ...], Meta(min_length=2, max_length=1 + MAX_JOINTS)
 ]
 FARTHEST = 100.0
-"""Largest norm of a live hand's target, m or rad; no arm reaches farther."""
+"""Largest norm of the target of a live operator, in m or rad. No arm reaches farther."""
 STRONGEST = 10.0
-"""Largest force that a program may ask of a live hand, in parts of the hand's force limit.
+"""Largest force that a program may request, as a multiple of the operator's force limit.
 
-A force between the limit and this is limited; a larger force is refused.
+A force above the limit is reduced to the limit. A force above this multiple is refused as a
+mistake.
 """
 DIRECTIONS = {
     "right": (1.0, 0.0, 0.0), "left": (-1.0, 0.0, 0.0), "ahead": (0.0, 1.0, 0.0),
@@ -49,12 +52,14 @@ _AXES_TEXTS = {
 
 
 class Pulse(ActorBase, frozen=True, tag="pulse"):
-    """A smooth push of an operator: peak * sin^2(pi (t - start) / (end - start)).
+    """Operator who pushes smoothly once.
+
+        torque = peak sin^2(pi (t - start) / (end - start))
 
     Attributes:
-        start_s: when it begins.
-        end_s: when it ends.
-        peak_nm: its peak on each joint, N m.
+        start_s: Start of the push, in s.
+        end_s: End of the push, in s.
+        peak_nm: Largest torque on each joint, in N m.
     """
 
     start_s: fields.NotNegative
@@ -62,21 +67,23 @@ class Pulse(ActorBase, frozen=True, tag="pulse"):
     peak_nm: fields.Joints
 
     def _source(self) -> TorqueSource:
+        """Returns the pulse for the kernel."""
         return TorqueSource(TorqueKind.PULSE, self.start_s, self.end_s, a=self.peak_nm)
 
 
 class MovingSpring(ActorBase, frozen=True, kw_only=True):
-    """A spring and a damper of an operator, towards a target that moves with minimum jerk.
+    """Base of operators who pull the arm with a spring and a damper towards a moving target.
 
-    A subclass begins with four fields: the target at the end of the motion; the target before
-    the motion, by default where the arm starts; the stiffness; the damping.
+    The target moves from a start to an end along a path with minimum jerk. The first four
+    fields of a subclass are, in this order: the end of the path; its start, by default the
+    start of the arm; the stiffness; the damping.
 
     Attributes:
-        move_start_s: when the target begins to move.
-        move_end_s: when it arrives.
-        start_s: when the operator takes hold.
-        end_s: when the operator lets go.
-        sampled: true: evaluated once per tick and held.
+        move_start_s: Time at which the target starts to move, in s.
+        move_end_s: Time at which it reaches the end of the path, in s.
+        start_s: Time at which the operator takes hold of the arm, in s.
+        end_s: Time at which the operator lets go of the arm, in s.
+        sampled: If True, the torque is computed once per tick and held.
     """
 
     at_tip: ClassVar[bool]
@@ -97,7 +104,7 @@ class MovingSpring(ActorBase, frozen=True, kw_only=True):
         held_arm: HeldArm,
         path: str,
     ) -> None:
-        """Writes the start pose as the target where the author gave none."""
+        """Adds the start of the arm as target if the author stated none."""
         end_key, start_key = fields.field_names(cls)[:2]
         start_pose = held_arm.end_effector_m() if cls.at_tip else held_arm.q0_rad
         held_arm.draws.follow_start(table, start_key, start_pose, path)
@@ -114,6 +121,7 @@ class MovingSpring(ActorBase, frozen=True, kw_only=True):
         )
 
     def _source(self) -> TorqueSource:
+        """Returns the spring for the kernel."""
         end_target, start_target, stiffness, damping = msgspec.structs.astuple(self)[:4]
         return TorqueSource(
             TorqueKind.TASK_HAND if self.at_tip else TorqueKind.HAND,
@@ -130,13 +138,13 @@ class MovingSpring(ActorBase, frozen=True, kw_only=True):
 
 
 class JointSpring(MovingSpring, frozen=True, tag="spring"):
-    """An operator as a spring and a damper on every joint, towards a pose that moves.
+    """Operator who pulls every joint with a spring and a damper towards a moving pose.
 
     Attributes:
-        to_rad: the pose to which the target moves, rad.
-        from_rad: the pose before the motion, rad; left out: the arm's start pose.
-        stiffness_nm_rad: per joint, N m/rad.
-        damping_nm_s_rad: per joint, N m s/rad.
+        to_rad: Pose at the end of the motion of the target, in rad.
+        from_rad: Pose before the motion, in rad. By default, the start pose of the arm.
+        stiffness_nm_rad: Stiffness for each joint, in N m/rad.
+        damping_nm_s_rad: Damping for each joint, in N m s/rad.
     """
 
     at_tip: ClassVar[bool] = False
@@ -148,13 +156,14 @@ class JointSpring(MovingSpring, frozen=True, tag="spring"):
 
 
 class EndEffectorSpring(MovingSpring, frozen=True, tag="tip_spring"):
-    """An operator at the end effector: a spring and a damper towards a point that moves.
+    """Operator who pulls the end effector with a spring and a damper towards a moving point.
 
     Attributes:
-        to_m: the point to which the target moves, m, one number per axis of the arm's space.
-        from_m: the point before the motion, m; left out: the end effector's start position.
-        stiffness_n_m: along each axis, N/m.
-        damping_n_s_m: along each axis, N s/m.
+        to_m: Point at the end of the motion of the target, in m, one number per axis.
+        from_m: Point before the motion, in m. By default, the start position of the end
+            effector.
+        stiffness_n_m: Stiffness along each axis, in N/m.
+        damping_n_s_m: Damping along each axis, in N s/m.
     """
 
     at_tip: ClassVar[bool] = True
@@ -167,10 +176,14 @@ class EndEffectorSpring(MovingSpring, frozen=True, tag="tip_spring"):
 
 
 class RecordedTorque(ActorBase, frozen=True, tag="recorded"):
-    """A recorded torque: linear between its points, and zero before and after them.
+    """Operator whose torque was recorded as a table.
+
+    The torque is interpolated linearly between the points of the table. It is zero before the
+    first and after the last point.
 
     Attributes:
-        points: rows of the time, s, and the torque on each joint, N m, in the order of time.
+        points: Rows with the time in s and the torque on each joint in N m, in the order of
+            time.
     """
 
     points: Annotated[tuple[RecordedPoint, ...], Meta(min_length=1, max_length=1_000_000)]
@@ -182,17 +195,18 @@ class RecordedTorque(ActorBase, frozen=True, tag="recorded"):
         return None
 
     def _source(self) -> TorqueSource:
+        """Returns the table for the kernel."""
         return TorqueSource(TorqueKind.RECORDED, table=np.array(self.points, dtype=np.float64))
 
 
 class Chirp(TimedActor, frozen=True, tag="chirp"):
-    """A torque of an operator whose frequency rises or falls linearly, sweep after sweep.
+    """Operator whose torque is a sine with a linearly changing frequency, swept repeatedly.
 
     Attributes:
-        peak_nm: its peak on each joint, N m.
-        from_hz: frequency at the beginning of a sweep, Hz.
-        to_hz: frequency at the end of a sweep, Hz.
-        sweep_s: duration of a sweep, s.
+        peak_nm: Amplitude on each joint, in N m.
+        from_hz: Frequency at the beginning of a sweep, in Hz.
+        to_hz: Frequency at the end of a sweep, in Hz.
+        sweep_s: Duration of a sweep, in s.
     """
 
     peak_nm: fields.Joints
@@ -201,6 +215,7 @@ class Chirp(TimedActor, frozen=True, tag="chirp"):
     sweep_s: fields.Positive
 
     def _source(self) -> TorqueSource:
+        """Returns the chirp for the kernel."""
         return TorqueSource(
             TorqueKind.CHIRP,
             start_s=self.start_s,
@@ -213,12 +228,12 @@ class Chirp(TimedActor, frozen=True, tag="chirp"):
 
 
 class Multisine(TimedActor, frozen=True, tag="multisine"):
-    """A torque of an operator that is a sum of sines of equal amplitude.
+    """Operator whose torque is a sum of sines with equal amplitude.
 
     Attributes:
-        amplitude_nm: amplitude of each sine on each joint, N m.
-        frequencies_hz: the frequencies of the sines, Hz.
-        phases_rad: the phases of the sines at the start, rad; left out: -pi k (k - 1) / n for
+        amplitude_nm: Amplitude of each sine on each joint, in N m.
+        frequencies_hz: Frequencies of the sines, in Hz.
+        phases_rad: Phases of the sines at the start, in rad. By default, -pi k (k - 1) / n for
             the k-th of n sines, which keeps the peak of the sum low (Schroeder, "Synthesis of
             low-peak-factor signals and binary sequences with low autocorrelation", IEEE Trans.
             Information Theory 16 (1970)).
@@ -238,9 +253,11 @@ class Multisine(TimedActor, frozen=True, tag="multisine"):
         return super().find_problem()
 
     def _source(self) -> TorqueSource:
+        """Returns the sines for the kernel: a row each, with the frequency and phase in turns."""
         count = len(self.frequencies_hz)
         turns = [phase / (2.0 * math.pi) for phase in self.phases_rad]
         if not turns:
+            # Schroeder's phases, see the class
             turns = [-k * (k - 1) / (2.0 * count) for k in range(1, count + 1)]
         table = np.column_stack((self.frequencies_hz, turns, np.zeros(count)))
         return TorqueSource(
@@ -249,19 +266,20 @@ class Multisine(TimedActor, frozen=True, tag="multisine"):
 
 
 class DeviceSettings(fields.Frozen, frozen=True, omit_defaults=True):
-    """How a device in a person's hand leads an arm and renders the arm's reaction.
+    """Settings of a haptic device or controller with which a person moves an arm.
 
     Attributes:
-        frame: the direction of each axis of the arm as seen by the person who holds the device:
-            "right", "left", "ahead", "back", "up" or "down"; left out: right and up in the
-            plane; ahead, left and up in space.
-        scale: motion of the target over motion of the device.
-        clutch: the button that leads the arm while it is pressed; the first press takes hold.
-        release: the button that lets go.
-        force_scale: force on the device over the reaction of the arm.
-        force_limit_n: the largest force on the device, N.
-        jump_m_s: speed of the device above which its motion is a jump, m/s; a jump does not
-            move the target.
+        frame: Direction of each axis of the arm as the person sees it: "right", "left",
+            "ahead", "back", "up" or "down". By default, right and up in the plane, and ahead,
+            left and up in space.
+        scale: Ratio of the motion of the target to the motion of the device.
+        clutch: Button that couples device and arm while it is pressed. The first press takes
+            hold of the arm.
+        release: Button that lets go of the arm.
+        force_scale: Ratio of the force on the device to the force of the arm on its operator.
+        force_limit_n: Largest force on the device, in N.
+        jump_m_s: Speed of the device above which its motion counts as a jump of the
+            measurement, in m/s. A jump does not move the target.
     """
 
     frame: Annotated[tuple[str, ...], Meta(max_length=3)] = ()
@@ -273,33 +291,39 @@ class DeviceSettings(fields.Frozen, frozen=True, omit_defaults=True):
     jump_m_s: fields.Positive = 5.0
 
     def rows(self, axes: int) -> list[tuple[float, ...]]:
-        """Returns the directions of the arm's axes as seen by the holder of the device."""
+        """Returns the directions of the arm's axes in the coordinates of the person.
+
+        Args:
+            axes: Number of axes, which decides the default.
+        """
         return [DIRECTIONS[name] for name in self.frame or FRAMES[axes]]
 
 
 class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
-    """An operator who takes hold during a live session: with a mouse, a device or a program.
+    """Operator who takes hold of the arm during a live session.
 
-    Nobody holds the arm before. In virtual time nobody ever holds the arm, unless the run
-    executes a log in which somebody did. The force is computed once per tick and held. In the
-    mode "force" the operator sets the force itself; its work then has an error of first order
-    in the period, because nothing but the arm resists the force.
+    The operator uses a mouse, a haptic device or a program. Before, nobody holds the arm. In
+    virtual time nobody ever holds it, except when a log is run again in which somebody did.
+
+    The force is computed once per tick and held. In the mode "force", the operator commands the
+    force itself. The work of such a force has an error of first order in the tick period,
+    because only the arm resists it.
 
     Attributes:
-        mode: "tip": a spring at the end effector; "joint": a spring at every joint; both
-            towards a target that somebody moves. "force": a force at the end effector that
-            somebody sets.
-        stiffness_n_m: for "tip", along each axis, N/m.
-        damping_n_s_m: for "tip", along each axis, N s/m.
-        force_limit_n: for "tip" and "force", the largest force, N.
-        speed_limit_m_s: for "tip", the largest speed of the target, m/s.
-        stiffness_nm_rad: for "joint", per joint, N m/rad.
-        damping_nm_s_rad: for "joint", per joint, N m s/rad.
-        torque_limit_nm: for "joint", the largest norm of its torques, N m.
-        speed_limit_rad_s: for "joint", the largest speed of the target, rad/s.
-        acceleration_limit_m_s2: for "tip", the largest acceleration of the target, m/s^2.
-        acceleration_limit_rad_s2: for "joint", the largest acceleration of the target, rad/s^2.
-        device: for "tip", how a device leads the arm (`trilat hand --device`, a controller in
+        mode: "tip": A spring pulls the end effector towards a target that the operator moves.
+            "joint": A spring at every joint pulls towards a target pose. "force": The operator
+            commands a force at the end effector.
+        stiffness_n_m: For "tip": stiffness along each axis, in N/m.
+        damping_n_s_m: For "tip": damping along each axis, in N s/m.
+        force_limit_n: For "tip" and "force": largest force, in N.
+        speed_limit_m_s: For "tip": largest speed of the target, in m/s.
+        stiffness_nm_rad: For "joint": stiffness for each joint, in N m/rad.
+        damping_nm_s_rad: For "joint": damping for each joint, in N m s/rad.
+        torque_limit_nm: For "joint": largest norm of the torques, in N m.
+        speed_limit_rad_s: For "joint": largest speed of the target, in rad/s.
+        acceleration_limit_m_s2: For "tip": largest acceleration of the target, in m/s^2.
+        acceleration_limit_rad_s2: For "joint": largest acceleration of the target, in rad/s^2.
+        device: For "tip": settings of the device (`trilat hand --device`, or a controller in
             virtual reality).
     """
 
@@ -308,7 +332,7 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
         "device": "a table of " + ", ".join(fields.field_names(DeviceSettings)),
     }
     is_open: ClassVar[bool] = True
-    """True: anybody in the session may take hold."""
+    """True if any member of the session may take hold of the arm."""
 
     mode: Literal["tip", "joint", "force"] = "tip"
     stiffness_n_m: fields.NotNegativeAxes = (300.0,)
@@ -327,7 +351,12 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
     def complete_table(
         cls, table: fields.TomlTable, entry: fields.TomlTable, held_arm: HeldArm, path: str
     ) -> None:
-        """Removes the keys of the other modes, and refuses those that the author wrote."""
+        """Removes the keys of the other modes, which would have no effect.
+
+        Raises:
+            ScenarioError: The author wrote a key of another mode, or a wrong direction of an
+                axis.
+        """
         mode = entry.get("mode", "tip")
         fields.check_choice(mode, list(LIVE_KEYS), f"{path}.mode")
         mode_keys = LIVE_KEYS[mode]
@@ -349,12 +378,12 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
     def make_rules(
         self, rate_hz: int, arm: ArmModel, limits: MotionLimits | None = None
     ) -> HandRules:
-        """Returns the rules that the holder of an arm must keep to.
+        """Returns the rules that limit the targets and forces that an operator may command.
 
         Args:
-            rate_hz: the tick rate of the site, Hz.
-            arm: the arm.
-            limits: the limits of the motion of its site; None: no limits.
+            rate_hz: Tick rate of the site, in Hz.
+            arm: Arm of the site.
+            limits: Limits of the motion of the site. None: there are no limits.
         """
         if self.mode == "force":
             return HandRules(
@@ -364,6 +393,7 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
                 starts_at_arm=False,
                 max_goal_norm=STRONGEST * self.force_limit_n,
             )
+
         if self.mode == "joint":
             size = arm.counts.joints
             speed_limit = self.speed_limit_rad_s
@@ -385,6 +415,7 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
         )
 
     def _source(self) -> TorqueSource:
+        """Returns the operator for the kernel, without the target, which changes."""
         stiffness = self.stiffness_n_m
         damping = self.damping_n_s_m
         limit = self.force_limit_n
@@ -397,7 +428,14 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
 
 
 def _check_frame(frame: list[Any], axes: int, path: str) -> None:
-    """Refuses directions of axes that are unknown, too few or too many, or on the same line."""
+    """Refuses directions of axes that are unknown, too few, too many, or parallel.
+
+    Args:
+        frame: Names of the directions, one per axis.
+        axes: Number of axes.
+        path: Path of the key, for error messages.
+    """
+    # The absolute values are equal for opposite directions. An unknown name gives ().
     lines = {tuple(map(abs, DIRECTIONS.get(str(name), ()))) for name in frame}
     lines.discard(())
     if not len(frame) == axes == len(lines):
@@ -426,14 +464,14 @@ LIVE_KEYS = {
     ),
     "force": ("force_limit_n",),
 }
-"""The keys of a live hand by its mode."""
+"""Keys of a live operator, by the mode."""
 
 
 class ViscousEnvironment(SampledActor, frozen=True, tag="viscous"):
-    """An environment that resists motion of the joints.
+    """Environment that resists the motion of the joints, like a viscous liquid.
 
     Attributes:
-        damping_nm_s_rad: per joint, N m s/rad.
+        damping_nm_s_rad: Damping for each joint, in N m s/rad.
     """
 
     group: ClassVar[str] = "environment"
@@ -441,6 +479,7 @@ class ViscousEnvironment(SampledActor, frozen=True, tag="viscous"):
     damping_nm_s_rad: fields.NotNegativeJoints
 
     def _source(self) -> TorqueSource:
+        """Returns the environment for the kernel."""
         return TorqueSource(
             TorqueKind.VISCOUS,
             self.start_s,
@@ -451,13 +490,13 @@ class ViscousEnvironment(SampledActor, frozen=True, tag="viscous"):
 
 
 class Wall(SampledActor, frozen=True, tag="wall"):
-    """A unilateral wall for the end effector: it pushes along its normal and never pulls.
+    """Wall that pushes the end effector out along its normal, and never pulls.
 
     Attributes:
-        point_m: a point of its surface, m, one number per axis of the arm's space.
-        normal: direction of the free side; its length does not matter.
-        stiffness_n_m: N/m.
-        damping_n_s_m: N s/m.
+        point_m: A point of the surface, in m, one number per axis.
+        normal: Direction of the free side. Its length does not matter.
+        stiffness_n_m: Stiffness, in N/m.
+        damping_n_s_m: Damping, in N s/m.
     """
 
     group: ClassVar[str] = "environment"
@@ -472,6 +511,7 @@ class Wall(SampledActor, frozen=True, tag="wall"):
     damping_n_s_m: fields.NotNegative = 0.0
 
     def _source(self) -> TorqueSource:
+        """Returns the wall for the kernel, with a normal of length 1."""
         x, y, z = (*self.normal, 0.0)[:3]
         # Unlike that of two numbers, `math.hypot` of three rounds differently between machines.
         length = math.hypot(x, y) if len(self.normal) == 2 else math.sqrt(x * x + y * y + z * z)

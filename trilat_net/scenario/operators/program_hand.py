@@ -1,11 +1,12 @@
-"""A user's own hand in a scenario: `{ kind = "own", class = "my_policy:Reach", ... }`.
+"""Runs a program of a user as the operator of an arm.
 
-`ProgramHand` is the table of the hand, and `HandPlayer` runs the program of the hand at a site.
+In a scenario the program is named by its class: `{ kind = "own", class = "my_policy:Reach" }`.
+`ProgramHand` is the table in the scenario, and `HandPlayer` calls the program at a site.
 
 Invariant:
-    - Naming the class does not run any code of it.
-    - A hand that fails lets go at that tick and is not asked again. The run goes on without it,
-      and nothing else at the site, or at other sites, is affected.
+    - Naming the class does not run any of its code.
+    - If the program fails, it lets go of the arm at that tick, and is not called again. The run
+      goes on, and nothing else at this site or at other sites is affected.
 """
 
 import math
@@ -36,29 +37,30 @@ if TYPE_CHECKING:
     from ..scenario_types import Scenario
 
 PROGRAM_KEYS = ("class", "rate_hz", "delay_ms", "process", "source_sha256", "settings")
-"""The keys of a hand that is a program, besides those of a live hand."""
+"""Keys that a program has in addition to the keys of a live operator."""
 
 
 class ProgramHand(
     LiveHand, frozen=True, kw_only=True, tag="own", omit_defaults=True, rename={"code": "class"}
 ):
-    """An operator that is a user's class: from what its site knows it moves, turns or pushes.
+    """Operator that is a program: a class of a user.
 
-    The hand takes hold of the arm at its first action. Nobody else can hold that arm. Otherwise
-    it is as a live hand.
+    The program receives what its site knows, and moves, turns or pushes the arm. It takes hold
+    of the arm at its first action, and nobody else can hold that arm. Otherwise the same rules
+    apply as for a live operator.
 
     Attributes:
-        code: its class, as in "my_policy:Reach".
-        rate_hz: how often the class is asked for an action, Hz; it divides the tick rate of the
+        code: Class of the program, for example "my_policy:Reach".
+        rate_hz: Rate at which the program is called, in Hz. It divides the tick rate of the
             site.
-        delay_ms: time from a view to the action on it, which is the time that the class may
-            take to decide.
-        process: true: in a live session the class runs in a process of its own (`trilat hand`);
-            false: in that of the site.
-        acceleration_limit_m_s2: as of a live hand; left out: no limit.
-        acceleration_limit_rad_s2: as of a live hand; left out: no limit.
-        source_sha256: hash of the file of the class.
-        settings: the arguments of the class, by name.
+        delay_ms: Time from the observation to the resulting action, in ms. The program may take
+            this time for its computation.
+        process: If True, the program runs in a process of its own in a live session
+            (`trilat hand`). Otherwise it runs in the process of the site.
+        acceleration_limit_m_s2: As for a live operator, but without a limit by default.
+        acceleration_limit_rad_s2: As for a live operator, but without a limit by default.
+        source_sha256: SHA-256 hash of the file of the class.
+        settings: Arguments of the class, by name.
     """
 
     is_open: ClassVar[bool] = False
@@ -86,7 +88,7 @@ class ProgramHand(
     def complete_table(
         cls, table: fields.TomlTable, entry: fields.TomlTable, held_arm: HeldArm, path: str
     ) -> None:
-        """Adds the hash of the file of the class, and completes the keys of a live hand."""
+        """Adds the hash of the file of the class, and completes the keys of a live operator."""
         code = table.get("class")
         if isinstance(code, str) and "source_sha256" not in entry:
             table["source_sha256"] = read_code(code, f"{path}.class").sha256
@@ -97,14 +99,14 @@ class ProgramHand(
 
 
 class HandSite(NamedTuple):
-    """A site with a user's own hand.
+    """A site whose operator is a program, with the settings of the program.
 
     Attributes:
-        scenario: the scenario.
-        name: the site.
-        spec: the hand in the scenario.
-        rate_hz: how often the hand is asked for an action, Hz.
-        delay_s: time from a view to the action on it, s.
+        scenario: The scenario.
+        name: Name of the site.
+        spec: Table of the operator in the scenario.
+        rate_hz: Rate at which the program is called, in Hz.
+        delay_s: Time from the observation to the resulting action, in s.
     """
 
     scenario: "Scenario"
@@ -115,21 +117,21 @@ class HandSite(NamedTuple):
 
     @property
     def program(self) -> str:
-        """The name of the hand's class in the scenario."""
+        """Name of the program's class in the scenario."""
         return self.spec.code if isinstance(self.spec, ProgramHand) else "a program"
 
     @property
     def has_separate_process(self) -> bool:
-        """True if the hand runs in a process of its own in a live session."""
+        """True if the program runs in a process of its own in a live session."""
         return isinstance(self.spec, ProgramHand) and self.spec.process
 
     @property
     def source(self) -> str:
-        """The source that marks the hand's messages: its class and the hash of the scenario."""
+        """Text that marks the messages of the program: its class and the scenario's hash."""
         return f"{self.program[:40]} {self.scenario.sha256[:16]}"
 
     def describe(self) -> HandContext:
-        """Returns the facts with which the program of the hand is made."""
+        """Returns the facts that the program receives when it is created."""
         spec = self.spec
         rules = spec.make_rules(
             self.scenario.sites[self.name].rate_hz, self.scenario.arms[self.name]
@@ -147,7 +149,7 @@ class HandSite(NamedTuple):
         )
 
     def make_hand(self) -> OwnHand:
-        """Returns the hand, which knows when the program is asked and its actions apply."""
+        """Returns the schedule of the program: when it is called and its actions apply."""
         tick_rate_hz = self.scenario.sites[self.name].rate_hz
         arm = self.scenario.arms[self.name]
         locate: Any = list if self.spec.mode == "joint" else arm.end_effector
@@ -158,15 +160,19 @@ class HandSite(NamedTuple):
 
 
 class HandPlayer:
-    """Runs a user's own hand at its site.
+    """Calls the program that operates an arm, and applies its actions at the site.
 
-    The player asks the program of the hand for actions and applies them. If the program fails,
-    the hand lets go of the arm for good.
+    If the program fails, it lets go of the arm for the rest of the run.
+
+    Args:
+        hand_site: The site and the settings of the program.
+        program: The program, an instance of the user's class.
+        watch: Function that makes the call, for example with a time limit.
 
     Attributes:
-        hand: the hand, which decides when the program is asked and when its actions apply.
-        failure: why the program failed; "": it did not.
-        news: ticks, and sentences on changes of the hand that no event reports yet.
+        hand: Schedule that decides when the program is called and when its actions apply.
+        failure: Reason why the program failed. Empty if it did not fail.
+        news: Ticks and sentences about changes that have not been published as events yet.
     """
 
     def __init__(self, hand_site: HandSite, program: Any, watch: Watch = call_directly) -> None:
@@ -182,27 +188,32 @@ class HandPlayer:
         self.hand = hand_site.make_hand()
 
     def track(self, site: Site, k: int) -> list[float]:
-        """Returns the action of the hand in tick `k`, the next tick of its site.
+        """Returns the action of the program for tick `k`.
 
-        The numbers are those of `HandInForce`.
+        The tick must be the next one of the site. The numbers are those of `HandInForce`.
         """
         step = self.hand.advance_to(k, self._prepare(k, site.arrays))
         self.news += [(k, self._describe_change(k, change)) for _, change in step.changes]
         return step.vector
 
     def compute_actions(self, k: int, end: int, arrays: SiteArrays) -> Array:
-        """Returns the actions from tick `k` until the hand needs the arm's state again.
+        """Returns the actions from tick `k` on, as long as the state of the arm is not needed.
+
+        Args:
+            k: First tick.
+            end: Tick before which the result ends at the latest.
+            arrays: State of the site before tick `k`.
 
         Returns:
-            A row per tick, at most until before tick `end`.
+            A row per tick.
         """
         return self.hand.advance_span(k, end, self._prepare(k, arrays))
 
     def _prepare(self, k: int, arrays: SiteArrays) -> Callable[[], list[float]]:
-        """Asks the program for an action if tick `k` is due for one.
+        """Calls the program if it is due in tick `k`.
 
         Returns:
-            A function that returns the joint angles of the arm, rad.
+            A function that returns the joint angles of the arm, in rad.
         """
         if self.hand.is_decision_tick(k) and not self.failure:
             self.request_action(k, arrays)
@@ -210,11 +221,11 @@ class HandPlayer:
         return angles.tolist
 
     def view(self, k: int, arrays: SiteArrays) -> HandView:
-        """Returns what the program sees at tick `k`."""
+        """Returns the observation that the program receives in tick `k`."""
         return self.hand.build_view(k, arrays, self._layout)
 
     def request_action(self, k: int, arrays: SiteArrays) -> None:
-        """Asks the program for an action at tick `k`."""
+        """Calls the program in tick `k`, and schedules the action that it returns."""
         view = self.view(k, arrays)
         try:
             action = self._watch(k, lambda: self._program.act(view))
@@ -224,18 +235,24 @@ class HandPlayer:
             self.fail(k, f"{type(error).__name__}: {error}")
 
     def fail(self, k: int, problem: str) -> None:
-        """Makes the hand let go at tick `k`, for good."""
+        """Makes the program let go of the arm at tick `k` for the rest of the run.
+
+        Args:
+            k: The tick.
+            problem: Reason of the failure.
+        """
         self.failure = f"{self._site}: its hand {self._code} failed at tick {k}: {problem}"
         self.news.append((k, f"{self.failure}; it lets go and is not asked again"))
         self.hand.release(k)
 
     def _describe_change(self, k: int, change: str) -> str:
+        """Returns a sentence about a change in tick `k`, such as taking hold of the arm."""
         t_s = tick_ns(k, self._rate_hz) / NS_PER_S
         return f"{self._site}: {self._code} {change} at t = {t_s:.3f} s"
 
 
 def find_own_hand(scenario: "Scenario", site: str) -> HandSite | None:
-    """Returns a site with its own hand, or None if none of its hands is a program."""
+    """Returns the site with its program, or None if no operator of the site is a program."""
     for hand in scenario.sites[site].hands:
         if isinstance(hand, ProgramHand):
             return HandSite(
@@ -249,11 +266,11 @@ def find_own_hand(scenario: "Scenario", site: str) -> HandSite | None:
 
 
 def make_hand_program(hand_site: HandSite) -> HandProgram:
-    """Returns the program of a hand: an instance of its class.
+    """Creates the program of a site: an instance of the user's class.
 
     Raises:
-        CodeWithheld: the class may not run.
-        ScenarioError: the class cannot be imported, or its instance cannot be made.
+        CodeWithheld: The class may not run.
+        ScenarioError: The class cannot be imported, or no instance of it can be created.
     """
     path = f"sites.{hand_site.name}.hands"
     spec = hand_site.spec
@@ -266,11 +283,11 @@ def make_hand_program(hand_site: HandSite) -> HandProgram:
 
 
 def make_hand_players(scenario: "Scenario") -> dict[str, HandPlayer]:
-    """Returns the players of all users' own hands, by site.
+    """Returns a player for each site whose operator is a program, by the name of the site.
 
     Raises:
-        CodeWithheld: a class may not run.
-        ScenarioError: a program cannot be made.
+        CodeWithheld: A class may not run.
+        ScenarioError: A program cannot be created.
     """
     players = {}
     for name in scenario.names:
