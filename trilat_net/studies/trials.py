@@ -1,4 +1,8 @@
-"""Trials: a scenario run once per seed and checked against its [expect].
+"""Runs a scenario once per seed and checks whether it behaves as expected.
+
+A scenario is the TOML file that describes an experiment. Its table [expect] states what a run
+must achieve, such as a largest error or a time until which the arms agree. A trial is a run of
+the scenario with one seed of the random numbers, whose metrics are compared with this table.
 
 From pytest, one test per seed:
 
@@ -11,18 +15,20 @@ From pytest, one test per seed:
     def test_jitter(trial):
         trial.check()
 
-Or all seeds in one, on all cores: `trilat_net.check("jitter", seeds=range(1, 21))`.
+All seeds in one test, on all cores: `trilat_net.check("jitter", seeds=range(1, 21))`.
 
-The XML report follows Jenkins' `junit-10.xsd`: a suite per scenario, a case per run, one
-`failure` with all unmet expectations, and an `error` for a run without a result.
+The report for build servers is JUnit XML according to Jenkins' `junit-10.xsd`. It has a suite
+per scenario and a case per run. A case has one `failure` with all unmet expectations, or an
+`error` if the run has no result.
 
 Invariant:
-    - One command repeats a trial, and the trial's result contains that command.
-    - An evaluation is a pure function of metrics and expectation. It states the measured value,
-      the limit and the margin, whether the expectation is met or not.
-    - A live trial is evaluated from its log by the same code. In addition its session must end
-      in order, and its records must be the same bit for bit when executed again.
-    - Results are in the order of the trials, whatever ran them.
+    - One command repeats a trial, and the result of the trial contains that command.
+    - An evaluation is a pure function of metrics and expectations. It states the measured
+      value, the limit and the margin, whether or not the expectation is met.
+    - A live trial, which runs over a network, is evaluated from its log by the same code. In
+      addition its session must end in order, and its records must be the same bit for bit when
+      they are computed again.
+    - Results are in the order of the trials, no matter which process ran them.
     - A trial that repeatedly kills its worker process affects no other trial.
 """
 
@@ -66,12 +72,12 @@ class TrialResult(NamedTuple):
     """Result of a trial.
 
     Attributes:
-        trial: the trial.
-        outcomes: an outcome per expectation.
-        simulated_s: duration of the run in its own time, s.
-        wall_s: duration in real time, s.
-        error: the reason why the run has no result; "" if it has.
-        log: log of a live trial.
+        trial: The trial.
+        outcomes: Outcome of each expectation.
+        simulated_s: Duration of the run in its own time, in s.
+        wall_s: Duration in real time, in s.
+        error: Reason why the run has no result. Empty if it has one.
+        log: Log of a live trial, if it exists.
     """
 
     trial: "Trial"
@@ -88,7 +94,7 @@ class TrialResult(NamedTuple):
 
     @property
     def failures(self) -> list[str]:
-        """One sentence per unmet expectation, after the error of a run without a result."""
+        """Sentences about the unmet expectations, and about a run without a result."""
         sentences = [f"no result: {self.error}"] if self.error else []
         sentences += [
             f"{outcome.key}: {outcome.measured}, expected {outcome.limit}"
@@ -99,13 +105,13 @@ class TrialResult(NamedTuple):
 
 
 class Trial(NamedTuple):
-    """One scenario with one seed.
+    """A scenario with one seed, ready to be run and checked.
 
     Attributes:
-        scenario: the scenario.
-        source: its name or path, as in a command.
-        overrides: overrides KEY=VALUE, as in a command.
-        live: run over a network instead of in virtual time.
+        scenario: The scenario.
+        source: Name or path of the scenario, as in a command.
+        overrides: Overrides KEY=VALUE of the scenario, as in a command.
+        live: True if the trial runs over a network instead of in virtual time.
     """
 
     scenario: Scenario
@@ -125,17 +131,25 @@ class Trial(NamedTuple):
 
     @property
     def look(self) -> str:
-        """The command that writes a log of the same run, for inspection."""
+        """The command that simulates the same run and writes its log, for inspection."""
         arguments = ["--seed", str(self.scenario.seed), "-o", f"{self}.mcap"]
         return format_command("sim", self.source, *arguments, *set_options(self.overrides))
 
     def evaluate(self, metrics: RunMetrics, wall_s: float) -> TrialResult:
-        """Returns the result of this trial for measured metrics."""
+        """Compares the metrics of a run with the expectations of the scenario.
+
+        Args:
+            metrics: Metrics of the run.
+            wall_s: Duration of the run in real time, in s.
+        """
         outcomes = evaluate_expectations(self.scenario.expect, metrics)
         return TrialResult(self, outcomes, metrics.simulated_s, wall_s)
 
     def run(self) -> TrialResult:
-        """Runs the trial in virtual time, in this process."""
+        """Runs the trial in virtual time, in this process.
+
+        If a user's control law fails, the result contains the error instead of outcomes.
+        """
         clock = SystemClock()
         start_ns = clock.monotonic_ns()
         try:
@@ -143,14 +157,15 @@ class Trial(NamedTuple):
         except LawFailed as failed:
             wall_s = (clock.monotonic_ns() - start_ns) * 1e-9
             return TrialResult(self, wall_s=wall_s, error=str(failed))
-        return self.evaluate(metrics, (clock.monotonic_ns() - start_ns) * 1e-9)
+        wall_s = (clock.monotonic_ns() - start_ns) * 1e-9
+        return self.evaluate(metrics, wall_s)
 
     def check(self) -> TrialResult:
-        """Runs the trial in virtual time and returns the result if all expectations are met.
+        """Runs the trial in virtual time, and returns the result if all expectations are met.
 
         Raises:
-            AssertionError: an expectation is not met; the text has the commands that repeat
-                the run.
+            AssertionError: An expectation is not met. The text contains the reasons, and the
+                commands that repeat the run and record it.
         """
         __tracebackhide__ = True  # pytest shows the reason instead of this line
         result = self.run()
@@ -167,29 +182,30 @@ def trials(
     *,
     live: bool = False,
 ) -> list[Trial]:
-    """Returns the trials of a scenario, one per seed, as for parameters of a test.
+    """Returns the trials of a scenario, one per seed, for example as parameters of a test.
 
     >>> [str(trial) for trial in tn.trials("jitter", seeds=[1, 2])]
     ['jitter-seed1', 'jitter-seed2']
 
-    In virtual time a scenario in which nothing is random has one trial, with the first of the
-    seeds: the others would be the same run.
+    In virtual time, a scenario in which nothing is random has a single trial, with the first of
+    the seeds. All other seeds would give the same run.
 
     Args:
-        source: the name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
-        seeds: the seeds; empty: the scenario's own seed.
-        set: overrides, as in `{"link.delay_ms": 400}` or `["link.delay_ms=400"]`.
-        live: the trials will run over a network.
+        source: Name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
+        seeds: Seeds of the random numbers. Empty stands for the scenario's own seed.
+        set: Overrides, as in `{"link.delay_ms": 400}` or `["link.delay_ms=400"]`.
+        live: True if the trials will run over a network.
 
     Raises:
-        ScenarioError: the scenario or an override is not valid, or the scenario has no
-            [expect].
+        ScenarioError: The scenario, a seed or an override is not valid, or the scenario has no
+            expectations.
     """
     scenario = load_scenario(source, set)
     label = read_experiment(source).label
     _check_expectations_reachable(scenario, label)
     if not live:
         virtual.check_virtual(scenario)
+
     distinct_seeds = list(dict.fromkeys(seeds)) or [scenario.seed]
     for seed in distinct_seeds:
         if not 0 <= seed < 2**63:
@@ -198,6 +214,7 @@ def trials(
             )
     if not scenario.random and not live:
         del distinct_seeds[1:]
+
     overrides = tuple(list_assignments(set) if isinstance(set, Mapping) else set)
     return [
         Trial(reseed_scenario(scenario, seed), label, overrides, live)
@@ -208,9 +225,13 @@ def trials(
 def _check_expectations_reachable(scenario: Scenario, source: str) -> None:
     """Refuses expectations that no run of a scenario can meet.
 
+    Args:
+        scenario: The scenario.
+        source: Name or path of the scenario, for error messages.
+
     Raises:
-        ScenarioError: the scenario expects nothing, a metric is unknown, or a time is after the
-            end of the run.
+        ScenarioError: The scenario expects nothing, a metric is unknown, or a time lies after
+            the end of the run.
     """
     expect = scenario.expect
     end_s = scenario.duration_s
@@ -220,6 +241,7 @@ def _check_expectations_reachable(scenario: Scenario, source: str) -> None:
             "synchronised_by_s = 12.0; the template of `trilat scenario new` lists all keys",
             source=source,
         )
+
     for key in expect.metrics:
         try:
             find_quantity(key)
@@ -227,6 +249,7 @@ def _check_expectations_reachable(scenario: Scenario, source: str) -> None:
             raise ScenarioError(
                 error.args[0], path=f"expect.metrics.{key}", source=source
             ) from None
+
     by_s = expect.synchronised_by_s
     if by_s is not None and by_s >= end_s:
         problem = f"must be before the end of the run at {end_s:g} s, is {by_s:g}"
@@ -238,11 +261,11 @@ def _check_expectations_reachable(scenario: Scenario, source: str) -> None:
 
 
 def list_assignments(overrides: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
-    """Yields overrides as texts KEY=VALUE of the command line.
+    """Yields overrides as the texts KEY=VALUE of the command line.
 
     Args:
-        overrides: the overrides, also as nested tables.
-        prefix: prefix of the keys.
+        overrides: Values by key, also as nested tables.
+        prefix: Keys of the enclosing tables, each followed by a dot.
     """
     for key, value in overrides.items():
         if isinstance(value, Mapping) and not is_distribution(value):
@@ -254,13 +277,16 @@ def list_assignments(overrides: Mapping[str, Any], prefix: str = "") -> Iterator
 def evaluate_live_log(
     trial: Trial, log_file: Path, problems: Sequence[str], wall_s: float
 ) -> TrialResult:
-    """Returns the result of a live trial.
+    """Evaluates a live trial from its log.
+
+    To the expectations of the scenario, two are added: that the session ended in order, and
+    that all records are the same bit for bit when they are computed again.
 
     Args:
-        trial: the trial.
-        log_file: log of the session.
-        problems: problems of the session; empty if it ended in order.
-        wall_s: duration of the session, s.
+        trial: The trial.
+        log_file: Log of the session, which may be missing.
+        problems: Problems of the session. Empty if the session ended in order.
+        wall_s: Duration of the session, in s.
     """
     existing_log = log_file if log_file.exists() else None
     try:
@@ -272,31 +298,42 @@ def evaluate_live_log(
     except LogError as error:
         text = "; ".join([*problems, str(error)])
         return TrialResult(trial, wall_s=wall_s, error=text, log=existing_log)
-    session_end = "; ".join(problems) or "ended in order"
-    session = ExpectationResult("session", not problems, session_end, "ends in order")
+
+    session = ExpectationResult(
+        key="session",
+        held=not problems,
+        measured="; ".join(problems) or "ended in order",
+        limit="ends in order",
+    )
     coverage = "" if verdict.coverage.share == 1.0 else f"; judged {verdict.coverage}"
-    identical = f"{verdict.identical} identical{coverage}"
-    records = f"{count_nouns(verdict.records, 'record')}"
-    execution = ExpectationResult("executed again", verdict.passed, identical, records)
+    execution = ExpectationResult(
+        key="executed again",
+        held=verdict.passed,
+        measured=f"{verdict.identical} identical{coverage}",
+        limit=count_nouns(verdict.records, "record"),
+    )
     return result._replace(outcomes=[*result.outcomes, session, execution], log=existing_log)
 
 
 MAX_FAILURES_SHOWN = 5
-"""Failed runs of a scenario that are printed in full; of further runs only the seeds."""
+"""Failed runs of a scenario that are printed in full. Of further runs only the seeds are
+printed.
+"""
 
 TRIAL_COLUMNS = ("", "scenario", "expected", "limit", "worst", "margin", "held")
+"""Headers of the columns of the table of expectations."""
 
 
 class ExpectationRow(NamedTuple):
-    """One expectation of one scenario over its runs.
+    """One expectation of a scenario, combined over all runs.
 
     Attributes:
-        scenario: the scenario as in a command.
-        key: the expectation.
-        worst: the worst outcome.
-        held: number of runs that met the expectation.
-        runs: number of runs.
-        mean: mean of the measured values.
+        scenario: Name or path of the scenario, as in a command.
+        key: Key of the expectation.
+        worst: Outcome of the run that came closest to its limit, or exceeded it most.
+        held: Number of runs that met the expectation.
+        runs: Number of all runs.
+        mean: Mean of the measured values, with its interval. None if it cannot be computed.
     """
 
     scenario: str
@@ -307,7 +344,7 @@ class ExpectationRow(NamedTuple):
     mean: MeanInterval | None = None
 
     def cells(self) -> tuple[str, ...]:
-        """Returns the texts of the row in the columns `TRIAL_COLUMNS`."""
+        """Returns the texts of the row, one for each of `TRIAL_COLUMNS`."""
         mark = "ok" if self.held == self.runs else "FAIL"
         worst = self.worst
         margin = format_margin(self.worst.margin)
@@ -317,11 +354,11 @@ class ExpectationRow(NamedTuple):
 
 @dataclass(frozen=True, repr=False)
 class TrialReport(Result):
-    """The results of several trials.
+    """Results of several trials, with the texts that report them.
 
     Attributes:
-        results: the results, in the order of scenarios and seeds.
-        wall_s: duration of all trials together, s.
+        results: The results, in the order of scenarios and seeds.
+        wall_s: Duration of all trials together in real time, in s.
     """
 
     results: list[TrialResult]
@@ -334,14 +371,17 @@ class TrialReport(Result):
 
     @property
     def scenarios(self) -> dict[str, list[TrialResult]]:
-        """The results by scenario, with its name or path as in a command."""
+        """The results of each scenario, by the name or path of the scenario."""
         groups: dict[str, list[TrialResult]] = {}
         for result in self.results:
             groups.setdefault(result.trial.source, []).append(result)
         return groups
 
     def rows(self) -> list[ExpectationRow]:
-        """Returns the table: a row per scenario and expectation."""
+        """Returns one row for each expectation of each scenario.
+
+        If some runs of a scenario have no result, another row states their number.
+        """
         rows = []
         for name, results in self.scenarios.items():
             outcomes_by_key: dict[str, list[ExpectationResult]] = {}
@@ -349,7 +389,7 @@ class TrialReport(Result):
                 for outcome in result.outcomes:
                     outcomes_by_key.setdefault(outcome.key, []).append(outcome)
             for key, outcomes in outcomes_by_key.items():
-                # a failed outcome is worse than any other, and then the margin decides
+                # An unmet expectation is worse than any other. After that the margin decides.
                 worst = min(outcomes, key=lambda outcome: (outcome.held, outcome.margin or 0.0))
                 row = ExpectationRow(
                     scenario=name,
@@ -360,6 +400,7 @@ class TrialReport(Result):
                     mean=mean_interval([outcome.value for outcome in outcomes]),
                 )
                 rows.append(row)
+
             errors = [result.error for result in results if result.error]
             if errors:
                 row = ExpectationRow(
@@ -373,7 +414,7 @@ class TrialReport(Result):
         return rows
 
     def failures(self) -> list[str]:
-        """Returns lines with the failures and the commands that repeat them."""
+        """Returns lines about the failed runs, with the commands that repeat them."""
         lines = []
         for results in self.scenarios.values():
             failed = [result for result in results if not result.held]
@@ -389,11 +430,16 @@ class TrialReport(Result):
         return lines
 
     def remarks(self) -> list[str]:
-        """Returns remarks: common overrides, scenarios that ran once, and the speed."""
+        """Returns lines that help to interpret the results.
+
+        They name the overrides, the scenarios that ran once because nothing in them is random,
+        and the duration and speed of all runs.
+        """
         remarks = []
         overrides = self.results[0].trial.overrides if self.results else ()
         if overrides:
             remarks.append(f"changed in all: {', '.join(overrides)}")
+
         first_trials = {name: results[0].trial for name, results in self.scenarios.items()}
         run_once = [
             name
@@ -402,6 +448,7 @@ class TrialReport(Result):
         ]
         if run_once:
             remarks.append(f"run once, nothing in it is random: {', '.join(run_once)}")
+
         simulated_s = sum(result.simulated_s for result in self.results)
         is_live = any(result.trial.live for result in self.results)
         kind = "ran live" if is_live else "simulated"
@@ -411,7 +458,10 @@ class TrialReport(Result):
         return remarks
 
     def table(self) -> list[str]:
-        """Returns the table as aligned lines; the first line is the header."""
+        """Returns the table of expectations as aligned lines, of which the first is the header.
+
+        A column with means is added if there are any.
+        """
         rows = self.rows()
         cells = [row.cells() for row in rows]
         if not any(row.mean for row in rows):
@@ -421,7 +471,7 @@ class TrialReport(Result):
         return TextTable((*TRIAL_COLUMNS, "mean, 95 %"), cells, align="lllllrrr").lines()
 
     def blocks(self) -> Iterator[Block]:
-        """Yields the table, the failures and the remarks."""
+        """Yields the table, the failures and the remarks, for the terminal."""
         header, *lines = self.table()
         yield header
         for line in lines:
@@ -430,12 +480,12 @@ class TrialReport(Result):
         yield from [*self.failures(), *self.remarks()]
 
     def headline(self) -> str:
-        """Returns the number of runs that met all expectations."""
+        """Returns a sentence with the number of runs that met all expectations."""
         held = sum(result.held for result in self.results)
         return f"{held} of {count_nouns(len(self.results), 'run')} as expected"
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns plain values, with the keys of `trilat test --json`."""
+        """Returns the results as plain values, with the keys of `trilat test --json`."""
         runs = [
             {
                 "scenario": result.trial.source,
@@ -451,7 +501,7 @@ class TrialReport(Result):
         return {"held": self.held, "wall_s": self.wall_s, "runs": runs}
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a row per run and expectation."""
+        """Returns one row for each expectation of each run, as plain values."""
         return [
             {
                 "scenario": result.trial.source,
@@ -464,7 +514,11 @@ class TrialReport(Result):
 
 
 def _run_trial(trial: Trial) -> TrialResult:
-    """Runs a trial in a worker; an error that concerns this trial only becomes its result."""
+    """Runs a trial in a worker process.
+
+    An error that concerns only this trial becomes its result, so that the other trials of the
+    worker still run.
+    """
     try:
         return trial.run()
     except (TrilatError, ArithmeticError, ValueError, MemoryError) as error:
@@ -477,15 +531,15 @@ def run_trials(
     done: Callable[[TrialResult], None] = lambda _: None,
     on: Workers = None,
 ) -> TrialReport:
-    """Runs trials in virtual time and returns their results.
+    """Runs trials in virtual time and collects their results.
 
     A single trial, or a single job, runs in this process.
 
     Args:
-        batch: the trials.
-        jobs: number of processes, as for `check`.
-        done: called with each result as it arrives.
-        on: runs the trials instead of processes, as for `check`.
+        batch: The trials.
+        jobs: Number of worker processes. None uses all cores.
+        done: Function that is called with each result as it arrives.
+        on: Workers to use instead of processes of this machine, as for `check`.
     """
     clock = SystemClock()
     start_ns = clock.monotonic_ns()
@@ -493,25 +547,31 @@ def run_trials(
     results: dict[int, TrialResult] = {}
     with open_worker_pool(jobs, on, most=len(batch), laws=laws) as pool:
         for n, result in _iterate_results(pool, batch):
-            # the same object as in the batch, and not a worker's copy
+            # The result names the trial of the batch, and not the copy that a worker received.
             results[n] = result._replace(trial=batch[n])
             done(results[n])
-    in_order = [results[n] for n in range(len(batch))]
-    return TrialReport(in_order, (clock.monotonic_ns() - start_ns) * 1e-9)
+    ordered_results = [results[n] for n in range(len(batch))]
+    return TrialReport(ordered_results, (clock.monotonic_ns() - start_ns) * 1e-9)
 
 
 def _iterate_results(
     pool: WorkerPool, batch: Sequence[Trial]
 ) -> Iterator[tuple[int, TrialResult]]:
-    """Yields the index and the result of each trial as it ends."""
+    """Yields the index and the result of each trial, in the order in which the trials end.
+
+    Args:
+        pool: Workers that run the trials.
+        batch: The trials.
+    """
     if pool.is_local:
         for n, trial in enumerate(batch):
             yield n, trial.run()
         return
+
     if not is_core_cached():
-        # compiles the core once for all processes
+        # The first step compiles the simulation kernel, once for all processes.
         next(virtual.execute_virtual(batch[0].scenario))
-    # the longest trials first, so that no worker is left with a long one at the end
+    # The longest trials run first, so that no worker is left with a long trial at the end.
     longest_first = sorted(range(len(batch)), key=lambda n: -batch[n].scenario.duration_s)
     queue = [batch[n] for n in longest_first]
     lost = partial(TrialResult, error=f"its worker process ended, {MAX_LOSSES} times")
@@ -527,27 +587,30 @@ def check(
     jobs: int | None = None,
     on: Workers = None,
 ) -> TrialReport:
-    """Runs a scenario in virtual time, once per seed, and checks its [expect].
+    """Runs a scenario in virtual time, once per seed, and checks its expectations.
 
-    Returns the results if all expectations are met. The command is `trilat test`.
+    The command is `trilat test`.
 
     >>> tn.check("free", jobs=1).held
     True
 
     Args:
-        source: the name of a shipped scenario, a path, or a scenario.
-        seeds: the seeds; empty: the scenario's own seed.
-        set: overrides, as in `{"link.delay_ms": 400}`.
-        jobs: number of processes; None: one per core.
-        on: runs the trials instead of processes: a Dask scheduler's address, as in
-            "tcp://10.0.0.5:8786", or an executor.
+        source: Name of a shipped scenario, a path, or a scenario.
+        seeds: Seeds of the random numbers. Empty stands for the scenario's own seed.
+        set: Overrides, as in `{"link.delay_ms": 400}`.
+        jobs: Number of worker processes. None uses all cores.
+        on: Workers to use instead of processes of this machine: the address of a Dask
+            scheduler, as in "tcp://10.0.0.5:8786", or an executor.
+
+    Returns:
+        The results, if all expectations are met.
 
     Raises:
-        ScenarioError: the scenario or an override is not valid, or the scenario has no
-            [expect].
-        UsageError: the cluster cannot be reached, or a worker does not meet the requirements.
-        AssertionError: an expectation is not met; the text has the margin and the command that
-            repeats the run.
+        ScenarioError: The scenario or an override is not valid, or the scenario has no
+            expectations.
+        UsageError: The cluster cannot be reached, or a worker does not meet the requirements.
+        AssertionError: An expectation is not met. The text contains the margin and the command
+            that repeats the run.
     """
     __tracebackhide__ = True  # pytest shows the reason instead of this line
     report = run_trials(trials(source, seeds, set), jobs, on=on)
@@ -561,7 +624,13 @@ def check(
 
 
 def format_margin(margin: float | None) -> str:
-    """Returns a margin in percent; "" for None."""
+    """Returns a margin as a text in percent, with a sign.
+
+    Margins below 10 % have one decimal place.
+
+    Args:
+        margin: Distance to a limit as a fraction of the limit. None becomes an empty text.
+    """
     if margin is None:
         return ""
     digits = 0 if abs(margin) >= 0.1 else 1
@@ -569,46 +638,38 @@ def format_margin(margin: float | None) -> str:
 
 
 def _list_repeat_commands(result: TrialResult) -> list[str]:
-    """Returns lines with the commands that repeat and show a run."""
+    """Returns lines with the command that repeats a run, and the command that shows it."""
     look = f"trilat report {result.log}" if result.log else result.trial.look
     return [f"again: {result.trial.again}", f"look:  {look}"]
 
 
+# Characters that XML 1.0 forbids, even as character references.
 _NOT_XML = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
 def encode_junit_xml(report: TrialReport, began_unix_ns: int, host: str) -> bytes:
-    """Returns the results as a JUnit XML document.
+    """Returns the results as a JUnit XML document, which build servers display.
 
     Args:
-        report: the results.
-        began_unix_ns: start of the trials, ns since 1970.
-        host: name of this machine.
+        report: The results.
+        began_unix_ns: Start of the trials in Unix time, in ns.
+        host: Name of this machine.
     """
-    root = Xml.Element("testsuites", _counts(report.results), name="trilat test")
+    root = Xml.Element(
+        "testsuites", _build_count_attributes(report.results), name="trilat test"
+    )
     began = datetime.fromtimestamp(began_unix_ns // 10**9, UTC)
     for name, results in report.scenarios.items():
         suite = Xml.SubElement(
             root,
             "testsuite",
-            _counts(results),
-            name=_clean(name),
+            _build_count_attributes(results),
+            name=_replace_forbidden(name),
             skipped="0",
             timestamp=f"{began:%Y-%m-%dT%H:%M:%S}",
-            hostname=_clean(host),
+            hostname=_replace_forbidden(host),
         )
-        properties = Xml.SubElement(suite, "properties")
-        trial = results[0].trial
-        facts = {
-            "driver": "live" if trial.live else "virtual",
-            "source": trial.source,
-            "overrides": " ".join(trial.overrides),
-            "duration_s": f"{trial.scenario.duration_s:g}",
-            "simulated_s": f"{sum(result.simulated_s for result in results):.6g}",
-            "random": str(trial.scenario.random).lower(),
-        }
-        for key, value in facts.items():
-            Xml.SubElement(properties, "property", name=key, value=_clean(value))
+        _add_properties(suite, results)
         for result in results:
             _add_case(suite, result)
     Xml.indent(root)
@@ -616,8 +677,32 @@ def encode_junit_xml(report: TrialReport, began_unix_ns: int, host: str) -> byte
     return document + b"\n"
 
 
-def _counts(results: Sequence[TrialResult]) -> dict[str, str]:
-    """Returns the attributes of a suite: counts of tests, failures, errors; and the time."""
+def _add_properties(suite: Xml.Element, results: Sequence[TrialResult]) -> None:
+    """Adds the properties that are common to all runs of a scenario to its suite.
+
+    Args:
+        suite: Suite of the scenario.
+        results: Results of the scenario.
+    """
+    properties = Xml.SubElement(suite, "properties")
+    trial = results[0].trial
+    property_values = {
+        "driver": "live" if trial.live else "virtual",
+        "source": trial.source,
+        "overrides": " ".join(trial.overrides),
+        "duration_s": f"{trial.scenario.duration_s:g}",
+        "simulated_s": f"{sum(result.simulated_s for result in results):.6g}",
+        "random": str(trial.scenario.random).lower(),
+    }
+    for key, value in property_values.items():
+        Xml.SubElement(properties, "property", name=key, value=_replace_forbidden(value))
+
+
+def _build_count_attributes(results: Sequence[TrialResult]) -> dict[str, str]:
+    """Returns the XML attributes with the numbers of tests, failures and errors, and the time.
+
+    A run without a result counts as an error, and a run with an unmet expectation as a failure.
+    """
     errors = sum(bool(result.error) for result in results)
     failures = sum(not result.held for result in results) - errors
     return {
@@ -629,7 +714,12 @@ def _counts(results: Sequence[TrialResult]) -> dict[str, str]:
 
 
 def _add_case(suite: Xml.Element, result: TrialResult) -> None:
-    """Adds the test case of a run to a suite."""
+    """Adds the test case of a run to a suite.
+
+    Args:
+        suite: Suite of the scenario.
+        result: Result of the run.
+    """
     trial = result.trial
     case = Xml.SubElement(
         suite,
@@ -641,21 +731,21 @@ def _add_case(suite: Xml.Element, result: TrialResult) -> None:
     if not result.held:
         tag = "error" if result.error else "failure"
         problem_type = "error" if result.error else "expectation"
-        message = _clean("; ".join(result.failures))
+        message = _replace_forbidden("; ".join(result.failures))
         problem = Xml.SubElement(case, tag, type=problem_type, message=message)
         lines = [*result.failures, *_list_repeat_commands(result)]
-        problem.text = _clean("\n".join(lines))
+        problem.text = _replace_forbidden("\n".join(lines))
     output = [_describe_outcome(outcome) for outcome in result.outcomes]
-    Xml.SubElement(case, "system-out").text = _clean("\n".join(output))
+    Xml.SubElement(case, "system-out").text = _replace_forbidden("\n".join(output))
 
 
 def _describe_outcome(outcome: ExpectationResult) -> str:
-    """Returns a line with the measured value, the limit and the margin of an outcome."""
+    """Returns a line with the measured value, the limit and the margin of an expectation."""
     mark = "ok" if outcome.held else "FAIL"
     margin = "" if outcome.margin is None else f" ({format_margin(outcome.margin)})"
     return f"{mark} {outcome.key}: {outcome.measured}, expected {outcome.limit}{margin}"
 
 
-def _clean(text: str) -> str:
-    """Returns a text in which characters that XML forbids are replaced."""
+def _replace_forbidden(text: str) -> str:
+    """Returns a text in which the characters that XML forbids are replaced by U+FFFD."""
     return _NOT_XML.sub("\N{REPLACEMENT CHARACTER}", text)

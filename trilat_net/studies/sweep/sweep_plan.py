@@ -51,7 +51,7 @@ _VALUES_EXAMPLE = "as in KEY=0:1600:50 (from, to, step) or KEY=1,2,5"
 
 
 class _Steps:
-    """Sequence of equally spaced numbers as texts, each of which is formatted when it is accessed.
+    """Sequence of equally spaced numbers as texts, each formatted when it is accessed.
 
     A range may have so many values that a list of them would not fit into memory.
 
@@ -88,7 +88,7 @@ class SweepAxis(NamedTuple):
     texts: tuple[str, ...] | _Steps
 
     def value(self, number: int) -> float | str:
-        """Returns the value with index `number`: a float if it is a number, and its text otherwise."""
+        """Returns the value with index `number`: a float if it is a number, else its text."""
         text = self.texts[number]
         value = _parse_value(text)
         return float(value) if is_number(value) else text
