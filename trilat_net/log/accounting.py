@@ -1,15 +1,21 @@
-"""Accounts of channels: which numbered messages were received, and which are missing.
+"""Counts the messages of a session: which were received, and which are missing.
 
-An account counts the messages of one channel by number, live or from a log. The number of a
-record is its tick. Statistics and events are numbered from 0.
+The messages of a channel are numbered consecutively, so that a gap in the numbers shows that a
+message is missing. An account counts the messages of one channel, while they are recorded or
+from a log. The number of a record, the result of one tick of a site's control loop, is its
+tick. Statistics and events are numbered from 0. A site is a process that runs one arm.
+
+Some numbers never had a message: a site that is late skips ticks, and a site that is killed and
+started again continues at a later tick. Such numbers count as unpublished instead of missing.
 
 Invariant:
-    - expected = received + missing, always.
-    - Ticks between two starts of a site were never published: they are neither expected nor
-      missing.
-    - Memory is bounded: of more than `MAX_GAPS` gaps, the lowest ones are only counted.
-    - Accounts that are made from a file decode events only. They count a later part of a log
-      from its first message on.
+    - In every account, the number of expected messages is the sum of the received and the
+      missing messages.
+    - Unpublished numbers are neither expected nor missing.
+    - The memory is bounded: an account stores at most `MAX_GAPS` gaps. The messages of lower
+      gaps are only counted.
+    - To count the messages of a file, only the events are decoded.
+    - A later part of a log is counted from its first message on.
 """
 
 import math
@@ -30,10 +36,10 @@ from .log_layout import PART, SCENARIO, SESSION, SITE_CHANNELS
 
 
 class RangeSet:
-    """A set of whole numbers, stored as ranges (first, last) in ascending order.
+    """Set of integers, stored as ranges (first, last) in ascending order.
 
     Args:
-        max_ranges: largest number of ranges; the lowest ranges are dropped beyond it.
+        max_ranges: Largest number of ranges. If there are more, the lowest ones are forgotten.
     """
 
     def __init__(self, max_ranges: int) -> None:
@@ -47,11 +53,16 @@ class RangeSet:
         return len(self._ranges)
 
     def _count_started(self, number: int) -> int:
-        """Returns the number of ranges that begin at or below a number."""
+        """Returns the number of ranges whose first number is at most `number`."""
         return bisect_right(self._ranges, (number, math.inf))
 
     def insert(self, first: int, last: int) -> None:
-        """Inserts a range of numbers that the set does not contain yet."""
+        """Inserts a range of numbers that the set does not contain yet.
+
+        Args:
+            first: First number of the range.
+            last: Last number of the range.
+        """
         index = self._count_started(first)
         if index > 0:
             previous_first, previous_last = self._ranges[index - 1]
@@ -62,14 +73,22 @@ class RangeSet:
         del self._ranges[: -self._max_ranges]
 
     def remove(self, number: int, last: int | None = None) -> bool:
-        """Removes a number, or all numbers from it to `last`, which are in one range.
+        """Removes a number, or the numbers from `number` to `last`.
+
+        All numbers to remove must be in one range of the set. What remains of that range is one
+        range, two ranges or nothing.
+
+        Args:
+            number: The number, or the first of several numbers.
+            last: Last number to remove. None removes only `number`.
 
         Returns:
-            False if the set does not contain the number.
+            False if the set does not contain `number`. Nothing is removed in this case.
         """
         containing = self.find(number)
         if containing is None:
             return False
+
         last_removed = last or number
         before = (containing[0], number - 1)
         after = (last_removed + 1, containing[1])
@@ -80,17 +99,26 @@ class RangeSet:
         return True
 
     def find(self, number: int) -> tuple[int, int] | None:
-        """Returns the range that contains a number, or None if there is no such range."""
+        """Returns the range (first, last) that contains a number.
+
+        None if there is no such range.
+
+        """
         index = self._count_started(number) - 1
         if index < 0 or number > self._ranges[index][1]:
             return None
         return self._ranges[index]
 
     def find_from(self, number: int) -> tuple[int, int] | None:
-        """Returns the first range that reaches a number, without its part below the number.
+        """Returns the first range of numbers in the set that are at or above a number.
 
-        Returns None if the set has no number at or above that number.
+        If a range of the set contains the number, only the part from the number on is returned.
+
+        Returns:
+            The range (first, last). None if all numbers of the set are lower.
         """
+        # The range that starts at or below the number may contain it. If it does not, the next
+        # range is entirely above the number.
         index = max(0, self._count_started(number) - 1)
         for first, last in self._ranges[index : index + 2]:
             if last >= number:
@@ -99,23 +127,25 @@ class RangeSet:
 
 
 MAX_GAPS = 50_000
-"""Number of gaps that an account stores. Of lower gaps it counts only the messages."""
+"""Largest number of gaps that an account stores. The messages of lower gaps are only counted.
+"""
 SHOWN_GAPS = 20
-"""Number of gaps that a text lists."""
+"""Largest number of gaps that are listed in a text."""
 
 
 class Account:
-    """The account of one channel.
+    """Counts of the messages of one channel, and the gaps in their numbers.
 
     Attributes:
-        received: messages that were received, each number once.
-        duplicate: messages that arrived although their number had been received.
-        reordered: messages that arrived after a message with a higher number.
-        refilled: messages that were missing, and then came from the sender's memory.
-        unpublished: numbers that no message has, because the sender skipped these numbers, or
-            ended before them and started again behind them.
-        last: largest number that is known to exist; -1 before the first message.
-        silence_ns: the longest time between two arrivals, in ns; 0 without arrival times.
+        received: Number of messages that were received, without repetitions.
+        duplicate: Number of messages that arrived although their number had been received.
+        reordered: Number of messages that arrived after a message with a higher number.
+        refilled: Number of messages that were missing at first, and that the sender sent again
+            from its memory.
+        unpublished: Number of numbers that never had a message. The sender skipped them, or was
+            killed before it reached them and continued behind them after its next start.
+        last: Largest number that is known to exist. It is -1 before the first message.
+        silence_ns: Longest time between two arrivals, in ns. It is 0 without arrival times.
     """
 
     def __init__(self) -> None:
@@ -134,11 +164,11 @@ class Account:
         self._gaps = RangeSet(MAX_GAPS)
 
     def receive(self, number: int, arrived_ns: int | None = None) -> bool:
-        """Counts a message that its sender published.
+        """Counts a message that arrived from its sender without a request.
 
         Args:
-            number: number of the message.
-            arrived_ns: arrival on a clock that never steps; None if it is unknown.
+            number: Number of the message.
+            arrived_ns: Time of the arrival on a monotonic clock, in ns. None if it is unknown.
 
         Returns:
             False if the number had been received before.
@@ -157,7 +187,7 @@ class Account:
         return True
 
     def refill(self, number: int) -> bool:
-        """Counts a message from the sender's memory.
+        """Counts a message that the sender sent again from its memory on request.
 
         Returns:
             False if the number had been received before.
@@ -168,24 +198,26 @@ class Account:
         return is_new
 
     def add_expected(self, published: int) -> None:
-        """Adds the first `published` messages to the expected messages.
+        """States that the sender has published at least `published` messages, numbered from 0.
 
-        Messages that are not known yet count as missing.
+        Those that have not been received count as missing from now on.
         """
         if published > self.last + 1:
             self._gaps.insert(self.last + 1, published - 1)
             self.last = published - 1
 
     def mark_unpublished(self, first: int, published: int = 0) -> int:
-        """Counts the gap just below a number as never published.
+        """States that the sender published no messages in the gap just below a number.
 
         Args:
-            first: first number of the sender's next start, or after a pause.
-            published: number of messages that exist at least; missing messages among them stay
-                missing.
+            first: First number after the gap: of the sender's next start, or after skipped
+                numbers.
+            published: Number of messages that are known to exist nevertheless. Those that were
+                not received stay missing.
 
         Returns:
-            The lowest number that counts as never published, or `first` if there is none.
+            The lowest number that now counts as unpublished, or `first` if there is no such
+            number.
         """
         self.add_expected(first)
         gap = self._gaps.find(first - 1)
@@ -199,34 +231,43 @@ class Account:
         return lowest
 
     def mark_missing(self, first: int, last: int) -> None:
-        """Counts a range of numbers as missing that counted as never published."""
+        """States that unpublished numbers had messages after all, which are missing.
+
+        Args:
+            first: First number of the range.
+            last: Last number of the range.
+        """
         self._gaps.insert(first, last)
         self.unpublished -= last + 1 - first
 
     def abandon_below(self, number: int) -> None:
-        """Stops requests for the missing messages below a number.
+        """Stops requests for the missing messages below a number, which nobody has any more.
 
-        Such a message still counts if it arrives.
+        Such a message still counts as received if it arrives.
         """
         self._abandoned_below = max(self._abandoned_below, number)
 
     def find_requestable_gap(self, number: int = 0) -> tuple[int, int] | None:
-        """Returns the first gap at or above a number that is not abandoned, or None."""
+        """Returns the first gap at or above a number that is not abandoned.
+
+        Returns:
+            The range (first, last) of missing numbers. None if there is no such gap.
+        """
         return self._gaps.find_from(max(number, self._abandoned_below))
 
     @property
     def expected(self) -> int:
-        """Number of messages that are known to exist."""
+        """Number of messages that are known to have been published."""
         return self.last + 1 - self.unpublished
 
     @property
     def missing(self) -> int:
-        """Number of missing messages."""
+        """Number of messages that were published but not received."""
         return self.expected - self.received
 
     @property
     def gaps(self) -> list[list[int]]:
-        """Missing numbers as [first, last] pairs: the highest MAX_GAPS gaps."""
+        """Ranges [first, last] of missing numbers, at most the highest `MAX_GAPS` ranges."""
         return [list(gap) for gap in self._gaps]
 
     @property
@@ -235,11 +276,11 @@ class Account:
         return max((last - first + 1 for first, last in self._gaps), default=0)
 
     def describe(self, *before: "Account") -> str:
-        """Returns the account in one line, as a log stores it.
+        """Returns the counts and the first gaps in one line, as a log stores them.
 
         Args:
-            *before: accounts of earlier starts of the sender, which numbered their messages
-                from 0 as well. Their counts are added.
+            *before: Accounts of earlier starts of the sender, which numbered their messages
+                from 0 as well. Their counts are added. Gaps are listed for the last start only.
         """
         starts = (*before, self)
         counts = []
@@ -252,6 +293,7 @@ class Account:
         if gaps:
             more = " ..." if len(self._gaps) > len(gaps) else ""
             text += f" ({' '.join(gaps)}{more})"
+
         if self.silence_ns:
             text += f", longest silence {self.silence_ns / 1e6:.1f} ms"
         if self.unpublished:
@@ -261,17 +303,22 @@ class Account:
         return text
 
     def format_gaps(self, most: int, base: int = 0) -> list[str]:
-        """Returns at most `most` of the first gaps as "first-last".
+        """Returns the first gaps as texts "first-last".
 
         Args:
-            most: largest number of gaps.
-            base: number of the message that this account counts as 0.
+            most: Largest number of gaps.
+            base: Number that is added to all numbers, if the account does not count from the
+                first message of the session.
         """
         gaps = islice(self._gaps, most)
         return [f"{base + first}-{base + last}" for first, last in gaps]
 
     def _add(self, number: int) -> bool:
-        """Adds a received number; returns False if the number had been added before."""
+        """Removes a number from the gaps, or extends the known numbers up to it.
+
+        Returns:
+            False if the number had been added before.
+        """
         if number > self.last:
             self.add_expected(number)
             self.last = number
@@ -280,37 +327,39 @@ class Account:
 
 
 class StartGap:
-    """Missing messages of one channel between two starts of its sender.
+    """Gap between the messages of two starts of a site, in one channel.
 
-    The earlier start may have been killed before it stated how many messages it published.
-    Other members may know a number of messages that it published at least; their reports come
-    in any order, before or after the next start. Messages that were still under way to the
-    recorder died with the sender, and count as never published.
+    A site that is killed cannot state how many messages it published. After its next start it
+    continues at a later tick. The messages in between were either published and lost on the way
+    to the recorder, or never published. Other sites may have received samples of the earlier
+    start, so that they know a number of messages that it published at least. Their reports may
+    arrive before or after the next start. A few messages were still in transit to the recorder
+    when the site was killed. These count as unpublished.
 
     Args:
-        account: account of the channel.
-        under_way: largest number of messages that may have been under way.
+        account: Account of the channel.
+        under_way: Largest number of messages that may have been in transit.
     """
 
     def __init__(self, account: Account, under_way: int) -> None:
         self._account = account
         self._under_way = under_way
-        # Messages that the earlier start published, as others report.
+        # Number of messages that the earlier start published, as other sites report.
         self._reported = 0
         # First number that never arrived.
         self._first_silent = -1
-        # First number that counts as never published.
+        # First number that counts as unpublished.
         self._first_unpublished = -1
-        # First number of the next start; -1 before the next start.
+        # First number of the next start. It is -1 until the next start is known.
         self._next_first = -1
 
     def begin_next_start(self, first: int, published: int) -> None:
-        """Starts the next start of the sender.
+        """States that the site was started again. Further calls have no effect.
 
         Args:
-            first: first number of the next start.
-            published: number of messages that the earlier start stated to have published; 0 if
-                it stated no number.
+            first: First number of the next start.
+            published: Number of messages that the earlier start itself stated to have
+                published. It is 0 if the site was killed before it could state the number.
         """
         if self._next_first < 0:
             self._next_first = first
@@ -319,7 +368,11 @@ class StartGap:
             self.note_published(self._reported)
 
     def note_published(self, published: int) -> None:
-        """Notes the number of messages that the earlier start published at least."""
+        """States how many messages the earlier start published at least, as others report.
+
+        If the number exceeds the received messages by more than those in transit, the messages
+        count as missing instead of unpublished.
+        """
         self._reported = max(self._reported, published)
         published = min(published, self._next_first)
         is_beyond_under_way = published - self._first_silent > self._under_way
@@ -329,7 +382,11 @@ class StartGap:
 
 
 def describe_unknown_ends(sites: Sequence[str]) -> str:
-    """Returns the sentence for sites whose event at their end never arrived."""
+    """Returns the sentence about sites whose "end" event never arrived.
+
+    Args:
+        sites: Names of the sites, at least one.
+    """
     names = sites[0]
     if len(sites) > 1:
         names = f"{', '.join(sites[:-1])} and {sites[-1]}"
@@ -337,24 +394,24 @@ def describe_unknown_ends(sites: Sequence[str]) -> str:
 
 
 def parse_counts(account: str) -> dict[str, int]:
-    """Returns the numbers of "received" and "missing" messages in an account's text.
+    """Returns the numbers of "received" and "missing" messages in a line of `Account.describe`.
 
-    The dictionary is empty if the text is not that of an account.
+    The dictionary is empty if the text is no such line.
     """
     matches = re.findall(r"(received|missing) (\d{1,15})\b", account)
     return {name: int(digits) for name, digits in matches}
 
 
 MIN_COVERAGE = 0.999
-"""Default of the smallest share of every site's ticks that must be judged."""
+"""Default of the smallest fraction of every site's ticks that must be judged."""
 
 
 class Coverage(NamedTuple):
-    """Coverage of a run: how many ticks of each site were recorded or judged.
+    """How much of a run was recorded or judged, for each site.
 
     Attributes:
-        judged: number of recorded or judged ticks, by site.
-        expected: number of all ticks, by site.
+        judged: Number of recorded or judged ticks, by site.
+        expected: Number of all ticks of the run, by site.
     """
 
     judged: dict[str, int]
@@ -362,13 +419,13 @@ class Coverage(NamedTuple):
 
     @property
     def share(self) -> float:
-        """Smallest share of judged ticks of any site; 0 if there are no ticks at all."""
+        """Smallest fraction of judged ticks of any site. It is 0 if no site has ticks."""
         if not any(self.expected.values()):
             return 0.0
         return min(map(self._share, self.expected), default=0.0)
 
     def _share(self, site: str) -> float:
-        """Returns the share of judged ticks of a site; 1 for a site without ticks."""
+        """Returns the fraction of judged ticks of a site. It is 1 for a site without ticks."""
         expected = self.expected[site]
         if not expected:
             return 1.0
@@ -381,46 +438,55 @@ class Coverage(NamedTuple):
         return ", ".join(map(self._describe_site, incomplete))
 
     def _describe_site(self, site: str) -> str:
-        """Returns the coverage of a site as a text."""
+        """Returns the coverage of a site as a text, such as "m1 990 of 1000 ticks (99 %)"."""
         ticks = count_nouns(self.expected[site], "tick")
         percent = _format_percent(self._share(site))
         return f"{site} {self.judged.get(site, 0)} of {ticks} ({percent})"
 
     def describe(self, least: float) -> str:
-        """Returns the coverage as a text, which names `least` if the share is below it."""
+        """Returns the coverage as a text. It mentions `least` if the fraction is too small.
+
+        Args:
+            least: Smallest fraction of judged ticks that is sufficient.
+        """
         shortage = f", less than {_format_percent(least)}" if self.share < least else ""
         return f"judged {self}{shortage}"
 
     def to_json(self) -> dict[str, list[int]]:
-        """Returns [judged ticks, all ticks] of every site."""
+        """Returns the pair [judged ticks, all ticks] of every site."""
         return {
             site: [self.judged.get(site, 0), ticks] for site, ticks in self.expected.items()
         }
 
 
 def _format_percent(share: float) -> str:
-    """Returns a share in percent, rounded down so that only a full share is 100 %."""
+    """Formats a fraction as a percentage, rounded down so that only a full share is 100 %."""
     return f"{math.floor(1e5 * share) / 1e3:g} %"
 
 
 OVERRUN = "overrun"
-"""Kind of the event that lists the ticks that a site skipped."""
+"""Kind of the event in which a site lists the ticks that it skipped because it was late."""
 LAST = "last"
-"""Kind of the event that states how many ticks others received of an earlier start."""
+"""Kind of the event in which a site states how many ticks of a peer it had received before the
+peer was started again.
+"""
 MAX_STARTS = 64
-"""Number of starts of a member whose events are counted separately."""
+"""Largest number of starts of a member whose events are counted separately."""
 EVENTS_NUMBERED_SINCE = 3
 """First version of the schema whose events have numbers."""
 
 
 class SessionAccounts:
-    """Accounts of the numbered channels of a session.
+    """Accounts of all numbered channels of a session.
+
+    A recorder uses this class while it records, and the tools use it to count a log. The caller
+    passes every message. From the events, the class learns how many ticks the sites executed.
 
     Args:
-        session: name of the session.
-        scenario: scenario of the session; None if it cannot be read.
+        session: Name of the session.
+        scenario: Scenario of the session. None if it cannot be read.
         continued: True for a later part of a log, which is counted from its first message on.
-        events: True if events have numbers.
+        events: True if events have numbers, which they lack in the oldest logs.
     """
 
     def __init__(
@@ -441,10 +507,12 @@ class SessionAccounts:
         self._end_ticks: dict[str, int] = {}
         self._numbered_channels = SITE_CHANNELS if events else (topics.STATE, topics.LINK)
         self._accounts: dict[str, Account] = {}
-        # Accounts of events by boot: every start of a member numbers its events from 0.
+        # Accounts of events, by topic and by the boot, a random number that identifies a start
+        # of the member. Every start numbers its events from 0.
         self._starts: dict[str, dict[int, Account]] = {}
-        # Numbers of the messages that accounts count as 0, by topic.
+        # Number of the first message of a later part, by topic. The account counts it as 0.
         self._bases: dict[str, int] = {}
+        # Gap before a start of a site, by topic and boot.
         self._start_gaps: dict[tuple[str, int], StartGap] = {}
 
     def _topic(self, member: str, channel: str) -> str:
@@ -452,7 +520,7 @@ class SessionAccounts:
         return "/" + topics.key(self._session, member, channel)
 
     def open_channel(self, topic: str) -> None:
-        """Opens the account of a topic, if the topic is a numbered channel of the session."""
+        """Creates the account of a topic, if it is a numbered channel of the session."""
         key = topics.parse_key(topic.removeprefix("/"))
         if key is None or key.session != self._session:
             return
@@ -460,15 +528,20 @@ class SessionAccounts:
             self._accounts.setdefault(topic, Account())
 
     def receive(self, topic: str, sequence: int, payload: bytes = b"") -> None:
-        """Counts a message by its sequence number.
+        """Counts a message of a file.
+
+        A message of a topic without an account is ignored.
 
         Args:
-            topic: topic of the message.
-            sequence: its sequence number in the file: the tick of records and statistics.
-            payload: its bytes; an event may state the number of a site's ticks.
+            topic: Topic of the message.
+            sequence: Sequence number of the message in the file. For records and statistics, it
+                is the tick.
+            payload: Bytes of the message. Only those of events are used, because events state
+                how many ticks a site executed or skipped.
         """
         if topic not in self._accounts:
             return
+
         member, channel = topic.split("/")[-2:]
         event: Event | None = None
         if channel == topics.EVENT and payload:
@@ -480,10 +553,16 @@ class SessionAccounts:
         else:
             self.receive_event(topic, number, event)
         if channel == topics.LINK:
+            # The statistics of a tick show that the record of this tick exists.
             self._add_expected(member, topics.STATE, sequence + 1)
 
     def receive_event(self, topic: str, number: int, event: Event) -> bool:
-        """Counts an event, and applies its statements on the ticks of a site.
+        """Counts an event, and evaluates what it states about the ticks of a site.
+
+        Args:
+            topic: Topic of the event.
+            number: Number of the event.
+            event: The event.
 
         Returns:
             False if the event had been received before.
@@ -493,6 +572,9 @@ class SessionAccounts:
             starts[event.boot] = Account() if starts else self._accounts[topic]
             self._accounts[topic] = starts[event.boot]
         account = starts.get(event.boot, self._accounts[topic])
+
+        # In a later part of a log, the first start is counted from its first event in this
+        # part.
         first_start = next(iter(starts.values()))
         if account is first_start:
             is_new = self.count_message(topic, number, account)
@@ -502,7 +584,10 @@ class SessionAccounts:
         return is_new
 
     def apply_event(self, event: Event) -> None:
-        """Applies the statements of an event on the ticks that sites made or skipped."""
+        """Evaluates what an event states about the ticks that sites executed or skipped.
+
+        Other events are ignored.
+        """
         if event.member not in self._rates_hz or event.ticks < 0:
             return
         if event.kind == "end":
@@ -516,7 +601,7 @@ class SessionAccounts:
             self._apply_last(event)
 
     def _apply_join(self, event: Event) -> None:
-        """Begins the next start of a site, from the tick that its event states."""
+        """Handles the event of a site that joins the running session at a stated tick."""
         site = event.member
         published_ticks = self._end_ticks.pop(site, 0)
         rate_hz = self._rates_hz[site]
@@ -527,7 +612,11 @@ class SessionAccounts:
             gap.begin_next_start(first, published)
 
     def _apply_overrun(self, event: Event) -> None:
-        """Marks the ranges of ticks that an event lists as skipped."""
+        """Handles the event of a site that skipped ticks.
+
+        Its command lists ranges "first-last".
+
+        """
         ranges = re.findall(r"(\d{1,12})-(\d{1,12})", event.command)
         for first_digits, last_digits in ranges:
             first = int(first_digits)
@@ -536,7 +625,7 @@ class SessionAccounts:
                 self.mark_skipped_ticks(event.member, last + 1, last + 1 - first)
 
     def _apply_last(self, event: Event) -> None:
-        """Notes how many ticks of an earlier start of a site another site received."""
+        """Handles the event that states how many ticks of a peer's earlier start arrived."""
         site = event.about
         for channel, gap in self._find_start_gaps(site, event.boots.get(site, 0)):
             base = self._bases.get(self._topic(site, channel), 0)
@@ -544,7 +633,13 @@ class SessionAccounts:
             gap.note_published(number - base)
 
     def mark_skipped_ticks(self, site: str, tick: int, skipped: int) -> None:
-        """Counts the messages of `skipped` ticks before `tick` as never published."""
+        """Counts the messages of skipped ticks as unpublished.
+
+        Args:
+            site: Name of the site.
+            tick: First tick after the skipped ones.
+            skipped: Number of skipped ticks.
+        """
         for channel in (topics.STATE, topics.LINK):
             topic = self._topic(site, channel)
             account = self._accounts.get(topic)
@@ -557,10 +652,12 @@ class SessionAccounts:
     def count_message(self, topic: str, number: int, account: Account | None = None) -> bool:
         """Counts a message by its number in its channel.
 
+        In a later part of a log, messages with lower numbers than the first one are ignored.
+
         Args:
-            topic: topic of the message.
-            number: number of the message.
-            account: the account to use; by default that of the topic.
+            topic: Topic of the message.
+            number: Number of the message.
+            account: The account to use. None uses the account of the topic.
 
         Returns:
             False if the message had been received before.
@@ -572,7 +669,15 @@ class SessionAccounts:
         return account.receive(number - base)
 
     def _find_start_gaps(self, site: str, boot: int) -> Iterator[tuple[str, StartGap]]:
-        """Yields the channels of a site, with the gap before its start `boot`."""
+        """Yields the numbered channels of a site, with the gap before one of its starts.
+
+        The gaps are created when they are needed first. Their number is limited, so that events
+        with invented boots cannot fill the memory.
+
+        Args:
+            site: Name of the site.
+            boot: Random number that identifies the start.
+        """
         for channel in (topics.STATE, topics.LINK):
             topic = self._topic(site, channel)
             if topic not in self._accounts:
@@ -587,16 +692,16 @@ class SessionAccounts:
                 yield channel, gap
 
     def add_expected_ticks(self, site: str, ticks: int) -> None:
-        """Adds the messages of a site's first `ticks` ticks to the expected messages.
+        """States that a site executed at least `ticks` ticks.
 
-        Messages that the log lacks count as missing.
+        Records and statistics of these ticks that have not been received count as missing.
         """
         for channel in (topics.STATE, topics.LINK):
             published = count_messages(channel, ticks, self._rates_hz[site])
             self._add_expected(site, channel, published)
 
     def _add_expected(self, member: str, channel: str, published: int) -> None:
-        """Adds the first `published` messages of a channel to the expected messages."""
+        """States that at least `published` messages of a channel exist."""
         topic = self._topic(member, channel)
         account = self._accounts.get(topic)
         if account is not None:
@@ -604,12 +709,16 @@ class SessionAccounts:
             account.add_expected(published - base)
 
     def format_accounts(self) -> dict[str, str]:
-        """Returns the accounts as texts, by topic, as a file stores them."""
+        """Returns the counts of each topic as a line of text, as a log stores them.
+
+        Members that are not sites are left out if nothing is expected of them.
+        """
         texts = {}
         for topic, account in self._accounts.items():
             member = topic.split("/")[-2]
             if not account.expected and member not in self._rates_hz:
                 continue
+            # The last account is that of the topic itself.
             earlier_starts = list(self._starts.get(topic, {}).values())[:-1]
             base = self._bases.get(topic, 0)
             prefix = f"from {base} on: " if base else ""
@@ -617,11 +726,15 @@ class SessionAccounts:
         return texts
 
     def list_starts(self, topic: str) -> list[Account]:
-        """Returns the accounts of a topic: of events, one for each start of their sender."""
+        """Returns the accounts of a topic.
+
+        For events, there is one for each start of the sender.
+
+        """
         return list(self._starts.get(topic, {}).values()) or [self._accounts[topic]]
 
     def list_gaps(self, topic: str) -> list[tuple[int, int]]:
-        """Returns the ranges (first, last) of missing numbers of a topic."""
+        """Returns the ranges (first, last) of missing numbers of a topic, over all starts."""
         base = self._bases.get(topic, 0)
         gaps = []
         for account in self.list_starts(topic):
@@ -629,9 +742,9 @@ class SessionAccounts:
         return gaps
 
     def coverage(self) -> Coverage:
-        """Returns the number of records and of ticks of every site.
+        """Returns how many ticks of every site were recorded.
 
-        A site whose end is unknown is expected to make all ticks of the scenario.
+        If the end of a site is unknown, all ticks of the scenario are expected of the site.
         """
         records = {}
         ticks = {}
@@ -646,7 +759,7 @@ class SessionAccounts:
         return Coverage(records, ticks)
 
     def describe_missing(self) -> Iterator[str]:
-        """Yields a text for every site that lacks records."""
+        """Yields a line for every site that lacks records, with its first gaps."""
         for site in self._rates_hz:
             topic = self._topic(site, topics.STATE)
             account = self._accounts.get(topic)
@@ -659,11 +772,15 @@ class SessionAccounts:
 
     @property
     def unknown_ends(self) -> list[str]:
-        """The sites whose event at their end never arrived."""
+        """Names of the sites whose "end" event never arrived."""
         return [site for site in self._rates_hz if site not in self._end_ticks]
 
     def describe_unfinished_sites(self) -> Iterator[str]:
-        """Yields a text for every site with an unknown end whose last ticks are missing."""
+        """Yields a line for every site that may have executed more ticks than were recorded.
+
+        These are the sites whose "end" event never arrived, and whose last recorded tick is not
+        the last tick of the scenario.
+        """
         for site in self.unknown_ends:
             topic = self._topic(site, topics.STATE)
             account = self._accounts.get(topic)
@@ -679,14 +796,14 @@ class SessionAccounts:
 def open_session_accounts(
     metadata: Mapping[str, Mapping[str, str]], attachments: Mapping[str, bytes]
 ) -> SessionAccounts | None:
-    """Returns empty accounts for the messages of a file.
+    """Creates empty accounts for the messages of a file.
 
     Args:
-        metadata: metadata of the file, by name.
-        attachments: attachments of the file, by name.
+        metadata: Metadata of the file, by name.
+        attachments: Attachments of the file, by name.
 
     Returns:
-        The accounts; None if the file is not a log of trilat-net.
+        The accounts. None if the file is not a log of trilat-net.
     """
     session_facts = metadata.get(SESSION, {})
     try:

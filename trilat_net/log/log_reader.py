@@ -1,18 +1,26 @@
-"""Reading of a log from one file, or from several files that are parts of one session.
+"""Opens recorded sessions, and gives access to the records of every site.
+
+A log is the MCAP file of a run. A session may have several files, because a recorder can split
+its log, and because several recorders can record parts of one session. They are read as one:
 
     log = open_log("run.mcap")
     log["m1"].t_s, log["m1"].q
 
-`read_link_delays` reads the measured delays of a link, for scenarios with `model = "trace"`.
+Here "m1" is a site, a process that runs one arm and its control loop. A record is the stored
+result of one tick, a period of that loop.
+
+`read_link_delays` extracts the measured delays of a link between two sites, so that a scenario
+with `model = "trace"` can reproduce them.
 
 Invariant:
     - Files of every released schema version can be opened. A file that is cut off is read up to
-      its end, and its `complete` is false.
-    - Messages are decoded when they are accessed. An invalid record is an error that names the
-      file. An invalid event or statistics message is left out and reported (`unreadable`).
+      its end, and `Log.complete` is False for it.
+    - Messages are decoded when they are accessed. An invalid record raises an error that names
+      the file. An invalid event or statistics message is skipped, and `Log.unreadable` reports
+      it.
     - Channels of other sessions and members are ignored.
     - A sample counts as lost only if records cover every tick at which it could have arrived,
-      up to the longest delay of the link. Other samples whose arrival is unknown are left out.
+      up to the longest delay of the link. Samples whose arrival is unknown are left out.
 """
 
 import hashlib
@@ -78,25 +86,29 @@ M = TypeVar("M", Event, LinkStats, RecorderStats)
 class Log(Result, Mapping[str, SiteLog]):
     """A recorded session: a mapping from the names of the sites to their records.
 
+    `open_log` creates this object from one file, or from several files of one session.
+
     Args:
-        contents: the contents of its file, or of its files together.
+        contents: Contents of the file, or of all files together.
 
     Attributes:
-        source: name of the file; of several files the name of the first file and their number.
-        sources: names of the files, in order.
-        session: metadata of the session: driver, seed, epoch, versions, commit, fingerprint.
-        driver: driver of the session: "live", "virtual" or "rerun".
-        scenario: the scenario that ran.
-        scenario_text: the scenario as it is in the file.
+        source: Name of the file. For several files, the name of the first one and their number.
+        sources: Names of the files, in the order of their messages.
+        session: Metadata of the session: driver, seed, start time, versions, commit,
+            fingerprint.
+        driver: How the session ran: "live", "virtual" (simulated time) or "rerun".
+        scenario: The scenario that ran.
+        scenario_text: Text of the scenario, as stored in the file.
         scenario_sha256: SHA-256 of that text.
-        sites: names of the sites, in scenario order.
-        events: the events of all members, per member in order.
-        damaged: parts of the file that cannot be read, a sentence each.
-        chain: agreement with the digest chain; of several files the worst.
-        unreadable: channels with messages that cannot be read, a sentence each.
+        sites: Names of the sites, in the order of the scenario.
+        events: Events of all members, grouped by member, in the order of their numbers.
+        damaged: A sentence for each part of the file that cannot be read.
+        chain: Result of the comparison with the digests that the file contains. For several
+            files, the worst result.
+        unreadable: A sentence for each channel with messages that cannot be decoded.
 
     Raises:
-        LogError: the scenario cannot be read.
+        LogError: The scenario cannot be read.
     """
 
     def __init__(self, contents: LogContents) -> None:
@@ -123,7 +135,7 @@ class Log(Result, Mapping[str, SiteLog]):
             self.events += self._read_events(topic)
 
     def headline(self) -> str:
-        """Returns a line on the session: its driver, sites, length and records."""
+        """Returns a line about the session: its driver, sites, length and records."""
         try:
             summary = self._describe_records()
         except LogError:
@@ -133,7 +145,7 @@ class Log(Result, Mapping[str, SiteLog]):
         return f"{self.source}: {kind}; {summary}{state}"
 
     def _describe_records(self) -> str:
-        """Returns the length of the session, and the numbers of its records, as a text."""
+        """Returns the length of the session and the numbers of its records, as a text."""
         last_times_s = [float(self[name].t_s[-1]) for name in self.sites if len(self[name])]
         length_s = max(last_times_s, default=0.0)
         records = sum(len(self[name]) for name in self.sites)
@@ -148,7 +160,7 @@ class Log(Result, Mapping[str, SiteLog]):
         return text
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns plain values, with the keys of `trilat sim --json`."""
+        """Returns the facts about the session, with the keys of `trilat sim --json`."""
         return {
             "files": list(self.sources),
             "session": dict(self.session),
@@ -163,7 +175,7 @@ class Log(Result, Mapping[str, SiteLog]):
         }
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a row per site."""
+        """Returns a row per site: its tick rate, record counts and last time in s."""
         rows = []
         for name, part in self.items():
             row = {
@@ -180,8 +192,8 @@ class Log(Result, Mapping[str, SiteLog]):
         """Returns a table of the log as a pandas data frame.
 
         Args:
-            name: name of the table, see `table`; "": a row per site.
-            kind: kind of the table, see `table`.
+            name: Name of the table, see `table`. If it is empty, the frame has a row per site.
+            kind: Kind of the table, see `table`.
         """
         return to_pandas_frame(self.table(name, kind)) if name else super().to_frame()
 
@@ -202,19 +214,30 @@ class Log(Result, Mapping[str, SiteLog]):
         return "/" + topics.key(self.session["session"], member, channel)
 
     def _event_topics(self) -> list[str]:
-        """Returns the topics of the members' events, as far as the log has them."""
+        """Returns the topics of the members' events that the log contains, sorted."""
         members = (*self.sites, topics.RECORDER)
         event_topics = {self._topic(member, topics.EVENT) for member in members}
         return sorted(event_topics & self._contents.channels.keys())
 
     def _channel(self, topic: str) -> ChannelMessages:
-        """Returns the messages of a topic, as far as the log has them."""
+        """Returns the messages of a topic.
+
+        They are empty if the log does not contain the topic.
+        """
         return self._contents.channels.get(topic) or ChannelMessages()
 
     def _decode(self, topic: str, kind: type[M]) -> list[M]:
-        """Returns the messages of a channel.
+        """Decodes the messages of a channel.
 
-        Messages that cannot be read are removed from the channel and reported once.
+        Messages that cannot be decoded are removed from the channel, so that `unreadable`
+        reports them only once. The log then counts as incomplete.
+
+        Args:
+            topic: Topic of the channel.
+            kind: Type of the messages.
+
+        Returns:
+            The messages that can be decoded, in the order of the file.
         """
         channel = self._channel(topic)
         readable = ChannelMessages()
@@ -236,7 +259,11 @@ class Log(Result, Mapping[str, SiteLog]):
         return messages
 
     def _read_events(self, topic: str) -> list[Event]:
-        """Returns the events of a member, start by start, in order of their numbers."""
+        """Returns the events of a member, sorted by its starts and by their numbers.
+
+        A member that is started again numbers its events from 0 again. The starts are in the
+        order in which they first appear in the file.
+        """
         events = self._decode(topic, Event)
         boots = list(dict.fromkeys(event.boot for event in events))
         starts = {boot: start for start, boot in enumerate(boots)}
@@ -244,7 +271,10 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @cached_property
     def diverged_s(self) -> float | None:
-        """Time at which the first site left its limits and ended the run, in s; else None."""
+        """Time at which the first site exceeded a limit, which ended the run, in s.
+
+        None if no site exceeded its limits.
+        """
         times_s = [part.diverged_s for part in self.values()]
         known_times_s = [time_s for time_s in times_s if time_s is not None]
         return min(known_times_s, default=None)
@@ -264,10 +294,11 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @cached_property
     def complete(self) -> bool:
-        """True if the file was finished.
+        """True if the recording was finished.
 
-        A log of several files is complete if all files were finished, or if the last file was
-        finished and no record is missing.
+        A log of several files is complete if all of them were finished. It is also complete if
+        the last file was finished and no record is missing, because an unfinished part may have
+        been covered by another recorder.
         """
         if self._contents.complete or len(self.sources) == 1:
             return self._contents.complete
@@ -279,10 +310,11 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @property
     def executed_sites(self) -> tuple[str, ...]:
-        """The sites whose records can be executed from the file.
+        """Names of the sites whose records can be computed again from this file.
 
-        These are all sites, except in an open-loop rerun. The records of its recorded sites
-        depend on samples that the file does not hold.
+        These are all sites, except in an open-loop rerun. In an open-loop rerun, some sites are
+        not executed. Their records are copied from the original log and depend on samples that
+        this file does not contain.
         """
         executed = self.session.get(EXECUTED_SITES_KEY)
         if self.driver != RERUN_DRIVER or executed is None:
@@ -291,7 +323,10 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @property
     def part(self) -> int:
-        """Number of the file among the parts of a log; 0 for a whole log or several parts."""
+        """Number of the file among the parts of a log.
+
+        It is 0 for a whole log or for several files.
+        """
         if len(self.sources) > 1:
             return 0
         number = self._contents.metadata.get(PART, {}).get("index", "0")
@@ -300,10 +335,10 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @cached_property
     def accounts(self) -> dict[str, str]:
-        """Per topic the numbers of received and missing messages, as texts.
+        """Numbers of received and missing messages of each topic, as a line of text per topic.
 
-        A finished file states them at its end; a torn file has none ({}). For several files the
-        messages of all files are counted together.
+        The recorder writes them at the end of a file. The dictionary is empty for a file that
+        was not finished. For several files, the messages of all files are counted together.
         """
         written = self._contents.metadata.get(ACCOUNTS, {})
         if len(self.sources) == 1:
@@ -327,15 +362,19 @@ class Log(Result, Mapping[str, SiteLog]):
         return {**accounts.format_accounts(), **written}
 
     def account(self, site: str) -> str:
-        """Returns the account of a site's records, see `accounts`; "" in a torn file."""
+        """Returns the message counts of a site's records as a line of text, see `accounts`.
+
+        The text is empty if the file was not finished.
+        """
         return self.accounts.get(self._topic(site, topics.STATE), "")
 
     @cached_property
     def unknown_ends(self) -> tuple[str, ...]:
-        """Sites whose end event never arrived, so that their number of ticks is unknown.
+        """Names of the sites whose "end" event is not in the log.
 
-        Empty for a log without events, and for a part of a log, because the end events may be
-        in a later part.
+        Such a site may have executed more ticks than the log shows. The tuple is empty if the
+        recorder filtered out the events. It is also empty for a part of a log, because the
+        events may be in a later part.
         """
         if self.part and len(self.sources) == 1:
             return ()
@@ -350,7 +389,7 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @cached_property
     def _stated_ticks(self) -> dict[str, int]:
-        """Number of ticks that each site states in its end event."""
+        """Number of ticks that each site states in its "end" event, at most the scenario's."""
         ticks = {}
         for event in self.events:
             if event.kind == "end" and event.member in self.scenario.sites:
@@ -360,7 +399,11 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @cached_property
     def starts(self) -> dict[str, list[tuple[int, int]]]:
-        """Per site that joined the running session its starts, as (first tick, boot)."""
+        """Starts of each site that joined the running session, as (first tick, boot).
+
+        The boot is a random number that identifies one start of the process. Sites that were
+        present from the beginning and were never started again have no entry.
+        """
         starts: dict[str, list[tuple[int, int]]] = {}
         for event in self.events:
             if event.kind != "join" or event.member not in self.scenario.sites:
@@ -371,19 +414,23 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @cached_property
     def absences(self) -> dict[str, list[tuple[int, int]]]:
-        """Per site the ranges of ticks before its `starts` without execution, as (first, last).
+        """Ranges of ticks, (first, last), that sites did not execute before their `starts`.
 
-        A range begins after the last tick of the previous start that is known: by a record, by
-        the end event of that start, or by another site that received the tick.
+        A range begins after the last tick that the previous start is known to have executed.
+        The tick is known from a record, from the "end" event of that start, or because another
+        site received the sample of that tick.
         """
         return {site: self._find_absences(site, starts) for site, starts in self.starts.items()}
 
     def _find_absences(self, site: str, starts: list[tuple[int, int]]) -> list[tuple[int, int]]:
-        """Returns the absences of a site, see `absences`.
+        """Finds the ranges of ticks that a site did not execute, see `absences`.
 
         Args:
-            site: name of the site.
-            starts: its starts, as (first tick, boot).
+            site: Name of the site.
+            starts: Its starts, as (first tick, boot), in ascending order.
+
+        Returns:
+            The ranges, as (first tick, last tick), in ascending order.
         """
         end_events = [event for event in self.events if event.kind == "end"]
         end_ticks = [event.ticks - 1 for event in end_events if event.member == site]
@@ -393,16 +440,20 @@ class Log(Result, Mapping[str, SiteLog]):
         absences: list[tuple[int, int]] = []
         for first, boot in starts:
             begin = int(executed[executed < first].max(initial=-1)) + 1
+
+            # Other sites report how many ticks they received before this start.
             received = 0
             for event in self.events:
                 if event.kind == LAST and event.boots.get(site) == boot:
                     received = max(received, event.ticks)
             received = min(first, received)
-            # a few more ticks may be records that were in transit when the site was lost
+            # A few ticks more than recorded are no missing records: the site was lost while
+            # their records were still in transit to the recorder.
             if received - begin > under_way:
                 begin = received
-            # the start in between had no tick
+
             if absences and begin == absences[-1][0]:
+                # The start in between executed no tick, so that the two ranges are one.
                 absences.pop()
             if begin < first:
                 absences.append((begin, first - 1))
@@ -411,17 +462,18 @@ class Log(Result, Mapping[str, SiteLog]):
     def absent_ticks(self, site: str) -> int:
         """Returns the number of ticks that a site did not execute.
 
-        These are the ticks of its `absences`, and the ticks that its records state as skipped.
+        These are the ticks of its `absences`, and the ticks that the site skipped because it
+        was late, as its records state.
         """
         between = sum(last - first + 1 for first, last in self.absences.get(site, ()))
         return between + self[site].skipped
 
     def expected_ticks(self, site: str) -> int:
-        """Returns the number of ticks of a site that belong to the run.
+        """Returns the number of ticks that a site should have executed in this run.
 
-        The end event of the site states that number. Without an end event, the ticks up to the
-        last record count if the site was lost for good, else the ticks of the scenario. Ticks
-        that the site did not execute are subtracted.
+        The "end" event of the site states that number. Without this event, the ticks up to the
+        last record count if the site was lost for good. Otherwise all ticks of the scenario
+        count. Ticks that the site did not execute (`absent_ticks`) are subtracted.
         """
         recorded = self[site].last_tick + 1
         ticks = self._stated_ticks.get(site)
@@ -432,7 +484,7 @@ class Log(Result, Mapping[str, SiteLog]):
         return max(ticks, recorded) - self.absent_ticks(site)
 
     def _is_gone(self, site: str) -> bool:
-        """Returns True if the last event about a site states that the site was lost or left."""
+        """Returns True if the latest news about a site is that it was lost or left."""
         kinds = ("lost", "left", "back", "admit")
         events = [event for event in self.events if event.about == site and event.kind in kinds]
         if not events:
@@ -441,10 +493,10 @@ class Log(Result, Mapping[str, SiteLog]):
         return last.kind in ("lost", "left")
 
     def missing(self, site: str) -> int:
-        """Returns the number of missing records of a site.
+        """Returns the number of records of a site that the log lacks.
 
-        The end event states how many ticks the site executed. Without an end event, only
-        records before the last record can be missing.
+        The "end" event states how many ticks the site executed. Without this event, only
+        records before the last record can be known to be missing.
         """
         part = self[site]
         after_last = max(0, self._stated_ticks.get(site, 0) - (part.last_tick + 1))
@@ -452,21 +504,22 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @cached_property
     def last_ticks(self) -> dict[str, int]:
-        """Last tick that each site is known to have executed; -1 if no tick is known.
+        """Last tick that each site is known to have executed. It is -1 if no tick is known.
 
-        The end event of a site states that tick. Without an end event, the records of the site
-        and of its peers are used.
+        The "end" event of a site states that tick. Without this event, the last record of the
+        site counts, or the last sample that one of its peers received, whichever is later.
         """
         stated = self._stated_ticks
         last = {}
         for name in self.sites:
             ticks = stated.get(name, self[name].last_tick + 1)
             last[name] = ticks - 1
+
         for name in self.sites:
             peers = self[name].peers
             unknown = {index: peer for index, peer in enumerate(peers) if peer not in stated}
             if not unknown:
-                continue
+                continue  # spares the decoding of all records
             for state in self[name].states:
                 for index, tick, _ in state.rx:
                     peer = unknown.get(index)
@@ -484,7 +537,11 @@ class Log(Result, Mapping[str, SiteLog]):
         return self._sites[site]
 
     def _read_site(self, site: str) -> SiteLog:
-        """Returns the records of a site, whose ticks are checked against the scenario."""
+        """Returns the records of a site.
+
+        Raises:
+            LogError: A tick is beyond the length of the scenario.
+        """
         channel = self._channel(self._topic(site, topics.STATE))
         part = SiteLog(
             name=site,
@@ -499,7 +556,8 @@ class Log(Result, Mapping[str, SiteLog]):
         )
         ticks = self.scenario.ticks(site)
         last = part.last_tick
-        # a damaged tick would make counts and arrays of any size
+        # Counts and arrays grow with the last tick, so that a damaged tick could fill the
+        # memory.
         if last >= ticks:
             raise LogError(
                 f"{self.source}: {site} has a record of tick {last}; the scenario has {ticks}"
@@ -507,10 +565,10 @@ class Log(Result, Mapping[str, SiteLog]):
         return part
 
     def changes(self, site: str) -> dict[int, list[str]]:
-        """Returns the texts of the changes that a site applied, by tick, in order.
+        """Returns the changes of parameters that a site applied, as JSON texts by tick.
 
-        The changes are in its records. Changes whose record is missing are taken from its
-        events.
+        The site stores its changes in its records. For a missing record, the changes are taken
+        from the site's "change" events.
         """
         changes = self[site].changes()
         change_events = [event for event in self.events if event.kind == "change"]
@@ -523,10 +581,10 @@ class Log(Result, Mapping[str, SiteLog]):
         return dict(sorted(changes.items()))
 
     def commands(self, site: str) -> dict[int, list[CoreChange]]:
-        """Returns the changes that a site applied, by tick, as `Site.step` gets them.
+        """Returns the changes that a site applied, by tick, as `Site.step` receives them.
 
         Raises:
-            LogError: the log holds a text that is not a change of the scenario.
+            LogError: A text is not a valid change of the scenario.
         """
         commands = {}
         try:
@@ -538,14 +596,15 @@ class Log(Result, Mapping[str, SiteLog]):
         return commands
 
     def shown(self, site: str) -> dict[str, Ints]:
-        """Returns the ticks of the peers' samples that the user of a site saw.
+        """Returns which samples of the peers the user of a site saw at each record.
 
-        A user sees the sample in use. With `[sites.NAME.view]` the user sees the newest sample
-        that had arrived over the view.
+        The user sees the sample that the control law uses. If the scenario has a table
+        `[sites.NAME.view]`, the picture has a separate delay, and the user sees the newest
+        sample that has arrived with that delay.
 
         Returns:
-            Per peer the tick of the visible sample at each record of the site, shape (K,); -1
-            before the first sample.
+            For each peer the ticks of the visible samples, shape (K,). They are -1 before the
+            first sample.
         """
         part = self[site]
         samples = PictureDelay(self.scenario, site).list_shown_samples(part.last_tick + 1)
@@ -555,11 +614,11 @@ class Log(Result, Mapping[str, SiteLog]):
         return ticks
 
     def link_stats(self, site: str) -> list[LinkStats]:
-        """Returns the statistics that a site published, in order."""
+        """Returns the statistics messages of a site, sorted by tick."""
         return self.timed_link_stats(site).messages
 
     def timed_link_stats(self, site: str) -> TimedMessages[LinkStats]:
-        """Returns the statistics of a site with their times of arrival and of sending."""
+        """Returns the statistics messages of a site, with their arrival and sending times."""
         topic = self._topic(site, topics.LINK)
         stats = self._decode(topic, LinkStats)
         order = sorted(range(len(stats)), key=lambda n: stats[n].tick)
@@ -567,7 +626,7 @@ class Log(Result, Mapping[str, SiteLog]):
         return TimedMessages([stats[n] for n in order], log_ns[order], publish_ns[order])
 
     def timed_events(self) -> TimedMessages[Event]:
-        """Returns the events in order of their arrival, with arrival and sending times."""
+        """Returns the events in the order of their arrival, with arrival and sending times."""
         events: list[Event] = []
         log_times = [np.zeros(0, np.int64)]
         publish_times = [np.zeros(0, np.int64)]
@@ -583,20 +642,20 @@ class Log(Result, Mapping[str, SiteLog]):
         return TimedMessages(ordered_events, log_ns[order], publish_ns[order])
 
     def recorder_stats(self) -> list[RecorderStats]:
-        """Returns the statistics of the recorder, in order."""
+        """Returns the statistics messages of the recorder, in the order of the file."""
         return self._decode(self._topic(topics.RECORDER, topics.STATS), RecorderStats)
 
     def table(self, name: str, kind: str = "") -> Table:
         """Returns a table of the log: columns with names, units and meanings.
 
         Args:
-            name: a site, or "events".
-            kind: kind of a site's table: "state" (a row per record), "link" (a row per
-                statistics message) or "arrivals" (a row per sample that arrived).
+            name: Name of a site, or "events".
+            kind: Kind of a site's table: "state" (the default) has a row per record, "link" a
+                row per statistics message, and "arrivals" a row per sample that arrived.
 
         Raises:
-            UnknownName: the log has no such table.
-            LogError: the messages cannot be read.
+            UnknownName: The log has no such table.
+            LogError: The messages cannot be read.
         """
         if name == EVENTS_TABLE and name not in self.sites:
             return build_events_table(self.timed_events(), self.source)
@@ -613,14 +672,16 @@ class Log(Result, Mapping[str, SiteLog]):
         )
 
     def tables(self) -> Iterator[Table]:
-        """Yields every table, one at a time: the tables of each site, and the events."""
+        """Yields every table, one at a time: the tables of each site, then the events."""
         for site in self.sites:
             for kind in SITE_TABLE_KINDS:
                 yield self.table(site, kind)
         yield build_events_table(self.timed_events(), self.source)
 
     def frame(self, name: str, kind: str = "") -> "polars.DataFrame":
-        """Returns a table as a polars data frame, see `table`. `to_frame` is for pandas.
+        """Returns a table as a polars data frame, see `table`.
+
+        `to_frame` returns a pandas frame.
 
         Raises:
             UsageError: polars is not installed.
@@ -636,26 +697,28 @@ def open_log(
     other_version: bool = False,
     remember: bool = False,
 ) -> Log:
-    """Opens a log in a file, or in files that are parts of one session, in any order.
+    """Opens a log in a file, or in several files that are parts of one session.
 
     >>> path = tn.simulate("two_sites", duration_s=0.1).save("run.mcap")
     >>> tn.open_log(path)["m"].t_s[-1]
     np.float64(0.099)
 
     Args:
-        source: a path, or a file opened for reading.
-        more: further parts.
-        progress: called now and then with the number of bytes read and their total.
-        law: files of control laws that the log names and that may run when the log is executed,
-            see docs/code-that-runs.md. Laws of runs of this process need no permission.
-        other_version: True if these files may have another hash than the log names.
+        source: A path, or a binary file opened for reading.
+        more: Further parts of the session, in any order.
+        progress: Function that is called now and then with the number of bytes read and their
+            total.
+        law: Files of control laws that the log names and that may run when the log is executed,
+            see docs/code-that-runs.md. Laws that this process has run itself need no
+            permission.
+        other_version: True if these files may have other hashes than the log names.
         remember: True if these laws may also run for other logs that name their hashes, with
             the same settings.
 
     Raises:
-        UsageError: the log does not name a law of `law`.
-        LogError: a file is missing, is no MCAP file, or is no log of trilat-net; or files are
-            of different sessions, or disagree on a message.
+        UsageError: The log does not name one of the files of `law`.
+        LogError: A file is missing, is no MCAP file or no log of trilat-net. Also raised if the
+            files belong to different sessions or disagree on a message.
     """
     log = Log(merge_parts(_read_parts((source, *more), progress)))
     allow_logged_code(log.scenario, law, other_version=other_version, remember=remember)
@@ -663,9 +726,18 @@ def open_log(
 
 
 def open_logs(*sources: str | Path, progress: Progress | None = None) -> list[Log]:
-    """Opens the logs in files and folders, see `open_log`.
+    """Opens all logs in files and folders, see `open_log`.
 
-    Files of one session are the parts of one log.
+    Args:
+        sources: Paths of logs, or of folders that contain logs.
+        progress: Function that is called now and then with the number of bytes read and their
+            total over all files.
+
+    Returns:
+        A log per session. Files of the same session are read as one log.
+
+    Raises:
+        LogError: A folder contains no log, or a file cannot be read.
     """
     files: list[Path] = []
     for path in map(Path, sources):
@@ -685,7 +757,11 @@ def open_logs(*sources: str | Path, progress: Progress | None = None) -> list[Lo
 def _read_parts(
     sources: Sequence[str | Path | BinaryIO], progress: Progress | None
 ) -> list[LogContents]:
-    """Returns the contents of files; reports the progress over all files together."""
+    """Reads the contents of files, and reports the progress over all files together.
+
+    All files are opened before the first one is read, so that a missing file is reported at
+    once.
+    """
     files: list[tuple[BinaryIO, str]] = []
     parts: list[LogContents] = []
     with ExitStack() as stack:
@@ -730,20 +806,24 @@ def _measure_size(stream: BinaryIO) -> int:
 
 
 def read_link_delays(path: Path, link: str) -> list[TracePoint]:
-    """Returns the measured delays of the samples of a link, in order of their stamps.
+    """Returns the measured delays of the samples of a link, in the order of their stamps.
 
-    These are the delays of the network, as the receiver's records have them in `rx`, without
-    the delays that the scenario injected. A negative delay is an error of the clocks and counts
-    as 0. If a sample arrived twice, the shorter delay counts. A sample was sent if the sender
-    has a record of its tick; a lost sample has an infinite delay.
+    The stamp of a sample is the nominal time of the tick in which the sender computed it. The
+    receiver stores the network delay of each sample in the field `rx` of its records. Delays
+    that the scenario injected are not included. A negative delay is an error of the clocks and
+    counts as 0. If a sample arrived twice, the shorter delay counts. A sample counts as sent if
+    the sender has a record of its tick. A lost sample has an infinite delay.
 
     Args:
-        path: the log.
-        link: name of the link, such as "m1->s".
+        path: The log.
+        link: Name of the link, such as "m1->s".
+
+    Returns:
+        The pairs (stamp in s, delay in ms).
 
     Raises:
-        OSError: the file cannot be opened.
-        ValueError: the file is no log, has no such link, or no sample arrived over the link.
+        OSError: The file cannot be opened.
+        ValueError: The file is no log, has no such link, or no sample arrived over the link.
     """
     status = path.stat()  # raises the same errors as opening the file
     links = _read_links(path, status.st_mtime_ns, status.st_size)
@@ -757,10 +837,11 @@ def read_link_delays(path: Path, link: str) -> list[TracePoint]:
 
 @lru_cache(maxsize=1)
 def _read_links(path: Path, modified_ns: int, size: int) -> dict[str, list[TracePoint]]:  # noqa: ARG001
-    """Returns the delays of every link of a log.
+    """Returns the delays of every link of a log, by the name of the link.
 
-    The last log is cached, because a scenario reads one link after the other. `modified_ns` and
-    `size` detect that the file has changed.
+    The result for the last file is cached, because a scenario reads the links of a log one
+    after the other. `modified_ns` and `size` are part of the key of the cache. They change if
+    the file is written again.
     """
     delays = {}
     try:
@@ -774,13 +855,19 @@ def _read_links(path: Path, modified_ns: int, size: int) -> dict[str, list[Trace
 
 
 def _iterate_delays(log: Log, site: str, index: int, peer: str) -> Iterator[TracePoint]:
-    """Yields the stamp, s, and delay, ms, of every sample of a link, in order of the stamps.
+    """Yields the stamp and the delay of every sample of a link, in the order of the stamps.
+
+    A sample that was sent but did not arrive has an infinite delay. It is left out if it may
+    have arrived in a tick whose record is missing.
 
     Args:
-        log: the log.
-        site: the receiver.
-        index: index of the sender among the receiver's peers.
-        peer: the sender.
+        log: The log.
+        site: Name of the receiver.
+        index: Index of the sender among the receiver's peers.
+        peer: Name of the sender.
+
+    Yields:
+        The stamp in s after the start of the session, and the delay in ms.
     """
     states = log[site].states
     delays_us: dict[int, int] = {}
@@ -791,30 +878,42 @@ def _iterate_delays(log: Log, site: str, index: int, peer: str) -> Iterator[Trac
                 delays_us[tick] = min(earlier_us, max(delay_us, 0))
     if not delays_us:
         return
+
     longest_ns = 1000 * max(delays_us.values())
     gaps = _find_gaps_ns(states)
     rate_hz = log.scenario.sites[peer].rate_hz
     sent = log[peer].tick.tolist() if peer in log.sites else []
-    # samples that were sent before the first or after the last arrival were lost as well
+    # Samples that were sent before the first or after the last arrival were lost as well.
+    # Without records of the sender, all ticks up to the last arrival count as sent.
     ticks = {*sent, *delays_us} if sent else range(max(delays_us) + 1)
     for tick in sorted(ticks):
         stamp_ns = tick * NS_PER_S // rate_hz
-        # whole microseconds, as the core counts
+        # The simulation kernel counts in whole microseconds.
         stamp_s = stamp_ns // 1000 / 1e6
         if tick in delays_us:
             yield stamp_s, delays_us[tick] / 1e3
             continue
-        latest_ns = stamp_ns + longest_ns
-        may_be_unseen = any(stamp_ns <= end and latest_ns >= start for start, end in gaps)
-        if not may_be_unseen:
+
+        latest_arrival_ns = stamp_ns + longest_ns
+        may_have_arrived_unseen = any(
+            stamp_ns <= gap_end and latest_arrival_ns >= gap_start
+            for gap_start, gap_end in gaps
+        )
+        if not may_have_arrived_unseen:
             yield stamp_s, math.inf
 
 
 def _find_gaps_ns(states: Sequence[State]) -> list[tuple[int, float]]:
-    """Returns the times, (start, end) in ns, in which a sample may have arrived unseen.
+    """Returns the intervals in which a sample may have arrived although no record shows it.
 
-    Records are missing in these times: between records, before the first record, and after the
-    last record.
+    Records are missing before the first record, between records whose ticks are not
+    consecutive, and after the last record.
+
+    Args:
+        states: Records of the receiver, in the order of their ticks.
+
+    Returns:
+        The intervals (start, end) in ns after the start of the session.
     """
     if not states:
         return [(0, math.inf)]

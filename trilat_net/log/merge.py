@@ -1,10 +1,12 @@
-"""Merge of the parts of a session's log.
+"""Merges the parts of a session's log into one log.
 
-A log has several parts if it was split, or continued by another recorder.
+A log has several parts if the recorder split it, or if several recorders recorded the session
+after one another or at the same time.
 
 Invariant:
-    - A message in several parts counts once.
-    - Parts that disagree on a message, and parts of different sessions, are refused.
+    - A message that several parts contain counts once.
+    - Parts of different sessions are refused, and so are parts that contain different messages
+      with the same number.
     - The order of the arguments does not matter.
 """
 
@@ -26,31 +28,37 @@ from .running_digest import DIGESTS, PREVIOUS_DIGEST_KEY, DigestState
 
 
 def merge_parts(parts: Sequence[LogContents]) -> LogContents:
-    """Returns the contents of one or more parts of a session as one log.
+    """Merges the contents of the parts of a session.
 
-    Of the accounts of several parts, only the counts that belong to no channel are kept, summed
-    up.
+    The recorder states at the end of each part how many messages it received. The counts of a
+    channel do not apply to the merged log and are left out. The other counts, such as dropped
+    messages, are added.
 
     Args:
-        parts: the parts, in any order.
+        parts: One or more parts, in any order.
+
+    Returns:
+        The contents of all parts, as if they were one file.
 
     Raises:
-        LogError: the parts are of different sessions, or disagree on a message, or a part
+        LogError: The parts belong to different sessions or disagree on a message, or a part
             cannot be read.
     """
     if len(parts) == 1:
         return parts[0]
     for other in parts[1:]:
         _check_same_session(parts[0], other)
+    _check_digests(parts)
+
     ordered = sorted(parts, key=_first_time)
     first = ordered[0]
     last = ordered[-1]
-    _check_digests(parts)
     damaged = [damage for part in ordered for damage in part.damaged]
     topic_names = dict.fromkeys(topic for part in ordered for topic in part.channels)
     all_ended = all(part.ended for part in parts)
     all_present = sorted(map(_part_index, parts)) == [*range(1, len(parts) + 1)]
-    states = list(DigestState)  # from best to worst
+
+    states = list(DigestState)  # in order from the best to the worst
     chains = [part.chain for part in parts]
     worst_chain = max(chains, key=lambda chain: states.index(chain.state))
     return LogContents(
@@ -67,7 +75,11 @@ def merge_parts(parts: Sequence[LogContents]) -> LogContents:
 
 
 def _check_same_session(first: LogContents, other: LogContents) -> None:
-    """Raises a `LogError` unless two parts are of the same session."""
+    """Checks that two parts belong to the same session.
+
+    Raises:
+        LogError: They do not. The text lists the differences.
+    """
     expected = identify_session(first)
     actual = identify_session(other)
     differences = [
@@ -81,7 +93,14 @@ def _check_same_session(first: LogContents, other: LogContents) -> None:
 
 
 def _check_digests(parts: Sequence[LogContents]) -> None:
-    """Raises a `LogError` unless every part follows the part whose digest it states."""
+    """Checks that every part follows the part that it was written after.
+
+    At the end of a part, the recorder writes a digest of its messages. The next part repeats
+    this digest at its beginning.
+
+    Raises:
+        LogError: A part states the digest of another file.
+    """
     finished = {_part_index(part): part for part in parts if DIGESTS in part.metadata}
     for part in parts:
         stated = part.metadata.get(PART, {}).get(PREVIOUS_DIGEST_KEY)
@@ -95,45 +114,52 @@ def _check_digests(parts: Sequence[LogContents]) -> None:
 
 
 def _first_time(part: LogContents) -> tuple[int, str]:
-    """Returns the first log time of a part, and its name, as a sorting key."""
+    """Returns the arrival time of a part's first message, and its name, as a sorting key."""
     first_times = [channel.log_ns[0] for channel in part.channels.values() if channel.log_ns]
     return min(first_times, default=1 << 63), part.source
 
 
 def _part_index(part: LogContents) -> int:
-    """Returns the index of a part, from 1; 0 if the part states no valid index."""
+    """Returns the index of a part, from 1. It is 0 if the part states no valid index."""
     text = part.metadata.get(PART, {}).get("index", "1")
     return int(text) if text.isdecimal() and len(text) < 10 else 0
 
 
 def _sum_other_counts(parts: Sequence[LogContents]) -> dict[str, str]:
-    """Returns the recorders' counts that belong to no channel, such as dropped messages.
+    """Adds the recorders' counts that belong to no channel, such as dropped messages.
 
-    A recorder continues its counts from part to part, so that its last part has the totals.
+    A recorder continues its counts from part to part, so that its last part contains the
+    totals. The totals of different recorders are added.
+
+    Args:
+        parts: The parts, in the order of their first messages.
     """
     last_counts: dict[int | str, dict[str, str]] = {}
     for part in parts:
         recorder = _recorder_boot(part) or part.source
         last_counts[recorder] = part.metadata.get(ACCOUNTS, {})
+
     sums: Counter[str] = Counter()
     for counts in last_counts.values():
         for name, count in counts.items():
-            if not name.startswith("/") and count.isdecimal():
+            is_channel = name.startswith("/")
+            if not is_channel and count.isdecimal():
                 sums[name] += int(count)
     return {name: str(count) for name, count in sums.items()}
 
 
 def _recorder_boot(part: LogContents) -> int:
-    """Returns the boot of the recorder that wrote a part.
+    """Returns the number that identifies the start of the recorder that wrote a part.
 
-    The boot is 0 if the part has no readable message of the recorder.
+    The number is 0 if the part has no readable message of the recorder.
     """
     kinds: dict[str, Any] = {topics.STATS: RecorderStats, topics.EVENT: Event}
     for channel, kind in kinds.items():
         topic = "/" + topics.key(part.session["session"], topics.RECORDER, channel)
         messages = part.channels.get(topic)
         if messages is not None and messages.payloads:
-            with suppress(WireError):  # reading the messages reports the error
+            # A message that cannot be decoded is reported when the log is read.
+            with suppress(WireError):
                 message: RecorderStats | Event = decode(messages.payloads[-1], kind, READABLE)
                 return message.boot
             return 0
@@ -141,7 +167,7 @@ def _recorder_boot(part: LogContents) -> int:
 
 
 def identify_session(part: LogContents) -> dict[str, str]:
-    """Returns the facts that all parts of a session share, and that identify the session."""
+    """Returns the facts that identify a session. All parts of a session agree on them."""
     names = ("session", "driver", "epoch_unix_ns")
     facts = {name: part.session.get(name, "unknown") for name in names}
     facts["scenario"] = hashlib.sha256(part.scenario).hexdigest()[:16]
@@ -149,10 +175,22 @@ def identify_session(part: LogContents) -> dict[str, str]:
 
 
 def _merge_channel(topic: str, parts: Sequence[LogContents]) -> ChannelMessages:
-    """Returns the messages of a topic in all parts, each once, in the order of the parts."""
+    """Merges the messages of a topic, in the order of the parts.
+
+    Messages are recognised by a key, such as the tick of a record. A message that an earlier
+    part contains already is left out.
+
+    Args:
+        topic: The topic. At least one part contains it.
+        parts: The parts, in order.
+
+    Raises:
+        LogError: Two parts contain different messages with the same key.
+    """
     topic_parts = [part for part in parts if topic in part.channels]
     if len(topic_parts) == 1:
         return topic_parts[0].channels[topic]
+
     merged = ChannelMessages()
     # Index of each message in `merged`, by its key.
     merged_indices: dict[Hashable, int] = {}
@@ -180,10 +218,15 @@ def _merge_channel(topic: str, parts: Sequence[LogContents]) -> ChannelMessages:
 
 
 def _list_keys(topic: str, channel: ChannelMessages, source: str) -> Sequence[Hashable]:
-    """Returns a key for each message of a topic, which is equal for equal messages.
+    """Returns a key for each message of a topic. Copies of a message have the same key.
+
+    Args:
+        topic: The topic.
+        channel: Messages of the topic.
+        source: Name of the file for error messages.
 
     Raises:
-        LogError: a message cannot be read.
+        LogError: A message cannot be decoded.
     """
     payloads = channel.payloads
     try:
@@ -197,7 +240,7 @@ def _list_keys(topic: str, channel: ChannelMessages, source: str) -> Sequence[Ha
                 events = [decode(payload, Event, READABLE) for payload in payloads]
                 keys: list[Hashable] = []
                 for event, payload in zip(events, payloads, strict=True):
-                    # Events have no number before version 3; then their content is the key.
+                    # Events have no number before version 3. Then their content is the key.
                     keys.append((event.boot, event.n) if event.n >= 0 else payload)
                 return keys
         statistics = [decode(payload, RecorderStats, READABLE) for payload in payloads]
@@ -207,7 +250,11 @@ def _list_keys(topic: str, channel: ChannelMessages, source: str) -> Sequence[Ha
 
 
 def _describe_message(topic: str, key: Hashable) -> str:
-    """Returns a noun phrase for the message with a key, see `_list_keys`."""
+    """Returns a noun phrase for the message with a key, see `_list_keys`.
+
+    For example, the key 12 on the topic of the records of "m1" is "the record of tick 12 of
+    m1".
+    """
     member, kind = topic.split("/")[-2:]
     match key:
         case int():

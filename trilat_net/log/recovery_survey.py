@@ -1,16 +1,19 @@
-"""Survey of a damaged file before its recovery.
+"""Surveys a damaged MCAP file before its recovery.
 
-The survey reads the records that describe the file, and finds chunks that are not where they
-were written.
+The survey collects everything in the file except the messages: the session, the scenario, the
+definitions of the channels and the index. A damaged disk or a damaged copy may contain parts of
+other files, so that the survey also decides which of them belong together. It lists the chunks,
+the compressed blocks of messages, that are not in their original places.
 
 Invariant:
-    - Of two definitions with one number, the one that a valid checksum covers counts; otherwise
-      the first one counts.
-    - Of several sessions and scenarios in a file, those count that name each other. A session
-      whose epoch contradicts all messages with a checksum is of another log, and does not
-      count. In virtual time, where the epoch is 0, the boots of the messages decide.
-    - A chunk with a right checksum may still be old, of another file, or in the wrong place. In
-      a finished file, the index decides, which has a separate checksum. In a log that was not
+    - If a schema or channel is defined twice with the same number, the definition that a valid
+      checksum covers counts. Without a checksum, the first one counts.
+    - If a file contains several sessions and scenarios, a session and a scenario count that
+      name each other. A session does not count if its start time contradicts all messages with
+      a checksum, because it belongs to another log. In simulated time all sessions start at 0.
+      There, the random numbers that identify the starts of the sites decide.
+    - A chunk with a valid checksum may still be old, of another file, or in the wrong place. In
+      a finished file, the index decides, which has its own checksum. In a log that was not
       finished, the times of the chunks decide, which never decrease.
 """
 
@@ -31,104 +34,145 @@ from .mcap_records import ChunkHead, RecordFrame, UnreadableRecord
 from .torn_chunk import PAGE_BYTES
 
 Definition = tuple[int, bytes]
-"""A schema or a channel: opcode and content."""
+"""Record that defines a schema or a channel: its opcode and its content."""
 _PROGRAM = "trilat-net"
 _TOPIC_ROOT = f"/{topics.ROOT}/".encode()
 _SAMPLED_CHUNKS = 16
-"""Chunks whose messages are compared with the epoch of the session."""
+"""Number of chunks, from the first one, whose messages are compared with the session."""
 
 
 class RecoverySurvey:
-    """The contents of a file besides its messages, wherever they are in the file.
+    """Contents of a damaged file besides its messages.
+
+    The recovery creates this object first, and then copies the messages to a new file.
 
     Args:
-        scanner: finds the records of the file.
+        scanner: Scanner that finds the records of the file.
 
     Attributes:
-        profile: the MCAP profile.
-        library: program that wrote the file.
-        definitions: schemas and channels outside of chunks.
-        metadata: the last metadata of each name; of several sessions, the one that names the
-            scenario.
-        attachments: the first attachment of each name; of several scenarios, the one that the
-            session names.
-        count: number of messages that the file states; None if no checksum covers the number.
-        is_redefined: True if a definition among the data differs from that in the summary,
-            which a checksum covers.
+        profile: Profile in the header of the MCAP file.
+        library: Program that wrote the file, as stated in the header.
+        definitions: Schemas and channels that are defined outside of chunks.
+        metadata: Metadata by name. If a name occurs repeatedly, the last one counts. Of several
+            sessions, the one that names the scenario counts.
+        attachments: Attachments by name. If a name occurs repeatedly, the first one counts. Of
+            several scenarios, the one that the session names counts.
+        count: Number of messages that the file states. None if no valid checksum covers it.
+        is_redefined: True if a definition among the data differs from that in the summary at
+            the end of the file, which a checksum covers.
         is_foreign_session: True if the session that the file names is not that of its messages.
-        misplaced: a problem for each chunk that is not where it was written, by offset.
-        is_chunked: True if the file has chunks.
+        misplaced: Description of the problem for each chunk that is not in its original place,
+            by the offset of the chunk.
+        is_chunked: True if the file contains chunks.
         is_session_log: True if anything in the file shows that it is the log of a session.
-        why_empty: the reason if there is nothing to save; else "".
+        why_empty: Reason why there is nothing to recover. Empty if there is something.
     """
 
     def __init__(self, scanner: mcap_records.RecordScanner) -> None:
-        self.profile = self.library = ""
+        self.profile = ""
+        self.library = ""
         self.metadata: dict[str, dict[str, str]] = {}
         self.attachments: dict[str, bytes] = {}
+        self.definitions: list[Definition] = []
         self.count: int | None = None
         self._scanner = scanner
-        self._sessions: list[tuple[dict[str, str], int]] = []  # (metadata, offset)
-        self._scenarios: list[tuple[bytes, bool]] = []  # (text, True if a checksum covers it)
+        # Sessions as (metadata, offset in the file).
+        self._sessions: list[tuple[dict[str, str], int]] = []
+        # Scenarios as (text, True if a checksum covers the text).
+        self._scenarios: list[tuple[bytes, bool]] = []
         self._chunks: list[tuple[RecordFrame, ChunkHead]] = []
-        self._chunk_indexes: dict[int, Any] = {}  # by offset of the chunk
+        # Entries of the index, by the offset of the chunk.
+        self._chunk_indexes: dict[int, Any] = {}
+        # Offsets of the definitions that no checksum covers.
+        self._uncovered_offsets: dict[Definition, int] = {}
+
+        has_messages = self._read_records()
+        self.is_session_log = (
+            any(_TOPIC_ROOT in content for _, content in self.definitions)
+            or _PROGRAM in self.library
+            or bool({SESSION, PART, ACCOUNTS} & self.metadata.keys())
+        )
+        self._choose_session()
+        self.is_foreign_session = False
+        self._judge_messages()
+        self.misplaced = self._find_misplaced_chunks()
+
+        is_torn_chunk = (
+            scanner.torn is not None and scanner.read(scanner.torn.offset, 1) == _CHUNK_BYTE
+        )
+        self.is_chunked = bool(self._chunks) or is_torn_chunk
+        self.why_empty = ""
+        if not (has_messages or is_torn_chunk or self.metadata or self.attachments):
+            self.why_empty = self._explain_empty()
+
+    def _read_records(self) -> bool:
+        """Reads all records of the file except the messages.
+
+        Returns:
+            True if the file contains messages or chunks.
+        """
+        scanner = self._scanner
         summary_offset = _find_intact_summary(scanner)
         # Schemas and channels, by (True in the summary, opcode).
         defined: dict[tuple[bool, int], list[Definition]] = defaultdict(list)
-        # Offsets of the definitions that no checksum covers.
-        self._uncovered_offsets: dict[Definition, int] = {}
         has_messages = False
         for frame in scanner.frames():
             has_messages |= frame.opcode in (Opcode.CHUNK, Opcode.MESSAGE)
             if frame.opcode in mcap_records.DEFINITIONS:
                 entry = frame.opcode, scanner.content(frame)
-                defined[frame.offset >= summary_offset, frame.opcode].append(entry)
-                if frame.offset < summary_offset:
+                is_in_summary = frame.offset >= summary_offset
+                defined[is_in_summary, frame.opcode].append(entry)
+                if not is_in_summary:
                     self._uncovered_offsets.setdefault(entry, frame.offset)
             elif frame.opcode == Opcode.CHUNK:
                 self._chunks.append((frame, scanner.head(frame)))
             elif frame.opcode in _DESCRIBING:
                 with suppress(UnreadableRecord):
                     self._read_description(frame, scanner.content(frame))
+        self._choose_definitions(defined)
+
         if summary_offset == scanner.size:
+            # The summary is missing or damaged, so that its statements are not used.
             self.count = None
             self._chunk_indexes = {}
-        self.definitions = [
-            entry
-            for kind in mcap_records.DEFINITIONS
-            for entry in defined[True, kind] or defined[False, kind]
-        ]
+        return has_messages
+
+    def _choose_definitions(self, defined: dict[tuple[bool, int], list[Definition]]) -> None:
+        """Chooses between the definitions in the summary and those among the data.
+
+        A checksum covers the definitions in the summary. Therefore they are preferred.
+
+        Args:
+            defined: Definitions, by (True in the summary, opcode).
+        """
+        self.is_redefined = False
         for kind in mcap_records.DEFINITIONS:
-            for entry in defined[True, kind]:
+            in_summary = defined[True, kind]
+            among_data = defined[False, kind]
+            self.definitions += in_summary or among_data
+            for entry in in_summary:
                 self._uncovered_offsets.pop(entry, None)
-        self.is_redefined = any(
-            defined[True, kind] and not set(defined[False, kind]) <= set(defined[True, kind])
-            for kind in mcap_records.DEFINITIONS
-        )
-        self.is_session_log = (
-            any(_TOPIC_ROOT in content for _, content in self.definitions)
-            or _PROGRAM in self.library
-            or bool({SESSION, PART, ACCOUNTS} & self.metadata.keys())
-        )
-        self.is_chunked = bool(self._chunks)
-        self._choose_session()
-        self.is_foreign_session = False
-        self._judge_messages()
-        self.misplaced = self._find_misplaced_chunks()
-        is_torn_chunk = (
-            scanner.torn is not None and scanner.read(scanner.torn.offset, 1) == _CHUNK_BYTE
-        )
-        self.is_chunked |= is_torn_chunk
-        self.why_empty = ""
-        if not (has_messages or is_torn_chunk or self.metadata or self.attachments):
-            self.why_empty = "it holds no messages"
-            if not scanner.begins:
-                self.why_empty = (
-                    "it does not begin as an MCAP file does" if scanner.size else "it is empty"
-                )
+            if in_summary and not set(among_data) <= set(in_summary):
+                self.is_redefined = True
+
+    def _explain_empty(self) -> str:
+        """Returns the reason why the file contains nothing to recover."""
+        if self._scanner.begins:
+            return "it holds no messages"
+        return "it does not begin as an MCAP file does" if self._scanner.size else "it is empty"
 
     def _read_description(self, frame: RecordFrame, content: bytes) -> None:
-        """Reads a header, metadata, an attachment, the statistics or a chunk index."""
+        """Reads a record that describes the file.
+
+        It is a header, metadata, an attachment, the statistics or an entry of the chunk index.
+
+        Args:
+            frame: Place of the record.
+            content: Content of the record.
+
+        Raises:
+            UnreadableRecord: The content makes no sense.
+        """
         record = mcap_records.parse_record(frame.opcode, content)
         match frame.opcode:
             case Opcode.HEADER:
@@ -151,13 +195,15 @@ class RecoverySurvey:
     def _choose_session(self) -> None:
         """Chooses the session and the scenario that belong together.
 
-        A scenario that no session names counts if a checksum covers it. A checksum of 0 covers
-        nothing: a page of zeros in the file may have replaced the right one.
+        The metadata of a session contain the SHA-256 of its scenario. If no session names a
+        scenario of the file, a scenario counts that a checksum covers. A checksum of 0 covers
+        nothing: a page of zeros in the file may have replaced the original one.
         """
         self.attachments.pop(SCENARIO, None)
         covered = [text for text, is_covered in self._scenarios if is_covered]
         if covered:
             self.attachments[SCENARIO] = covered[0]
+
         digests = {hashlib.sha256(text).hexdigest(): text for text, _ in self._scenarios}
         for session, _ in self._sessions:
             if session.get("scenario_sha256") in digests:
@@ -170,8 +216,9 @@ class RecoverySurvey:
     def _judge_messages(self) -> None:
         """Compares the messages of the first chunks with the session that the file names.
 
-        A chunk without a checksum may show that the file is a log of a session, but is no
-        evidence against the session.
+        If the messages belong to another session, the stated session is removed. Only chunks
+        with a checksum are evidence against the stated session. Any chunk may show that the
+        file is the log of a session at all.
         """
         origins = MessageOrigins(set(), set())
         for frame, head in self._chunks[:_SAMPLED_CHUNKS]:
@@ -182,6 +229,7 @@ class RecoverySurvey:
                 if head.crc:
                     origins.epochs_ns.update(stated.epochs_ns)
                     origins.boots.update(stated.boots)
+
         session = self.metadata.get(SESSION, {})
         epochs = set(map(str, origins.epochs_ns))
         if session and epochs and session.get("epoch_unix_ns", "") not in epochs:
@@ -190,12 +238,16 @@ class RecoverySurvey:
             self._reject_session(session, is_renamed=False)
 
     def _reject_session(self, session: dict[str, str], *, is_renamed: bool) -> None:
-        """Removes a session of another log, with its scenario and its uncovered channels.
+        """Removes a session that belongs to another log.
+
+        The scenario is removed as well, and so are the channels of that session that no
+        checksum covers.
 
         Args:
-            session: metadata of the session.
-            is_renamed: False if the session of the messages may have the same name; then only
-                channels in the same page as the session are removed.
+            session: Metadata of the session.
+            is_renamed: True if the session of the messages has another name. If it may have the
+                same name, only those channels are removed that are in the same page of the file
+                as the session, because whole pages of a file are overwritten.
         """
         self.is_foreign_session = True
         pages = {offset // PAGE_BYTES for entry, offset in self._sessions if entry == session}
@@ -213,11 +265,16 @@ class RecoverySurvey:
         self.definitions = list(filter(is_kept, self.definitions))
 
     def _find_misplaced_chunks(self) -> dict[int, str]:
-        """Returns a problem for each chunk that is not where it was written, by offset."""
+        """Finds the chunks that are not in their original places.
+
+        Returns:
+            A description of the problem for each of these chunks, by the offset of the chunk.
+        """
         if self._chunk_indexes:
             return self._find_unnamed_chunks()
         if SESSION not in self.metadata:
-            return {}  # chunks in files of other programs may be in any order
+            # Other programs may write chunks in any order.
+            return {}
         spans_ns = [(head.start_ns, head.end_ns) for _, head in self._chunks]
         ordered = _find_longest_ordered(spans_ns)
         return {
@@ -227,13 +284,17 @@ class RecoverySurvey:
         }
 
     def _find_unnamed_chunks(self) -> dict[int, str]:
-        """Returns a problem for each chunk that the index does not name, by offset.
+        """Finds the chunks that the index of the file does not name.
 
-        In a file whose contents were shifted, a chunk counts as named if the index names one
-        with equal sizes and times at another offset.
+        If bytes were inserted or removed, chunks have other offsets than the index states.
+        Therefore a chunk is also accepted if the index names a missing chunk with the same
+        sizes and times at another offset.
+
+        Returns:
+            A description of the problem for each of these chunks, by the offset of the chunk.
         """
-        unnamed = []
         unmatched = Counter(_chunk_measures(index) for index in self._chunk_indexes.values())
+        unnamed = []
         for frame, head in self._chunks:
             index = self._chunk_indexes.get(frame.offset)
             sizes = frame.size, head.size
@@ -241,6 +302,7 @@ class RecoverySurvey:
                 unmatched[_chunk_measures(index)] -= 1
             else:
                 unnamed.append((frame, head))
+
         misplaced = {}
         for frame, head in unnamed:
             measures = frame.size, head.size, head.start_ns, head.end_ns
@@ -252,7 +314,10 @@ class RecoverySurvey:
 
 
 def _find_intact_summary(scanner: mcap_records.RecordScanner) -> int:
-    """Returns the offset of the summary whose checksum is right, or the size of the file."""
+    """Returns the offset of the summary at the end of a file, if its checksum is valid.
+
+    If the summary is missing or damaged, the size of the file is returned.
+    """
     footer = scanner.footer()
     if footer is None or not footer.summary_crc or not scanner.is_summary_intact(footer):
         return scanner.size
@@ -260,7 +325,7 @@ def _find_intact_summary(scanner: mcap_records.RecordScanner) -> int:
 
 
 def _names_session(data: bytes) -> bool:
-    """True if an unpacked chunk defines a channel of a session."""
+    """Returns True if an unpacked chunk defines a channel of a session."""
     records = mcap_records.iterate_records(data)
     return any(
         opcode == Opcode.CHANNEL and _TOPIC_ROOT in data[begin:end]
@@ -275,7 +340,7 @@ _DESCRIBING = frozenset(
 
 
 def _chunk_measures(index: Any) -> tuple[int, int, int, int]:
-    """Returns the sizes and the times of a chunk, as its index states them."""
+    """Returns the sizes and the times of a chunk, as an entry of the index states them."""
     return (
         index.chunk_length,
         index.uncompressed_size,
@@ -285,19 +350,28 @@ def _chunk_measures(index: Any) -> tuple[int, int, int, int]:
 
 
 def _find_longest_ordered(spans_ns: Sequence[tuple[int, int]]) -> set[int]:
-    """Returns the indices of the longest increasing sequence of time spans.
+    """Finds the longest increasing sequence in a list of time spans.
 
-    The method is patience sorting. Equal spans belong to a chunk that the file contains twice,
-    so the sequence increases strictly.
+    The method is patience sorting, with O(K log K) comparisons for K spans. The sequence
+    increases strictly, because equal spans belong to a chunk that the file contains twice.
+
+    Args:
+        spans_ns: First and last time of each chunk, in ns.
+
+    Returns:
+        The indices of the spans that belong to the sequence.
     """
-    last_spans: list[tuple[int, int]] = []  # earliest last span of a sequence, by its length
-    last_indices: list[int] = []  # index of that span
-    predecessors: list[int] = []  # index before each index in its sequence; -1 for the first
+    # For each length, the increasing sequence of that length with the earliest last span.
+    last_spans: list[tuple[int, int]] = []
+    last_indices: list[int] = []
+    # For each index, the index before it in its sequence. It is -1 for the first one.
+    predecessors: list[int] = []
     for index, span_ns in enumerate(spans_ns):
         length = bisect_left(last_spans, span_ns)
         predecessors.append(last_indices[length - 1] if length else -1)
         last_spans[length : length + 1] = [span_ns]
         last_indices[length : length + 1] = [index]
+
     ordered = set()
     index = last_indices[-1] if last_indices else -1
     while index >= 0:

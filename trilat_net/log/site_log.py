@@ -1,10 +1,14 @@
-"""The records of one site of a log: as arrays over time, or one by one.
+"""Gives access to the records of one site of a log, as arrays over time or one by one.
+
+A site is a process that runs one arm and its control loop. It publishes a record in every tick,
+a period of this loop. A log stores the records as encoded bytes. This module decodes the fields
+of all records into arrays (`SiteLog.q`), or whole records into objects (`SiteLog.states`).
 
 Invariant:
-    - Only requested fields and records are decoded.
-    - An invalid record is an error that names the site.
-    - Memory is bounded for a log of any length: long sequences of records are decoded in blocks
-      when they are accessed.
+    - Only the requested fields and records are decoded.
+    - An invalid record raises an error that names the site.
+    - The memory for whole records is bounded, however long the log is: long sequences of
+      records are decoded in blocks when they are accessed.
 """
 
 from bisect import bisect_right
@@ -38,9 +42,9 @@ BLOCK_RECORDS = 1 << 11
 """Number of records that are decoded together."""
 HEAVY_BYTES = 12 << 20
 HEAVY_RATIO = 10
-"""Records are heavy if their decoded form is larger than `HEAVY_BYTES`, and also larger than
-`HEAVY_RATIO` times their payloads. Only few heavy records are kept decoded, because a hostile
-file could otherwise fill the memory.
+"""The records of a site are heavy if their decoded form is larger than `HEAVY_BYTES`, and also
+larger than `HEAVY_RATIO` times their encoded form. Only few heavy records are kept decoded,
+because a file that was made to do harm could otherwise fill the memory.
 """
 HEAVY_BLOCK = 128
 """Number of heavy records that are decoded together."""
@@ -48,13 +52,16 @@ HEAVY_BLOCKS = 8
 """Number of blocks of heavy records that are kept decoded."""
 
 DecodeStates = Callable[[Sequence[bytes]], list[State]]
-"""Decodes some records; raises an error if a payload is not a valid record."""
+"""Function that decodes some records. It raises an error if a payload is not a valid record."""
 
 
 def freeze(value: T) -> T:
-    """Makes arrays read-only, also arrays in a tuple or a dict, and returns the value.
+    """Makes an array read-only, so that a user cannot change a log by accident.
 
-    A user cannot change a log by accident.
+    Arrays in tuples and in dictionaries are made read-only, too.
+
+    Returns:
+        The same value.
     """
     if isinstance(value, np.ndarray):
         value.setflags(write=False)
@@ -68,15 +75,19 @@ def freeze(value: T) -> T:
 
 
 def compute_task_errors(x: Array, x_des: Array, axes: Sequence[float]) -> Array:
-    """Returns the errors of a pose from its reference, shape (K, m).
+    """Computes the pose errors of an end effector in task space.
 
-    The error of a position is x - x_des. The error of an orientation is the rotation vector
-    from the reference to the orientation, rad.
+    The error of a position is x - x_des. The error of an orientation is the rotation vector of
+    the shortest rotation from the reference to the orientation.
 
     Args:
-        x: positions, or positions and rotation vectors, shape (K, m), m and rad.
-        x_des: their references, shape (K, m).
-        axes: per coordinate 1 if the site follows along that axis; else 0, and the error is 0.
+        x: Positions, or positions and rotation vectors, shape (K, m), in m and rad.
+        x_des: Their references, shape (K, m).
+        axes: For each coordinate, 1 if the site follows its reference along that axis. For the
+            other axes it is 0, and the error is set to 0.
+
+    Returns:
+        The errors, shape (K, m), in m and rad.
     """
     e: Array = x - x_des
     if e.shape[1] > POSITION:
@@ -88,37 +99,49 @@ def compute_task_errors(x: Array, x_des: Array, axes: Sequence[float]) -> Array:
 
 
 def _compute_rotation_errors(rotation: Array, reference: Array) -> Array:
-    """Returns the rotation vectors from references to orientations, shape (K, 3), rad.
+    """Computes the rotation vectors from reference orientations to orientations.
 
-    The orientation (a, u) times the conjugate (b, -v) of the reference is the quaternion (w,
-    p):
+    The orientation is the quaternion (a, u), with the scalar part a and the vector part u, and
+    the reference is (b, v). The product of (a, u) and the conjugate (b, -v) is the rotation
+    between them, the quaternion (w, p):
 
         w = a b + u . v
         p = b u - a v - u x v
 
-    It turns by 2 atan2(|p|, w) about p.
+    It is a rotation by the angle 2 atan2(|p|, w) about the axis p.
+
+    Args:
+        rotation: Orientations as rotation vectors, shape (K, 3), in rad.
+        reference: Reference orientations in the same form.
+
+    Returns:
+        Rotation vectors of at most half a turn, shape (K, 3), in rad.
     """
     a, u = compute_quaternion_parts(rotation)
     b, v = compute_quaternion_parts(reference)
     w = a * b + np.sum(u * v, axis=1, keepdims=True)
     p = b * u - a * v - np.cross(u, v)
-    # two quaternions stand for the same rotation: choose the shorter turn
+
+    # (w, p) and (-w, -p) are the same rotation. The one with w >= 0 is the shorter turn.
     p *= np.where(w < 0.0, -1.0, 1.0)
     sine = np.linalg.norm(p, axis=1, keepdims=True)
     angle = 2.0 * np.arctan2(sine, abs(w))
-    # the limit of angle / sine for small angles is 2
+
+    # The limit of angle / sine for small angles is 2.
     limit = np.full_like(w, 2.0)
     angle_by_sine = np.divide(angle, sine, out=limit, where=sine > 0.0)
     return np.asarray(angle_by_sine * p)
 
 
 class LazyRecords(Sequence[State]):
-    """Records that are decoded in blocks; the blocks accessed last are kept.
+    """Sequence of records that are decoded when they are accessed.
+
+    The records are decoded in blocks. The blocks that were accessed last are kept in memory.
 
     Args:
-        payloads: the records.
-        decode_block: decodes some of them.
-        heavy: whether only few records are kept decoded.
+        payloads: The encoded records.
+        decode_block: Function that decodes some of them.
+        heavy: True if only few records are kept decoded, see `HEAVY_BYTES`.
     """
 
     def __init__(
@@ -131,7 +154,7 @@ class LazyRecords(Sequence[State]):
 
         @lru_cache(maxsize=blocks)
         def get_block(number: int) -> list[State]:
-            """Returns the records of the block with a number."""
+            """Decodes the block with a number. Blocks are numbered from 0."""
             first = number * size
             return decode_block(payloads[first : first + size])
 
@@ -141,9 +164,8 @@ class LazyRecords(Sequence[State]):
         return len(self._payloads)
 
     def __iter__(self) -> Iterator[State]:
-        blocks = -(-len(self._payloads) // self._size)
-        for number in range(blocks):
-            yield from self._get_block(number)
+        for first in range(0, len(self._payloads), self._size):
+            yield from self._get_block(first // self._size)
 
     @overload
     def __getitem__(self, index: int) -> State: ...
@@ -160,17 +182,22 @@ class LazyRecords(Sequence[State]):
 
 
 def decode_records(payloads: Sequence[bytes], decode_block: DecodeStates) -> Sequence[State]:
-    """Returns the records of a site, in the order of their payloads.
+    """Decodes the records of a site, at once or when they are accessed.
 
-    Few records are decoded at once into a list; many or heavy records are decoded when they are
-    accessed.
+    A list is faster to use, but keeps all decoded records in memory. Therefore records are
+    decoded at once only if there are at most `MAX_DECODED_RECORDS` of them, and if they are not
+    heavy (see `HEAVY_BYTES`).
 
     Args:
-        payloads: the records.
-        decode_block: decodes some of them.
+        payloads: The encoded records.
+        decode_block: Function that decodes some of them.
+
+    Returns:
+        The records in the order of `payloads`: a list, or a sequence that decodes on access.
     """
     if len(payloads) > MAX_DECODED_RECORDS:
         return LazyRecords(payloads, decode_block)
+
     remaining_bytes = max(HEAVY_BYTES, HEAVY_RATIO * sum(map(len, payloads)))
     states: list[State] = []
     with process.pause_gc():
@@ -184,17 +211,22 @@ def decode_records(payloads: Sequence[bytes], decode_block: DecodeStates) -> Seq
 
 
 def _estimate_bytes(state: State) -> int:
-    """Returns the approximate memory of a decoded record, bytes."""
+    """Estimates the memory that a decoded record takes, in bytes.
+
+    Each entry of `rx`, `echo` and `cmd` is a separate Python object, and takes much memory.
+    """
     entries = len(state.rx) + len(state.echo) + len(state.cmd)
     return 2_000 + 130 * entries + 100 * len(state.used) + 32 * len(state.mem)
 
 
 class RecordsByTick(Mapping[int, State]):
-    """Records by tick; of several records with one tick, the last.
+    """Mapping from ticks to records, which decodes a record when it is accessed.
+
+    If several records have the same tick, the mapping contains the last of them.
 
     Args:
-        states: the records, in order of their ticks.
-        ticks: the ticks, shape (K,).
+        states: The records, in the order of their ticks.
+        ticks: Their ticks, shape (K,).
     """
 
     def __init__(self, states: Sequence[State], ticks: Ints) -> None:
@@ -215,12 +247,12 @@ class RecordsByTick(Mapping[int, State]):
 
 
 class TimedMessages(NamedTuple, Generic[M]):
-    """Messages with their times.
+    """Messages of a log with their arrival and sending times.
 
     Attributes:
-        messages: K messages.
-        log_ns: times of arrival at the recorder, Unix ns, shape (K,).
-        publish_ns: times of sending, Unix ns, shape (K,).
+        messages: The K messages.
+        log_ns: Times of arrival at the recorder, in Unix time, shape (K,), in ns.
+        publish_ns: Times of sending, in Unix time, shape (K,), in ns.
     """
 
     messages: list[M]
@@ -229,13 +261,14 @@ class TimedMessages(NamedTuple, Generic[M]):
 
 
 class _RecordField(cached_property[T]):
-    """A field of every record as an array, decoded on first access.
+    """Property of `SiteLog` with one field of all records as an array.
 
-    The name of the attribute is the name of the field.
+    The field is decoded when the property is accessed for the first time. The name of the
+    property is the name of the field.
 
     Args:
-        decode_column: decodes the field of all records, by its name.
-        meaning: the docstring of the attribute.
+        decode_column: Function that decodes the field of all records, by its name.
+        meaning: Docstring of the property.
     """
 
     def __init__(
@@ -246,7 +279,11 @@ class _RecordField(cached_property[T]):
 
 
 class _RecordVector(cached_property[Array]):
-    """A vector of every record as an array, decoded on first access; see `_RecordField`."""
+    """Property of `SiteLog` with one vector of all records as an array, see `_RecordField`.
+
+    Args:
+        meaning: Docstring of the property.
+    """
 
     def __init__(self, meaning: str) -> None:
         super().__init__(lambda site: site._read_vectors(self.attrname)[self.attrname])
@@ -254,34 +291,40 @@ class _RecordVector(cached_property[Array]):
 
 
 _HTML = "trilat_net.reporting.site_html"
-"""Module that renders the records of a site, imported only when a notebook needs it."""
+"""Module that renders the records of a site as HTML. Imported only when a notebook needs it."""
 
 
 class SiteLog:
-    """The records of one site, in tick order.
+    """Records of one site, in the order of their ticks.
+
+    `Log` creates this object for each site of a log. K is the number of records below, n the
+    number of joints, m the number of coordinates that the sites share (the joints, or the
+    coordinates of the end effector in task space), and P the number of parameters.
 
     Args:
-        name: name of the site.
-        peers: names of its peers, in scenario order.
-        rate_hz: tick rate of the site, Hz.
-        payloads: the records as published.
-        source: name of the file in errors.
-        times: times of arrival and of sending of each record, Unix ns, shape (K,) each; by
-            default 0.
-        layout: lengths of the vectors of a record: n joints, m shared coordinates, P
-            parameters.
-        channel: the numbers that the site's law sends to its peers.
-        axes: in task space per coordinate 1 if the site follows along that axis, else 0.
+        name: Name of the site.
+        peers: Names of its peers, the sites whose samples it receives, in scenario order.
+        rate_hz: Tick rate of the site, in Hz.
+        payloads: The encoded records, as published, in any order.
+        source: Name of the file for error messages.
+        times: Times of arrival and of sending of each record, in Unix time, shape (K,) each, in
+            ns. If None, all times are 0.
+        layout: Lengths of the vectors of a record: n, m and P.
+        channel: Names and lengths of the numbers that the site's control law sends to its
+            peers.
+        axes: In task space, 1 for each coordinate that the site follows, and 0 for the others.
 
     Attributes:
-        payloads: the records as published, in tick order.
-        tick: tick of each record, shape (K,).
-        log_time_ns: time of arrival of each record, Unix ns, shape (K,).
-        publish_time_ns: time of sending of each record by its own stamp, Unix ns, shape (K,).
+        payloads: The encoded records, in the order of their ticks.
+        tick: Tick of each record, shape (K,).
+        log_time_ns: Time of arrival of each record at the recorder, in Unix time, shape (K,),
+            in ns.
+        publish_time_ns: Time of sending of each record, as the record states it, in Unix time,
+            shape (K,), in ns.
 
     Raises:
-        LogError: a record cannot be read; every property raises it too, for the fields that it
-            decodes.
+        LogError: A record cannot be read. The properties raise it as well, for the fields that
+            they decode.
     """
 
     def __init__(
@@ -335,7 +378,15 @@ class SiteLog:
         return html
 
     def _read(self, decode_column: Callable[..., T], *arguments: Any) -> T:
-        """Returns decoded columns, read-only; raises LogError if a record cannot be read."""
+        """Decodes columns of all records, and makes the arrays read-only.
+
+        Args:
+            decode_column: Function that decodes the payloads.
+            *arguments: Further arguments of that function.
+
+        Raises:
+            LogError: A record cannot be decoded.
+        """
         try:
             return freeze(decode_column(self.payloads, *arguments))
         except WireError as error:
@@ -344,49 +395,63 @@ class SiteLog:
             ) from None
 
     def prepare(self, *fields: str) -> None:
-        """Decodes several vectors in one pass, which is three times as fast.
+        """Decodes several vectors in one pass, which is three times as fast as one by one.
 
         Args:
-            fields: names of the vectors.
+            fields: Names of the vectors, such as "q" and "tau".
         """
         missing = [field for field in fields if field not in self.__dict__]
         if missing:
             self.__dict__.update(self._read_vectors(*missing))
 
     def _read_vectors(self, *fields: str) -> dict[str, Array]:
-        """Returns vectors of every record, by field."""
+        """Returns vectors of all records by name, each of shape (K, length)."""
         return self._read(record_columns.decode_vectors, self.layout, *fields)
 
     def numbers(self, field: str) -> Ints:
-        """Returns an integer field of every record, shape (K,), by its name in `State`."""
+        """Returns an integer field of all records, shape (K,), by its name in `State`."""
         return self._read(record_columns.decode_ints, field)
 
     def memory(self, first: int, count: int) -> Array:
-        """Returns `count` numbers of `mem` of every record, shape (K, count).
+        """Returns a slice of the site's memory `mem` in all records.
+
+        A record contains in `mem` the state of the site and its control law that no other field
+        has, without names.
 
         Args:
-            first: index of the first number in `mem`.
-            count: number of numbers.
+            first: Index of the slice's first number in `mem`.
+            count: Length of the slice.
+
+        Returns:
+            The numbers, shape (K, count).
 
         Raises:
-            LogError: the `mem` of a record is shorter.
+            LogError: The `mem` of a record is too short.
         """
         parts = [row[first : first + count] for row in self.mem]
         try:
             return np.array(parts, dtype=np.float64).reshape(len(self), count)
         except ValueError:
-            # parts of different lengths, or too short parts
+            # The parts have different lengths, or all of them are too short.
             needed = f"{count_nouns(first + count, 'number')} in `mem`"
             raise LogError(
                 f"{self._source}: a record of {self.name} does not have {needed}"
             ) from None
 
     def record(self, n: int) -> State:
-        """Returns the record at index `n`, decoded alone; -1 is the last record."""
+        """Returns a record, decoded without the others.
+
+        Args:
+            n: Index of the record in the order of ticks. -1 is the last record.
+        """
         return self._decode([self.payloads[n]])[0]
 
     def _decode(self, payloads: Sequence[bytes]) -> list[State]:
-        """Returns some records, decoded and checked as a whole."""
+        """Decodes whole records and checks them.
+
+        Raises:
+            LogError: A record cannot be decoded.
+        """
 
         def decode_states(_: Sequence[bytes]) -> list[State]:
             return [decode(payload, State, READABLE, self.layout) for payload in payloads]
@@ -395,24 +460,27 @@ class SiteLog:
 
     @cached_property
     def states(self) -> Sequence[State]:
-        """The records, decoded and checked as a whole."""
+        """The whole records, decoded and checked. A long sequence is decoded on access."""
         return decode_records(self.payloads, self._decode)
 
     @cached_property
     def by_tick(self) -> "dict[int, State] | RecordsByTick":
-        """The records by tick; of several records with one tick, the last."""
+        """The records by tick. If several records have the same tick, the last one counts."""
         if isinstance(self.states, LazyRecords):
             return RecordsByTick(self.states, self.tick)
         return {state.tick: state for state in self.states}
 
     @property
     def last_tick(self) -> int:
-        """Tick of the last record; -1 without records."""
+        """Tick of the last record. It is -1 if there are no records."""
         return int(self.tick[-1]) if len(self) else -1
 
     @property
     def diverged_s(self) -> float | None:
-        """Time at which the site left its limits, s; None if it did not."""
+        """Time at which the arm exceeded its limits, which ended the run, in s.
+
+        None if the arm did not exceed its limits.
+        """
         if not len(self):
             return None
         last = self.record(-1)
@@ -423,13 +491,14 @@ class SiteLog:
         """Number of ticks before the last record that have no record."""
         if not len(self):
             return 0
-        # each record with a new tick fills one tick after the first record
-        later_ticks = int(np.count_nonzero(np.diff(self.tick)))
-        return self.last_tick - later_ticks
+        # There are `last_tick` ticks before the last record. The ticks of the log, without
+        # repetitions and without the last one, are as many as the changes of the tick.
+        recorded_ticks = int(np.count_nonzero(np.diff(self.tick)))
+        return self.last_tick - recorded_ticks
 
     @property
     def skipped(self) -> int:
-        """Number of ticks that the site skipped, as its records state."""
+        """Number of ticks that the site skipped because it was late, as its records state."""
         return sum(count_skipped_ticks(texts) for texts in self._changes.values())
 
     mode = _RecordField(
@@ -439,78 +508,96 @@ class SiteLog:
     )
     q = _RecordVector("Joint angles, shape (K, n), rad.")
     qd = _RecordVector("Joint velocities, shape (K, n), rad/s.")
-    q_des = _RecordVector("Reference of Eq. (6), shape (K, m), rad.")
-    qd_des = _RecordVector("Its derivative, shape (K, m), rad/s.")
+    q_des = _RecordVector(
+        "Reference of Eq. (6), a weighted mean of the peers' positions, shape (K, m), rad."
+    )
+    qd_des = _RecordVector("Derivative of the reference, shape (K, m), rad/s.")
     tau = _RecordVector("Control torque of Eq. (13), shape (K, n), N m.")
     tau_x = _RecordVector(
-        "Exogenous torque in the sign of Eq. (8), shape (K, n), N m; the torque ON the arm is "
+        "Exogenous torque in the sign of Eq. (8), shape (K, n), N m. The torque on the arm is "
         "its negative.",
     )
     theta_hat = _RecordVector(
-        "Estimate of the parameters, Eq. (15), shape (K, P), of two links as in Eq. (24)."
+        "Estimate of the arm's dynamic parameters, Eq. (15), shape (K, P). Those of a two-link "
+        "arm are defined in Eq. (24)."
     )
     x = _RecordVector(
-        "In task space the position and rotation vector of the end effector as recorded, "
+        "In task space, the position and the rotation vector of the end effector as recorded, "
         "shape (K, m), m and rad. "
-        "The vector jumps where it passes half a turn; `orientation` does not."
+        "The vector jumps where it passes half a turn. `orientation` does not jump."
     )
     xd = _RecordVector("Derivative of x, shape (K, m), m/s and rad/s.")
-    wrench = _RecordVector("Wrench equal to tau_x in task space, shape (K, m), N and N m.")
+    wrench = _RecordVector(
+        "Wrench in task space that is equivalent to tau_x, shape (K, m), N and N m."
+    )
     ch = _RecordVector(
-        "All numbers that the site's law sends, shape (K, C); `sent` has them by name."
+        "All numbers that the site's control law sends to its peers, shape (K, C). `sent` has "
+        "them by name."
     )
     hand = _RecordVector(
         "Action of the person or program that holds the arm, shape (K, h), see `HandInForce`."
     )
     bodies = _RecordVector(
-        "Poses of the bodies of its plant as recorded, shape (K, 7 b), m and quaternions."
+        "Poses of the b bodies of the site's plant as recorded, shape (K, 7 b), m and "
+        "quaternions. The plant is a simulated environment that the arm moves in."
     )
     mem = _RecordField(
-        record_columns.decode_strings, "Further memory of the site, shape (K,), a list each."
+        record_columns.decode_strings,
+        "State of the site and its control law that no other field contains, shape (K,), a list "
+        "of numbers each.",
     )
     t_ns = _RecordField(
-        record_columns.decode_ints, "Nominal time since the epoch, shape (K,), ns."
+        record_columns.decode_ints,
+        "Nominal time since the epoch, the common start time of the session, shape (K,), ns.",
     )
     late_us = _RecordField(
-        record_columns.decode_ints, "Wake-up minus deadline, shape (K,), us; 0 in virtual time."
+        record_columns.decode_ints,
+        "Delay of the tick's start after its nominal time, shape (K,), us. It is 0 in virtual "
+        "time.",
     )
     sent_ns = _RecordField(
         record_columns.decode_ints,
-        "Time at which each record was sent, by the site's own clock since the epoch on that "
+        "Time at which each record was sent, since the epoch, both read from the site's own "
         "clock, shape (K,), ns.",
     )
 
     @cached_property
     def t_s(self) -> Array:
-        """Nominal time since the epoch, shape (K,), s."""
+        """Nominal time since the epoch, the common start of the session, shape (K,), in s."""
         return freeze(self.t_ns / NS_PER_S)
 
     @cached_property
     def orientation(self) -> Array:
-        """Orientation of the end effector as unit quaternions w, x, y, z, shape (K, 4).
+        """Orientation of the end effector as unit quaternions (w, x, y, z), shape (K, 4).
 
-        Each quaternion is nearest to the quaternion before. Sites that do not follow
-        orientations have shape (K, 0).
+        A quaternion and its negative are the same orientation. The sign is chosen so that each
+        quaternion is nearest to the previous one. The shape is (K, 0) for sites that do not
+        follow orientations.
         """
         return self._compute_orientation(self.x)
 
     @cached_property
     def orientation_des(self) -> Array:
-        """Orientation of the reference as unit quaternions, as in `orientation`."""
+        """Orientation of the reference as unit quaternions, see `orientation`."""
         return self._compute_orientation(self.q_des)
 
     def _compute_orientation(self, poses: Array) -> Array:
-        """Returns the orientations of poses as unit quaternions, shape (K, 4) or (K, 0)."""
+        """Computes unit quaternions from poses, shape (K, m).
+
+        Returns:
+            The quaternions, shape (K, 4), or (K, 0) if the site does not follow orientations.
+        """
         if not self.layout.task or self.layout.shared != POSE:
             return freeze(np.zeros((len(self), 0)))
         return freeze(compute_quaternions(poses[:, POSITION:]))
 
     @cached_property
     def body_poses(self) -> Array:
-        """Poses of the bodies of the plant, shape (K, b, 7).
+        """Poses of the b bodies of the simulated environment, shape (K, b, 7).
 
-        A pose is x, y, z, m, and a unit quaternion w, x, y, z. Each quaternion is nearest to
-        the quaternion before, whichever sign the plant gave it.
+        A pose is the position x, y, z in m and the orientation as a unit quaternion w, x, y, z.
+        The sign of each quaternion is chosen so that the quaternion is nearest to the previous
+        one.
         """
         poses = self.bodies.reshape(len(self), -1, POSITION + 4).copy()
         for body in range(poses.shape[1]):
@@ -519,11 +606,12 @@ class SiteLog:
 
     @property
     def e(self) -> Array:
-        """Position error q - q_des, Eq. (9), shape (K, n), rad.
+        """Synchronisation error q - q_des, Eq. (9), shape (K, n), in rad.
 
-        In task space the error is x - x_des, shape (K, m), m. The error of an orientation is
-        the rotation vector from the reference to the end effector, rad, at most half a turn
-        long. The control law uses this vector, which jumps where it passes half a turn.
+        In task space, the error is x - x_des, shape (K, m), in m. For orientations, the error
+        is the rotation vector from the reference to the end effector, in rad, at most half a
+        turn long. The control law uses the same vector, which jumps where it passes half a
+        turn.
         """
         if self.layout.task:
             return compute_task_errors(self.x, self.q_des, self.axes)
@@ -531,9 +619,10 @@ class SiteLog:
 
     @cached_property
     def sent(self) -> dict[str, Array]:
-        """The numbers that the law sends, shape (K, length) each.
+        """Numbers that the site's control law sends to its peers, shape (K, length) each.
 
-        The keys are a name, as "E", or a name and a peer, as "u[m2]".
+        The key is the name of the quantity, such as "E", if all peers receive the same numbers.
+        For numbers that are meant for one peer, the key contains the peer, such as "u[m2]".
         """
         columns: dict[str, list[int]] = {}
         for column, entry in enumerate(self.channel.entries(self.peers)):
@@ -542,43 +631,51 @@ class SiteLog:
 
     @cached_property
     def busy_us(self) -> Ints:
-        """Computing time of ticks, shape (K - 1,), us; record k + 1 has that of tick k."""
+        """Computing time of each tick except the last one, shape (K - 1,), in us.
+
+        A record states the computing time of the previous tick, because its own is not known
+        yet when it is published.
+        """
         return self.numbers("busy_us")[1:]
 
     @cached_property
     def used(self) -> dict[str, Ints]:
-        """Per peer the tick of the sample in use, shape (K,); -1 before the first sample."""
+        """Tick of the sample of each peer that the control law uses, shape (K,).
+
+        The value is -1 before the first sample of the peer.
+        """
         return self._read(record_columns.decode_per_peer, "used", self.peers, -1)
 
     @cached_property
     def arrivals(self) -> tuple[Ints, Ints]:
-        """The samples that arrived.
+        """Samples of the peers that arrived at the site.
 
-        The first array has the number of arrivals of each record, shape (K,); the second array
-        has all arrivals as in `rx`, shape (N, 3).
+        The first array contains the number of arrivals in each record, shape (K,). The second
+        array contains all arrivals in order, shape (N, 3), with the columns of `rx`: index of
+        the peer, tick of the sample, and delay in us.
         """
         return self._read(record_columns.decode_arrivals)
 
     @cached_property
     def _changes(self) -> dict[int, list[str]]:
-        """The texts of `cmd`, by tick, of the records that have any."""
+        """Texts of the field `cmd` by tick, for the records that contain any."""
         texts = self._read(record_columns.decode_strings, "cmd").tolist()
         pairs = zip(self.tick.tolist(), texts, strict=True)
         return {tick: tick_texts for tick, tick_texts in pairs if tick_texts}
 
     def changes(self) -> dict[int, list[str]]:
-        """Returns the changes that the site applied, by tick, as texts of `cmd`."""
+        """Returns the changes that the site applied during the run, as JSON texts by tick."""
         return {tick: list(texts) for tick, texts in self._changes.items()}
 
     def age_s(self, peer: str, rate_hz: int) -> Array:
-        """Returns the age of the sample in use of a peer, shape (K,), s.
+        """Returns the age of the peer's sample that the control law uses, shape (K,), in s.
 
-        The age is the time of the record minus the stamp of the sample; NaN before the first
-        sample.
+        The age is the time of the record minus the stamp of the sample, which is the nominal
+        time of the tick in which the peer computed it. It is NaN before the first sample.
 
         Args:
-            peer: name of the peer.
-            rate_hz: tick rate of the peer, Hz.
+            peer: Name of the peer.
+            rate_hz: Tick rate of the peer, in Hz.
         """
         used = self.used[peer]
         stamp_ns = used * NS_PER_S // rate_hz
