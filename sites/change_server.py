@@ -123,8 +123,8 @@ class ChangeServer:
                 if change is not None:
                     changes.append(change)
                     has_order = has_order or bool(request.order)
-                if isinstance(request.source, str) and changes:
-                    self.sources[changes[-1].text] = request.source
+                    if isinstance(request.source, str):
+                        self.sources[change.text] = request.source
                 reply = ChangeReply(member=self._site, accepted=True, text=text, tick=tick)
             except (WireError, ScenarioError) as error:
                 reply = ChangeReply(member=self._site, accepted=False, text=str(error))

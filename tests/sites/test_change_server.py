@@ -220,6 +220,17 @@ def test_who_orders_is_kept_until_an_event_says_it() -> None:
     assert other.text not in asked.changes.sources
 
 
+def test_a_mark_does_not_claim_the_change_of_its_tick() -> None:
+    asked = Asked()
+    for order in (
+        {"link": "m1->s", "to": {"loss": 0.5}, "source": "m1"},
+        {"mark": "here", "source": "m2"},
+    ):
+        asked.send(encode(ChangeRequest(**order)))
+    (change,) = asked.changes.pop_changes(10)
+    assert asked.changes.sources == {change.text: "m1"}
+
+
 def test_request_without_source_has_the_bytes_of_before() -> None:
     """A site of an older program refuses a field that it does not know."""
     assert b"source" not in encode(ChangeRequest(order="stop"))
