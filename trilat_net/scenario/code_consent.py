@@ -1,13 +1,16 @@
-"""Permissions for code from outside: which laws, hands and plants of users may run.
+"""Manages permissions for code of users: which laws, operators and plants may run.
 
-The code of a user's own scenario may run. The code that a log or a member of a session names
-may run only if a person names its file.
+A scenario may name classes that users wrote. Code that a user names in a scenario of his or her
+own may run. Code that a log, or another member of a session, names may run only if a person
+names its file, because a stranger may have written it. A person may also let the program
+remember a permission; it is then stored in the configuration folder.
 
 Invariant:
-    - The named file must have the hash that the log names, unless another version is asked for.
-    - A permission, remembered or not, covers one class of that file with the settings of that
-      log. A log with other settings needs a permission of its own, and the refusal says which
-      settings differ.
+    - The file that a person names must have the hash that the log states, unless the person
+      explicitly allows another version.
+    - A permission applies to one class in one file, with the arguments of one log. A log with
+      other arguments needs a permission of its own, and the error message says which arguments
+      differ.
 """
 
 import json
@@ -41,15 +44,15 @@ if TYPE_CHECKING:
     from .scenario_types import Scenario
 
 LawFiles = str | Path | Sequence[str | Path]
-"""The file of a law, or the files of several laws."""
+"""File with code of a user, or several such files."""
 
 
 ImportedCode = ImportedLaw | ProgramHand | OwnPlant
-"""The parts of a scenario that may be classes from outside."""
+"""Parts of a scenario that are classes of users."""
 
 
 def list_imported_code(scenarios: "Iterable[Scenario]") -> list[ImportedCode]:
-    """Returns the users' own laws, hands and plants in some scenarios."""
+    """Returns the laws, operators and plants of scenarios that are classes of users."""
     imported = []
     for scenario in scenarios:
         for site in scenario.sites.values():
@@ -63,14 +66,17 @@ def allow_own_code(
     codes: Container[Any] | None = None,
     changed_from: "Scenario | None" = None,
 ) -> "Scenario":
-    """Allows the code of a scenario to run, and returns the scenario.
+    """Allows the code that a scenario names to run, because a user of this process named it.
 
     Args:
-        scenario: the scenario.
-        codes: the classes that a person named, as in "package.module:Law"; None: a person wrote
-            the whole scenario, and all its code may run.
-        changed_from: the scenario that a person changed into this one. Code that may run there
-            may also run here, with the settings that the person gave it.
+        scenario: The scenario.
+        codes: Classes that the user named, for example "package.module:Law". None: the user
+            wrote the whole scenario, so all its code may run.
+        changed_from: Scenario from which the user made this one. Code that may run there may
+            run here as well, with its new arguments.
+
+    Returns:
+        The scenario.
     """
     earlier_consents: dict[tuple[str, str], CodeConsent] = {}
     if changed_from is not None:
@@ -78,6 +84,7 @@ def allow_own_code(
             consent = find_consent(key)
             if consent is not None:
                 earlier_consents[key.code, key.sha256] = consent
+
     for key in map(CodeKey.of, list_imported_code([scenario])):
         earlier_consent = earlier_consents.get((key.code, key.sha256))
         if codes is None or key.code in codes:
@@ -88,11 +95,11 @@ def allow_own_code(
 
 
 class RememberedFile(msgspec.Struct):
-    """A file whose code a person allowed for good.
+    """File for which a person has stored a permission.
 
     Attributes:
-        file: the path of the file.
-        classes: the settings with which each class may run, by the name of the class.
+        file: Path of the file.
+        classes: For each class of the file, the sets of arguments with which it may run.
     """
 
     file: str
@@ -106,23 +113,28 @@ def allow_logged_code(
     other_version: bool = False,
     remember: bool = False,
 ) -> None:
-    """Allows the code of a log that is in named or remembered files to run, see `open_log`.
+    """Allows the code that a log names to run, as far as a person has permitted it.
+
+    A person permits code by naming its file now, or has stored a permission before. See
+    `open_log`.
 
     Args:
-        scenario: the scenario of the log.
-        law: the files that a person names.
-        other_version: whether a file may differ from the one that ran.
-        remember: whether the permission is remembered for later logs.
+        scenario: Scenario of the log.
+        law: Files that the person names.
+        other_version: If True, a file may differ from the one that ran.
+        remember: If True, the permission is stored for later logs.
 
     Raises:
-        UsageError: a file does not define code that the log names, or is another version of it;
-            or an option needs a file and none is named.
-        ScenarioError: a file cannot be read, or does not define such a law. No code has run.
+        UsageError: A file does not define code that the log names, or is another version of it;
+            or an option requires a file, and no file is named.
+        ScenarioError: A file cannot be read, or does not define such a class. No code has run.
     """
     files = [Path(law)] if isinstance(law, str | Path) else list(map(Path, law))
     if (other_version or remember) and not files:
         raise UsageError("--other-version and --remember need a file: give --law FILE, too")
     logged = {CodeKey.of(imported): imported for imported in list_imported_code([scenario])}
+
+    # Without code of users, the store is not read.
     remembered = _read_store() if logged else {}
     _load_remembered_settings(remembered)
     for key in logged:
@@ -130,6 +142,7 @@ def allow_logged_code(
         if key.sha256 in remembered and key.settings in texts:
             file = Path(remembered[key.sha256].file)
             allowed_code.setdefault(key, CodeConsent(file, key.sha256))
+
     for file in files:
         sha256, keys = _allow_file(file, logged, other_version=other_version)
         if remember:
@@ -143,7 +156,11 @@ def allow_logged_code(
 
 
 def _load_remembered_settings(remembered: Mapping[str, RememberedFile]) -> None:
-    """Replaces the settings that a refusal compares by those of the remembered files."""
+    """Makes the stored arguments available to the messages about refused code.
+
+    Args:
+        remembered: Stored permissions, by the hash of the file.
+    """
     remembered_settings.clear()
     for sha256, entry in remembered.items():
         for name, settings in entry.classes.items():
@@ -153,19 +170,21 @@ def _load_remembered_settings(remembered: Mapping[str, RememberedFile]) -> None:
 
 
 def _class_of(key: CodeKey) -> str:
+    """Returns the name of the class, without its module."""
     return key.code.partition(":")[2]
 
 
 def _find_store() -> Path:
-    """Returns the path of the file that holds remembered permissions."""
+    """Returns the path of the file in which permissions are stored."""
     folder = os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config"
     return Path(folder, "trilat-net", "laws.json")
 
 
 def _read_store() -> dict[str, RememberedFile]:
-    """Returns the remembered files by their hash.
+    """Returns the stored permissions, by the hash of the file.
 
-    An entry without settings, which earlier versions wrote, allows nothing.
+    If there is no store, or it cannot be read, there are no permissions. Earlier versions of
+    the program stored only the path of a file; such an entry permits nothing.
     """
     # A RuntimeError is raised if the user has no home folder.
     with suppress(OSError, ValueError, RuntimeError):
@@ -180,6 +199,7 @@ def _read_store() -> dict[str, RememberedFile]:
 
 
 def _write_store(remembered: Mapping[str, RememberedFile]) -> None:
+    """Writes the stored permissions."""
     make_folder(_find_store().parent)
     # The file may be a link: people link their settings to a folder under version control.
     store = _find_store().resolve()
@@ -189,10 +209,23 @@ def _write_store(remembered: Mapping[str, RememberedFile]) -> None:
 def _allow_file(
     file: Path, logged: Mapping[CodeKey, ImportedCode], *, other_version: bool
 ) -> tuple[str, list[CodeKey]]:
-    """Allows a file to run as the logged code that has its hash, or else its name.
+    """Allows a file to run as code that a log names.
+
+    The file belongs to the code that has the hash of the file. If there is no such code, it
+    belongs to the code whose module has the name of the file; it is then another version of
+    that code.
+
+    Args:
+        file: The file.
+        logged: Code that the log names.
+        other_version: If True, the file may be another version.
 
     Returns:
         The hash of the file, and the keys of the code that was allowed.
+
+    Raises:
+        UsageError: The file is not code that the log names, or is another version.
+        ScenarioError: The file cannot be read, or does not define the class.
     """
     source = read_code("", "--law", file.resolve())
     sha256 = source.sha256
@@ -200,6 +233,7 @@ def _allow_file(
     module = (source.file.parent if file.stem == "__init__" else file).stem
     keys = [key for key in logged if key.sha256 == sha256]
     if not keys:
+        # The last part of "package.module:Law" before the class is the name of the file.
         keys = [key for key in logged if re.split(r"[.:]", key.code)[-2] == module]
     if not keys:
         names = ", ".join(sorted({key.code for key in logged})) or "none from outside"
@@ -215,21 +249,24 @@ def _allow_file(
 
 
 def _compare_hashes(key: CodeKey, sha256: str) -> str:
+    """Returns the beginning of a file's hash, and of the hash that the log states."""
     return f"its sha256 is {sha256[:16]}, and was {key.sha256[:16]}"
 
 
 class LoggedUserLaw(NamedTuple):
-    """A user law that a log names, and its sites.
+    """Control law of a user that a log names, with the state of its file on this computer.
 
     Attributes:
-        code: the class of the law, as in "package.module:Law".
-        sites: the sites that it controls.
-        settings: the arguments of its class, as text.
-        allowed: whether its file may run with these settings.
-        file: that file, else the file that Python finds by the name of its module; None: there
-            is no such file.
-        changed: how the file differs from the one that ran, or "".
-        other_settings: how its settings differ from those that are allowed, or "".
+        code: Class of the law, for example "package.module:Law".
+        sites: Names of the sites that the law controls.
+        settings: Arguments of the class, as a text for people.
+        allowed: True if the file may run with these arguments.
+        file: The file that a person permitted, or else the file that Python's import finds for
+            the module. None if there is no such file.
+        changed: Text about the hashes if the file differs from the one that ran. Otherwise
+            empty.
+        other_settings: Text about the difference if the code was permitted with other
+            arguments. Otherwise empty.
     """
 
     code: str
@@ -241,6 +278,7 @@ class LoggedUserLaw(NamedTuple):
     other_settings: str = ""
 
     def __str__(self) -> str:
+        """Returns a sentence about the law, with the option that allows it to run."""
         law = f"{self.code} of {', '.join(self.sites)}"
         settings = f" with {self.settings}" if self.settings else ""
         state = f"was changed, {self.changed}" if self.changed else "is the one that ran"
@@ -256,7 +294,7 @@ class LoggedUserLaw(NamedTuple):
 
 
 def find_user_laws(scenario: "Scenario") -> list[LoggedUserLaw]:
-    """Returns the user laws of a scenario without running any code of them."""
+    """Returns the control laws of users in a scenario, without running any of their code."""
     sites: dict[CodeKey, tuple[str, ...]] = {}
     laws: dict[CodeKey, ImportedLaw] = {}
     for name, spec in scenario.sites.items():
@@ -268,7 +306,13 @@ def find_user_laws(scenario: "Scenario") -> list[LoggedUserLaw]:
 
 
 def _inspect_user_law(key: CodeKey, law: ImportedLaw, sites: tuple[str, ...]) -> LoggedUserLaw:
-    """Returns the state of a user law: its file, and whether it may run."""
+    """Returns the state of a user's law: its file, and whether the law may run.
+
+    Args:
+        key: Class, hash and arguments.
+        law: The law in the scenario.
+        sites: Names of the sites that it controls.
+    """
     consent = find_consent(key)
     sha256 = ""
     file = None
@@ -277,7 +321,9 @@ def _inspect_user_law(key: CodeKey, law: ImportedLaw, sites: tuple[str, ...]) ->
         check_class(source, key.code, "")
         sha256 = source.sha256
         file = source.file
+
     is_allowed = consent is not None and consent.sha256 == sha256
+    # The hash is empty if there is no file.
     is_changed = sha256 not in ("", key.sha256)
     settings = ", ".join(
         f"{argument} = {describe_setting(value)}" for argument, value in law.settings.items()

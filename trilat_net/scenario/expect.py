@@ -1,12 +1,14 @@
-"""Expectations of a run: the tables [expect] and [[expect.windows]] of a scenario.
+"""Defines the expectations of a scenario: conditions that its runs must satisfy.
 
-`trilat test` evaluates them.
+An author writes them in the tables `[expect]` and `[[expect.windows]]`, and the command
+`trilat test` evaluates them. For example, `peak_error_max_rad = 0.1` requires that no
+synchronisation error exceeds 0.1 rad.
 
 Invariant:
-    - A key names a quantity, its limit and its unit, and its docstring defines the quantity
-      exactly. An absent key expects nothing.
-    - `..._max_...` is the largest value that still holds, `..._min_...` the smallest. The key
-      of a window holds [least, most].
+    - The name of a key contains a quantity, a limit and a unit. Its docstring defines the
+      quantity exactly. A missing key is not a condition.
+    - `..._max_...` is the largest permitted value, and `..._min_...` the smallest. The keys of
+      a window contain both, as [smallest, largest].
 """
 
 import re
@@ -34,12 +36,14 @@ WindowTime = Annotated[float, Meta(ge=0.0, le=86_400.0)]
 LeastMost = Annotated[tuple[Real, ...], Meta(min_length=2, max_length=2)]
 
 ALL_SITES_QUANTITIES = ("error_peak_rad", "speed_peak_rad_s", "torque_peak_nm")
-"""Quantities of all sites together."""
+"""Quantities that can be evaluated over all sites together."""
 
 
 class _RunPart(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True
 ):
+    """Keys of a window that do not depend on the number of joints, see `ExpectWindow`."""
+
     from_s: WindowTime
     to_s: WindowTime
     site: str = ""
@@ -61,30 +65,31 @@ else:
 
 
 class ExpectWindow(_JointPart, frozen=True, kw_only=True):
-    """Expectations of the ticks from one time to another, as [least, most] of each quantity.
+    """Expectations of a part of a run, as [smallest, largest] permitted value of each quantity.
 
-    The force of the walls is computed from the logged state, along their normals, and added up
-    if the scenario has several walls. If a run ends before the window ends, the window is not
-    measured, and its expectations fail.
+    The force of the walls is computed from the logged state. It is the force along the normal,
+    added up over the walls of the scenario. If a run ends before the window ends, the
+    quantities are not measured, and the expectations count as not satisfied.
 
     Attributes:
-        from_s: nominal time of the first tick of the window, s.
-        to_s: end of the window, s; a tick at that time does not belong to the window.
-        site: the site; left out: all sites, which only the first three quantities allow.
-        error_peak_rad: largest |e| of a joint.
-        speed_peak_rad_s: largest speed of a joint.
-        torque_peak_nm: largest control torque of a joint.
-        q1_rad: angle of joint 1 at every tick, m for a prismatic joint; q2_rad is that of joint
-            2, and so on up to the last joint. If a URDF names the joints, q_NAME_rad may be
-            written as well.
-        push1_mean_nm: mean over the ticks of the torque of operator and environment ON joint 1;
-            push2_mean_nm is that of joint 2, and so on. If a URDF names the joints,
+        from_s: Nominal time of the first tick of the window, in s.
+        to_s: End of the window, in s. A tick at this time does not belong to the window.
+        site: Name of the site. If it is left out, all sites are evaluated together, which only
+            the first three quantities allow.
+        error_peak_rad: Largest absolute synchronisation error |e| of a joint.
+        speed_peak_rad_s: Largest speed of a joint.
+        torque_peak_nm: Largest control torque of a joint.
+        q1_rad: Angle of joint 1 at every tick, in m for a prismatic joint. q2_rad is the angle
+            of joint 2, and so on. If the URDF file names the joints, q_NAME_rad may be written
+            as well.
+        push1_mean_nm: Mean over the ticks of the torque of operators and environment ON joint
+            1. push2_mean_nm belongs to joint 2, and so on. If the URDF file names the joints,
             push_NAME_mean_nm may be written as well.
-        wall_mean_n: mean over the ticks of the force of the walls, with or without contact.
-        wall_deviation_n: standard deviation of that force over the ticks (of the population).
-        wall_peak_n: largest force of the walls.
-        wall_hits: number of contacts that begin: ticks of the window with a force after a tick
-            of the window without one.
+        wall_mean_n: Mean over the ticks of the force of the walls, with or without contact.
+        wall_deviation_n: Standard deviation of this force over the ticks (of the population).
+        wall_peak_n: Largest force of the walls.
+        wall_hits: Number of contacts that begin: ticks with a force that follow a tick of the
+            window without a force.
     """
 
     wall_mean_n: LeastMost | None = None
@@ -94,7 +99,7 @@ class ExpectWindow(_JointPart, frozen=True, kw_only=True):
 
     @property
     def limits(self) -> Iterator[tuple[str, tuple[float, ...]]]:
-        """Yields each quantity that the window limits, with its [least, most]."""
+        """Pairs of each limited quantity and its [smallest, largest] permitted value."""
         for key in _QUANTITIES:
             limits = getattr(self, key)
             if limits is not None:
@@ -107,7 +112,7 @@ _JOINT_QUANTITY = re.compile(r"(?:q|push)(\d+)_")
 
 
 def window_quantities(joints: int) -> tuple[str, ...]:
-    """Returns the quantities of a window for an arm with `joints` joints."""
+    """Returns the quantities that a window may limit for an arm with `joints` joints."""
     quantities = []
     for key in _QUANTITIES:
         number = _JOINT_QUANTITY.match(key)
@@ -117,17 +122,17 @@ def window_quantities(joints: int) -> tuple[str, ...]:
 
 
 def number_window_joints(written: Any, joint_names: Mapping[str, tuple[str, ...]]) -> Any:
-    """Returns the windows of a file with numbers in place of the names of joints in keys.
+    """Replaces the names of joints in the keys of windows by their numbers.
 
-    q_elbow_rad becomes q3_rad if the elbow is the third joint.
+    For example, q_elbow_rad becomes q3_rad if the elbow is the third joint.
 
     Args:
-        written: the windows; anything but a list of tables is returned as it is, and refused
-            later.
-        joint_names: the names of the joints of each site's arm, in their order.
+        written: Windows as their author wrote them. A value that is not a list of tables is
+            returned unchanged, and is refused later.
+        joint_names: Names of the joints of each site's arm, in their order.
 
     Raises:
-        ScenarioError: a window has no such key, or has a key twice.
+        ScenarioError: A window has an unknown key, or the same key twice.
     """
     if not isinstance(written, list):
         return written
@@ -144,7 +149,13 @@ def number_window_joints(written: Any, joint_names: Mapping[str, tuple[str, ...]
 
 
 def _number_joints(table: TomlTable, names: tuple[str, ...], path: str) -> TomlTable:
-    """Returns a window with numbers in place of the names of joints in its keys."""
+    """Returns a window in which the keys contain numbers of joints instead of names.
+
+    Args:
+        table: The window.
+        names: Names of the joints.
+        path: Path of the window, for error messages.
+    """
     window: TomlTable = {}
     for key, value in table.items():
         prefix, name, suffix = _split_joint_key(key)
@@ -158,9 +169,10 @@ def _number_joints(table: TomlTable, names: tuple[str, ...], path: str) -> TomlT
 
 
 def _split_joint_key(key: str) -> tuple[str, str, str]:
-    """Returns prefix, name and suffix of a key that names a joint, or empty texts.
+    """Splits a key that names a joint into its prefix, the name and its suffix.
 
-    "q_elbow_rad" is split into "q", "elbow" and "_rad".
+    For example, "q_elbow_rad" is split into "q", "elbow" and "_rad". All parts are empty if the
+    key does not name a joint.
     """
     for prefix, suffix in (("q", "_rad"), ("push", "_mean_nm")):
         if key.startswith(f"{prefix}_") and key.endswith(suffix):
@@ -172,11 +184,11 @@ def _split_joint_key(key: str) -> tuple[str, str, str]:
 def find_window_problem(
     window: ExpectWindow, joint_counts: Mapping[str, int]
 ) -> KeyProblem | None:
-    """Returns a problem of a window for which no run could meet it, or None.
+    """Returns the reason why no run could satisfy a window, or None.
 
     Args:
-        window: the window.
-        joint_counts: the number of joints of each site's arm.
+        window: The window.
+        joint_counts: Number of joints of each site's arm.
     """
     sites = f"its sites are {', '.join(joint_counts)}"
     if window.to_s <= window.from_s:
@@ -186,6 +198,7 @@ def find_window_problem(
     if window.site and window.site not in joint_counts:
         hint = suggest_nearest(window.site, list(joint_counts))
         return KeyProblem("site", f"no site {window.site!r}{hint}; {sites}")
+
     limits = dict(window.limits)
     if not limits:
         valid = window_quantities(max(joint_counts.values()))
@@ -203,47 +216,51 @@ def find_window_problem(
 
 
 END_WINDOW_S = 1.0
-"""Length of the part of a run that the keys `end_...` cover, s."""
+"""Duration of the last part of a run, to which the keys `end_...` apply, in s."""
 
 
 class Expect(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True
 ):
-    """Expectations of every run of a scenario, for every seed.
+    """Expectations of every run of a scenario, for every seed of the random numbers.
 
-    The error of a site is e = q_i - q_id, Eq. (9); |e| is taken per joint. "Largest" and
-    "smallest" are over all sites (or links), joints and ticks of the run. A run that diverged
-    ends at that tick: its figures are those of the part before, and the run fails unless
-    `stable = false` is expected.
+    The synchronisation error of a site is e = q_i - q_id, Eq. (9): the difference between its
+    angles and its reference. |e| is taken for each joint. "Largest" and "smallest" refer to all
+    sites (or links), all joints and all ticks of the run. A run that diverged ends at that
+    tick. Its quantities are those of the part before, and the run fails unless `stable = false`
+    is expected.
 
     Attributes:
-        stable: true: the run is stable; false: it is not. An open run fails both, see
-            `analysis.run_end`.
-        synchronised_by_s: from this time to the end of the run the largest |e| stays below
-            `synchronised_rad`.
-        synchronised_rad: the limit of |e| below which the sites are synchronised, rad.
-        peak_error_max_rad: largest |e| of the run.
-        peak_error_min_rad: lower limit of that figure.
-        rms_error_max_rad: root mean square of e over the run, of the worst joint of any site.
-        end_error_max_rad: largest |e| of the last second.
-        end_error_min_rad: lower limit of that figure.
-        end_spread_max_rad: largest difference between two sites' angles of one joint at the
-            same time, without delay, in the last second; at the ticks of the first site.
-        end_pose_rad: joint angles of a site at its last tick, by the site's name, rad.
-        end_pose_within_rad: largest deviation of each of those angles, rad.
-        peak_torque_max_nm: largest control torque of a joint.
-        peak_speed_max_rad_s: largest speed of a joint.
-        age_max_ms: largest age of the sample in use (now minus its stamp), from the first
-            sample of a link on; a link that never has a sample in use fails.
-        mean_age_max_ms: upper limit of that age averaged over the ticks of a link, for the link
-            with the largest average.
-        mean_age_min_ms: lower limit of that average, for the link with the smallest average.
-        late_samples_max: samples of all links that arrived after they were due.
-        no_gaps: true: there is a record of every tick, from 0 to the last tick that any site
-            had to make; false: nothing is expected.
-        windows: expectations of parts of the run, see `ExpectWindow`.
-        metrics: [least, most] of any number that `trilat metrics` measures, by its key, over
-            the whole run as in `trilat compare`.
+        stable: True if the run must be stable, False if it must be unstable. A run whose
+            stability cannot be decided fails both, see `analysis.run_end`.
+        synchronised_by_s: Time from which the largest |e| must stay below `synchronised_rad`
+            until the end of the run, in s.
+        synchronised_rad: Limit of |e| below which the sites count as synchronised, in rad.
+        peak_error_max_rad: Upper limit of the largest |e| of the run.
+        peak_error_min_rad: Lower limit of the same quantity.
+        rms_error_max_rad: Upper limit of the root mean square of e over the run, for the joint
+            with the largest value.
+        end_error_max_rad: Upper limit of the largest |e| in the last second.
+        end_error_min_rad: Lower limit of the same quantity.
+        end_spread_max_rad: Upper limit of the largest difference in the last second between two
+            sites' angles of the same joint at the same time, without delay. It is evaluated at
+            the ticks of the first site.
+        end_pose_rad: Expected joint angles at the last tick, by the name of the site, in rad.
+        end_pose_within_rad: Largest permitted deviation from each of these angles, in rad.
+        peak_torque_max_nm: Upper limit of the control torque of a joint.
+        peak_speed_max_rad_s: Upper limit of the speed of a joint.
+        age_max_ms: Upper limit of the age of the sample in use (now minus its send time), from
+            the first sample of a link on. A link on which no sample ever comes into use fails.
+        mean_age_max_ms: Upper limit of this age averaged over the ticks, for the link with the
+            largest average.
+        mean_age_min_ms: Lower limit of this average, for the link with the smallest average.
+        late_samples_max: Largest permitted number of samples, over all links, that arrived
+            after they were due.
+        no_gaps: If True, there must be a record of every tick, from 0 to the last tick that any
+            site had to compute. If False, gaps are permitted.
+        windows: Expectations of parts of the run, see `ExpectWindow`.
+        metrics: [smallest, largest] permitted value of any number that `trilat metrics`
+            measures, by its key, over the whole run as in `trilat compare`.
     """
 
     stable: bool | None = None
@@ -269,20 +286,23 @@ class Expect(
 
     @property
     def has_expectations(self) -> bool:
-        """True if at least one key states an expectation; a tolerance alone does not."""
+        """True if at least one key states an expectation.
+
+        A tolerance alone is not an expectation.
+        """
         tolerances = {"synchronised_rad": 0.01, "end_pose_within_rad": 0.01}
         return msgspec.structs.replace(self, **tolerances) != Expect()
 
 
 def find_expect_problem(expect: Expect, joint_counts: Mapping[str, int]) -> KeyProblem | None:
-    """Returns a problem of the expectations for which no run could meet them, or None.
+    """Returns the reason why no run could satisfy the expectations, or None.
 
     Args:
-        expect: the expectations.
-        joint_counts: the number of joints of each site's arm.
+        expect: The expectations.
+        joint_counts: Number of joints of each site's arm.
 
     Returns:
-        A problem with the path of its key below `expect`.
+        The problem, with the path of its key below `expect`.
     """
     for name, pose in expect.end_pose_rad.items():
         key = f"end_pose_rad.{name}"
@@ -295,15 +315,18 @@ def find_expect_problem(expect: Expect, joint_counts: Mapping[str, int]) -> KeyP
                 f"expected list of length {joints}, one angle per joint, and it has "
                 f"{len(pose)}",
             )
+
     for n, window in enumerate(expect.windows):
         problem = find_window_problem(window, joint_counts)
         if problem is not None:
             return problem._replace(key=f"windows[{n}].{problem.key}".rstrip("."))
+
     for metric, (low, high) in expect.metrics.items():
         if low > high:
             return KeyProblem(
                 f"metrics.{metric}", f"must be [least, most], is [{low:g}, {high:g}]"
             )
+
     for min_key, max_key in (
         ("peak_error_min_rad", "peak_error_max_rad"),
         ("end_error_min_rad", "end_error_max_rad"),

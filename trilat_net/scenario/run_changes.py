@@ -1,10 +1,13 @@
-"""Changes of links and of dominance during a run, by request or by the timeline.
+"""Checks and describes changes during a run: of links, dominance factors, or a site's mode.
 
-Orders to a site (stop, enable, reset, …) are changes as well.
+A dominance factor is the weight with which a site follows a peer. Changes are planned in the
+timeline of a scenario, or requested during the run. Commands to a site, such as stop, enable
+and reset, are changes as well.
 
 Invariant:
-    - A change is completed with the state before it, and its text in a record is the whole
-      change. Every reader therefore derives the same `CoreChange` from a record.
+    - A requested change is completed with the state before it, and its text in a record
+      contains the whole change. Therefore every reader derives the same `CoreChange` from a
+      record.
 """
 
 import re
@@ -24,10 +27,14 @@ from .validate import check_change, check_links_memory
 
 
 class LinkTables(dict[str, dict[str, Any]]):
-    """The current table of every link: as at the start, then after each change.
+    """Current table of every link of a run, by name.
 
-    The changes of the timeline are applied by `advance_to`; a caller that accepts another
-    change writes the new table of its link itself.
+    A table changes when a change of its link takes effect. `advance_to` applies the changes of
+    the timeline; a caller that accepts a requested change stores the new table itself.
+
+    Args:
+        links: Links at the start of the run, by name.
+        timeline: Planned changes, in the order of their times.
     """
 
     def __init__(self, links: Mapping[str, LinkBase], timeline: Sequence[Change]) -> None:
@@ -35,7 +42,7 @@ class LinkTables(dict[str, dict[str, Any]]):
         self._planned = deque(change for change in timeline if change.link)
 
     def advance_to(self, t_ns: int) -> None:
-        """Applies the changes of the timeline up to the time `t_ns`, ns since the epoch."""
+        """Applies the planned changes up to the time `t_ns`, in ns after the epoch."""
         while self._planned and self._planned[0].start_ns <= t_ns:
             change = self._planned.popleft()
             self[change.link] = change.to
@@ -44,19 +51,20 @@ class LinkTables(dict[str, dict[str, Any]]):
 def resolve_change(
     scenario: Scenario, current_links: LinkTables, written: dict[str, Any], from_ns: int
 ) -> Change:
-    """Returns a requested change, complete and checked.
+    """Completes and checks a change that was requested during a run.
 
     Args:
-        scenario: the scenario of the run.
-        current_links: every link as it is now.
-        written: the change as a scenario's timeline states it, without `at_s`.
-        from_ns: the time from which the change holds, ns since the epoch.
+        scenario: Scenario of the run.
+        current_links: Current table of every link.
+        written: The change in the form of a scenario's timeline, without `at_s`.
+        from_ns: Time at which the change takes effect, in ns after the epoch.
 
     Raises:
-        ScenarioError: there is no such link or site, or a value is not valid.
+        ScenarioError: There is no such link or site, or a value is not valid.
     """
     change = {**written, "at_s": from_ns / NS_PER_S}
-    if ("link" in change) == ("dominance" in change):
+    names_both_or_neither = ("link" in change) == ("dominance" in change)
+    if names_both_or_neither:
         raise ScenarioError("a change names either a link or, as dominance, a site")
     change["to"] = resolve_target(change, current_links, list(scenario.names), "change")
     # The table of a trace is too long for a record.
@@ -64,11 +72,14 @@ def resolve_change(
         raise ScenarioError(
             "a link with a trace can only be given another model", path="change.to"
         )
+
     try:
         complete = msgspec.convert(change, Change)
     except msgspec.ValidationError as error:
         raise ScenarioError(str(error), path="change") from None
     check_change(complete, "change")
+
+    # A longer delay may need more memory at the receiver.
     if complete.link:
         changed_scenario = msgspec.structs.replace(
             scenario, timeline=(*scenario.timeline, complete)
@@ -78,25 +89,28 @@ def resolve_change(
 
 
 def find_owner(change: Change) -> str:
-    """Returns the site that carries a change out; a link belongs to its receiver."""
+    """Returns the name of the site that carries out a change.
+
+    A change of a link is carried out by the site that receives its samples.
+    """
     return change.site or change.dominance or change.link.partition("->")[2]
 
 
 def make_site_order(
     scenario: Scenario, site: str, order: SiteOrder, from_ns: int, ticks: int = 0
 ) -> Change:
-    """Returns an order to a site as a change.
+    """Returns a command to a site as a change.
 
     Args:
-        scenario: the scenario of the run.
-        site: the site.
-        order: the order.
-        from_ns: the time of the tick at which the site carries the order out, ns since the
+        scenario: Scenario of the run.
+        site: Name of the site.
+        order: The command.
+        from_ns: Time of the tick in which the site carries out the command, in ns after the
             epoch.
-        ticks: for "overrun", the number of ticks that the site missed.
+        ticks: For the command "overrun": number of ticks that the site missed.
 
     Raises:
-        ScenarioError: the stale rule of the site does not allow orders.
+        ScenarioError: The site does not have the stale rule "glide", which commands require.
     """
     action = scenario.sites[site].on_stale.action
     if action != "glide":
@@ -118,17 +132,17 @@ _ORDER_SENTENCES = {
     "arm_back": "measurements came again from the arm of {site} at {at}",
     "overrun": "{site} missed {ticks} {noun} before {at}",
 }
-"""The sentence that reports each order to people."""
+"""Sentence that describes each command to people."""
 
 
 def describe_change(change: Change, ordered_by: str = "") -> str:
-    """Returns a sentence on a change without a full stop.
+    """Describes a change in a sentence without a full stop.
 
     An example is "m2 was stopped by the experimenter at 58.2 s".
 
     Args:
-        change: an order to a site, a change of a link, or a change of a row of shares.
-        ordered_by: who requested the change, a noun phrase; "": not known.
+        change: A command to a site, or a change of a link or of dominance factors.
+        ordered_by: Who requested the change, as a noun phrase. Empty if this is not known.
     """
     by = f" by {ordered_by}" if ordered_by else ""
     if change.order:
@@ -151,16 +165,19 @@ def describe_change(change: Change, ordered_by: str = "") -> str:
 
 
 def find_requester(sentence: str) -> str:
-    """Returns who requested a stop, from the sentence of `describe_change`; "" if not said."""
+    """Returns who requested a stop, from the sentence of `describe_change`.
+
+    Empty if the sentence does not describe a stop, or does not say who requested it.
+    """
     match = re.fullmatch(r"\S+ was stopped by (.+) at [\d.]+ s", sentence)
     return "" if match is None else match[1]
 
 
 def count_skipped_ticks(texts: Sequence[str]) -> int:
-    """Returns how many ticks a site missed just before a record.
+    """Returns the number of ticks that a site missed just before a record.
 
     Args:
-        texts: the texts of the changes in the record.
+        texts: Texts of the changes in the record. Texts that cannot be read are ignored.
     """
     skipped = 0
     for text in texts:
@@ -171,7 +188,7 @@ def count_skipped_ticks(texts: Sequence[str]) -> int:
 
 
 def to_core_change(scenario: Scenario, change: Change) -> CoreChange:
-    """Returns a change in the form in which the core of its owner applies it."""
+    """Returns a change in the form in which the simulation kernel of its site applies it."""
     text = msgspec.json.encode(change).decode()
     site = find_owner(change)
     if change.order:
@@ -188,10 +205,17 @@ def to_core_change(scenario: Scenario, change: Change) -> CoreChange:
 
 
 def parse_core_change(scenario: Scenario, site: str, text: str) -> CoreChange:
-    """Returns the change that a text in a site's record states.
+    """Parses the text of a change in a record of a site.
+
+    The record may come from an untrusted log, so the change is checked completely.
+
+    Args:
+        scenario: Scenario of the run.
+        site: Name of the site that published the record.
+        text: JSON text of the change.
 
     Raises:
-        ScenarioError: the text is not a change of that site.
+        ScenarioError: The text is not a valid change, or not a change of this site.
     """
     try:
         change = msgspec.json.decode(text, type=Change)
@@ -208,6 +232,7 @@ def parse_core_change(scenario: Scenario, site: str, text: str) -> CoreChange:
         raise ScenarioError(
             "the record names a command for a link or site that does not exist", path=text[:80]
         )
+
     targets = [name for name in (change.link, change.dominance, change.site) if name]
     is_order = bool(change.order)
     is_for_site = find_owner(change) == site
@@ -215,7 +240,9 @@ def parse_core_change(scenario: Scenario, site: str, text: str) -> CoreChange:
         raise ScenarioError(
             f"the record names a command that is not for {site}", path=text[:80]
         )
+
     if is_order:
+        # called only for its check
         make_site_order(scenario, site, change.order, change.start_ns)
     check_change(change, "cmd")
     if change.dominance:

@@ -1,8 +1,12 @@
-"""Load scenarios by name, by path, from tables or from a log, with overrides applied.
+"""Loads scenarios from files, texts, tables or logs, and applies overrides of their keys.
+
+A scenario is a TOML file that describes an experiment. An override changes single keys of it
+without editing the file, for example `control.Kd=5`.
 
 Invariant:
-    - The text of a log or a peer is not trusted: it may not name a file, its laws may not run
-      until a person allows it, and it must write out its traces.
+    - The scenario of a log or of another member of a session is not trusted. It may not name a
+      file, its code may not run until a person permits it, and its traces of delays must be
+      written out.
 """
 
 import re
@@ -25,12 +29,14 @@ from .scenario_types import Scenario, SiteSpec
 from .validate import build_scenario
 
 MAX_KEY_PARTS = 32
-"""Largest number of parts of a key; a scenario needs four, as in sites.m1.arm.l1_m."""
+"""Largest number of parts of a dotted key. Scenarios need four, as in sites.m1.arm.l1_m."""
 _MAX_NAME_LENGTH = 80
 
 
 def list_shipped() -> list[str]:
-    """Returns the names of the scenarios in the package, as `trilat scenario list` does.
+    """Returns the names of the scenarios in the package, as `trilat scenario list` shows them.
+
+    Files whose names begin with an underscore are not listed.
 
     >>> "paper" in tn.list_shipped()
     True
@@ -44,7 +50,14 @@ def list_shipped() -> list[str]:
 
 
 def read_shipped(name: str) -> str:
-    """Returns the TOML text of a shipped scenario, or of an unlisted one named _NAME."""
+    """Returns the TOML text of a scenario in the package.
+
+    Args:
+        name: Name of the scenario. The name of an unlisted file begins with an underscore.
+
+    Raises:
+        ScenarioError: There is no such scenario.
+    """
     file = SHIPPED_FOLDER / f"{name}.toml"
     shipped_names = list_shipped()
     if name not in shipped_names and not (len(name) < _MAX_NAME_LENGTH and file.is_file()):
@@ -57,7 +70,7 @@ def read_shipped(name: str) -> str:
 
 
 def read_template() -> str:
-    """Returns the commented template of `trilat scenario new`, a valid scenario.
+    """Returns the template of `trilat scenario new`, a valid scenario with comments.
 
     >>> tn.load_scenario(tn.read_template()).names
     ('m1', 'm2', 's')
@@ -72,21 +85,22 @@ def load_scenario(
     duration_s: float | None = None,
     seed: int | None = None,
 ) -> Scenario:
-    """Returns a scenario with overrides applied; the command is `trilat scenario show`.
+    """Loads a scenario and applies overrides. The command is `trilat scenario show`.
 
     >>> tn.load_scenario("paper", {"control.Kd": 5}).names
     ('m1', 'm2', 's')
 
     Args:
-        source: the name of a shipped scenario, a path, a TOML text of several lines, tables, a
-            scenario, or a run or log, which has a scenario.
-        overrides: as in `{"control.Kd": 5}` or `["control.Kd=5"]`. If `source` is a scenario, a
-            key of a group applies to all sites or links, see `override`.
-        duration_s: the duration, s; by default the scenario's.
-        seed: the seed; by default the scenario's.
+        source: Name of a scenario in the package, path of a file, TOML text of several lines,
+            tables, a `Scenario`, or a run or log, which contains a scenario.
+        overrides: Changed keys, for example `{"control.Kd": 5}` or `["control.Kd=5"]`. If
+            `source` is a `Scenario`, a key of a group such as `control` applies to all sites or
+            links, see `override`.
+        duration_s: Duration in s. By default, that of the scenario.
+        seed: Seed of the random numbers. By default, that of the scenario.
 
     Raises:
-        ScenarioError: the source cannot be read or is not a valid scenario.
+        ScenarioError: The source cannot be read or is not a valid scenario.
     """
     source = getattr(source, "scenario", source)
     pairs = _join_overrides(overrides, duration_s, seed)
@@ -101,7 +115,10 @@ def load_scenario(
 def _join_overrides(
     overrides: Mapping[str, Any] | Sequence[str], duration_s: float | None, seed: int | None
 ) -> Mapping[str, Any] | Sequence[str]:
-    """Returns overrides together with a duration and a seed, unless these are None."""
+    """Returns overrides together with a duration and a seed, unless these are None.
+
+    The result has the type of `overrides`: a mapping, or a list of texts.
+    """
     options = {"duration_s": duration_s, "seed": seed}
     chosen_options = {key: value for key, value in options.items() if value is not None}
     if isinstance(overrides, Mapping):
@@ -113,7 +130,14 @@ def _join_overrides(
 def _change_scenario(
     scenario: Scenario, overrides: Mapping[str, Any] | Sequence[str]
 ) -> Scenario:
-    """Returns a scenario with overrides; a key of a group applies to all sites or links."""
+    """Returns a scenario with overrides applied.
+
+    A key of a group, such as `control`, applies to all sites or links. A user who names a class
+    in an override thereby allows its code to run.
+
+    Raises:
+        ScenarioError: An override is not valid.
+    """
     try:
         expanded = expand_overrides(scenario, parse_overrides(overrides))
         changed = scenario
@@ -127,14 +151,15 @@ def _change_scenario(
 
 
 class ExperimentText(NamedTuple):
-    """An experiment as its author wrote it.
+    """Text of an experiment as its author wrote it.
 
     Attributes:
-        label: the name of the experiment in a command: a shipped name or a path. An experiment
-            that is not in a file has the path at which a command would look for it.
-        text: its TOML text.
-        folder: the folder of the files that it names; None: the text is a resolved scenario,
-            which does not name files.
+        label: Name by which a command finds the experiment: the name of a scenario in the
+            package, or a path. An experiment that is not in a file gets the path at which a
+            command would look for it.
+        text: TOML text.
+        folder: Folder of the files that the text names. None if the text is a resolved
+            scenario, which names no files.
     """
 
     label: str
@@ -142,10 +167,10 @@ class ExperimentText(NamedTuple):
     folder: Path | None
 
     def load(self, overrides: Sequence[str] = ()) -> Scenario:
-        """Returns the scenario of the text with overrides.
+        """Returns the scenario of the text with overrides applied.
 
         Raises:
-            ScenarioError: the scenario is not valid with them.
+            ScenarioError: The result is not a valid scenario.
         """
         if self.folder is None:
             return load_scenario(parse_scenario(self.text, self.label, folder=None), overrides)
@@ -153,10 +178,13 @@ class ExperimentText(NamedTuple):
 
 
 def read_experiment(source: str | Path | Mapping[str, Any] | Scenario) -> ExperimentText:
-    """Returns the text of a shipped name, a path, a TOML text, tables, or a scenario.
+    """Returns the text of an experiment, without checking it.
+
+    Args:
+        source: Name of a scenario in the package, path, TOML text, tables, or a `Scenario`.
 
     Raises:
-        ScenarioError: the source cannot be read.
+        ScenarioError: The source cannot be read.
     """
     if isinstance(source, Scenario):
         return ExperimentText(f"./{source.name}.toml", source.text, None)
@@ -171,19 +199,23 @@ def read_experiment(source: str | Path | Mapping[str, Any] | Scenario) -> Experi
 
 
 def reseed_scenario(scenario: Scenario, seed: int) -> Scenario:
-    """Returns the same experiment with another seed, which draws its random numbers again.
+    """Returns the same experiment with another seed, which gives other random numbers.
 
     Raises:
-        ScenarioError: the seed is not valid, or a number that it draws is out of range.
+        ScenarioError: The seed is not valid, or a number that is drawn with it is out of range.
     """
     return load_scenario(scenario, {"seed": seed}) if scenario.seed != seed else scenario
 
 
 def read_source(source: str | Path) -> tuple[str, Path]:
-    """Returns the TOML text of a shipped name or a path, and the folder of the named files.
+    """Returns the TOML text of a scenario, and the folder in which the files are that it names.
+
+    Args:
+        source: Name of a scenario in the package, or a path. A text counts as a path if it ends
+            in ".toml" or contains a slash or backslash.
 
     Raises:
-        ScenarioError: the source cannot be read.
+        ScenarioError: The source cannot be read.
     """
     name = str(source)
     is_path = isinstance(source, Path) or name.endswith(".toml") or "/" in name or "\\" in name
@@ -198,10 +230,10 @@ def read_source(source: str | Path) -> tuple[str, Path]:
 
 
 def find_site(scenario: Scenario, name: str) -> SiteSpec:
-    """Returns a site of a scenario.
+    """Returns a site of a scenario by its name.
 
     Raises:
-        ScenarioError: the scenario has no site of that name.
+        ScenarioError: There is no such site.
     """
     if name not in scenario.sites:
         hint = suggest_nearest(name, scenario.names)
@@ -213,7 +245,8 @@ def find_site(scenario: Scenario, name: str) -> SiteSpec:
 
 
 _PARSE_LOCK = RLock()
-"""Held while a scenario is parsed: msgspec 0.22 crashes if two threads use a type first."""
+"""Held while a scenario is parsed: msgspec 0.22 crashes if two threads use a type at first.
+"""
 
 
 def parse_scenario(
@@ -225,13 +258,13 @@ def parse_scenario(
     """Returns the scenario that a TOML text describes.
 
     Args:
-        text: the TOML text.
-        source: the name of the text in errors.
-        overrides: overrides of its keys.
-        folder: the folder of the files that the text names; None: it may not name any file.
+        text: The TOML text.
+        source: Name of the text, for error messages.
+        overrides: Changed keys, see `load_scenario`.
+        folder: Folder of the files that the text names. None refuses a text that names a file.
 
     Raises:
-        ScenarioError: with the path of the offending key.
+        ScenarioError: The text is not a valid scenario. The error contains the path of the key.
     """
     with _PARSE_LOCK:
         try:
@@ -253,6 +286,11 @@ def parse_scenario(
 
 
 def _parse_toml(text: str) -> dict[str, Any]:
+    """Returns the tables of a TOML text.
+
+    Raises:
+        ScenarioError: The text is not TOML.
+    """
     try:
         return tomllib.loads(text)
     # TOMLDecodeError is a ValueError; a number of 5000 digits raises another one.
@@ -263,15 +301,17 @@ def _parse_toml(text: str) -> dict[str, Any]:
 _KEY_PART = re.compile(
     r"""(?P<word>[\w-]+|"[^"]*"|'[^']*')|(?P<dot>\s{0,9}\.\s{0,9})|(?P<other>.)"""
 )
+"""Matches the next piece of a line: a part of a key, a dot, or another character."""
 
 
 def _refuse_long_keys(text: str) -> None:
-    """Refuses keys of very many parts.
+    """Refuses a text with a dotted key that has very many parts.
 
-    The time of a TOML parser grows faster than the square of the number of parts.
+    The time that a TOML parser needs grows faster than the square of the number of parts, so a
+    short text of a stranger could block the program.
 
     Raises:
-        ScenarioError: with the line of the key.
+        ScenarioError: There is such a key. The error contains the number of its line.
     """
     for number, line in enumerate(text.split("\n"), 1):
         if line.count(".") < MAX_KEY_PARTS:
@@ -280,22 +320,26 @@ def _refuse_long_keys(text: str) -> None:
         previous_kind = ""
         for part in _KEY_PART.finditer(line):
             kind = part.lastgroup or ""
-            # A key alternates words and dots; any other pair ends it.
-            if {kind, previous_kind} == {"word", "dot"}:
-                dots += kind == "dot"
-            else:
+            # In a key, words and dots alternate. Any other pair of pieces ends the key.
+            is_inside_key = {kind, previous_kind} == {"word", "dot"}
+            if not is_inside_key:
                 dots = 0
+            elif kind == "dot":
+                dots += 1
             previous_kind = kind
             if dots >= MAX_KEY_PARTS:
                 raise ScenarioError(f"line {number}: a key has more than {MAX_KEY_PARTS} parts")
 
 
 def parse_embedded(text: str, source: str = "") -> Scenario:
-    """Returns the resolved scenario of a log or a peer, which is not trusted.
+    """Returns the resolved scenario of a log or of another member, which is not trusted.
+
+    A table for all links could repeat a long trace of delays for every link, so that a short
+    text would fill the memory. Therefore the traces of all links together may not be longer
+    than the text.
 
     Raises:
-        ScenarioError: the scenario is not valid, names a file, or would fill the memory because
-            a default repeats a trace for many links.
+        ScenarioError: The scenario is not valid, names a file, or is larger than its text.
     """
     scenario = parse_scenario(text, source, folder=None)
     changed_links = [change.after for change in scenario.timeline if change.link]
@@ -309,6 +353,9 @@ def parse_embedded(text: str, source: str = "") -> Scenario:
 def embedded_names_reader(source: str) -> Callable[[str], tuple[str, ...]]:
     """Returns a function that reads the names of the sites from the text of a scenario.
 
-    The scenario is not trusted, see `parse_embedded`; errors call it `source`.
+    The function does not trust the text, see `parse_embedded`.
+
+    Args:
+        source: Name of the text, for error messages.
     """
     return lambda text: parse_embedded(text, source).names

@@ -253,7 +253,7 @@ class Multisine(TimedActor, frozen=True, tag="multisine"):
         return super().find_problem()
 
     def _source(self) -> TorqueSource:
-        """Returns the sines for the kernel: a row each, with the frequency and phase in turns."""
+        """Returns the sines for the kernel: a row each of frequency and phase in turns."""
         count = len(self.frequencies_hz)
         turns = [phase / (2.0 * math.pi) for phase in self.phases_rad]
         if not turns:
