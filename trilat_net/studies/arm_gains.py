@@ -1,23 +1,29 @@
-"""The largest gains for an arm over a delay: an edge along a ray, confirmed by runs.
+"""Finds the largest gains with which equal arms can follow each other over a delay.
 
-    K = k m,    d + Kd = 2 zeta sqrt(k) m
+Two or three equal arms follow one another over links with the given delay. Each joint has a
+stiffness K and a damping, the sum of d against its own motion and Kd against the motion of the
+other arm. All gains lie on a ray with one parameter k:
 
-with m of each joint the largest M_ii of its inertia in some poses, or less. Two or three such
-arms follow one another over links of that delay. The edge is the least k over the poses at
-which small motions of the sampled loop grow. The gains have the damping of the edge, and its
-stiffness divided by the margin.
+    K = k m,    d + Kd = 2 zeta sqrt(k) m,
 
-The gains keep the same margin to the sampled-data limit, where a damping that is held for a
-tick makes the lightest motion swing from tick to tick. If a light motion is shared by several
-joints, their m is reduced. For one joint at a wall such edges are known: Gil, Avello, Rubio and
-Florez, "Stability analysis of a 1 DOF haptic interface using the Routh-Hurwitz criterion", IEEE
-Trans. Control Systems Technology 12 (2004); over delays Hulin, Preusche and Hirzinger,
+where zeta is the damping ratio and m the inertia of the joint: the largest diagonal element
+M_ii of the inertia matrix in some poses, or less. The edge is the least k at which small
+motions of the sampled loop grow in one of these poses. The result has the damping at the edge,
+and the stiffness at the edge divided by a margin. Simulated runs then confirm the edge.
+
+The gains keep the same margin to the sampled-data limit, at which a damping torque that is held
+for a tick makes the lightest motion swing from tick to tick. If several joints share a light
+motion, their m is reduced.
+
+For a single joint at a wall such edges are known: J. J. Gil, A. Avello, A. Rubio and J. Florez,
+"Stability analysis of a 1 DOF haptic interface using the Routh-Hurwitz criterion", IEEE Trans.
+Control Systems Technology 12 (2004); over delays, T. Hulin, C. Preusche and G. Hirzinger,
 "Stability boundary for haptic rendering: influence of physical damping", IROS 2006.
 
 Invariant:
     - A result is a function of its arguments.
-    - Friction, stops and torque limits are left out: friction only helps, and limits do not
-      concern small motions.
+    - Friction, joint stops and torque limits are left out. Friction only helps, and limits do
+      not act on small motions.
 """
 
 import math
@@ -57,58 +63,76 @@ TUNED_LAWS = tuple(
     for name, law in BUILT_IN.items()
     if {"K", "d"} <= law.tune.keys() and not getattr(law, "sends", ())
 )
-"""Laws with a stiffness and a damping that send nothing but their motion."""
+"""Control laws with a stiffness and a damping that send only the motion of their arm."""
 SHARES = (0.95, 1.1)
-"""Shares of the edge's k at which runs confirm the edge."""
+"""Fractions of k at the edge with which runs confirm the edge, below and above it."""
 _PUSH = 1e-6
-"""Largest initial displacement of the first arm's joints, rad or m."""
+"""Largest initial displacement of the joints of the first arm, in rad or m."""
 _SMALL = 1.0
-"""Speed from which on motions are not small, rad/s."""
+"""Speed above which a motion does not count as small, in rad/s."""
 _STILL = 1e-7
-"""Share of the largest speed that counts as rounding."""
+"""Fraction of the largest speed below which a speed counts as a rounding error."""
 _SITES = {2: ("m", "s"), 3: ("m1", "m2", "s")}
+"""Names of the sites, by their number."""
 _SLACK = 0.05
-"""Share of a joint's range at each end that poses avoid."""
+"""Fraction of the range of a joint, at either end, that the drawn poses avoid."""
 _HALF_TURN = math.pi
+"""Half of the range of a revolute joint without limits, in rad."""
 _HALF_SLIDE_M = 0.5
-"""Half of the range of a prismatic joint without limits, m."""
+"""Half of the range of a prismatic joint without limits, in m."""
 _SETTLES = 4.0
-"""Time constants of its slowest motion that a run lasts at first."""
+"""First duration of a run, in time constants of its slowest motion."""
 _SHORTEST_S = 2.0
+"""Least first duration of a run, in s."""
 _LONGEST_S = 400.0
-"""Bounds of that first duration, s."""
+"""Largest first duration of a run, in s."""
 _EXTENSIONS = 3
-"""Number of durations of a run, each twice the one before."""
+"""Number of durations of a run that are tried, each twice as long as the one before."""
 _IS_STABLE = {EnvelopeTrend.GROWS: False, EnvelopeTrend.DECAYS: True}
+"""Whether a run is stable, by the trend of its speed. Other trends leave this undecided."""
 _NO_GAIN = 1e-6
+"""Negligible gain of the loop before its gains are set."""
 _CURVE_POINTS = 9
+"""Number of delays for which the edge is computed for a figure."""
 _EDGE_TOLERANCE = 1e-4
-"""Tolerance of the edge's ln k."""
+"""Tolerance of ln k at the edge."""
 _FITTING_STEP = 0.9
 """Least factor by which m is reduced in one step."""
 _NO_ROOT_PER_S = -1e3
-"""Real part that stands for a loop without roots, 1/s."""
+"""Real part that stands for a loop without roots, in 1/s."""
 _DELAY = re.compile(r"(\d+\.?\d*|\.\d+) ?(us|ms|s|)")
+"""A number with an optional unit, as in "40ms"."""
 _UNIT_MS = {"us": 1e-3, "ms": 1.0, "": 1.0, "s": 1e3}
+"""Units of a delay in ms. A number without a unit is in ms."""
 
 
 @dataclass(frozen=True, repr=False)
 class ArmGains(Result):
-    """The largest gains for an arm, with a margin; with the keys of `trilat tune --json`.
+    """The largest gains for an arm, with a margin. JSON has the same keys as this class.
 
     Attributes:
-        arm, law, sites, rate_hz, delay, margin, damping: the arguments.
-        age_ms: the constant age of samples that stands for the delay, ms.
-        joints: for each joint m, the gains with their unit, and the error at which the effort
-            limit is reached.
-        edge: k of the sampled loop over the delays in use, over a constant delay, in continuous
-            time (None: never), and the k from which damping swings from tick to tick, 1/s^2;
-            frequency, motion, pose, and the limit that bounds K.
-        runs: runs at the gains (share None) and at shares of the edge's k, with the growth rate
-            of the largest speed (None: motions were not small) and that of the roots.
-        agree: True if all runs behave as the roots predict, and the run at the gains decays.
-        line: the gains as a line to paste above the tables of a scenario.
-        curve: pairs of a delay, s, and k of the edge in the same pose, if requested.
+        arm: File name of the arm's URDF.
+        law: Name of the control law.
+        sites: Number of arms.
+        rate_hz: Tick rate, in Hz.
+        delay: Description of the delay.
+        age_ms: Constant age of samples that stands for the delay, in ms.
+        margin: Factor by which the stiffness lies below the edge.
+        damping: Damping ratio of the gains.
+        joints: For each joint, the inertia m, the gains with their unit, and the position error
+            at which the effort limit of the joint is reached.
+        edge: Values of k at the edge, in 1/s^2: of the sampled loop with the delays in use, of
+            the sampled loop with a constant delay, and in continuous time, where None means
+            that there is no edge. Further the k from which the damping makes a motion swing
+            from tick to tick; the frequency, motion and pose at the edge; and whether the delay
+            or the tick rate bounds K.
+        runs: Runs with the gains, whose `share` is None, and runs at fractions `share` of k at
+            the edge. Each has the measured growth rate of the largest speed, which is None if
+            the motions were not small, and the growth rate that the roots predict.
+        agree: True if all runs behave as the roots predict, and the run with the gains decays.
+        line: The gains as a line to paste above the tables of a scenario.
+        curve: Pairs of a delay, in s, and k at the edge in the same pose. Empty unless
+            requested.
     """
 
     arm: str
@@ -127,11 +151,11 @@ class ArmGains(Result):
     curve: list[tuple[float, float]]
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a row per joint."""
+        """Returns one row per joint."""
         return self.joints
 
     def blocks(self) -> Iterator[Block]:
-        """Yields the loop, a row per joint, the edge, the runs, and the line to paste."""
+        """Yields the loop, a table of the joints, the edge, the runs, and the line to paste."""
         yield (
             f"{self.arm}: {self.sites} equal arms, {self.law}, {self.rate_hz} Hz, "
             f"{self.delay}, damping ratio {self.damping:g}, margin {self.margin:g}"
@@ -147,7 +171,7 @@ class ArmGains(Result):
         yield self.line
 
     def _describe_edge(self) -> Iterator[str]:
-        """Yields lines on the edge and the sampled-data limit."""
+        """Yields the lines that describe the edge and the sampled-data limit."""
         edge = self.edge
         motion = CharacteristicRoot(0j, 1, tuple(edge["moves"])).description
         yield (
@@ -166,14 +190,18 @@ class ArmGains(Result):
 
 
 def _format_cell(value: Any) -> str:
-    """Returns a table's cell: a number with four digits, a text, or "-"."""
+    """Returns the text of a table cell: a number with four digits, a text, or "-" if empty."""
     if isinstance(value, float):
         return f"{value:.4g}"
     return value or "-"
 
 
 def _describe_run(run: Mapping[str, Any]) -> str:
-    """Returns a sentence on a run that confirms the edge or the gains."""
+    """Returns a sentence on a run that confirms the edge or the gains.
+
+    Args:
+        run: The run, as in `ArmGains.runs`.
+    """
     share = run["share"]
     gains = "these gains" if share is None else f"{share:g} of the edge"
     behaviours = {None: "is undecided", True: "decays", False: "grows"}
@@ -186,18 +214,24 @@ def _describe_run(run: Mapping[str, Any]) -> str:
 
 
 def _read_delay(delay: str | float) -> tuple[dict[str, Any], str]:
-    """Returns the table [link] of a delay, and its description.
+    """Reads the delay for which gains are wanted.
 
-    For a log it is the link with the longest median delay.
+    Args:
+        delay: A number with an optional unit, a table of delays, or a log. Of a log, the link
+            with the longest median delay is used.
+
+    Returns:
+        The table [link] of a scenario with this delay, and a description for the user.
 
     Raises:
-        UsageError: the text is no delay, or the log's delays cannot be used.
+        UsageError: The text is not a delay, or the delays of the log cannot be used.
     """
     text = str(delay).strip()
     match = _DELAY.fullmatch(text)
     if match:
         delay_ms = float(match[1]) * _UNIT_MS[match[2]]
         return {"delay_ms": delay_ms}, f"{delay_ms:g} ms each way"
+
     path = Path(text.removeprefix("measured:"))
     if path.suffix not in (".csv", ".mcap"):
         raise UsageError(
@@ -207,6 +241,7 @@ def _read_delay(delay: str | float) -> tuple[dict[str, Any], str]:
     link = {"model": "trace", "file": str(path), "at_end": "loop"}
     if path.suffix == ".csv":
         return link, f"the delays of {path.name}"
+
     medians_ms = {}
     try:
         for name in open_log(path).scenario.links:
@@ -228,21 +263,22 @@ def _build_loop(
     tip: str,
     rate_hz: int,
 ) -> Scenario:
-    """Returns a scenario of equal arms that follow one another, without friction.
+    """Builds a scenario of equal arms without friction that follow one another.
 
-    Its gains are negligible, and its limits do not act on small motions.
+    The gains are negligible; the search replaces them. The limits of the arms are so wide that
+    they do not act on small motions.
 
     Args:
-        arm: path of a URDF, or the name of a shipped file.
-        link: the table [link].
-        law: the control law.
-        overrides: overrides of the scenario.
-        sites: number of arms.
-        tip: the end link.
-        rate_hz: tick rate, Hz.
+        arm: Path of a URDF, or the name of a shipped file.
+        link: Table [link], which contains the delay.
+        law: Name of the control law.
+        overrides: Overrides of the scenario.
+        sites: Number of arms.
+        tip: Name of the end link.
+        rate_hz: Tick rate, in Hz.
 
     Raises:
-        UsageError: the law, the number of sites or an override is not valid.
+        UsageError: The law, the number of sites or an override is not valid.
     """
     if law not in TUNED_LAWS:
         known = ", ".join(TUNED_LAWS)
@@ -251,14 +287,15 @@ def _build_loop(
         )
     if sites not in _SITES:
         raise UsageError(f"--sites is 2 or 3, not {sites}")
+
     names = _SITES[sites]
     gains = {gain: _NO_GAIN for gain in ("K", "d", "Kd") if gain in BUILT_IN[law].tune}
-    share = 1.0 / (sites - 1)
+    dominance_factor = 1.0 / (sites - 1)
     roles = {}
     dominance = {}
     for name in names:
         roles[name] = {"role": "slave" if name == "s" else "master"}
-        dominance[name] = {peer: share for peer in names if peer != name}
+        dominance[name] = {peer: dominance_factor for peer in names if peer != name}
     tables = {
         "name": "tune",
         "duration_s": _SHORTEST_S,
@@ -275,6 +312,8 @@ def _build_loop(
         raise UsageError(
             "--set control.gravity: only with exact gravity is every pose an equilibrium"
         )
+
+    # Friction and damping of the joints are the attributes of the URDF's <dynamics>.
     without_friction = {}
     for name, text in scenario.urdf.items():
         without_friction[name] = re.sub(r"<dynamics\b[^>/]*", "<dynamics", text)
@@ -282,36 +321,51 @@ def _build_loop(
 
 
 def _draw_poses(scenario: Scenario, count: int, seed: int) -> Array:
-    """Returns random poses within the joints' limits, shape (count, n)."""
+    """Draws random poses within the limits of the joints.
+
+    A joint without limits, or with wide ones, stays within half a turn or half a metre of the
+    position that is closest to 0.
+
+    Args:
+        scenario: Scenario with the arm.
+        count: Number of poses.
+        seed: Seed of the random numbers.
+
+    Returns:
+        Joint angles or positions, shape (count, n), in rad or m.
+    """
     ranges = []
     first_site = scenario.sites[scenario.names[0]]
     model = read_arm(first_site.arm, scenario.urdf)
     for joint in model.joints:
-        half = _HALF_SLIDE_M if joint.kind == "prismatic" else _HALF_TURN
+        half_range = _HALF_SLIDE_M if joint.kind == "prismatic" else _HALF_TURN
         middle = min(max(joint.lower, 0.0), joint.upper)
-        lower = max(joint.lower, middle - half)
-        upper = min(joint.upper, middle + half)
+        lower = max(joint.lower, middle - half_range)
+        upper = min(joint.upper, middle + half_range)
         ranges.append((lower, upper))
     low, high = np.transpose(ranges)
     random = np.random.Generator(np.random.Philox(seed))
-    shares = random.uniform(_SLACK, 1.0 - _SLACK, (count, len(low)))
-    return np.asarray(low + (high - low) * shares)
+    fractions = random.uniform(_SLACK, 1.0 - _SLACK, (count, len(low)))
+    return np.asarray(low + (high - low) * fractions)
 
 
 class _GainSearch:
-    """The loop of equal arms in some poses, for the gains of a ray.
+    """Search for the edge of stability of equal arms along the ray of gains.
 
     Args:
-        scenario: the loop.
-        poses: the poses, shape (count, n).
-        margin: factor by which K is below the edge.
-        damping: damping ratio of the gains.
-        quantile: quantile of varying ages that stands for a constant age.
+        scenario: Scenario of the loop, see `_build_loop`.
+        poses: Poses in which the loop is analysed, shape (count, n).
+        margin: Factor by which the stiffness lies below the edge.
+        damping: Damping ratio of the gains.
+        quantile: Quantile of varying sample ages that stands for a constant age.
 
     Attributes:
-        conditions: conditions of the loop.
-        constant_conditions: the same with the constant age `age_s` of samples, if ages vary.
-        inertia: m, shape (n,).
+        conditions: Linearised conditions of the loop.
+        constant_conditions: The same conditions with the constant sample age `age_s`. They are
+            equal to `conditions` if the ages do not vary.
+        rate_hz: Tick rate, in Hz.
+        age_s: Constant age of samples, in s.
+        inertia: Inertia m of each joint, shape (n,).
     """
 
     def __init__(
@@ -320,7 +374,7 @@ class _GainSearch:
         self._scenario = scenario
         self._poses = poses
         self._margin = margin
-        # the damping ratio at the edge, where K is larger by the margin
+        # Damping ratio at the edge, where the damping is the same and K larger by the margin.
         self._damping = damping / math.sqrt(margin)
         self.conditions = derive_operating_conditions(scenario)
         self.constant_conditions = self.conditions
@@ -332,29 +386,42 @@ class _GainSearch:
             age_ticks = float(np.quantile(ages, quantile, method="higher"))
             self.constant_conditions = self.fix_age(age_ticks / self.rate_hz)
         self.age_s = float(self.constant_conditions.age_s.max())
-        # the heaviest mass is stable up to this k, (2 zeta / T)^2; there the damping shall have
-        # its margin to the sampled-data limit
-        self._least = (2.0 * self._damping / self.age_s) ** 2
+        # The heaviest mass is stable up to k = (2 zeta / T)^2, where T is the age. At this k
+        # the damping must keep its margin to the sampled-data limit.
+        self._least_k = (2.0 * self._damping / self.age_s) ** 2
         model = scenario.arms[scenario.names[0]]
         largest_factor = 1.0 if scenario.scheme == "second_order" else 2.0
-        self._swings_per_s = largest_factor * self.rate_hz
+        # A motion swings from tick to tick if its damping per inertia exceeds this value.
+        self._largest_damping_per_s = largest_factor * self.rate_hz
         self._M = [model.inertia(q) for q in poses]
         self.inertia: Array = np.max([np.diag(M) for M in self._M], axis=0)
         self._fit_inertia()
 
     def _fit_inertia(self) -> None:
-        """Reduces m of the joints of the lightest motion until its damping has the margin."""
-        divisor = 2.0 * self._damping * math.sqrt(self._least) * self._margin
-        allowed = self._swings_per_s / divisor
+        """Reduces the inertia m until the damping of the lightest motion keeps its margin.
+
+        The gains are proportional to m, but a motion that several joints share can be lighter
+        than each of them. The m of a joint is reduced the more, the more the joint takes part
+        in the lightest motion. Since another motion may then be the lightest, this is repeated
+        in small steps.
+        """
+        divisor = 2.0 * self._damping * math.sqrt(self._least_k) * self._margin
+        allowed_ratio = self._largest_damping_per_s / divisor
         ratio, participation = self._find_lightest()
-        while ratio > allowed * (1.0 + _EDGE_TOLERANCE):
-            shares = participation / participation.max()
-            self.inertia = self.inertia * max(allowed / ratio, _FITTING_STEP) ** shares
+        while ratio > allowed_ratio * (1.0 + _EDGE_TOLERANCE):
+            exponents = participation / participation.max()
+            step = max(allowed_ratio / ratio, _FITTING_STEP)
+            self.inertia = self.inertia * step**exponents
             ratio, participation = self._find_lightest()
 
     def _find_lightest(self) -> tuple[float, Array]:
-        """Returns the largest eigenvalue of m M^-1 over the poses, and the joints' shares."""
-        # m M^-1 has the eigenvalues of the symmetric m^(1/2) M^-1 m^(1/2)
+        """Finds the motion that is lightest in relation to the inertias m of its joints.
+
+        Returns:
+            The largest eigenvalue of m M^-1 over the poses, where M is the inertia matrix; and
+            the participation of each joint in that motion, shape (n,), with the sum 1.
+        """
+        # m M^-1 has the eigenvalues of the symmetric matrix m^(1/2) M^-1 m^(1/2).
         root = np.sqrt(self.inertia)
         decompositions = []
         for M in self._M:
@@ -364,30 +431,30 @@ class _GainSearch:
         return float(values[-1]), vectors[:, -1] ** 2
 
     def fix_age(self, age_s: float) -> OperatingConditions:
-        """Returns the conditions with one constant age of samples, s."""
+        """Returns the conditions of the loop with a constant age of all samples, in s."""
         ages_s: Array = np.where(self.conditions.age_s > 0.0, age_s, 0.0)
         return self.conditions._replace(age_s=ages_s, varying=False)
 
-    def build_law(self, k: float, softer: float = 1.0) -> Any:
-        """Returns the law with the gains at k, rounded to four digits.
+    def build_law(self, k: float, stiffness_divisor: float = 1.0) -> Any:
+        """Returns the control law with the gains at a point of the ray, with four digits.
 
-        Damping gains have the same ratio as the law's defaults.
+        The damping gains d and Kd have the same ratio as the default gains of the law.
 
         Args:
-            k: position on the ray of gains, 1/s^2.
-            softer: divisor of the stiffness.
+            k: Parameter of the ray, in 1/s^2.
+            stiffness_divisor: Factor by which the stiffness lies below that of the ray.
         """
         law: Any = self._scenario.controls[0]
-        defaults = {}
+        default_damping = {}
         for name in ("d", "Kd"):
             if name in law.kind.tune:
-                defaults[name] = getattr(law.kind, name)[0]
-        default_sum = sum(defaults.values())
-        # the damping per unit of the default gains
-        damping = 2.0 * self._damping * math.sqrt(k) * self.inertia / default_sum
-        gains = {"K": k / softer * self.inertia}
-        for name, default in defaults.items():
-            gains[name] = default * damping
+                default_damping[name] = getattr(law.kind, name)[0]
+        default_sum = sum(default_damping.values())
+        damping_scale = 2.0 * self._damping * math.sqrt(k) * self.inertia / default_sum
+
+        gains = {"K": k / stiffness_divisor * self.inertia}
+        for name, default in default_damping.items():
+            gains[name] = default * damping_scale
         rounded = {}
         for name, values in gains.items():
             rounded[name] = tuple(float(f"{value:.4g}") for value in values)
@@ -396,7 +463,16 @@ class _GainSearch:
     def find_root(
         self, law: Any, pose: Array, loop: OperatingConditions, *, sampled: bool = True
     ) -> CharacteristicRoot:
-        """Returns the rightmost root of a loop with a law at rest in a pose."""
+        """Returns the rightmost root of the linearised loop at rest in a pose.
+
+        Its real part is the rate at which small motions grow.
+
+        Args:
+            law: Control law with its gains.
+            pose: Pose of all arms, shape (n,).
+            loop: Conditions of the loop.
+            sampled: True to analyse the sampled loop, False to analyse it in continuous time.
+        """
         sites = tuple(site._replace(gains=law.linear_gains(site.theta)) for site in loop.sites)
         poses = np.tile(pose, (len(sites), 1))
         theta = np.array([site.theta for site in sites])
@@ -414,37 +490,50 @@ class _GainSearch:
         *,
         sampled: bool = True,
     ) -> tuple[float, Array]:
-        """Returns the least k at which small motions grow in a pose, and that pose.
+        """Finds the least k at which small motions grow in one of several poses.
 
-        k is inf if motions grow in no pose. Under varying delays motions may grow, decay and
-        grow again with rising k; therefore the first steps of the search are small.
+        In each pose, k is raised from `start` until motions grow. Then the edge below that k is
+        located with Brent's method. A later pose is searched only if motions already grow there
+        just below the least edge so far.
+
+        Under varying delays, motions may grow, decay and grow again as k rises. Therefore the
+        first steps of the search are small in this case.
 
         Args:
-            loop: conditions of the loop.
-            poses: the poses.
-            start: first k of the search.
-            sampled: analyse the sampled loop.
+            loop: Conditions of the loop.
+            poses: The poses.
+            start: First k of the search, in 1/s^2.
+            sampled: True to analyse the sampled loop, False to analyse it in continuous time.
+
+        Returns:
+            The least k, and the pose in which motions grow. k is infinite if motions grow in no
+            pose.
+
+        Raises:
+            UsageError: In one of the poses motions grow even for tiny gains.
         """
         edge = math.inf
         worst_pose = self._poses[0]
-        steps = np.arange(24) * math.log(2.0)
+        log_steps = np.arange(24) * math.log(2.0)
         if loop.varying:
             small_steps = np.arange(15) * math.log(1.1)
-            steps = np.append(small_steps, math.log(4.0) + steps)
+            log_steps = np.append(small_steps, math.log(4.0) + log_steps)
+
         for pose in poses:
 
             def growth(log_k: float, pose: Array = pose) -> float:
                 law = self.build_law(math.exp(log_k))
                 return self.find_root(law, pose, loop, sampled=sampled).s.real
 
-            candidates: Iterable[float] = math.log(start) + steps
+            candidates: Iterable[float] = math.log(start) + log_steps
             if edge != math.inf:
-                # only a pose with a lower edge matters
+                # Only a pose whose edge is lower than the least edge so far matters.
                 candidates = [math.log(edge) - 10.0 * _EDGE_TOLERANCE]
             high = next((log_k for log_k in candidates if growth(log_k) > 0.0), None)
             if high is None:
                 continue
-            low = next((log_k for log_k in high - steps[1:] if growth(log_k) <= 0.0), None)
+            lower_candidates = high - log_steps[1:]
+            low = next((log_k for log_k in lower_candidates if growth(log_k) <= 0.0), None)
             if low is None:
                 raise UsageError(f"--arm: no gains are stable in the pose {pose.tolist()}")
             edge = math.exp(brentq(growth, low, high, xtol=_EDGE_TOLERANCE))
@@ -452,10 +541,15 @@ class _GainSearch:
         return edge, worst_pose
 
     def find_edge(self) -> dict[str, Any]:
-        """Returns the edge and the sampled-data limit, see `ArmGains.edge`."""
+        """Finds the edge and the sampled-data limit, see `ArmGains.edge`.
+
+        The pose in which the edge is lowest is determined with a constant delay. The edges with
+        varying delays and in continuous time are computed in this pose only.
+        """
         constant, pose = self.find_least_edge(
-            self.constant_conditions, self._poses, self._least
+            self.constant_conditions, self._poses, self._least_k
         )
+
         varies = self.conditions.varying
         if varies:
             delay_s = self.age_s
@@ -463,17 +557,19 @@ class _GainSearch:
             link = next(iter(self._scenario.links.values()))
             delay_s = 1e-3 * link.moments().mean_ms
         continuous = math.inf
-        if delay_s > 0.0:  # without a delay the continuous loop is passive
+        if delay_s > 0.0:  # without a delay the loop is passive in continuous time
             fixed = self.fix_age(delay_s)
-            continuous, _ = self.find_least_edge(fixed, [pose], self._least, sampled=False)
+            continuous, _ = self.find_least_edge(fixed, [pose], self._least_k, sampled=False)
         k = constant
         if varies:
             k, _ = self.find_least_edge(self.conditions, [pose], 0.5 * constant)
+
         lightest, _ = self._find_lightest()
-        limit = (self._swings_per_s / (2.0 * self._damping * lightest)) ** 2
+        limit = (self._largest_damping_per_s / (2.0 * self._damping * lightest)) ** 2
         root = self.find_root(self.build_law(k), pose, self.conditions)
         limit_with_margin = limit / self._margin**2
-        tick_rate_bounds = limit_with_margin < 1.001 * max(self._least, min(k, constant))
+        # m was fitted to the limit at the least k, up to rounding.
+        tick_rate_bounds = limit_with_margin < 1.001 * max(self._least_k, min(k, constant))
         return {
             "k_per_s2": k,
             "constant_per_s2": constant,
@@ -487,9 +583,19 @@ class _GainSearch:
         }
 
     def trace_edge(self, pose: Array) -> list[tuple[float, float]]:
-        """Returns pairs of a delay, s, and the k of the sampled loop's edge in a pose."""
-        most = max(4.0 * self.age_s * self.rate_hz, 8.0)
-        ages_ticks = np.round(np.geomspace(1.0, most, _CURVE_POINTS))
+        """Computes the edge of the sampled loop for several delays, for a figure.
+
+        The delays are geometrically spaced whole numbers of ticks, up to four times the delay
+        of the loop.
+
+        Args:
+            pose: Pose of all arms, shape (n,).
+
+        Returns:
+            Pairs of a delay, in s, and k at the edge, in 1/s^2.
+        """
+        longest_ticks = max(4.0 * self.age_s * self.rate_hz, 8.0)
+        ages_ticks = np.round(np.geomspace(1.0, longest_ticks, _CURVE_POINTS))
         ages_s = np.unique(ages_ticks) / self.rate_hz
         curve = []
         for age_s in ages_s:
@@ -501,24 +607,28 @@ class _GainSearch:
     def confirm(
         self, law: Any, share: float | None, pose: Array, push: Array
     ) -> dict[str, Any]:
-        """Runs from a pose with the first arm displaced, until motions decay or grow.
+        """Runs the loop from a pose with the first arm displaced, until motions decay or grow.
+
+        The first duration is a few time constants of the slowest motion. It is doubled as long
+        as the trend of the motions is undecided.
 
         Args:
-            law: the law with its gains.
-            share: share of the edge's k, for the result; None: the tuned gains.
-            pose: the pose.
-            push: displacement of the first arm, shape (n,), rad or m.
+            law: Control law with its gains.
+            share: Fraction of k at the edge, which the result states. None for the tuned gains.
+            pose: Pose of all arms, shape (n,).
+            push: Displacement of the first arm, shape (n,), in rad or m.
 
         Returns:
-            The run as in `ArmGains.runs`.
+            The run, as in `ArmGains.runs`.
         """
         predicted_per_s = self.find_root(law, pose, self.conditions).s.real
         sites = {}
         for n, (name, spec) in enumerate(self._scenario.sites.items()):
-            start = pose + push * (n == 0)
+            start = pose + push * (n == 0)  # only the first arm is displaced
             q0_rad = tuple(start.tolist())
             sites[name] = msgspec.structs.replace(spec, control=law, q0_rad=q0_rad)
         run = FusedRun(msgspec.structs.replace(self._scenario, sites=sites))
+
         slowest_per_s = max(abs(predicted_per_s), _SETTLES / _LONGEST_S)
         first_s = max(_SHORTEST_S, _SETTLES / slowest_per_s)
         durations_s = first_s * 2.0 ** np.arange(_EXTENSIONS)
@@ -531,6 +641,7 @@ class _GainSearch:
             diverged = run.diverged_s is not None
             if diverged or fit.trend in _IS_STABLE:
                 break
+
         stable = False if diverged else _IS_STABLE.get(fit.trend)
         return {
             "share": share,
@@ -559,36 +670,36 @@ def tune_arm(
     curve: bool = False,
     progress: Progress = ignore_progress,
 ) -> ArmGains:
-    """Returns the largest gains with which equal arms follow one another stably.
+    """Finds the largest gains with which equal arms follow one another stably over a delay.
 
     The command is `trilat tune`.
 
-    >>> found = tn.tune_arm("arm6.urdf", "40ms", poses=2)
-    >>> found.agree, len(found.joints)
+    >>> tuned = tn.tune_arm("arm6.urdf", "40ms", poses=2)
+    >>> tuned.agree, len(tuned.joints)
     (True, 6)
 
     Args:
-        arm: path of a URDF, or the name of a shipped file.
-        delay: delay of each link: "40ms", a number of ms, a table t_s,delay_ms, or a log, as
-            "measured:run.mcap".
-        law: p_d, pd_d or saturated_pd.
-        set: overrides of the loop, as in `{"arm.armature_kg_m2": 0.1}`.
-        tip: the end link; "": the only link without a child.
-        sites: 2, or 3 with equal shares.
-        rate_hz: tick rate, Hz.
-        margin: factor by which K is below the edge, and the damping below its sampled-data
+        arm: Path of a URDF, or the name of a shipped file.
+        delay: Delay of each link: a text such as "40ms", a number of ms, a table with the
+            columns t_s,delay_ms, or a log, as in "measured:run.mcap".
+        law: Name of the control law: p_d, pd_d or saturated_pd.
+        set: Overrides of the loop, as in `{"arm.armature_kg_m2": 0.1}`.
+        tip: Name of the end link. Empty stands for the only link without a child.
+        sites: Number of arms: 2, or 3 that follow their two peers equally.
+        rate_hz: Tick rate, in Hz.
+        margin: Factor by which K lies below the edge, and the damping below its sampled-data
             limit.
-        damping: damping ratio of inertia m against a peer that stands still.
-        quantile: quantile of varying delays for which the edge of a constant delay is computed.
-        poses: number of poses within the joints' limits.
-        seed: seed of the poses.
-        curve: compute the edge over the delay too, for a figure.
-        progress: called with the number of finished steps and of all steps: the edge and each
-            run.
+        damping: Damping ratio of the inertia m against a peer that stands still.
+        quantile: Quantile of varying delays for which the edge of a constant delay is computed.
+        poses: Number of random poses within the limits of the joints.
+        seed: Seed of the poses.
+        curve: True to compute the edge as a function of the delay too, for a figure.
+        progress: Function that is called with the number of finished steps and of all steps.
+            The steps are the edge and each run.
 
     Raises:
-        ScenarioError: the file, its tip or an override is not valid.
-        UsageError: another argument is not valid.
+        ScenarioError: The URDF, its tip or an override is not valid.
+        UsageError: Another argument is not valid.
     """
     ranges = {
         "margin": (margin, 1.0, 100.0),
@@ -599,6 +710,7 @@ def tune_arm(
     for name, (value, low, high) in ranges.items():
         if not low <= value <= high:
             raise UsageError(f"{name} is from {low:g} to {high:g}, not {value:g}")
+
     link, delay_text = _read_delay(delay)
     scenario = _build_loop(arm, link, law, set, sites=sites, tip=tip, rate_hz=rate_hz)
     search = _GainSearch(
@@ -611,6 +723,7 @@ def tune_arm(
     edge = search.find_edge()
     pose = np.array(edge["pose"])
     tuned_law = search.build_law(edge["used_per_s2"], margin)
+
     random = np.random.Generator(np.random.Philox(seed))
     push = _PUSH * random.uniform(0.5, 1.0, len(pose))
     laws: list[tuple[float | None, Any]] = [(None, tuned_law)]
@@ -619,6 +732,7 @@ def tune_arm(
     for run_share, run_law in laws:
         progress(1 + len(runs), 1 + len(laws))
         runs.append(search.confirm(run_law, run_share, pose, push))
+
     gains = {}
     assignments = []
     for name in ("K", "Kd", "d"):
@@ -626,7 +740,8 @@ def tune_arm(
             values = list(getattr(tuned_law, name))
             gains[name] = values
             assignments.append(f"{name} = {msgspec.json.encode(values).decode()}")
-    agree = runs[0]["stable"] is True and all(run["agrees"] for run in runs)
+    tuned_run = runs[0]
+    agree = tuned_run["stable"] is True and all(run["agrees"] for run in runs)
     return ArmGains(
         arm=Path(arm).name,
         law=law,
@@ -648,7 +763,13 @@ def tune_arm(
 def _tabulate_joints(
     scenario: Scenario, inertia: Array, gains: Mapping[str, list[float]]
 ) -> list[dict[str, Any]]:
-    """Returns a row per joint: m, the gains, their unit, and the error at the effort limit."""
+    """Returns one row per joint, see `ArmGains.joints`.
+
+    Args:
+        scenario: Scenario with the arm.
+        inertia: Inertia m of each joint, shape (n,).
+        gains: Values of each gain, one per joint, by the name of the gain.
+    """
     model = scenario.arms[scenario.names[0]]
     errors = np.divide(model.efforts, gains["K"]).tolist()
     units = zip(model.joint_units("N m"), model.joint_units("rad"), strict=True)

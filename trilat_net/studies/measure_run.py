@@ -1,15 +1,19 @@
-"""Metrics of a run for the table [expect], and their outcomes.
+"""Measures a run and compares the result with the expectations of its scenario.
 
-The run is simulated in virtual time or read from a log.
+The table [expect] of a scenario states what a run must achieve. This module computes the
+metrics that the table can limit, such as the largest error or the time until the sites agree,
+and compares them with the limits. The run is either simulated in virtual time or read from a
+log. A site is a process that runs one arm and its control loop; a record is the result of one
+tick of this loop.
 
 Invariant:
-    - Each metric has one definition: both sources feed the same running statistics of the sites
-      with the same records, batch by batch in time order.
+    - Each metric has one definition. Both a simulation and a log pass their records, batch by
+      batch in the order of time, to the same running statistics (`SiteStats`).
     - A metric that a run cannot give is None, and never a guess.
-    - Memory is bounded: extrema, sums, the last second, and the buckets for the verdict are
-      kept.
+    - Memory is bounded. Only extrema, sums, the last second of the records, and the buckets
+      for the judgement of the end are kept.
     - The division of a run into batches changes only the last bits of a mean.
-    - An outcome states value, limit and margin.
+    - The outcome of an expectation states the value, the limit and the margin.
 """
 
 import math
@@ -50,21 +54,27 @@ from ..scenario.expect import ALL_SITES_QUANTITIES, END_WINDOW_S, ExpectWindow
 BATCH_RECORDS = 1000
 """Number of records of a site in a batch."""
 _VECTORS = ("q", "qd", "q_des", "tau", "tau_x", "x")
-"""Fields of a record from which `_build_batch` builds a batch."""
+"""Vectors of a record from which `_build_batch` builds a batch, in the order of its arguments.
+"""
 
 
 class RecordBatch(NamedTuple):
-    """Consecutive records of one site.
+    """Consecutive records of one site, as one array per quantity.
+
+    K is the number of records, n the number of joints, m the number of coordinates that the
+    sites agree on, and P the number of peers, the other sites whose states this site receives.
 
     Attributes:
-        t_ns: nominal time, shape (K,), ns.
-        q: joint angles, shape (K, n), rad.
-        qd: joint velocities, shape (K, n), rad/s.
-        e: error against the reference, Eq. (9), shape (K, m), rad; m in task space.
-        tau: control torque, shape (K, n), N m.
-        tau_x: exogenous torque in the sign of Eq. (8), shape (K, n), N m.
-        used: tick of each peer's sample in use, -1 before the first, shape (K, P); (K, 0) for a
-            compiled run, which does not report samples.
+        t_ns: Nominal times, shape (K,), in ns.
+        q: Joint angles, shape (K, n), in rad.
+        qd: Joint velocities, shape (K, n), in rad/s.
+        e: Error against the reference, Eq. (9), shape (K, m), in rad, or in the units of the
+            task space.
+        tau: Control torque, shape (K, n), in N m.
+        tau_x: Exogenous torque with the sign of Eq. (8), shape (K, n), in N m.
+        used: Tick in which each peer sent the sample that is in use, shape (K, P). It is -1
+            before the first sample. The shape is (K, 0) for a compiled run, which does not
+            report samples.
     """
 
     t_ns: Ints
@@ -76,40 +86,51 @@ class RecordBatch(NamedTuple):
     used: Ints
 
     def since(self, t_ns: int) -> "RecordBatch":
-        """Returns the records after a time, ns."""
+        """Returns the records after the time `t_ns`, in ns."""
         first = np.searchsorted(self.t_ns, t_ns, side="right")
         return self._slice(int(first), None)
 
     def between(self, from_ns: int, to_ns: int) -> "RecordBatch":
-        """Returns the records from `from_ns` until before `to_ns`."""
+        """Returns the records at `from_ns` or later, but before `to_ns`."""
         first = np.searchsorted(self.t_ns, from_ns)
         stop = np.searchsorted(self.t_ns, to_ns)
         return self._slice(int(first), int(stop))
 
     def reduce(self, into: Array = NO_BUCKETS) -> Array:
-        """Returns the buckets of a verdict with these records, see `reduce_to_buckets`."""
+        """Reduces the records to buckets, on which the judgement of a run's end is based.
+
+        Args:
+            into: Buckets of all earlier records, which may be changed in place.
+
+        Returns:
+            The buckets including these records, see `reduce_to_buckets`.
+        """
         bucket = self.t_ns * BUCKETS_PER_S // NS_PER_S
         return reduce_to_buckets(bucket=bucket, e=self.e, qd=self.qd, q=self.q, into=into)
 
     def _slice(self, first: int, stop: int | None) -> "RecordBatch":
-        """Returns the records from index `first` until before index `stop`."""
+        """Returns the records from index `first` up to, but not including, index `stop`."""
         return RecordBatch._make(column[first:stop] for column in self)
 
 
 def join_batches(batches: Sequence[RecordBatch]) -> RecordBatch:
-    """Returns consecutive batches as one."""
+    """Returns consecutive batches of a site as a single batch."""
     columns = zip(*batches, strict=True)
     return RecordBatch._make(np.concatenate(parts) for parts in columns)
 
 
 def _build_batch(axes: Sequence[float], t_ns: Ints, used: Ints, *vectors: Array) -> RecordBatch:
-    """Returns a batch with the error against the reference.
+    """Builds a batch, and computes the error e against the reference of the site.
+
+    In task space, the error is the difference between the pose of the end effector and its
+    reference. Otherwise it is the difference between the joint angles and their reference.
 
     Args:
-        axes: which coordinates of the task a site follows.
-        t_ns: nominal times, shape (K,), ns.
-        used: samples in use, shape (K, P).
-        vectors: q, qd, q_des, tau, tau_x and x, shape (K, ...) each.
+        axes: For each coordinate of the task, 1 if the site follows along it, and else 0.
+        t_ns: Nominal times, shape (K,), in ns.
+        used: Samples in use, shape (K, P), as in `RecordBatch`.
+        vectors: The arrays q, qd, q_des, tau, tau_x and x, shape (K, ...) each. The pose x of
+            the end effector is empty if the sites agree on joint angles.
     """
     q, qd, q_des, tau, tau_x, x = vectors
     e = compute_task_errors(x, q_des, axes) if x.size else q - q_des
@@ -119,21 +140,22 @@ def _build_batch(axes: Sequence[float], t_ns: Ints, used: Ints, *vectors: Array)
 def run_in_batches(
     scenario: Scenario, receivers: Mapping[str, Callable[[RecordBatch], None]]
 ) -> tuple[float | None, int]:
-    """Runs a scenario in virtual time and passes the records on, batch by batch.
+    """Runs a scenario in virtual time, and passes the records on batch by batch.
 
     Args:
-        scenario: the scenario.
-        receivers: function that receives the batches of each site.
+        scenario: The scenario.
+        receivers: For each site, the function that receives its batches.
 
     Returns:
-        The time at which the first site left its limits, s, or None; and the number of late
-        samples.
+        The time at which the first site left the limits of its arm, in s, or None if no site
+        did; and the number of samples that arrived too late to be used as planned.
     """
     pending: dict[str, list[TickRecord]] = {name: [] for name in receivers}
     sites: dict[str, Site] = {}
     diverged_at_s: float | None = None
 
     def flush(name: str) -> None:
+        """Passes the pending records of a site on."""
         records = pending[name]
         if not records:
             return
@@ -157,6 +179,7 @@ def run_in_batches(
                 diverged_at_s = output.t_ns / NS_PER_S
     for name in pending:
         flush(name)
+
     late_samples = 0
     for site in sites.values():
         late_samples += sum(count.late for count in site.counts())
@@ -166,28 +189,30 @@ def run_in_batches(
 def run_compiled_in_batches(
     scenario: Scenario, receivers: Mapping[str, Callable[[RecordBatch], None]]
 ) -> float | None:
-    """Runs a scenario in the compiled loop and passes the records on, batch by batch.
+    """Runs a scenario in the compiled loop, and passes the records on batch by batch.
 
-    The compiled loop does not report the samples in use.
+    The compiled loop executes all sites without returning to Python. It is faster than
+    `run_in_batches`, but it does not report the samples in use.
 
     Args:
-        scenario: the scenario.
-        receivers: function that receives the batches of each site.
+        scenario: The scenario.
+        receivers: For each site, the function that receives its batches.
 
     Returns:
-        The time at which the first site left its limits, s, or None.
+        The time at which the first site left the limits of its arm, in s. None if no site did.
     """
     run = FusedRun(scenario, keep=BATCH_RECORDS + 1)
     columns = {name: scenario.layout(name).columns() for name in scenario.names}
     fastest_hz = max(spec.rate_hz for spec in scenario.sites.values())
+    # In this time no site produces more records than the run keeps.
     period_s = BATCH_RECORDS / fastest_hz
-    empty = slice(0, 0)
+    no_columns = slice(0, 0)  # for vectors that the site does not have
     while run.ran_s < scenario.duration_s and run.diverged_s is None:
         run.advance_to(min(run.ran_s + period_s, scenario.duration_s))
         for name, (t_ns, rows) in zip(scenario.names, run.pop_records(), strict=True):
             if not len(t_ns):
                 continue
-            vectors = [rows[:, columns[name].get(key, empty)] for key in _VECTORS]
+            vectors = [rows[:, columns[name].get(key, no_columns)] for key in _VECTORS]
             used = np.zeros((len(t_ns), 0), np.int64)
             axes = scenario.arms[name].axes
             receivers[name](_build_batch(axes, t_ns, used, *vectors))
@@ -195,7 +220,11 @@ def run_compiled_in_batches(
 
 
 def run_whole(scenario: Scenario) -> tuple[dict[str, RecordBatch], RunEnd]:
-    """Runs a scenario in the compiled loop; returns all records, and how the run ended."""
+    """Runs a scenario in the compiled loop and keeps all records.
+
+    Returns:
+        The records of each site, and the judgement of the end of the run.
+    """
     batches: dict[str, list[RecordBatch]] = {name: [] for name in scenario.names}
     receivers = {name: batches[name].append for name in batches}
     diverged_s = run_compiled_in_batches(scenario, receivers)
@@ -207,14 +236,22 @@ def run_whole(scenario: Scenario) -> tuple[dict[str, RecordBatch], RunEnd]:
 
 
 class Range(NamedTuple):
-    """Smallest and largest value of a quantity; both are the same for a single value."""
+    """Smallest and largest value of a quantity. Both are equal if there is a single value."""
 
     least: float
     most: float
 
 
 class WindowStats:
-    """Running statistics of one site within a window of [expect]."""
+    """Running statistics of one site within a window of [expect].
+
+    A window is a period of the run for which the scenario states its own limits.
+
+    Args:
+        window: The window.
+        scenario: Scenario of the run.
+        site: Name of the site.
+    """
 
     def __init__(self, window: ExpectWindow, scenario: Scenario, site: str) -> None:
         spec = scenario.sites[site]
@@ -237,7 +274,7 @@ class WindowStats:
         self._hits = 0
 
     def add(self, rows: RecordBatch) -> None:
-        """Adds the next records of the site; records outside of the window are ignored."""
+        """Adds the next records of the site. Records outside of the window are ignored."""
         self._last_ns = int(rows.t_ns[-1])
         inside = rows.between(self._from_ns, self._to_ns)
         if not len(inside.t_ns):
@@ -258,13 +295,25 @@ class WindowStats:
             self._add_wall_force(np.sum(forces, axis=0))
 
     def _raise_peak(self, key: str, values: Array) -> None:
-        """Raises a peak to the largest absolute value."""
+        """Raises a peak to the largest absolute value, if this is larger.
+
+        Args:
+            key: Name of the peak.
+            values: New values, of any shape.
+        """
         largest = float(np.abs(values).max())
         self._peaks[key] = max(self._peaks[key], largest)
 
     def _add_wall_force(self, force: Array) -> None:
-        """Adds the force of the walls at the next records, shape (K,), N."""
+        """Updates the statistics of the force that the walls of the site exert on its arm.
+
+        A hit is a record with contact that follows a record without contact.
+
+        Args:
+            force: Sum of the forces of all walls in the next records, shape (K,), in N.
+        """
         touches = force > 0.0
+        # A contact that exists in the first record of the window is not a hit.
         was_touching = touches[0] if self._was_touching is None else self._was_touching
         previous = np.append(was_touching, touches[:-1])
         self._hits += int((touches & ~previous).sum())
@@ -274,12 +323,19 @@ class WindowStats:
         self._force_peak = max(self._force_peak, float(force.max()))
 
     def compute_ranges(self) -> dict[str, Range]:
-        """Returns the range of each quantity, by its key in the window of [expect].
+        """Returns the range of each quantity within the window.
 
-        There are no quantities if the records end before the window.
+        Joint angles have a smallest and a largest value. All other quantities, such as a mean
+        or a peak, have a single value.
+
+        Returns:
+            The ranges, by the keys of a window of [expect]. Empty if the records end before
+            the window does.
         """
-        if not self._records or self._last_ns < self._to_ns - self._period_ns:
+        ends_early = self._last_ns < self._to_ns - self._period_ns
+        if not self._records or ends_early:
             return {}
+
         ranges = {}
         angles = zip(self._q_least.tolist(), self._q_most.tolist(), strict=True)
         for n, (least, most) in enumerate(angles, 1):
@@ -291,7 +347,7 @@ class WindowStats:
             single_values[f"push{n}_mean_nm"] = push_nm
         mean_n = self._force_sum / self._records
         mean_square = self._force_squares / self._records
-        variance = max(0.0, mean_square - mean_n * mean_n)
+        variance = max(0.0, mean_square - mean_n * mean_n)  # rounding can make it negative
         single_values["wall_mean_n"] = mean_n
         single_values["wall_deviation_n"] = math.sqrt(variance)
         single_values["wall_peak_n"] = self._force_peak
@@ -303,17 +359,27 @@ class WindowStats:
 
 
 _BUCKET_NS = NS_PER_S // BUCKETS_PER_S
+"""Duration of a bucket, in ns."""
 _END_NS = round(END_WINDOW_S * NS_PER_S)
+"""Duration of the end of a run, the last second, in ns."""
 
 
 class SiteStats:
-    """Running statistics of one site.
+    """Running statistics of one site, which are fed with its records batch by batch.
+
+    Args:
+        scenario: Scenario of the run.
+        site: Name of the site.
 
     Attributes:
-        windows: statistics within each window of [expect]; None for windows of other sites.
-        unsynchronised_ns: time of the last record whose |e| was not below `synchronised_rad`;
-            -1 before the first such record.
-        age_max_ms: largest age of each peer's sample in use, shape (P,), ms.
+        windows: Statistics within each window of [expect]. None for windows of other sites.
+        records: Number of records.
+        peak_error_rad: Largest |e| of any joint, in rad.
+        peak_torque_nm: Largest absolute control torque of any joint, in N m.
+        peak_speed_rad_s: Largest absolute velocity of any joint, in rad/s.
+        unsynchronised_ns: Time of the last record in which |e| was not below the limit
+            `synchronised_rad` of [expect], in ns. It is -1 before the first such record.
+        age_max_ms: Largest age of each peer's sample in use, shape (P,), in ms.
     """
 
     def __init__(self, scenario: Scenario, site: str) -> None:
@@ -337,56 +403,63 @@ class SiteStats:
         self._tail: list[RecordBatch] = []
 
     def add(self, rows: RecordBatch) -> None:
-        """Adds the next records."""
+        """Adds the next records of the site to all statistics."""
         if not len(rows.t_ns):
             return
         error = np.abs(rows.e)
-        largest = error.max(axis=1)
+        largest_error = error.max(axis=1)
         torque_nm = np.abs(rows.tau)
         speed_rad_s = np.abs(rows.qd)
-        self.records += len(largest)
-        self.peak_error_rad = max(self.peak_error_rad, float(largest.max()))
+        self.records += len(largest_error)
+        self.peak_error_rad = max(self.peak_error_rad, float(largest_error.max()))
         self.peak_torque_nm = max(self.peak_torque_nm, float(torque_nm.max()))
         self.peak_speed_rad_s = max(self.peak_speed_rad_s, float(speed_rad_s.max()))
         self._squares = self._squares + (error * error).sum(axis=0)
-        unsynchronised = np.flatnonzero(largest >= self._synchronised_rad)
+        unsynchronised = np.flatnonzero(largest_error >= self._synchronised_rad)
         if len(unsynchronised):
             self.unsynchronised_ns = int(rows.t_ns[unsynchronised[-1]])
 
-        known = rows.used >= 0
-        sent_ns = rows.used * NS_PER_S // self._peer_rates
-        age_ms = (rows.t_ns[:, None] - sent_ns) * 1e-6
-        age_ms[~known] = 0.0
-        self.age_max_ms = np.maximum(self.age_max_ms, age_ms.max(axis=0))
-        self._age_sum_ms += age_ms.sum(axis=0)
-        self._age_records += known.sum(axis=0)
-
+        self._add_ages(rows)
         self._buckets = rows.reduce(self._buckets)
         for window in filter(None, self.windows):
             window.add(rows)
 
-        # a batch is dropped once the batch after it covers the last second
+        # Only the last second is kept: a batch is dropped once the next one covers it alone.
         self._tail.append(rows)
         last_second_ns = rows.t_ns[-1] - _END_NS
         while len(self._tail) > 1 and self._tail[1].t_ns[0] < last_second_ns:
             del self._tail[0]
 
+    def _add_ages(self, rows: RecordBatch) -> None:
+        """Updates the statistics of the ages of the samples in use.
+
+        The age of a sample is the time since its peer sent it. Records from before the first
+        sample of a peer do not count.
+        """
+        is_known = rows.used >= 0
+        sent_ns = rows.used * NS_PER_S // self._peer_rates
+        age_ms = (rows.t_ns[:, None] - sent_ns) * 1e-6
+        age_ms[~is_known] = 0.0
+        self.age_max_ms = np.maximum(self.age_max_ms, age_ms.max(axis=0))
+        self._age_sum_ms += age_ms.sum(axis=0)
+        self._age_records += is_known.sum(axis=0)
+
     @property
     def last_ns(self) -> int:
-        """Nominal time of the last record, ns; -1 before the first."""
+        """Nominal time of the last record, in ns. It is -1 before the first record."""
         if not self._tail:
             return -1
         return int(self._tail[-1].t_ns[-1])
 
     @property
     def rms_error_rad(self) -> float:
-        """Root mean square of e of the worst joint, rad."""
+        """Root mean square of e over all records, of the worst joint, in rad."""
         mean_square = self._squares.max() / max(1, self.records)
         return float(np.sqrt(mean_square))
 
     @property
     def link_ages(self) -> list["LinkAge"]:
-        """Age of each peer's sample in use; None for a peer without samples."""
+        """Ages of the samples in use, one entry per peer, in the order of the peers."""
         sums_ms = self._age_sum_ms.tolist()
         record_counts = self._age_records.tolist()
         largest_ms = self.age_max_ms.tolist()
@@ -399,20 +472,21 @@ class SiteStats:
         return ages
 
     def end(self, end_ns: int) -> RecordBatch:
-        """Returns the records of the last second before `end_ns`.
+        """Returns the records of the last second before a time.
 
-        `end_ns` is not before the last record.
+        Args:
+            end_ns: The time, in ns. It must not lie before the last record.
         """
         return join_batches(self._tail).since(end_ns - _END_NS)
 
     @property
     def buckets(self) -> Array:
-        """The buckets of the site for `RunTrace.buckets`."""
+        """Buckets of the site's records, for `RunTrace.buckets`."""
         return self._buckets[: self.last_ns // _BUCKET_NS + 1]
 
     @property
     def tau_x(self) -> Array:
-        """The torque of operator and environment at the last record, shape (n,), N m."""
+        """Torque of operator and environment in the last record, shape (n,), in N m."""
         if not self._tail:
             return np.zeros(1)
         last_tau_x: Array = self._tail[-1].tau_x[-1]
@@ -420,11 +494,13 @@ class SiteStats:
 
 
 class LinkAge(msgspec.Struct, frozen=True):
-    """Age of the sample in use on one link, over the ticks from the first sample on.
+    """Age of the samples in use of one link, which leads from one site to another.
+
+    Ticks before the first sample do not count.
 
     Attributes:
-        mean_ms: the mean age; None without a sample.
-        max_ms: the largest age; None without a sample.
+        mean_ms: Mean age, in ms. None if the link never delivered a sample.
+        max_ms: Largest age, in ms. None if the link never delivered a sample.
     """
 
     mean_ms: float | None
@@ -432,20 +508,20 @@ class LinkAge(msgspec.Struct, frozen=True):
 
 
 class RunMetrics(msgspec.Struct, frozen=True, kw_only=True):
-    """The metrics of one run; the docstring of `Expect` defines each of them.
+    """Metrics of one run. The docstring of `Expect` defines each of them.
 
-    None stands for a metric that the run cannot give, because it is too short or the event did
-    not happen. Metrics `end_...` concern the last second.
+    A metric is None if the run cannot give it, because it is too short or because the event
+    did not happen. The metrics `end_...` concern the last second of the run.
 
     Attributes:
-        end: the verdict on the run.
-        ages: ages of the samples in use, by link "j->i".
-        late_samples: number of samples that arrived too late for the use that their link
-            planned.
-        missing: number of ticks without a record.
-        windows: ranges of the quantities of each window; empty if the run ended before the
-            window.
-        metrics: the expected metrics of `docs/metrics.md`.
+        simulated_s: Duration of the run in its own time, in s.
+        end: Judgement of the end of the run.
+        ages: Ages of the samples in use, by link "j->i".
+        late_samples: Number of samples that arrived too late to be used as their link planned.
+        missing: Number of ticks without a record.
+        windows: Ranges of the quantities within each window. Empty for a window that ends after
+            the run.
+        metrics: Metrics of `docs/metrics.md` that the scenario limits.
     """
 
     simulated_s: float
@@ -467,55 +543,57 @@ class RunMetrics(msgspec.Struct, frozen=True, kw_only=True):
 
 def compute_run_metrics(
     scenario: Scenario,
-    tallies: Mapping[str, SiteStats],
+    site_stats: Mapping[str, SiteStats],
     *,
     diverged_at_s: float | None,
     late_samples: int,
     missing: int,
 ) -> RunMetrics:
-    """Returns the metrics of a run from the statistics of its sites.
+    """Combines the statistics of the sites to the metrics of the run.
 
     Args:
-        scenario: the scenario.
-        tallies: statistics of the sites, in scenario order.
-        diverged_at_s: time at which the first site left its limits, s; None: never.
-        late_samples: number of late samples.
-        missing: number of ticks without a record.
+        scenario: The scenario.
+        site_stats: Statistics of each site, in the order of the scenario.
+        diverged_at_s: Time at which the first site left the limits of its arm, in s. None if
+            no site did.
+        late_samples: Number of samples that arrived too late.
+        missing: Number of ticks without a record.
     """
-    with_records = {name: tally for name, tally in tallies.items() if tally.records}
-    all_ran = len(with_records) == len(tallies)
-    buckets = [tally.buckets for tally in tallies.values()]
-    last_tau_x = [tally.tau_x for tally in tallies.values()]
+    with_records = {name: stats for name, stats in site_stats.items() if stats.records}
+    all_ran = len(with_records) == len(site_stats)
+    buckets = [stats.buckets for stats in site_stats.values()]
+    last_tau_x = [stats.tau_x for stats in site_stats.values()]
     trace = RunTrace(buckets, last_tau_x, diverged_at_s)
 
     synchronised_at_s = None
     if all_ran:
         synchronised_at_s = _find_synchronisation_s(list(with_records.values()))
-    end_ns = max((tally.last_ns for tally in with_records.values()), default=0)
+    end_ns = max((stats.last_ns for stats in with_records.values()), default=0)
     durations_s = []
     ends = []
     end_errors_rad = []
     end_poses_rad = {}
-    for name, tally in with_records.items():
-        # to the end of the period after the last tick
+    for name, stats in with_records.items():
+        # The run lasts until the end of the period after the last tick.
         period_s = 1.0 / scenario.sites[name].rate_hz
-        durations_s.append(tally.last_ns / NS_PER_S + period_s)
-        end = tally.end(end_ns)
+        durations_s.append(stats.last_ns / NS_PER_S + period_s)
+        end = stats.end(end_ns)
         ends.append(end)
         end_errors_rad.append(float(np.abs(end.e).max(initial=0.0)))
-        last_pose_rad = tally.end(tally.last_ns).q[-1]
+        last_pose_rad = stats.end(stats.last_ns).q[-1]
         end_poses_rad[name] = tuple(last_pose_rad.tolist())
 
     ages = {}
-    for name, tally in tallies.items():
+    for name, stats in site_stats.items():
         peers = scenario.peers(name)
-        for peer, age in zip(peers, tally.link_ages, strict=True):
+        for peer, age in zip(peers, stats.link_ages, strict=True):
             ages[f"{peer}->{name}"] = age
-    windows_by_site = [tally.windows for tally in tallies.values()]
-    windows = zip(*windows_by_site, strict=True)
+    windows_by_site = [stats.windows for stats in site_stats.values()]
+    sites_by_window = zip(*windows_by_site, strict=True)
 
     def find_largest(name: str) -> float | None:
-        values = [getattr(tally, name) for tally in with_records.values()]
+        """Returns the largest value of an attribute over the sites with records."""
+        values = [getattr(stats, name) for stats in with_records.values()]
         return max(values, default=None)
 
     return RunMetrics(
@@ -532,29 +610,39 @@ def compute_run_metrics(
         ages=ages,
         late_samples=late_samples,
         missing=missing,
-        windows=tuple(map(_merge_windows, windows)),
+        windows=tuple(map(_merge_windows, sites_by_window)),
     )
 
 
-def _find_synchronisation_s(tallies: Sequence[SiteStats]) -> float | None:
-    """Returns the time from which all sites stay synchronised, in s.
+def _find_synchronisation_s(site_stats: Sequence[SiteStats]) -> float | None:
+    """Returns the time from which all sites stay synchronised until the end, in s.
 
-    None if a site is not synchronised at its last record.
+    A site is synchronised while its error |e| is below the limit of [expect].
 
     Args:
-        tallies: statistics of all sites, each with records.
+        site_stats: Statistics of all sites, each of which has records.
+
+    Returns:
+        The time. None if a site is not synchronised in its last record.
     """
-    if any(tally.unsynchronised_ns == tally.last_ns for tally in tallies):
+    if any(stats.unsynchronised_ns == stats.last_ns for stats in site_stats):
         return None
-    last_ns = max(tally.unsynchronised_ns for tally in tallies)
+    last_ns = max(stats.unsynchronised_ns for stats in site_stats)
     return max(0, last_ns) / NS_PER_S
 
 
 def _merge_windows(windows: Sequence[WindowStats | None]) -> dict[str, Range]:
-    """Returns the ranges of a window over all of its sites.
+    """Combines the statistics of a window over all sites to which the window applies.
+
+    If the window applies to a single site, the ranges are those of this site. Otherwise only
+    quantities that can be compared between sites are kept, each with its largest value.
 
     Args:
-        windows: statistics of each site within the window; None for a site that it excludes.
+        windows: Statistics of each site within the window. None for a site to which the window
+            does not apply.
+
+    Returns:
+        Ranges by the keys of a window of [expect].
     """
     site_ranges = [window.compute_ranges() for window in windows if window is not None]
     if len(site_ranges) == 1:
@@ -570,15 +658,24 @@ def _merge_windows(windows: Sequence[WindowStats | None]) -> dict[str, Range]:
 
 
 def _compute_end_spread_rad(ends: Sequence[RecordBatch]) -> float | None:
-    """Returns the largest difference of a joint's angles between sites in the last second.
+    """Returns the largest difference of a joint's angle between sites in the last second.
 
-    None: a site has no records there, or the arms have different numbers of joints.
+    Sites may have different tick rates. Therefore each record of the first site is compared
+    with the latest record of every other site at that time.
+
+    Args:
+        ends: Records of the last second, one batch per site.
+
+    Returns:
+        The difference in rad. None if a site has no records in the last second, or if the arms
+        have different numbers of joints.
     """
     if not all(len(end.t_ns) for end in ends):
         return None
     joint_counts = {end.q.shape[1] for end in ends}
     if len(joint_counts) > 1:
         return None
+
     first_common_ns = max(end.t_ns[0] for end in ends)
     times_ns = ends[0].t_ns[ends[0].t_ns >= first_common_ns]
     poses = []
@@ -590,19 +687,24 @@ def _compute_end_spread_rad(ends: Sequence[RecordBatch]) -> float | None:
 
 
 def measure_virtual_run(scenario: Scenario) -> RunMetrics:
-    """Runs a scenario in virtual time and returns its metrics."""
+    """Runs a scenario in virtual time and returns the metrics of the run.
+
+    The records are not kept, unless the scenario limits a metric of `docs/metrics.md`, which
+    needs the whole log.
+    """
     if scenario.expect.metrics:
         return measure_log(simulate_scenario(scenario))
-    tallies = {name: SiteStats(scenario, name) for name in scenario.names}
-    receivers = {name: tally.add for name, tally in tallies.items()}
+
+    site_stats = {name: SiteStats(scenario, name) for name in scenario.names}
+    receivers = {name: stats.add for name, stats in site_stats.items()}
     diverged_at_s, late_samples = run_in_batches(scenario, receivers)
     missing = 0
     if diverged_at_s is None:
         expected = sum(scenario.ticks(name) for name in scenario.names)
-        missing = expected - sum(tally.records for tally in tallies.values())
+        missing = expected - sum(stats.records for stats in site_stats.values())
     return compute_run_metrics(
         scenario,
-        tallies,
+        site_stats,
         diverged_at_s=diverged_at_s,
         late_samples=late_samples,
         missing=missing,
@@ -610,42 +712,44 @@ def measure_virtual_run(scenario: Scenario) -> RunMetrics:
 
 
 def measure_log(log: Log, expect: Expect | None = None) -> RunMetrics:
-    """Returns the metrics of a log.
+    """Returns the metrics of a recorded run.
 
     Args:
-        log: the log.
-        expect: expectations instead of those of the log's scenario.
+        log: Log of the run.
+        expect: Expectations that replace those of the log's scenario.
 
     Raises:
-        LogError: a record cannot be read.
+        LogError: A record cannot be read.
     """
     scenario = log.scenario
     if expect is not None:
         scenario = msgspec.structs.replace(scenario, expect=expect)
     ticks_at_end = {event.member: event.ticks for event in log.events if event.kind == "end"}
     diverged_at_s = log.diverged_s
-    tallies = {name: SiteStats(scenario, name) for name in log.sites}
+    site_stats = {name: SiteStats(scenario, name) for name in log.sites}
     missing = 0
-    for name, tally in tallies.items():
-        part = log[name]
+    for name, stats in site_stats.items():
+        site_log = log[name]
         batch = RecordBatch(
-            t_ns=part.t_ns,
-            q=part.q,
-            qd=part.qd,
-            e=part.e,
-            tau=part.tau,
-            tau_x=part.tau_x,
-            used=np.array([part.used[peer] for peer in part.peers]).T,
+            t_ns=site_log.t_ns,
+            q=site_log.q,
+            qd=site_log.qd,
+            e=site_log.e,
+            tau=site_log.tau,
+            tau_x=site_log.tau_x,
+            used=np.array([site_log.used[peer] for peer in site_log.peers]).T,
         )
-        tally.add(batch)
+        stats.add(batch)
         expected = scenario.ticks(name)
         if diverged_at_s is not None:
+            # A run that diverged ends early, in the tick that its sites announced.
             expected = ticks_at_end.get(name, 0)
-        missing += max(0, expected - len(part))
+        missing += max(0, expected - len(site_log))
+
     late_samples = sum(sample.arrived_tick is not None for sample in find_absent_samples(log))
     metrics = compute_run_metrics(
         scenario,
-        tallies,
+        site_stats,
         diverged_at_s=diverged_at_s,
         late_samples=late_samples,
         missing=missing,
@@ -655,16 +759,16 @@ def measure_log(log: Log, expect: Expect | None = None) -> RunMetrics:
 
 
 class ExpectationResult(msgspec.Struct, frozen=True):
-    """The outcome of one expectation of one run.
+    """Outcome of one expectation of one run.
 
     Attributes:
-        key: the key of [expect], or a word for a requirement on every run.
+        key: Key of [expect], or the name of a requirement that every run must meet.
         held: True if the expectation is met.
-        measured: the measured value as a text with its unit.
-        limit: the limit as a text with its unit.
-        margin: distance to the limit as a fraction of the limit, negative beyond the limit;
-            None if there is no such number.
-        value: the measured number in the unit of the limit; None if there is none.
+        measured: Measured value as a text with its unit.
+        limit: Limit as a text with its unit.
+        margin: Distance to the limit as a fraction of the limit, negative beyond the limit.
+            None if the expectation has no such number.
+        value: Measured number in the unit of the limit. None if there is no such number.
     """
 
     key: str
@@ -676,9 +780,17 @@ class ExpectationResult(msgspec.Struct, frozen=True):
 
 
 def evaluate_expectations(expect: Expect, metrics: RunMetrics) -> list[ExpectationResult]:
-    """Returns an outcome for each expectation of a run, in the order of the keys of `Expect`.
+    """Compares the metrics of a run with the expectations of its scenario.
 
-    A run that diverged has an outcome `stable` even if that key is absent, see `Expect`.
+    A run that diverged, that is, left the limits of an arm, has an outcome `stable` even if the
+    scenario does not contain this key, see `Expect`.
+
+    Args:
+        expect: Expectations of the scenario.
+        metrics: Metrics of the run.
+
+    Returns:
+        The outcome of each expectation, in the order of the keys of `Expect`.
     """
     outcomes = list(_evaluate_stability(expect, metrics))
     for key in _LIMITS:
@@ -700,7 +812,7 @@ def evaluate_expectations(expect: Expect, metrics: RunMetrics) -> list[Expectati
 
 
 def _evaluate_stability(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:
-    """Yields the outcome of `stable`, if it is expected or the run diverged."""
+    """Yields the outcome of `stable`, if the scenario expects it or if the run diverged."""
     expects_stable = expect.stable is not False
     end = metrics.end
     if expect.stable is not None or end.diverged_at_s is not None:
@@ -711,18 +823,25 @@ def _evaluate_stability(expect: Expect, metrics: RunMetrics) -> Iterator[Expecta
 
 
 _LIMITS = tuple(key for key in field_names(Expect) if re.search("_(max|min|by)(_|$)", key))
-"""Keys of [expect] that limit a metric."""
+"""Keys of [expect] that are a smallest or largest value of a metric."""
 
 
 def _read_metric(key: str, metrics: RunMetrics) -> float | None:
     """Returns the metric that a key of [expect] limits.
 
-    For ages it is that of the worst link, and None if a link never had a sample.
+    The name of the metric follows from the key: "peak_error_max_rad" limits `peak_error_rad`,
+    and "synchronised_by_s" limits `synchronised_at_s`. Keys in ms limit the ages of samples,
+    of which the worst link counts.
+
+    Returns:
+        The metric. None if the run does not have it, or if a link never delivered a sample.
     """
-    if not key.endswith("_ms"):
+    is_age = key.endswith("_ms")
+    if not is_age:
         name = re.sub("_(max|min)", "", key).replace("_by_", "_at_")
         value: float | None = getattr(metrics, name)
         return value
+
     is_mean = key.startswith("mean")
     ages_ms = []
     for age in metrics.ages.values():
@@ -730,17 +849,18 @@ def _read_metric(key: str, metrics: RunMetrics) -> float | None:
         if age_ms is None:
             return None
         ages_ms.append(age_ms)
-    choose = min if "_min_" in key else max
-    return choose(ages_ms) if ages_ms else None
+    if not ages_ms:
+        return None
+    return min(ages_ms) if "_min_" in key else max(ages_ms)
 
 
 def _compare_with_limit(key: str, measured: float | None, limit: float) -> ExpectationResult:
-    """Returns the outcome of a smallest or a largest value.
+    """Compares a metric with a smallest or largest value.
 
     Args:
-        key: the key of [expect].
-        measured: the measured value; None: the run has none.
-        limit: the limit, in the same unit.
+        key: Key of [expect]. It contains "_min_" for a smallest value, and ends in the unit.
+        measured: The metric. None if the run does not have it, which fails the expectation.
+        limit: The limit, in the same unit.
     """
     is_minimum = "_min_" in key
     relation = "≥" if is_minimum else "≤"
@@ -760,7 +880,7 @@ def _compare_with_limit(key: str, measured: float | None, limit: float) -> Expec
 
 
 def _evaluate_poses(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:
-    """Yields the outcome of each expected end pose."""
+    """Yields the outcome of the expected end pose of each site that has one."""
     tolerance_rad = expect.end_pose_within_rad
     for site, expected in expect.end_pose_rad.items():
         key = f"end_pose_rad.{site}"
@@ -783,7 +903,7 @@ def _evaluate_poses(expect: Expect, metrics: RunMetrics) -> Iterator[Expectation
 
 
 def _evaluate_windows(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:
-    """Yields the outcome of each quantity of each window."""
+    """Yields the outcome of each limited quantity of each window."""
     for window, ranges in zip(expect.windows, metrics.windows, strict=True):
         site = f" {window.site}" if window.site else ""
         period = f"{window.from_s:g}-{window.to_s:g} s"
@@ -794,7 +914,7 @@ def _evaluate_windows(expect: Expect, metrics: RunMetrics) -> Iterator[Expectati
 
 
 def _evaluate_metrics(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:
-    """Yields the outcome of each expected metric of docs/metrics.md."""
+    """Yields the outcome of each limited metric of docs/metrics.md."""
     for key, limits in expect.metrics.items():
         value, reason, _ = metrics.metrics[key]
         yield _compare_with_range(
@@ -813,14 +933,18 @@ def _compare_with_range(
     unit: str,
     missing_text: str = "never",
 ) -> ExpectationResult:
-    """Returns the outcome of a quantity that must stay within a range.
+    """Compares a quantity with the range within which it must stay.
 
     Args:
-        name: name of the expectation.
-        measured: smallest and largest value; None: the run has none.
-        limits: lower and upper limit.
-        unit: unit of the quantity.
-        missing_text: text for a missing value.
+        name: Name of the expectation.
+        measured: Smallest and largest value of the quantity. None if the run does not have it,
+            which fails the expectation.
+        limits: Lower and upper limit.
+        unit: Unit of the quantity.
+        missing_text: Text in place of a missing value.
+
+    Returns:
+        The outcome. Its margin is relative to half the width of the permitted range.
     """
     least, most = limits
     limit_text = f"{least:g} to {most:g} {unit}".rstrip()
