@@ -1,11 +1,14 @@
-"""A dead-man switch in a terminal: its arm moves while keys are pressed, or while lines come from a program.
+"""A dead-man switch in a terminal: the arm may move only while a key is held down.
 
     python examples/dead_man_switch.py two_sites s --connect tcp/127.0.0.1:10241
     pedal | python examples/dead_man_switch.py two_sites s --connect tcp/127.0.0.1:10241
 
-A terminal does not say that a key is let go: it repeats one that is held. The switch is let go once nothing
-came for --gap-s, which must be longer than a keyboard waits before it repeats; a button could say it sooner.
-At the end of its input it is let go at once. Linux and macOS; the scenario has `dead_man = true`.
+Instead of a key, a program such as `pedal` can write lines while the arm may move.
+
+A terminal does not report that a key was released, but it repeats a key that is held down. The
+switch is therefore released when nothing has arrived for --gap-s. This time must be longer than
+the delay after which the keyboard starts to repeat. At the end of the input the switch is
+released at once. The scenario of the session needs `dead_man = true`. Works on Linux and macOS.
 """
 
 import argparse
@@ -27,33 +30,36 @@ def hold(
     now_s: Callable[[], float],
     gap_s: float,
 ) -> None:
-    """Holds a switch while something comes in, until its session or its input ends.
+    """Holds a switch while keys arrive, until the session or the input ends.
 
     Args:
-        switch: of the arm.
-        read: waits for a period, and returns what came in; b"" for nothing, None at the end.
-        now_s: a clock.
-        gap_s: once nothing came for so long, it is let go.
+        switch: the dead-man switch of an arm.
+        read: waits for one period, and returns the keys that arrived. Empty if there are none,
+            and None at the end of the input.
+        now_s: returns the present time, in s.
+        gap_s: time without keys after which the switch is released, in s.
     """
-    came_s = -gap_s + now_s()
+    last_key_s = -gap_s + now_s()
     try:
         while not switch.over and (keys := read()) is not None:
             if keys:
-                came_s = now_s()
-            switch.send(held=now_s() - came_s < gap_s)
+                last_key_s = now_s()
+            switch.send(held=now_s() - last_key_s < gap_s)
     finally:
         switch.send(held=False)
 
 
 def read_input() -> bytes | None:
-    """Returns what comes in within a period; None at its end."""
-    there, _, _ = select.select([sys.stdin], [], [], PERIOD_S)
-    return (os.read(sys.stdin.fileno(), 4096) or None) if there else b""
+    """Returns the keys that arrive within one period. None at the end of the input."""
+    readable, _, _ = select.select([sys.stdin], [], [], PERIOD_S)
+    if not readable:
+        return b""
+    return os.read(sys.stdin.fileno(), 4096) or None
 
 
 @contextmanager
 def single_keys() -> Iterator[None]:
-    """Lets a terminal give every key as it is pressed, and show none; afterwards it is as before."""
+    """Makes the terminal report each key at once and show none, until the end of the block."""
     if not sys.stdin.isatty():
         yield
         return
@@ -69,16 +75,19 @@ def single_keys() -> Iterator[None]:
 
 
 def main() -> None:
-    """Holds the switch of a site until its session ends, its input does, or Ctrl-C."""
+    """Holds the switch of a site until the session or the input ends, or until Ctrl-C."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("session", help="its name, as the site prints it")
-    parser.add_argument("site", help="whose arm moves while the switch is held")
+    parser.add_argument("session", help="name of the session, as the site prints it")
+    parser.add_argument("site", help="site whose arm moves while the switch is held")
     parser.add_argument(
         "--connect", action="append", required=True, help="endpoint of the site; repeatable"
     )
     parser.add_argument("--keys", help="folder of the operator's keys, in a session with keys")
     parser.add_argument(
-        "--gap-s", type=float, default=0.6, help="let go once nothing came for so long"
+        "--gap-s",
+        type=float,
+        default=0.6,
+        help="time without keys after which the switch is released, s",
     )
     options = parser.parse_args()
     connect = (options.session, options.site, options.connect, options.keys)

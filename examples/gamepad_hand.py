@@ -1,9 +1,12 @@
-"""A gamepad as a hand: its left stick moves the end effector, its first button lets go.
+"""Moves an arm with a gamepad: the left stick moves the end effector.
+
+The first button releases the arm.
 
     trilat demo play --duration 60
     python examples/gamepad_hand.py play m1
 
-Linux alone; it needs python-evdev (`pip install evdev`) and a gamepad that this user may read.
+Works on Linux only. It needs python-evdev (`pip install evdev`), and a gamepad that your user
+may read.
 """
 
 import argparse
@@ -16,11 +19,11 @@ import trilat_net
 PERIOD_S = 1.0 / 60.0
 SPEED_M_S = 0.3
 DEAD = 0.1
-"""Part of a stick's way that counts as its middle."""
+"""Deflection of the stick, as a share of the largest, below which it counts as centred."""
 
 
 def find_gamepad(evdev: Any) -> Any:
-    """Returns the first device with a left stick, or ends with what is missing."""
+    """Returns the first device with a left stick. Ends the program if there is none."""
     for path in evdev.list_devices():
         device = evdev.InputDevice(path)
         axes = dict(device.capabilities().get(evdev.ecodes.EV_ABS, []))
@@ -33,7 +36,8 @@ class Stick:
     """The left stick of a gamepad and its first button."""
 
     def __init__(self, evdev: Any, device: Any) -> None:
-        self._device, self._codes = device, evdev.ecodes
+        self._device = device
+        self._codes = evdev.ecodes
         axes = dict(device.capabilities()[evdev.ecodes.EV_ABS])
         self._ranges = {
             code: (axes[code].min, axes[code].max)
@@ -43,7 +47,10 @@ class Stick:
         self.released = False
 
     def poll(self) -> tuple[float, float]:
-        """Returns where the stick is, to the right and up, -1 to 1, by all that has come in."""
+        """Returns the deflection of the stick to the right and up, each from -1 to 1.
+
+        All events that have arrived since the last call are read.
+        """
         while (event := self._device.read_one()) is not None:
             if event.type == self._codes.EV_ABS and event.code in self._ranges:
                 low, high = self._ranges[event.code]
@@ -55,10 +62,10 @@ class Stick:
 
 
 def main() -> None:
-    """Moves an arm until the session ends or Ctrl-C."""
+    """Moves an arm until the session ends or until Ctrl-C."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("session", help="its name, as in play")
-    parser.add_argument("site", help="whose arm the gamepad holds")
+    parser.add_argument("session", help="name of the session, for example play")
+    parser.add_argument("site", help="site whose arm the gamepad moves")
     parser.add_argument(
         "--connect", action="append", help="endpoint of the session; repeatable"
     )

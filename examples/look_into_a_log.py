@@ -1,13 +1,14 @@
-"""How well does the slave follow, and how old is what it follows?
+"""Analyse a log in Python: how well does the slave follow, and how old are the samples it
+follows?
 
-A notebook as a script: each `# %%` is a cell in VS Code, PyCharm, Spyder or, by `jupytext`, in Jupyter. It
-runs from top to bottom as it stands, makes its own log, and draws `look_into_a_log.png`.
+This script is also a notebook: each `# %%` starts a cell in VS Code, PyCharm, Spyder or, with
+`jupytext`, in Jupyter. Without arguments it simulates a run. It draws `look_into_a_log.png`.
 
-    python examples/look_into_a_log.py            # a log from virtual time
-    python examples/look_into_a_log.py run.mcap   # one of yours; several parts of a run may be named
+    python examples/look_into_a_log.py            # a simulated run
+    python examples/look_into_a_log.py run.mcap   # a log of yours, or all parts of one
 """
 
-# %% A log: yours, or five seconds of the paper's experiment on a link that jitters
+# %% Open a log, or simulate five seconds of an experiment over links with jitter
 import sys
 
 import matplotlib.pyplot as plt
@@ -19,7 +20,7 @@ files = [name for name in sys.argv[1:] if name.endswith(".mcap")]
 log = trilat_net.open_log(*files) if files else trilat_net.simulate("jitter", {"duration_s": 5})
 print(log)
 
-# %% What ran: the scenario stands in the log, every value of every site and link
+# %% The log contains the scenario, with all values of all sites and links
 slave = next(
     (name for name in log.sites if log.scenario.sites[name].role == "slave"), log.sites[-1]
 )
@@ -29,25 +30,25 @@ print(
 for name, link in log.scenario.links.items():
     print(f"  {name}: {link.describe()}")
 
-# %% Arrays with time: a row per tick, SI units and radians
+# %% The signals of a site are arrays with a row per tick, in SI units and radians
 site = log[slave]
 print(site)
 error_rad = np.abs(site.e)  # q - q_des, shape (K, 2)
-print(
-    f"largest tracking error {error_rad.max():.4f} rad, at {site.t_s[error_rad.max(axis=1).argmax()]:.3f} s"
-)
+worst_s = site.t_s[error_rad.max(axis=1).argmax()]
+print(f"largest tracking error {error_rad.max():.4f} rad, at {worst_s:.3f} s")
 
-# %% How old is the sample in use? Ages are NaN before the first
+# %% How old is the sample in use? The age is NaN before the first sample
 ages_ms = {
     peer: 1e3 * site.age_s(peer, log.scenario.sites[peer].rate_hz) for peer in site.peers
 }
 for peer, age_ms in ages_ms.items():
     median, worst = np.nanpercentile(age_ms, [50, 100])
     print(
-        f"sample of {peer} in use at {slave}: median {median:.1f} ms old, at most {worst:.1f} ms"
+        f"sample of {peer} in use at {slave}: "
+        f"median {median:.1f} ms old, at most {worst:.1f} ms"
     )
 
-# %% One figure
+# %% Draw a figure
 figure, (top, middle, bottom) = plt.subplots(
     3, sharex=True, figsize=(8, 7), layout="constrained"
 )
@@ -72,32 +73,32 @@ for axes in (top, middle, bottom):
 figure.suptitle(f"{slave} in {log.session['scenario']}")
 figure.savefig("look_into_a_log.png", dpi=150)
 
-# %% The same as a data frame, where polars is installed: pip install 'trilat-net[frames]'
+# %% The same signals as a data frame; this needs polars: pip install 'trilat-net[frames]'
 try:
     import polars as pl
 except ImportError:
     pl = None
-    print("no polars: what follows is left out")
+    print("no polars: the rest is skipped")
 
 if pl is not None:
-    frame = log.frame(slave)  # log.to_frame(slave) where you prefer pandas
+    frame = log.frame(slave)  # for pandas: log.to_frame(slave)
     print(frame.select("t_s", "q1_rad", "q2_rad", "tau1_nm", "tau2_nm", "mode").tail(3))
 
-# %% Per second: how large the error was, how old the samples were
+# %% Largest error and mean age of the samples in each second
 if pl is not None:
     ages = [column for column in frame.columns if column.startswith("age_")]
     error1_rad = (pl.col("q1_rad") - pl.col("q_des1_rad")).abs()
     seconds = frame.group_by(pl.col("t_s").floor().alias("from_s"), maintain_order=True)
     print(seconds.agg(error1_rad.max().alias("error1_rad"), pl.col(ages).mean()))
 
-# %% Two sites side by side: each record of one with the last one of the other before it
+# %% Compare two sites: join each record with the peer's latest record before it
 if pl is not None:
     peer = site.peers[0]
-    theirs = log.frame(peer).select("t_s", theirs_rad="q1_rad")
-    both = frame.select("t_s", "q1_rad").join_asof(theirs, on="t_s")
-    apart_rad = (both["q1_rad"] - both["theirs_rad"]).abs().mean()
-    print(f"{slave} and {peer}: joint 1 was {apart_rad:.4f} rad apart on average")
+    peer_frame = log.frame(peer).select("t_s", peer_q1_rad="q1_rad")
+    both = frame.select("t_s", "q1_rad").join_asof(peer_frame, on="t_s")
+    difference_rad = (both["q1_rad"] - both["peer_q1_rad"]).abs().mean()
+    print(f"{slave} and {peer}: joint 1 differed by {difference_rad:.4f} rad on average")
 
-# %% What happened
+# %% List the events
 if pl is not None:
     print(log.frame("events").select("t_s", "member", "kind", "text"))

@@ -1,9 +1,11 @@
-"""A program as second user: it leads the slave, a person takes over and gives back, and no reference jumps.
+"""Shares a slave between a program and a person: the lead changes twice, and no reference
+jumps.
 
-The program holds m2 and follows a circle with it. A person (here a second hand with a path of its own; leave
-it out with `--alone` and use the mouse) holds m1. Who of the two leads the slave is its row of the dominance
-matrix, changed by ramps of a second. The example prints the largest step of every reference q_id from tick to
-tick, while somebody leads and while the lead changes. Two terminals:
+The program moves master m2 along a circle. A person moves master m1; here a second program
+takes the person's place (with `--alone`, move m1 with the mouse on the page). The slave's row
+of the dominance matrix decides who leads, and changes along ramps of one second. The example
+prints the largest step of each site's reference from one tick to the next, once while the lead
+is constant and once while it changes. Run two terminals:
 
     trilat demo play --duration 60
     python examples/policy_hand.py play
@@ -21,19 +23,28 @@ import numpy as np
 import trilat_net as tn
 
 PERIOD_S = 0.016
-RAMP_S, SPARE_S = 1.0, 0.5
-RADIUS_M, TURN_S = 0.10, 3.0
+RAMP_S = 1.0
+SPARE_S = 0.5
+"""Time after a ramp until its effect has reached all sites, s."""
+RADIUS_M = 0.10
+TURN_S = 3.0
+"""Time for one turn around the circle, s."""
 
 
 def circle(start: Sequence[float], t_s: float, radius_m: float) -> tuple[float, float]:
-    """Returns a point on a circle through the start, which it leaves slowly."""
+    """Returns a position on a circle through the start. The radius grows during one turn."""
     angle = 2.0 * math.pi * t_s / TURN_S
-    size = radius_m * min(1.0, t_s / TURN_S)
-    return start[0] - size * (1.0 - math.cos(angle)), start[1] + size * math.sin(angle)
+    radius = radius_m * min(1.0, t_s / TURN_S)
+    return start[0] - radius * (1.0 - math.cos(angle)), start[1] + radius * math.sin(angle)
 
 
 class References:
-    """The references of all sites, tick by tick, and how far they step."""
+    """Steps of the references of all sites, from one tick to the next.
+
+    Attributes:
+        steps: for each site, the time (s) and the size (rad) of every step.
+        now_s: time of the newest record, s.
+    """
 
     def __init__(self) -> None:
         self._last: dict[str, tuple[int, np.ndarray]] = {}
@@ -41,43 +52,54 @@ class References:
         self.now_s = 0.0
 
     def add(self, records: Iterable[Any]) -> None:
-        """Takes in records that have come."""
+        """Adds the steps of new records."""
         for record in records:
             q_des = np.array(record.q_des)
-            tick, before = self._last.get(record.site, (-2, q_des))
+            last_tick, last_q_des = self._last.get(record.site, (-2, q_des))
             self.now_s = record.t_ns * 1e-9
-            if record.tick == tick + 1:
-                step = float(np.abs(q_des - before).max())
+            if record.tick == last_tick + 1:
+                step = float(np.abs(q_des - last_q_des).max())
                 self.steps.setdefault(record.site, []).append((self.now_s, step))
             self._last[record.site] = record.tick, q_des
 
     def largest(self, site: str, spans: Sequence[tuple[float, float]]) -> float:
-        """Returns the largest step of a site's reference within some times, rad."""
-        within = (
-            step for t_s, step in self.steps[site] if any(a <= t_s <= b for a, b in spans)
-        )
-        return max(within, default=0.0)
+        """Returns the largest step of a site's reference during some spans of time, rad."""
+        largest = 0.0
+        for t_s, step in self.steps[site]:
+            if any(start_s <= t_s <= end_s for start_s, end_s in spans):
+                largest = max(largest, step)
+        return largest
 
 
 def main() -> None:
-    """Leads the slave, hands over, and takes back."""
+    """Connects both operators, moves the arms, and prints the largest steps."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("session", help="its name, as in play")
+    parser.add_argument("session", help="name of the session, for example play")
     parser.add_argument(
         "--connect", action="append", help="endpoint of the session; repeatable"
     )
-    parser.add_argument("--alone", action="store_true", help="leave m1 to a real person")
+    parser.add_argument("--alone", action="store_true", help="let a real person move m1")
     parser.add_argument(
-        "--seconds", type=float, default=15.0, help="in all; the lead changes at each third"
+        "--seconds", type=float, default=15.0, help="duration; the lead changes at each third"
     )
     options = parser.parse_args()
-    name, reached = options.session, {"connect": options.connect}
-    session = tn.session(name, **reached)
-    person = (
-        nullcontext(None) if options.alone else tn.hand(name, "m1", source="person", **reached)
-    )
-    with tn.hand(name, "m2", source="policy", **reached) as program, person as other:
-        report(*lead(session, program, other, options.seconds, time.monotonic, time.sleep))
+    name = options.session
+    connect = options.connect
+    session = tn.session(name, connect=connect)
+    program_hand = tn.hand(name, "m2", source="policy", connect=connect)
+    person_hand: Any = nullcontext(None)
+    if not options.alone:
+        person_hand = tn.hand(name, "m1", source="person", connect=connect)
+    with program_hand as program, person_hand as person:
+        references, ramps = lead(
+            session=session,
+            program=program,
+            person=person,
+            seconds=options.seconds,
+            now_s=time.monotonic,
+            wait_s=time.sleep,
+        )
+    report(references, ramps)
 
 
 def lead(
@@ -88,39 +110,57 @@ def lead(
     now_s: Callable[[], float],
     wait_s: Callable[[float], None],
 ) -> tuple[References, Sequence[tuple[float, float]]]:
-    """Moves both hands for some time; returns the references, and when the lead changed, s."""
-    references, ramps = References(), []
-    leads = iter([(seconds / 3.0, "m1"), (2.0 * seconds / 3.0, "m2")])
-    change_s, leader = next(leads)
-    first, start = program.pose, (0.0, 0.0) if person is None else person.pose
-    begun_s = now_s()
-    with session.records() as take:
-        while (t_s := now_s() - begun_s) < seconds and not program.over:
-            program.move(*circle(first, t_s, RADIUS_M))
+    """Moves both masters for some time, and changes the lead at each third.
+
+    Args:
+        session: the running session.
+        program: the operator of m2.
+        person: the operator of m1. None if a real person moves m1.
+        seconds: duration, s.
+        now_s: returns the present time, s.
+        wait_s: waits for a time, s.
+
+    Returns:
+        The references of all sites, and the spans of time in which the lead changed.
+    """
+    references = References()
+    ramps = []
+    planned_changes = iter([(seconds / 3.0, "m1"), (2.0 * seconds / 3.0, "m2")])
+    change_s, leader = next(planned_changes)
+    program_start = program.pose
+    person_start = (0.0, 0.0) if person is None else person.pose
+    start_s = now_s()
+    with session.records() as read_records:
+        while (t_s := now_s() - start_s) < seconds and not program.over:
+            program.move(*circle(program_start, t_s, RADIUS_M))
             if person is not None:
-                person.move(*circle(start, t_s, 1.3 * RADIUS_M))
-            references.add(take())
+                person.move(*circle(person_start, t_s, 1.3 * RADIUS_M))
+            references.add(read_records())
             if t_s >= change_s:
-                shares = {"m1": 0.9, "m2": 0.1} if leader == "m1" else {"m1": 0.1, "m2": 0.9}
-                said = session.set_dominance("s", shares, RAMP_S)
+                weights = {"m1": 0.1, "m2": 0.9}
+                if leader == "m1":
+                    weights = {"m1": 0.9, "m2": 0.1}
+                reply = session.set_dominance("s", weights, RAMP_S)
                 ramps.append((references.now_s, references.now_s + RAMP_S + SPARE_S))
-                print(f"{leader} leads: {said}")
-                change_s, leader = next(leads, (math.inf, ""))
+                print(f"{leader} leads: {reply}")
+                change_s, leader = next(planned_changes, (math.inf, ""))
             wait_s(PERIOD_S)
-        references.add(take())
+        references.add(read_records())
     return references, ramps
 
 
 def report(references: References, ramps: Sequence[tuple[float, float]]) -> None:
-    """Prints how far each reference stepped from tick to tick, while the lead changed and between."""
+    """Prints the largest step of each reference, with a constant and with a changing lead."""
     first_s = min(steps[0][0] for steps in references.steps.values()) + TURN_S / 2.0
-    ends = [first_s, *(end_s for _, end_s in ramps)]
-    still = list(zip(ends, [*(start_s for start_s, _ in ramps), math.inf], strict=True))
+    starts_s = [first_s, *(end_s for _, end_s in ramps)]
+    ends_s = [*(start_s for start_s, _ in ramps), math.inf]
+    constant_spans = list(zip(starts_s, ends_s, strict=True))
     for site in sorted(references.steps):
-        moving, changing = references.largest(site, still), references.largest(site, ramps)
+        constant = references.largest(site, constant_spans)
+        changing = references.largest(site, ramps)
         print(
-            f"{site}: q_id steps by {1e3 * moving:.4f} mrad at most while somebody leads, "
-            f"{1e3 * changing:.4f} while the lead changes: {changing / moving:.2f} times"
+            f"{site}: q_id steps by {1e3 * constant:.4f} mrad at most while somebody leads, "
+            f"{1e3 * changing:.4f} while the lead changes: {changing / constant:.2f} times"
         )
 
 

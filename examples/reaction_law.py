@@ -1,13 +1,14 @@
-"""Springs with reactions: the force with which a site pulls at a peer is sent to it, and acts there too.
+"""Springs with reactions: a site sends each peer the torque of the spring between them.
 
     cd examples
     trilat sim paper --set control.law=reaction_law:Reaction --set control.K=30 -o reaction.mcap
     trilat verify reaction.mcap --law reaction_law.py
     trilat sweep paper --over control.K=10:60:10 --set control.law=reaction_law:Reaction
 
-Between each two sites there are two springs, one computed at either end, and each acts at both ends: at
-once at its own, and after the delay at the other. The energy in a site's springs goes to all peers; it stands
-in the record too, under `ch`, and every tool shows it by its name.
+Two sites are connected by two springs, one of which is computed at each of them. A spring acts
+on the arm of its own site at once, and on the arm of the peer after the delay of the link. Each
+site also sends the energy of its springs to all peers. The numbers that a law sends are part of
+each record, under `ch`, and all tools show them by their names.
 """
 
 import trilat_net as tn
@@ -15,32 +16,40 @@ import trilat_net as tn
 
 @tn.compiled
 class Reaction:
-    """tau_i = G - d qd_i + the pulls of the site's springs + those of the peers' springs, as received."""
+    """Control law: tau_i = gravity - d qd_i - torques of own springs + torques of peers'
+    springs.
+
+    Args:
+        facts: numbers of joints and peers.
+        K: stiffness of the springs to all peers together, N m/rad.
+        d: damping of each joint, N m s/rad.
+    """
 
     sends = {  # noqa: RUF012 - a declaration
-        "energy": {"unit": "J", "length": 1},  # the same to all peers
-        "pull": {"unit": "N m", "length": "joints", "per_peer": True},  # another one to each
+        "energy": {"unit": "J", "length": 1},  # one number for all peers
+        "pull": {"unit": "N m", "length": "joints", "per_peer": True},  # one vector per peer
     }
-    remembers = ("felt_most",)
+    remembers = ("largest_pull",)
 
     def __init__(self, facts: tn.LawContext, K: float = 20.0, d: float = 12.0) -> None:
-        self.K, self.d = K, d
-        self.felt_most = [0.0] * facts.joints  # the largest pull of peers so far, per joint
+        self.K = K
+        self.d = d
+        self.largest_pull = [0.0] * facts.joints  # of the peers so far, by joint
 
     def torque(self, now: tn.LawInput) -> None:
-        """Writes now.tau, and what the peers get."""
+        """Writes the torques to `now.tau`, and the numbers for the peers to `now.sent`."""
         energy = 0.0
         for i in range(now.joints):
             now.tau[i] = now.gravity[i] - self.d * now.qd[i]
-            felt = 0.0
+            pull_of_peers = 0.0
             for j in range(len(now.peers)):
                 peer = now.peers[j]
-                apart = now.q[i] - peer.q[i]
+                stretch = now.q[i] - peer.q[i]
                 stiffness = self.K * peer.alpha
-                energy += 0.5 * stiffness * apart * apart
-                now.sent[j].pull[i] = stiffness * apart
-                now.tau[i] -= stiffness * apart
-                felt += now.received[j].pull[i]
-            now.tau[i] += felt
-            self.felt_most[i] = max(self.felt_most[i], abs(felt))
+                energy += 0.5 * stiffness * stretch * stretch
+                now.sent[j].pull[i] = stiffness * stretch
+                now.tau[i] -= stiffness * stretch
+                pull_of_peers += now.received[j].pull[i]
+            now.tau[i] += pull_of_peers
+            self.largest_pull[i] = max(self.largest_pull[i], abs(pull_of_peers))
         now.to_all.energy[0] = energy

@@ -1,10 +1,12 @@
-"""A SpaceMouse at an arm that moves along one axis at a time: that along which its cap is pushed furthest.
+"""Moves an arm with a SpaceMouse along one axis at a time.
+
+The axis is the one along which the cap is pushed furthest.
 
     trilat demo play --duration 60
     python examples/spacemouse_hand.py play m1
 
-Hold the first button and push the cap; the second one lets go. On Linux; this user may read the SpaceMouse
-(docs/devices.md).
+Hold the first button and push the cap to move the arm; the second button releases the arm.
+Works on Linux, if your user may read the device (docs/devices.md).
 """
 
 import argparse
@@ -13,27 +15,33 @@ import trilat_net as tn
 
 
 class OneAxis(tn.SpaceMouse):
-    """A SpaceMouse of which only the fastest axis moves."""
+    """A SpaceMouse that moves along its fastest axis only."""
 
-    place_m, before_m = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    position_m = (0.0, 0.0, 0.0)
+    previous_m = (0.0, 0.0, 0.0)
 
     def read(self) -> tn.DeviceState:
-        """Returns where it has been led, axis by axis."""
+        """Returns the position to which the device was moved, axis by axis."""
         state = super().read()
         fastest = max(range(3), key=lambda axis: abs(state.velocity_m_s[axis]))
-        place = list(self.place_m)
-        place[fastest] += state.position_m[fastest] - self.before_m[fastest]
-        self.place_m, self.before_m = (place[0], place[1], place[2]), state.position_m
-        return tn.DeviceState(self.place_m, state.velocity_m_s, state.buttons)
+        x, y, z = (
+            old + (new - previous if axis == fastest else 0.0)
+            for axis, (old, new, previous) in enumerate(
+                zip(self.position_m, state.position_m, self.previous_m, strict=True)
+            )
+        )
+        self.position_m = (x, y, z)
+        self.previous_m = state.position_m
+        return tn.DeviceState(self.position_m, state.velocity_m_s, state.buttons)
 
 
 def main() -> None:
-    """Leads an arm until the session ends or Ctrl-C."""
+    """Moves an arm until the session ends or until Ctrl-C."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("session", help="its name, as in play")
-    parser.add_argument("site", help="whose arm the device holds")
+    parser.add_argument("session", help="name of the session, for example play")
+    parser.add_argument("site", help="site whose arm the device moves")
     parser.add_argument(
-        "--device", default="", help="as /dev/hidraw3; by default the first one"
+        "--device", default="", help="for example /dev/hidraw3; default: the first SpaceMouse"
     )
     parser.add_argument(
         "--connect", action="append", help="endpoint of the session; repeatable"

@@ -1,11 +1,16 @@
-"""A person takes over from a policy that fails: by a ramp of the dominance factors, at once, or not at all.
+"""Compares how a person takes over from a failing policy: along a ramp, at once, or not at all.
 
-A small policy is trained without delay (examples/train_over_delay.py) and leads the slave over 200 ms with
-bursts of loss, where it fails. A model of a person holds the other master, and moves to the goal once it has
-the lead: after two seconds, by a ramp of two seconds or at once. What is printed, over twenty
-goals: how often the slave is within 5 cm of its goal for the last second, the largest step of any reference
-while the lead changes over the largest step of the motion itself, and for how long nobody had control: ticks
-in which the slave did not follow. About a minute:
+A small policy is trained without delay (examples/train_over_delay.py). It then leads the slave
+over a network with 200 ms delay and bursts of loss, where it fails. A model of a person holds
+the other master. After two seconds the person gets the lead, along a ramp of two seconds or at
+once, and moves to the goal. For twenty goals, the example prints
+
+- success: how often the slave stays within 5 cm of its goal in the last second;
+- jump: the largest step of a reference while the lead changes, divided by the largest step of
+  the motion itself;
+- without control: the time in which the slave did not follow anybody.
+
+It takes about a minute:
 
     pip install 'trilat-net[gym]'
     python examples/takeover.py
@@ -20,17 +25,31 @@ from train_over_delay import FIRM, NETWORKS, STUDIES, interval, train
 
 import trilat_net as tn
 
-TAKEN_S, RAMP_S, LASTS_S, NEAR_M = 2.0, 2.0, 10.0, 0.05
+TAKEN_S = 2.0
+"""Time at which the person gets the lead, s."""
+RAMP_S = 2.0
+LASTS_S = 10.0
+NEAR_M = 0.05
 WAYS = {"not taken over": None, "at once": 0.001, f"ramp of {RAMP_S:g} s": RAMP_S}
 
 
 def run(weights: np.ndarray, seed: int, ramp_s: float | None) -> dict[str, float]:
-    """Returns what became of one goal: success, jump, and time without control."""
+    """Simulates one goal, and returns success, distance, jump, and time without control.
+
+    Args:
+        weights: weights of the policy.
+        seed: seed of the goal and of the network.
+        ramp_s: duration of the change of the lead, s. None: the policy keeps the lead.
+    """
     random = np.random.default_rng(seed)
     base = STUDIES["reach"].scenario
     start_m = tn.load_scenario("paper", base).arms["s"].end_effector(base["sites.s.q0_rad"])
-    angle, way_m = random.uniform(0.0, 2.0 * math.pi), random.uniform(0.15, 0.3)
-    goal_m = [start_m[0] + way_m * math.cos(angle), start_m[1] + way_m * math.sin(angle)]
+    angle = random.uniform(0.0, 2.0 * math.pi)
+    distance_m = random.uniform(0.15, 0.3)
+    goal_m = [
+        start_m[0] + distance_m * math.cos(angle),
+        start_m[1] + distance_m * math.sin(angle),
+    ]
     policy = {"goal_m": goal_m, "weights": weights.tolist()}
     hand = {
         "kind": "own",
@@ -58,35 +77,36 @@ def run(weights: np.ndarray, seed: int, ramp_s: float | None) -> dict[str, float
         overrides["timeline"] = [change]
     log = tn.simulate("paper", overrides, duration_s=LASTS_S)
     slave = log["s"]
-    last = slave.q[slave.t_s >= LASTS_S - 1.0]
-    places = np.array([log.scenario.arms["s"].end_effector(q) for q in last[::10]])
-    apart_m = np.linalg.norm(places - goal_m, axis=1)
+    last_second = slave.q[slave.t_s >= LASTS_S - 1.0]
+    positions_m = np.array([log.scenario.arms["s"].end_effector(q) for q in last_second[::10]])
+    distances_m = np.linalg.norm(positions_m - goal_m, axis=1)
     lead_jump = tn.metrics(log).run["lead_jump"].value
     return {
-        "success": float((apart_m < NEAR_M).all()),
-        "apart_mm": 1e3 * float(apart_m.mean()),
+        "success": float((distances_m < NEAR_M).all()),
+        "distance_mm": 1e3 * float(distances_m.mean()),
         "jump": math.nan if lead_jump is None else float(lead_jump),
         "without_control_s": float((slave.mode != "run").sum()) / slave.rate_hz,
     }
 
 
 def main() -> None:
-    """Trains, takes over, prints."""
+    """Trains the policy, simulates all goals, and prints the comparison."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--goals", type=int, default=20)
     options = parser.parse_args()
     weights = train(STUDIES["reach"], "no delay", 0)
     print(f"{options.goals} goals, 95 % intervals of the mean")
     for name, ramp_s in WAYS.items():
-        found = [run(weights, seed, ramp_s) for seed in range(options.goals)]
-        shares = interval(np.array([one["success"] for one in found]))
-        apart = interval(np.array([one["apart_mm"] for one in found]))
-        jump = interval(np.array([one["jump"] for one in found]))
-        without_s = max(one["without_control_s"] for one in found)
+        runs = [run(weights, seed, ramp_s) for seed in range(options.goals)]
+        success = interval(np.array([result["success"] for result in runs]))
+        distance = interval(np.array([result["distance_mm"] for result in runs]))
+        jump = interval(np.array([result["jump"] for result in runs]))
+        without_s = max(result["without_control_s"] for result in runs)
         print(
-            f"  {name:<14}  success {shares[0]:.2f} [{shares[1]:.2f}, {shares[2]:.2f}]"
-            f"  distance {apart[0]:.1f} mm [{apart[1]:.1f}, {apart[2]:.1f}]"
-            f"  jump {jump[0]:.2f} [{jump[1]:.2f}, {jump[2]:.2f}]  without control {without_s:g} s"
+            f"  {name:<14}  success {success[0]:.2f} [{success[1]:.2f}, {success[2]:.2f}]"
+            f"  distance {distance[0]:.1f} mm [{distance[1]:.1f}, {distance[2]:.1f}]"
+            f"  jump {jump[0]:.2f} [{jump[1]:.2f}, {jump[2]:.2f}]"
+            f"  without control {without_s:g} s"
         )
 
 

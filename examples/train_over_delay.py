@@ -1,9 +1,10 @@
-"""Does it matter over which network a policy is trained? Two policies of each of twenty seeds, both tested.
+"""Trains policies over different networks: does the network of the training matter?
 
-Each seed trains one policy without delay and one over 200 ms with bursts of loss, by an evolution strategy,
-with the same budget; both are then tested on both networks, on goals that neither has seen. What is printed
-and drawn is how far the slave is from its goal, or where the box that it pushes ends from its own, with 95 %
-intervals over seeds. At most ten minutes a task on two cores:
+For each of twenty seeds, an evolution strategy trains one policy without delay and one over 200
+ms delay with bursts of loss, with the same budget. Both are tested on both networks, with goals
+that neither has seen. The result is the distance of the slave from its goal, or of a pushed box
+from its goal, with 95 % intervals over the seeds. A task takes at most ten minutes on two
+cores:
 
     pip install 'trilat-net[gym]'
     python examples/train_over_delay.py --out policies.png
@@ -36,7 +37,10 @@ USERS: dict[str, Any] = {
     "sites.m1.hands": [{"kind": "tip_spring", **FIRM}],
     "sites.m2.hands": [{"kind": "live", "force_limit_n": 200.0, **FIRM}],
 }
-"""A person rests at m1 and has two fifths of the slave, so that the program has to see where the slave is."""
+"""A person holds m1 still and has two fifths of the authority over the slave.
+
+The slave therefore does not simply follow the program, which has to observe it.
+"""
 SCENE = {
     "class": "scene:Scene",
     "bodies": {"box": [0.2, 0.2, 0.2]},
@@ -46,32 +50,50 @@ SCENE = {
 
 
 class PushTask:
-    """The box that the slave pushes ahead is to end at a place; the user sees where the slave is to end.
+    """Task: the slave pushes a box to a goal. It cannot pull the box back.
 
-    What was pushed too far cannot be pulled back. The reward is how much nearer the box has come, m.
+    The reward of a step is the decrease of the box's distance from its goal, m.
+
+    Attributes:
+        goal: position of the slave's end effector at which the box reaches its goal, m. The
+            policy observes it.
+        box_goal_m: goal of the box along the x axis, m.
+        distance_m: present distance of the box from its goal, m.
     """
 
     bound = 100.0
 
     def __init__(self) -> None:
-        self.goal, self.box_goal_m, self.apart_m = np.zeros(2), 0.0, 0.0
+        self.goal = np.zeros(2)
+        self.box_goal_m = 0.0
+        self.distance_m = 0.0
 
     def begin(self, random: np.random.Generator, scene: Any) -> None:
-        """Draws the way of the box, 5 to 20 cm."""
-        start_m, tip_m = scene.bodies["s"]["box"][0], scene.end_effector_m["s"]
+        """Draws a goal 5 to 20 cm in front of the box."""
+        start_m = scene.bodies["s"]["box"][0]
+        tip_m = scene.end_effector_m["s"]
         self.box_goal_m = start_m + random.uniform(0.05, 0.2)
-        self.apart_m = abs(start_m - self.box_goal_m)
+        self.distance_m = abs(start_m - self.box_goal_m)
         self.goal = np.array([self.box_goal_m - 0.13, tip_m[1]])
 
     def judge(self, scene: Any) -> float:
         """Returns the reward of a step."""
-        before_m = self.apart_m
-        self.apart_m = abs(scene.bodies["s"]["box"][0] - self.box_goal_m)
-        return before_m - self.apart_m
+        previous_m = self.distance_m
+        self.distance_m = abs(scene.bodies["s"]["box"][0] - self.box_goal_m)
+        return previous_m - self.distance_m
 
 
 class Study(NamedTuple):
-    """A task, the experiment in which it is done, and what its cost says."""
+    """A task, and the settings of its training.
+
+    Attributes:
+        scenario: keys of the scenario in which the task is done.
+        make_task: returns a new task. None selects the task of the environment, reaching.
+        rounds: number of rounds of the evolution strategy.
+        pairs: number of pairs of opposite perturbations per round.
+        rate: step size of the first round; it falls to zero linearly.
+        measure: meaning of the cost of an episode.
+    """
 
     scenario: dict[str, Any]
     make_task: Callable[[], Any]
@@ -110,117 +132,151 @@ STUDIES = {
         "distance of the box from its goal at the end",
     ),
 }
-STEP_HZ, EPISODE_S = 25, 4.0
+STEP_HZ = 25
+EPISODE_S = 4.0
 SPREAD = 0.15
+"""Standard deviation of the perturbations of a weight."""
 TESTS = 12
+"""Number of episodes of a test."""
 FIRST = np.array([0.2, 0.0, 0.0, 0.0])
+"""Weights with which the training starts."""
 
 
 def make_env(study: Study, network: str) -> Any:
-    """Returns the environment of a network."""
-    how = {"user": "m2", "rate_hz": STEP_HZ, "duration_s": EPISODE_S, "mode": "tip"}
+    """Returns the environment of a task over a network."""
     return tn.make_env(
-        "paper", {**study.scenario, **NETWORKS[network]}, task=study.make_task(), **how
+        "paper",
+        {**study.scenario, **NETWORKS[network]},
+        task=study.make_task(),
+        user="m2",
+        rate_hz=STEP_HZ,
+        duration_s=EPISODE_S,
+        mode="tip",
     )
 
 
 def play(env: Any, weights: np.ndarray, seed: int) -> float:
-    """Returns the cost of an episode, m; see `Study.measure`."""
-    seen, _ = env.reset(seed=seed)
+    """Returns the cost of an episode, m. `Study.measure` states its meaning."""
+    observation, _ = env.reset(seed=seed)
     total = 0.0
     for _ in range(int(EPISODE_S * STEP_HZ)):
         action = decide(
-            weights, seen["goal"], seen["pose"], seen["peer_q"][1], seen["peer_qd"][1]
+            weights=weights,
+            goal_m=observation["goal"],
+            pose=observation["pose"],
+            slave_q=observation["peer_q"][1],
+            slave_qd=observation["peer_qd"][1],
         )
-        seen, reward, ended, _, info = env.step(action)
+        observation, reward, ended, _, info = env.step(action)
         total -= reward - float(info["success"])
         if ended and not info["success"]:
-            return EPISODE_S
+            return EPISODE_S  # an episode that ends early without success costs most
         if ended:
             break
     task = env.unwrapped.task
-    return float(task.apart_m) if isinstance(task, PushTask) else total / EPISODE_S
+    return float(task.distance_m) if isinstance(task, PushTask) else total / EPISODE_S
 
 
 def train(study: Study, network: str, seed: int) -> np.ndarray:
-    """Returns the weights that an evolution strategy finds: pairs of opposite steps, weighed by cost."""
-    env, random = make_env(study, network), np.random.default_rng(seed)
+    """Returns the weights that an evolution strategy finds.
+
+    In each round, pairs of opposite perturbations are tried. The weights move along each
+    perturbation in proportion to the difference of the two costs.
+    """
+    env = make_env(study, network)
+    random = np.random.default_rng(seed)
     weights = FIRST.copy()
     for n in range(study.rounds):
-        steps = random.normal(size=(study.pairs, len(weights)))
+        directions = random.normal(size=(study.pairs, len(weights)))
         episode = int(random.integers(2**31))
-        costs = [
-            [play(env, weights + sign * SPREAD * step, episode + pair) for sign in (1.0, -1.0)]
-            for pair, step in enumerate(steps)
-        ]
-        gain = np.array(costs)[:, 1] - np.array(costs)[:, 0]
+        costs = np.zeros((study.pairs, 2))
+        for pair, direction in enumerate(directions):
+            for column, sign in enumerate((1.0, -1.0)):
+                tried = weights + sign * SPREAD * direction
+                costs[pair, column] = play(env, tried, episode + pair)
+        gain = costs[:, 1] - costs[:, 0]
         scale = max(float(np.abs(gain).max()), 1e-9)
-        weights = (
-            weights
-            + study.rate * (1.0 - n / study.rounds) * (gain / scale) @ steps / study.pairs
-        )
+        rate = study.rate * (1.0 - n / study.rounds)
+        weights = weights + rate * (gain / scale) @ directions / study.pairs
     return weights
 
 
 def run_seed(name: str, seed: int) -> dict[str, Any]:
-    """Returns what one seed finds: weights by network, and costs by network of training and of test."""
+    """Trains and tests the policies of one seed.
+
+    Args:
+        name: name of the task.
+        seed: the seed.
+
+    Returns:
+        The weights by network of training, and the costs by networks of training and of test.
+    """
     sys.path.insert(0, str(Path(__file__).parent / "mujoco"))
     study = STUDIES[name]
     weights = {network: train(study, network, seed) for network in NETWORKS}
     costs = {}
-    for there in NETWORKS:
-        env = make_env(study, there)
-        for here in NETWORKS:
+    for tested in NETWORKS:
+        env = make_env(study, tested)
+        for trained in NETWORKS:
             tests = [
-                play(env, weights[here], 10_000_019 * (seed + 1) + n) for n in range(TESTS)
+                play(env, weights[trained], 10_000_019 * (seed + 1) + n) for n in range(TESTS)
             ]
-            costs[f"{here} -> {there}"] = float(np.mean(tests))
+            costs[f"{trained} -> {tested}"] = float(np.mean(tests))
     return {
         "seed": seed,
-        "weights": {name: one.tolist() for name, one in weights.items()},
+        "weights": {network: array.tolist() for network, array in weights.items()},
         "costs": costs,
     }
 
 
 def interval(values: np.ndarray) -> tuple[float, float, float]:
-    """Returns the mean and a 95 % interval of it, by 10 000 bootstrap samples."""
+    """Returns the mean, and its 95 % interval from 10 000 bootstrap samples."""
     random = np.random.default_rng(0)
     means = random.choice(values, (10_000, len(values))).mean(axis=1)
     return float(values.mean()), *map(float, np.quantile(means, [0.025, 0.975]))
 
 
 def report(found: list[dict[str, Any]], measure: str) -> dict[str, tuple[float, float, float]]:
-    """Prints the table, and the paired difference that the question is about; returns the intervals."""
+    """Prints the mean cost of each combination of networks, and the difference in question.
+
+    Args:
+        found: results of all seeds, see `run_seed`.
+        measure: meaning of the cost.
+
+    Returns:
+        The mean and its interval, mm, by combination.
+    """
     columns = {
-        name: np.array([one["costs"][name] for one in found]) for name in found[0]["costs"]
+        name: np.array([result["costs"][name] for result in found])
+        for name in found[0]["costs"]
     }
     calm, hard = NETWORKS
     columns["difference"] = columns[f"{calm} -> {hard}"] - columns[f"{hard} -> {hard}"]
     print(f"{measure}, mm, {len(found)} seeds, 95 % interval of the mean")
     spans = {name: interval(1e3 * values) for name, values in columns.items()}
     for name, (mean, low, high) in spans.items():
-        what = f"trained -> tested: {name}"
+        label = f"trained -> tested: {name}"
         if "->" not in name:
-            what = f"at {hard}: trained at {calm}, minus trained there"
-        print(f"  {what:<62} {mean:7.1f}  [{low:.1f}, {high:.1f}]")
+            label = f"tested at {hard}: trained at {calm}, minus trained there"
+        print(f"  {label:<62} {mean:7.1f}  [{low:.1f}, {high:.1f}]")
     return spans
 
 
 def draw(found: list[dict[str, Any]], measure: str, path: Path) -> None:
-    """Draws every seed, and the means: a row for each network of a test and each of training."""
+    """Draws the cost of every seed and the means, with a row per combination of networks."""
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(figsize=(6.4, 2.8), layout="constrained")
-    rows = [(here, there) for there in NETWORKS for here in NETWORKS]
-    for place, (here, there) in enumerate(rows):
-        values = 1e3 * np.array([one["costs"][f"{here} -> {there}"] for one in found])
-        colour = f"C{list(NETWORKS).index(here)}"
-        axes.plot(values, np.full(len(values), place), "o", alpha=0.4, color=colour)
-        axes.plot(values.mean(), place, "|", markersize=20, markeredgewidth=2, color="black")
-    axes.set_yticks(
-        range(len(rows)), [f"trained: {here}\ntested: {there}" for here, there in rows]
-    )
-    axes.set_xlabel(f"{measure}, mm;\na dot a seed, a bar their mean")
+    rows = [(trained, tested) for tested in NETWORKS for trained in NETWORKS]
+    for row, (trained, tested) in enumerate(rows):
+        costs_m = [result["costs"][f"{trained} -> {tested}"] for result in found]
+        costs_mm = 1e3 * np.array(costs_m)
+        colour = f"C{list(NETWORKS).index(trained)}"
+        axes.plot(costs_mm, np.full(len(costs_mm), row), "o", alpha=0.4, color=colour)
+        axes.plot(costs_mm.mean(), row, "|", markersize=20, markeredgewidth=2, color="black")
+    labels = [f"trained: {trained}\ntested: {tested}" for trained, tested in rows]
+    axes.set_yticks(range(len(rows)), labels)
+    axes.set_xlabel(f"{measure}, mm;\ndots: seeds, bars: their means")
     axes.set_xlim(left=0.0)
     axes.invert_yaxis()
     figure.savefig(path, dpi=150)
@@ -228,7 +284,7 @@ def draw(found: list[dict[str, Any]], measure: str, path: Path) -> None:
 
 
 def main() -> None:
-    """Trains, tests, prints and draws."""
+    """Trains and tests the policies of all seeds, and prints and draws the result."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--task", choices=STUDIES, default="reach")
     parser.add_argument("--seeds", type=int, default=20)

@@ -1,12 +1,20 @@
-"""Wave variables in plain Python, as a law of your own: the built-in `wave` where no sample is late or lost.
+"""Wave variables in plain Python: the built-in law `wave`, written as a law of your own.
 
-In this folder:  trilat sim two_sites --set control.law=wave_law:Wave --set sites.s.control.K=100
-                 --set sites.s.control.B=10 -o wave.mcap;  trilat verify wave.mcap --law wave_law.py
+If no sample is late or lost, the results equal those of the built-in law. In this folder:
 
-Sites are joined by lines of impedance b, c = sqrt(2 b). A site without a spring of its own is pushed by -F,
-F = b qd - c v, where v is the wave that comes out of the line, and sends u = c qd - v into it, a tick later,
-when the arm's step is known. One with a spring K and a damper B follows q_sd, whose velocity solves
-c v = b qd_sd + F, and sends v - (c / b) F. See docs/laws.md.
+    trilat sim two_sites --set control.law=wave_law:Wave --set sites.s.control.K=100 \
+        --set sites.s.control.B=10 -o wave.mcap
+    trilat verify wave.mcap --law wave_law.py
+
+Two sites exchange waves over a line with the impedance b, and c = sqrt(2 b). At each end of the
+line, the incoming wave v gives a force on the arm, and an outgoing wave u is sent back:
+
+- A site without a spring applies F = b qd - c v to the arm, with the opposite sign. It sends
+  u = c qd - v one tick later, when the motion of the arm in the tick is known.
+- A site with a spring K and a damper B moves the far end of the spring, q_sd, so that
+  c v = b qd_sd + F. It sends u = v - (c / b) F.
+
+docs/laws.md derives these equations.
 """
 
 import math
@@ -16,7 +24,14 @@ import trilat_net as tn
 
 
 class Wave:
-    """One end of a line to each peer."""
+    """Control law of one site, with a wave line to each peer.
+
+    Args:
+        facts: numbers of joints and peers.
+        b: impedance of the lines, N m s/rad.
+        K: stiffness of the spring between arm and line, N m/rad. 0: no spring.
+        B: damping beside the spring, N m s/rad.
+    """
 
     sends: ClassVar = {"u": {"unit": "sqrt(W)", "length": "joints", "per_peer": True}}
     remembers = ("q_sd", "played")
@@ -24,35 +39,51 @@ class Wave:
     def __init__(
         self, facts: tn.LawContext, b: float = 10.0, K: float = 0.0, B: float = 0.0
     ) -> None:
-        self.b, self.K, self.B = b, K, B
+        self.b = b
+        self.K = K
+        self.B = B
         self.c = math.sqrt(2.0 * b)
         self.q_sd = [[0.0] * facts.joints for _ in facts.peers]
         self.played = [[0.0] * facts.joints for _ in facts.peers]
 
     def torque(self, now: tn.LawInput) -> list[float]:
-        """Returns the torque of each joint, and sends the waves."""
+        """Returns the torque of each joint, and sends a wave to each peer."""
         if now.k == 0:
-            self.q_sd = [list(peer.q) for peer in now.peers]  # they begin where they stand
+            # the springs start without tension
+            self.q_sd = [list(peer.q) for peer in now.peers]
         tau = list(now.gravity)
         for j, peer in enumerate(now.peers):
             for i in range(now.joints):
-                # a wave that does not come is none
-                v = now.received[j].u[i] if peer.new else 0.0
-                if self.K == 0.0:  # the line pushes the arm
-                    step = now.q[i] - now.q_before[i]
-                    force, wave = (
-                        self.c * v - self.b * now.qd[i],
-                        self.c * step / now.h_s - self.played[j][i],
-                    )
-                    self.played[j][i] = v
+                # a tick without a new sample brings no wave
+                received_wave = now.received[j].u[i] if peer.new else 0.0
+                if self.K == 0.0:
+                    force, sent_wave = self.push(now, j, i, received_wave)
                 else:
-                    force, wave = self.follow(now, j, i, v)
-                now.sent[j].u[i] = wave
+                    force, sent_wave = self.pull(now, j, i, received_wave)
+                now.sent[j].u[i] = sent_wave
                 tau[i] += force
         return tau
 
-    def follow(self, now: tn.LawInput, j: int, i: int, v: float) -> tuple[float, float]:
-        """Returns the torque of a spring whose far end the line moves, and the wave that goes back."""
+    def push(self, now: tn.LawInput, j: int, i: int, v: float) -> tuple[float, float]:
+        """Returns the torque of a line without a spring, and the wave that is sent back.
+
+        Args:
+            now: the state of the site in this tick.
+            j: index of the peer.
+            i: index of the joint.
+            v: the received wave.
+        """
+        moved = now.q[i] - now.q_before[i]
+        force = self.c * v - self.b * now.qd[i]
+        sent_wave = self.c * moved / now.h_s - self.played[j][i]
+        self.played[j][i] = v
+        return force, sent_wave
+
+    def pull(self, now: tn.LawInput, j: int, i: int, v: float) -> tuple[float, float]:
+        """Returns the torque of a line with a spring, and the wave that is sent back.
+
+        The arguments are those of `push`.
+        """
         stretch = self.q_sd[j][i] - now.q[i]
         qd_sd = (self.c * v - self.K * stretch + self.B * now.qd[i]) / (self.b + self.B)
         force = self.K * stretch + self.B * (qd_sd - now.qd[i])

@@ -287,6 +287,7 @@ def test_a_trained_policy_acts_alike_as_a_hand(
     hand = {"kind": "own", "class": "reach_policy:ReachPolicy", "rate_hz": 25, **study["FIRM"]}
     hand |= {
         "force_limit_n": 200.0,
+        "acceleration_limit_m_s2": 20.0,  # that of the environment, whose user is a live hand
         "settings": {"goal_m": env.task.goal.tolist(), "weights": weights},
     }
     acted = trilat_net.simulate(
