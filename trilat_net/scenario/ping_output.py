@@ -1,4 +1,7 @@
-"""Read the output of `ping` as probes: iputils, BSD and macOS, busybox, fping and Windows.
+"""Reads the output of `ping`: when each probe was sent, and how long its round trip took.
+
+A probe is one packet that `ping` sends to measure the round trip. The formats of iputils, BSD,
+macOS, busybox, fping and Windows are supported:
 
     64 bytes from 192.0.2.5: icmp_seq=6 ttl=64 time=5.00 ms           iputils, BSD, macOS
     64 bytes from 192.0.2.5: seq=0 ttl=64 time=3.000 ms               busybox
@@ -7,12 +10,12 @@
 
 Invariant:
     - A probe without an answer counts as lost, also before the first answer and after the last
-      one. Sequence numbers, lines about a missing answer and the number of packets in the
-      summary tell which probes were sent.
-    - Numbers are read and words are not, so that the language of the program does not matter. A
-      decimal comma is a decimal point.
-    - Output that contradicts its own summary is refused. If the output does not tell how the
-      run began or ended, `PingProbes` says so.
+      one. Which probes were sent follows from the sequence numbers, from lines about missing
+      answers, and from the number of packets in the summary at the end.
+    - Only numbers and units are read, not words, so that the language of the program does not
+      matter. A decimal comma is read as a decimal point.
+    - Output that contradicts its own summary is refused. If the output does not show how the
+      measurement began or ended, the result says so.
 """
 
 import math
@@ -32,42 +35,49 @@ _MAX_PROBES = 2**24
 """Largest number of probes that a summary may count: 194 days at one probe per second."""
 
 _NUMBER = re.compile(r"(?:\bicmp_(?:seq|req)|\bseq)[= ]\s*(\d+)\b")
+"""Matches the sequence number of a probe."""
 _ROUND_TRIP = re.compile(r"[=<]\s?(\d+(?:[.,]\d+)?)\s?ms?\b")
-"""Spanish Windows prints "tiempo<1m"; French Windows prints "temps=21 ms"."""
+"""Matches the round-trip time. Spanish Windows prints "tiempo<1m", French "temps=21 ms"."""
 _STAMP = re.compile(r"\[(\d+[.,]\d+)\]")
+"""Matches the time at which a line was printed, with the option -D."""
 _HEADER = re.compile(r"ping6?\b.*\d", re.IGNORECASE)
+"""Matches the first line of a run."""
 _COUNTS_FROM_0 = re.compile(r": \d+ \w+ \w+|=\d+\+\d+")
-"""Headers of busybox, BSD and macOS, which count from 0.
+"""Matches the headers of busybox, BSD and macOS, whose sequence numbers start from 0.
 
 Examples: "PING host (192.0.2.5): 56 data bytes", "PING6(56=40+8+8 bytes) ...".
 """
 _SUMMARY = re.compile(r"\s*(\d+) [^\d,]+, (\d+)\b.*%")
-"""An example is "40 packets transmitted, 25 received, 37.5% packet loss, time 39000ms"."""
+"""Matches, for example, "40 packets transmitted, 25 received, 37.5% packet loss, time 39000ms".
+"""
 
 _FPING = re.compile(
     r"(?:\[(\d+[.,]\d+)\] )?(\S+)\s+: \[(\d+)\], (?:\d+ bytes, (\d+(?:[.,]\d+)?) ms)?"
 )
+"""Matches a line of `fping`: time of printing, host, sequence number and round trip."""
 _FPING_SUMMARY = re.compile(r"\S+\s+: \S+ = (\d+)/(\d+)/\d+%")
+"""Matches, for example, "192.0.2.5 : xmt/rcv/%loss = 3/3/0%"."""
 
 _WINDOWS_REPLY = re.compile(
     r"[=<]\s?\d+\s?ms?\b.*\bTTL=\d+|^\D*[\w.:%]+: \w+[=<]\d+\s?ms?\s*$", re.IGNORECASE
 )
-"""IPv6 answers have no TTL: "Reply from 2001:db8::1: time=21ms"."""
+"""Matches an answer. Those of IPv6 have no TTL: "Reply from 2001:db8::1: time=21ms"."""
 _WINDOWS_COUNTS = re.compile(r"[^=]*=\s*(\d+),[^=\d]+=\s*(\d+),[^=\d]+=\s*(\d+)\s*(?:[(,]|$)")
-"""An example is "Packets: Sent = 30, Received = 29, Lost = 1 (3% loss)"."""
+"""Matches, for example, "Packets: Sent = 30, Received = 29, Lost = 1 (3% loss)"."""
 _WINDOWS_BREAK = re.compile(r"\^C|\S+[-+]C")
+"""Matches the line after the user has interrupted the program, such as "Control-C"."""
 
 _SEVERAL_RUNS = "it has several runs of ping: import each by itself"
 
 
 class PingProbes(NamedTuple):
-    """The probes of one run, in the order of sending.
+    """Probes of one run of `ping`, in the order in which they were sent.
 
     Attributes:
-        sent_s: times of sending, s, on any clock.
-        rtt_ms: round-trip times, ms; infinite if no answer came.
-        begin_known: False if probes may have been sent before the first one here.
-        end_known: False if probes may have been sent after the last one here.
+        sent_s: Time at which each probe was sent, in s. The zero of the clock is arbitrary.
+        rtt_ms: Round-trip time of each probe, in ms. Infinite if there was no answer.
+        begin_known: False if earlier probes may be missing from the output.
+        end_known: False if later probes may be missing from the output.
     """
 
     sent_s: Sequence[float]
@@ -77,11 +87,12 @@ class PingProbes(NamedTuple):
 
 
 class _Answer(NamedTuple):
-    """An answer to a probe.
+    """Answer to a probe.
 
     Attributes:
-        rtt_ms: the round-trip time, ms.
-        printed_s: the time at which the line was printed, s; None: the line has no time.
+        rtt_ms: Round-trip time, in ms.
+        printed_s: Time at which the line of the answer was printed, in s. None if the line does
+            not contain a time.
     """
 
     rtt_ms: float
@@ -89,7 +100,7 @@ class _Answer(NamedTuple):
 
 
 class _Summary(NamedTuple):
-    """The counts in a summary: packets sent, and answers received."""
+    """Numbers in the summary at the end: sent packets and received answers."""
 
     sent: int
     received: int
@@ -98,12 +109,15 @@ class _Summary(NamedTuple):
 def read_ping(text: str, every_s: float) -> PingProbes:
     """Returns the probes in the output of one run of `ping` or `fping`.
 
+    The program that produced the output is recognised by its lines.
+
     Args:
-        text: the output.
-        every_s: the interval between probes, s, if the lines bear no times.
+        text: The output.
+        every_s: Interval between probes, in s. It is used if the lines do not contain times.
 
     Raises:
-        ValueError: the output is not of ping, has several runs, or contradicts its summary.
+        ValueError: The text is not the output of `ping`, contains several runs, or contradicts
+            its summary.
     """
     lines = [line.rstrip() for line in text.splitlines()]
     if any(_NUMBER.search(line) for line in lines):
@@ -112,10 +126,11 @@ def read_ping(text: str, every_s: float) -> PingProbes:
         return _read_fping(lines, every_s)
     if any(_WINDOWS_REPLY.search(line) or _WINDOWS_COUNTS.match(line) for line in lines):
         return _read_windows(lines, every_s)
+
+    # If no probe was answered, only the summary says how many probes were sent.
     for line in lines:
         summary = _parse_summary(_SUMMARY, line)
         if summary is not None:
-            # Nothing was answered: the summary alone tells how many probes were sent.
             return _arrange_probes(
                 answers={}, mentioned=set(), first=1, summary=summary, every_s=every_s
             )
@@ -123,14 +138,20 @@ def read_ping(text: str, every_s: float) -> PingProbes:
 
 
 def _parse_summary(pattern: re.Pattern[str], line: str) -> _Summary | None:
+    """Returns the numbers in a summary. None if the line is not a summary."""
     match = pattern.match(line)
     return None if match is None else _Summary(int(match[1]), int(match[2]))
 
 
 def _read_numbered(lines: Sequence[str], every_s: float) -> PingProbes:
-    """Returns the probes in lines with a sequence number each.
+    """Returns the probes of a program that prints the sequence number of each probe.
 
-    A line of an answer has a round-trip time as well.
+    A line with a sequence number and a round-trip time is an answer. A line with a sequence
+    number alone reports that the answer is missing.
+
+    Args:
+        lines: Lines of the output.
+        every_s: Interval between probes, in s, if the lines do not contain times.
     """
     answers: dict[int, _Answer] = {}
     mentioned: set[int] = set()
@@ -148,6 +169,7 @@ def _read_numbered(lines: Sequence[str], every_s: float) -> PingProbes:
                     raise ValueError(_SEVERAL_RUNS)
                 first = 0 if _COUNTS_FROM_0.search(line) else 1
             continue
+
         number = _unwrap_number(number, int(number_match[1]))
         mentioned.add(number)
         rtt = _ROUND_TRIP.search(line)
@@ -156,8 +178,9 @@ def _read_numbered(lines: Sequence[str], every_s: float) -> PingProbes:
             stamp = _STAMP.match(line)
             printed_s = None if stamp is None else _parse_decimal(stamp[1])
             answers[number] = _Answer(_parse_decimal(rtt[1]), printed_s)
+
     if first is None and summary is not None:
-        # iputils counts from 1. A number 0 shows that this program does not.
+        # iputils counts from 1. If the number 0 occurs, `_arrange_probes` starts there instead.
         first = 1
     return _arrange_probes(
         answers=answers, mentioned=mentioned, first=first, summary=summary, every_s=every_s
@@ -165,11 +188,14 @@ def _read_numbered(lines: Sequence[str], every_s: float) -> PingProbes:
 
 
 def _unwrap_number(previous: int, number: int) -> int:
-    """Returns a sequence number as if `ping` never counted from 0 again.
+    """Returns a sequence number as if `ping` never started from 0 again.
+
+    The result is the number nearest to the previous one that agrees with the printed number
+    modulo `_SEQUENCE_NUMBERS`.
 
     Args:
-        previous: the unwrapped number of the previous line; -1: there is no such line.
-        number: the printed number.
+        previous: Unwrapped number of the previous line. -1 if this is the first line.
+        number: Printed number.
     """
     if previous < 0:
         return number
@@ -178,11 +204,20 @@ def _unwrap_number(previous: int, number: int) -> int:
 
 
 def _parse_decimal(text: str) -> float:
+    """Returns a number that may have a decimal comma."""
     return float(text.replace(",", "."))
 
 
 def _read_fping(lines: Sequence[str], every_s: float) -> PingProbes:
-    """Returns the probes in the output of `fping`, which counts from 0 and never wraps."""
+    """Returns the probes in the output of `fping`, whose numbers start from 0 and never wrap.
+
+    Args:
+        lines: Lines of the output.
+        every_s: Interval between probes, in s, if the lines do not contain times.
+
+    Raises:
+        ValueError: The output contains probes to several hosts.
+    """
     answers: dict[int, _Answer] = {}
     mentioned: set[int] = set()
     hosts: set[str] = set()
@@ -192,6 +227,7 @@ def _read_fping(lines: Sequence[str], every_s: float) -> PingProbes:
         if match is None:
             summary = _parse_summary(_FPING_SUMMARY, line) or summary
             continue
+
         stamp, host, number_text, rtt = match.groups()
         number = int(number_text)
         hosts.add(host)
@@ -199,6 +235,7 @@ def _read_fping(lines: Sequence[str], every_s: float) -> PingProbes:
         if rtt is not None and number not in answers:
             printed_s = None if stamp is None else _parse_decimal(stamp)
             answers[number] = _Answer(_parse_decimal(rtt), printed_s)
+
     if len(hosts) > 1:
         raise ValueError(
             f"it has {len(hosts)} hosts, {', '.join(sorted(hosts)[:3])}: keep the lines of one"
@@ -215,20 +252,26 @@ def _arrange_probes(
     summary: _Summary | None,
     every_s: float,
 ) -> PingProbes:
-    """Returns the probes of a run in the order of their numbers.
+    """Returns the probes of a run in the order of their numbers, including the lost ones.
 
     Args:
-        answers: the answers by number.
-        mentioned: all numbers in the output, also of lines without an answer.
-        first: the number of the first probe by the header or the summary; None: the output does
-            not tell.
-        summary: the counts in the summary; None: there is no summary.
-        every_s: the interval between probes without times, s.
+        answers: Answers, by the number of the probe.
+        mentioned: All numbers in the output, including those of lines about missing answers.
+        first: Number of the first probe, as the header or the summary shows. None if the output
+            does not show it.
+        summary: Numbers in the summary. None if there is no summary.
+        every_s: Interval between probes, in s, if the lines do not contain times.
+
+    Raises:
+        ValueError: The lines contradict the summary, or the summary counts too many packets.
     """
-    lowest = min(mentioned, default=first or 0)
-    highest = max(mentioned, default=(first or 0) - 1)
+    # Without any line, the range of probes begins at the first number and is empty.
+    assumed_first = first or 0
+    lowest = min(mentioned, default=assumed_first)
+    highest = max(mentioned, default=assumed_first - 1)
     begin = lowest if first is None else min(first, lowest)
     end = highest + 1
+
     if summary is not None:
         end = begin + summary.sent
         if highest >= end:
@@ -245,6 +288,7 @@ def _arrange_probes(
         raise ValueError(
             f"its summary counts {end - begin} packets, at most {_MAX_PROBES} are read"
         )
+
     numbers = np.arange(begin, end)
     rtt_ms = [answers[n].rtt_ms if n in answers else math.inf for n in numbers.tolist()]
     return PingProbes(
@@ -258,12 +302,20 @@ def _arrange_probes(
 def _find_sending_times(
     numbers: NDArray[np.int64], answers: dict[int, _Answer], every_s: float
 ) -> Array:
-    """Returns when probes were sent, s, from the times that the lines of all answers bear.
+    """Estimates when each probe was sent.
 
-    `ping` prints no time of sending, so a probe with an answer was sent a round trip before its
-    line was printed. Between two answers the times are interpolated; before the first answer
-    and after the last one they continue at the mean interval. If a line bears no time, the
-    interval is `every_s`.
+    `ping` prints the time at which it prints the line of an answer. The probe was sent one
+    round trip earlier. The times of probes without an answer are interpolated between two
+    answers. Before the first answer and after the last one, they are extrapolated with the mean
+    interval.
+
+    Args:
+        numbers: Numbers of all probes.
+        answers: Answers, by the number of the probe.
+        every_s: Interval between probes, in s. It is used if a line does not contain a time.
+
+    Returns:
+        The times in s, in the order of `numbers`.
     """
     timed_answers = [
         (n, answer.printed_s - answer.rtt_ms * 1e-3)
@@ -272,21 +324,36 @@ def _find_sending_times(
     ]
     if not timed_answers or len(timed_answers) < len(answers):
         return np.asarray(numbers * every_s)
+
     timed_numbers, sent_s = np.array(timed_answers).T
     mean_s = every_s
     if len(timed_answers) > 1:
         mean_s = (sent_s[-1] - sent_s[0]) / (timed_numbers[-1] - timed_numbers[0])
+    # The clock may have been set back, and NaN is not positive either.
     if not mean_s > 0.0:
         mean_s = every_s
+
+    # `np.interp` is constant beyond the ends. The extrapolation is added to that.
     before = np.minimum(numbers - timed_numbers[0], 0.0)
     after = np.maximum(numbers - timed_numbers[-1], 0.0)
-    return np.asarray(np.interp(numbers, timed_numbers, sent_s) + mean_s * (before + after))
+    interpolated_s = np.interp(numbers, timed_numbers, sent_s)
+    return np.asarray(interpolated_s + mean_s * (before + after))
 
 
 def _read_windows(lines: Sequence[str], every_s: float) -> PingProbes:
-    """Returns the probes in the output of Windows.
+    """Returns the probes in the output of Windows, which prints no sequence numbers.
 
-    It has a header, a line per probe without a sequence number, and then the counts.
+    The output has a header that ends in a colon, one line per probe, and then the summary,
+    whose first line ends in a colon as well. A line about a missing answer is a sentence in the
+    language of the user; it is recognised by its full stop.
+
+    Args:
+        lines: Lines of the output.
+        every_s: Interval between probes, in s.
+
+    Raises:
+        ValueError: There are several runs, a line cannot be read, or the lines contradict the
+            summary.
     """
     rtt_ms: list[float] = []
     sent: int | None = None
@@ -308,12 +375,14 @@ def _read_windows(lines: Sequence[str], every_s: float) -> PingProbes:
             sent = int(counts[1])
             is_over = True
         elif is_over:
+            # further lines of the summary
             continue
         elif line.endswith(":"):
-            # This line begins the header, or else the counts.
+            # After the header and answers, this line begins the summary.
             is_over = has_header and bool(rtt_ms)
             has_header = True
         elif (has_header or rtt_ms) and not _WINDOWS_BREAK.fullmatch(line.strip()):
+            # a sentence about a missing answer, which ends in a (Chinese or Japanese) full stop
             if not line.endswith((".", "。")):
                 raise ValueError(
                     f"line {n} is neither an answer nor the sentence of one that is missing"

@@ -1,19 +1,22 @@
-"""Read arms from URDF: the bodies and joints between a base and an end link.
+"""Reads arms from URDF files: joints between a base and an end link, and the moved bodies.
 
-Units are those of URDF: kg, m, rad, N m; N along a prismatic joint. The frame of a link lies on
-the joint that moves the link.
+URDF is an XML format for robots. A robot is a tree of links (bodies) and joints; an arm is the
+path from one link, the base, to another link, the tip. Links that are fixed to a link of the
+arm, and branches such as fingers, become part of its body. Units are those of URDF: kg, m, rad,
+N m, and N along a prismatic joint. The frame of a link is that of the joint that moves the
+link.
 
 Invariant:
-    - A chain that is read is physical: every moving body has mass, and its principal moments of
+    - An arm is physically possible: every moving body has mass, and its principal moments of
       inertia are positive and satisfy the triangle inequality.
-    - Everything that hangs on a moving link is part of its body. A link that does not lead to
-      the end link never makes an arm unusable: if no body can have its inertia, a note says how
-      the link counts.
-    - A link on the way to the end link whose inertia no body can have is refused by name,
-      unless the caller balances inertias or gives that link another inertia.
+    - Everything that is attached to a moving link is part of its body. A link that does not
+      lead to the tip never makes an arm unusable. If its inertia is impossible, a note says how
+      the link was treated.
+    - A link on the way to the tip with an impossible inertia is refused with its name, unless
+      the caller permits to balance inertias or states another inertia for the link.
     - The text is not trusted: no file that it names is opened, and no entity is expanded.
-    - The numbers of a chain have the same bits on every machine: angles become matrices by
-      `core.elementary.sincos` and sums in a fixed order.
+    - The numbers of an arm have the same bits on every machine. Therefore sines and cosines are
+      those of `core.elementary.sincos`, and sums have a fixed order.
 """
 
 import math
@@ -32,25 +35,35 @@ from ..fields import MAX_QUANTITY, suggest_nearest
 from .link_inertia import LinkInertia, balance_tensor, fill_tensor
 
 MAX_CHARACTERS = 1_000_000
+"""Largest length of a file, in characters."""
 MAX_NUMBER_LENGTH = 100
-"""Largest length of a number. The time to match a text that is not a number grows with the
-square of its length.
+"""Largest length of the text of a number. The regular expression needs a time that grows with
+the square of the length if the text is not a number.
 """
 MAX_OFFSET_M = 100.0
-"""Largest coordinate of an origin. A file with larger ones is in millimetres, or wrong."""
+"""Largest coordinate of an origin, in m. A file with larger ones is wrong, or in millimetres.
+"""
 CONSISTENCY = 1e-9
-"""Share of the largest principal moment by which rounding may violate the inequalities."""
+"""Fraction of the largest principal moment by which rounding may violate the inequalities."""
 LEAST_MASS_KG = 1e-9
+"""Smallest mass of a body that moves, in kg."""
 LEAST_MOMENT_KG_M2 = 1e-12
-"""Least mass and least principal moment of a body that moves. The moments of a single link may
-violate the inequalities by less than the latter.
+"""Smallest principal moment of inertia of a body that moves, in kg m^2.
+
+The moments of a single link may violate the inequalities by less than this.
 """
 _MIN_AXIS_LENGTH = 1e-6
+"""Smallest length of the vector of an axis."""
 _MAX_LISTED_NAMES = 8
+"""Largest number of names in an error message."""
 _MAX_QUOTED_LENGTH = 60
+"""Largest length of a text of the file in an error message."""
 
 BodyParameters = tuple[float, ...]
-"""m, m cx, m cy, m cz, Ixx, Ixy, Iyy, Ixz, Iyz, Izz about a frame's origin, in its axes."""
+"""Ten inertial parameters m, m cx, m cy, m cz, Ixx, Ixy, Iyy, Ixz, Iyz, Izz of a body.
+
+m is the mass and c the centre of mass. The inertia is about the origin of a frame, in its axes.
+"""
 
 _ORIGIN: Three = (0.0, 0.0, 0.0)
 _IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -58,17 +71,17 @@ _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _MOVING_KINDS = ("revolute", "continuous", "prismatic")
 _KINDS = (*_MOVING_KINDS, "fixed", "floating", "planar")
 _plain_sincos = getattr(sincos, "py_func", sincos)
-"""`sincos` without compilation, which would take longer than reading a file."""
+"""The function `sincos` as plain Python. Its compilation would take longer than the reading."""
 
 
 class UrdfPayload(NamedTuple):
-    """A body fixed to the end link.
+    """Body that is fixed to the tip of an arm.
 
     Attributes:
-        mass_kg: its mass.
-        com_m: its centre of mass in the frame of the end link.
-        inertia_kg_m2: Ixx, Ixy, Iyy, Ixz, Iyz, Izz about its centre of mass in the axes of the
-            end link.
+        mass_kg: Mass, in kg.
+        com_m: Centre of mass in the frame of the tip, in m.
+        inertia_kg_m2: Ixx, Ixy, Iyy, Ixz, Iyz, Izz about the centre of mass, in the axes of the
+            tip, in kg m^2.
     """
 
     mass_kg: float
@@ -77,24 +90,24 @@ class UrdfPayload(NamedTuple):
 
 
 class UrdfJoint(NamedTuple):
-    """A joint that moves, and the body that it moves.
+    """A moving joint of an arm, and the body that it moves.
 
     Attributes:
-        name: the name of the joint.
-        link: the name of the link that the joint moves.
+        name: Name of the joint.
+        link: Name of the link that the joint moves.
         kind: "revolute" (also for a continuous joint) or "prismatic".
-        axis: unit vector in the joint's frame.
-        rotation: orientation of the joint's frame at q = 0, three rows, in the frame of the
-            previous moving link; for the first joint in the frame of the base.
-        origin_m: origin of the joint's frame in the same frame.
-        inertia: the body's `BodyParameters` in the joint's frame, with everything that is fixed
-            to the link.
-        lower: least position, rad or m; -inf if the file states no limit.
-        upper: largest position, rad or m; inf if the file states no limit.
-        effort_limit: largest effort, N m or N; inf if the file states no limit.
-        velocity_limit: largest speed, rad/s or m/s; inf if the file states no limit.
-        viscous: viscous friction, N m s/rad or N s/m.
-        coulomb: Coulomb friction, N m or N.
+        axis: Unit vector of the axis in the joint's frame.
+        rotation: Orientation of the joint's frame at q = 0, three rows, in the frame of the
+            previous moving link. For the first joint, in the frame of the base.
+        origin_m: Origin of the joint's frame, in the same frame, in m.
+        inertia: Inertial parameters of the body in the joint's frame, including everything that
+            is fixed to the link.
+        lower: Smallest position, in rad or m. -inf if the file states no limit.
+        upper: Largest position, in rad or m. inf if the file states no limit.
+        effort_limit: Largest torque or force, in N m or N. inf if the file states no limit.
+        velocity_limit: Largest speed, in rad/s or m/s. inf if the file states no limit.
+        viscous: Viscous friction, in N m s/rad or N s/m.
+        coulomb: Coulomb friction, in N m or N.
     """
 
     name: str
@@ -113,16 +126,15 @@ class UrdfJoint(NamedTuple):
 
 
 class UrdfChain(NamedTuple):
-    """An arm: the joints that move between a base and an end link.
+    """An arm: the moving joints between a base and a tip.
 
     Attributes:
-        base: the name of the link that does not move.
-        tip: the name of the end link.
-        joints: 1 to `MAX_JOINTS` joints, from the base on.
-        tip_rotation: orientation of the end link in the frame of the last moving link, three
-            rows.
-        tip_origin_m: origin of the end link in the same frame.
-        notes: sentences on what may differ from the intention of the file.
+        base: Name of the link that does not move.
+        tip: Name of the link at the end of the arm.
+        joints: 1 to `MAX_JOINTS` joints, starting at the base.
+        tip_rotation: Orientation of the tip in the frame of the last moving link, three rows.
+        tip_origin_m: Origin of the tip in the same frame, in m.
+        notes: Sentences about details that the author of the file may not have intended.
     """
 
     base: str
@@ -134,20 +146,31 @@ class UrdfChain(NamedTuple):
 
 
 class _Pose(NamedTuple):
-    """The orientation and the origin of a frame in another frame."""
+    """Orientation and origin of a frame, expressed in another frame."""
 
     rotation: Matrix = _IDENTITY
     origin_m: Three = _ORIGIN
 
     def __matmul__(self, inner: "_Pose") -> "_Pose":
-        """Returns the pose of a frame that is given in this frame."""
+        """Returns the pose of a frame `inner` that is expressed in this frame.
+
+        The result is expressed in the frame in which this frame is expressed.
+        """
         x, y, z = apply(self.rotation, inner.origin_m)
         ox, oy, oz = self.origin_m
         return _Pose(multiply(self.rotation, inner.rotation), (ox + x, oy + y, oz + z))
 
 
 class _Edge(NamedTuple):
-    """A joint of the file, which connects two links."""
+    """Joint of the file, which connects a parent link and a child link.
+
+    Attributes:
+        name: Name of the joint.
+        kind: Type of the joint in URDF, for example "revolute" or "fixed".
+        parent: Name of the link that carries the joint.
+        child: Name of the link that hangs on the joint.
+        element: XML element of the joint.
+    """
 
     name: str
     kind: str
@@ -157,16 +180,17 @@ class _Edge(NamedTuple):
 
     @property
     def moves(self) -> bool:
+        """True if the joint can move a link of an arm."""
         return self.kind in _MOVING_KINDS
 
 
 class _Robot(NamedTuple):
-    """The links and joints of a file, a tree.
+    """Tree of the links and joints of a file.
 
     Attributes:
-        links: the elements of the links, by name.
-        above: the joint that moves each link but the root, by the link's name.
-        below: the joints that hang on each link, by the link's name.
+        links: XML elements of the links, by name.
+        above: For each link except the root, the joint on which it hangs.
+        below: For each link, the joints that it carries.
     """
 
     links: Mapping[str, Element]
@@ -175,12 +199,12 @@ class _Robot(NamedTuple):
 
 
 class _Inertias(NamedTuple):
-    """The changes that a scenario makes to the inertias of a file.
+    """Changes that a scenario makes to the inertias of a file.
 
     Attributes:
-        links: masses and inertias in place of those in the file, by the link's name.
-        balance: true: a tensor that no body can have is balanced; false: it is refused, or a
-            note reports it.
+        links: Masses and inertias that replace those in the file, by the name of the link.
+        balance: If True, an impossible inertia is replaced by the nearest possible one. If
+            False, it is refused or noted.
     """
 
     links: Mapping[str, LinkInertia]
@@ -188,13 +212,14 @@ class _Inertias(NamedTuple):
 
 
 class _LinkBody(NamedTuple):
-    """The body of a link, in the frame of the moving link to which it belongs.
+    """Inertia of one link, expressed in the frame of the moving link to which it belongs.
 
     Attributes:
-        link: the name of the link.
-        body: its parameters as they are stated, or balanced.
-        point: its parameters as a point of mass, if no body can have its moments; else None.
-        problem: why no body can have its moments; "" if a body can.
+        link: Name of the link.
+        body: Inertial parameters as the file states them, or balanced.
+        point: If the stated moments are impossible, the inertial parameters of a point with the
+            same mass. Otherwise None.
+        problem: Reason why the moments are impossible. Empty if they are possible.
     """
 
     link: str
@@ -214,37 +239,41 @@ def read_urdf(
 ) -> UrdfChain:
     """Returns the arm between two links of a robot.
 
-    A link behind a fixed joint is part of the moving link before it. So is a branch that a
-    moving link carries on joints of its own, such as fingers, at the zero position of these
-    joints; a note says so.
+    A link on a fixed joint is part of the moving link that carries it. The same holds for a
+    branch with joints of its own, such as fingers: these joints are held at zero, and a note
+    says so.
 
     Args:
-        text: the URDF document.
-        base: the link that does not move; "": the root of the robot.
-        tip: the end link; "": the only leaf that moves.
-        payload: a body that the end link carries.
-        links: masses and inertias in place of those in the file, by the link's name.
-        balance: true: a stated inertia that no body can have is replaced by the nearest inertia
-            that a body can have.
+        text: URDF document.
+        base: Name of the link that does not move. By default, the root of the robot.
+        tip: Name of the link at the end of the arm. By default, the only moving link that
+            carries no other link.
+        payload: Body that the tip carries.
+        links: Masses and inertias that replace those in the file, by the name of the link.
+        balance: If True, an impossible inertia is replaced by the nearest possible one.
 
     Raises:
-        ScenarioError: the file cannot be used; with the line, link or joint. A problem of a key
-            of `links` has its path, as in links.NAME.mass_kg.
+        ScenarioError: The file cannot be used. The error names the line, link or joint. If a
+            key of `links` is wrong, the error contains its path, for example
+            links.NAME.mass_kg.
     """
     robot = _read_tree(_parse_xml(text))
     base = _check_end(robot, "base", base) or _find_base(robot)
     tip = _check_end(robot, "tip", tip) or _find_tip(robot, base)
     path = _find_path(robot, base, tip)
     inertias = _Inertias(links or {}, balance)
+
     joints: list[UrdfJoint] = []
     notes: list[str] = []
     moved_links: set[str] = set()
+    # pose of the current joint in the frame of the previous moving link
     pose = _Pose()
     last_moving = max(n for n, edge in enumerate(path) if edge.moves)
     for n, edge in enumerate(path):
         pose = pose @ _read_origin(edge.element, _joint(edge.name))
         if not edge.moves:
             continue
+
         carried = list(_walk_carried(robot, edge, path, notes))
         moved_links |= {name for name, _ in carried}
         bodies = list(
@@ -257,6 +286,7 @@ def read_urdf(
         body = _lump_bodies(edge, bodies, notes)
         joints.append(_read_joint(edge, pose, body, notes))
         pose = _Pose()
+
     _check_supplied_inertias(robot, inertias.links, moved_links)
     return UrdfChain(
         base=base,
@@ -271,7 +301,7 @@ def read_urdf(
 def _check_supplied_inertias(
     robot: _Robot, links: Mapping[str, LinkInertia], moved_links: Collection[str]
 ) -> None:
-    """Refuses inertias of links that the robot lacks, or that no joint of the arm moves."""
+    """Refuses stated inertias of links that do not exist, or that no joint of the arm moves."""
     for name in links:
         if name not in robot.links:
             hint = suggest_nearest(name, list(robot.links))
@@ -285,31 +315,39 @@ def _check_supplied_inertias(
 
 
 def _key(link: str) -> str:
-    """Returns the key path of a link's inertia, as an author writes it."""
+    """Returns the path of a link's inertia in a scenario, quoted if TOML requires it."""
     return f"links.{link}" if re.fullmatch(r"[A-Za-z0-9_-]+", link) else f'links."{link}"'
 
 
 def _refuse(subject: str, problem: str) -> NoReturn:
-    """Raises the error of a problem; `subject`: the link, joint or line, "" for the file."""
+    """Raises an error about the file.
+
+    Args:
+        subject: Link, joint or line that is wrong. Empty if the file as a whole is wrong.
+        problem: Rest of the sentence.
+    """
     raise ScenarioError(f"{subject}: {problem}" if subject else problem)
 
 
 def _quote(text: str) -> str:
-    """Returns a text in quotation marks, cut off if it is long."""
+    """Returns a text in quotation marks, shortened if it is long."""
     if len(text) > _MAX_QUOTED_LENGTH:
         text = f"{text[: _MAX_QUOTED_LENGTH - 3]}..."
     return repr(text)
 
 
 def _link(name: str) -> str:
+    """Returns how an error message names a link."""
     return f"link {_quote(name)}"
 
 
 def _joint(name: str) -> str:
+    """Returns how an error message names a joint."""
     return f"joint {_quote(name)}"
 
 
 def _list_names(names: Sequence[str]) -> str:
+    """Returns the first names of a list as a text, and the number of the others."""
     text = ", ".join(map(_quote, names[:_MAX_LISTED_NAMES]))
     more = len(names) - _MAX_LISTED_NAMES
     return f"{text} and {more} more" if more > 0 else text
@@ -319,7 +357,12 @@ def _list_names(names: Sequence[str]) -> str:
 
 
 def _parse_xml(text: str) -> Element:
-    """Returns the root element of a URDF document."""
+    """Returns the root element of a URDF document.
+
+    Raises:
+        ScenarioError: The text is too long, is not XML, contains a document type or entities,
+            or is not URDF.
+    """
     if len(text) > MAX_CHARACTERS:
         _refuse(
             "", f"has {count_nouns(len(text), 'character')}, at most {MAX_CHARACTERS} are read"
@@ -335,7 +378,7 @@ def _parse_xml(text: str) -> Element:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
         _refuse(f"line {error.position[0]}", f"is not XML: {error.msg.partition(':')[0]}")
-    # A character that cannot be encoded.
+    # raised for a character that cannot be encoded
     except ValueError as error:
         _refuse("", f"is not XML: {error}")
     for element in root.iter():
@@ -353,13 +396,17 @@ def _parse_xml(text: str) -> Element:
 
 
 def _is_xacro(element: Element) -> bool:
-    """True if an element belongs to xacro, or has an expression of xacro in an attribute."""
+    """True if an element belongs to xacro, a macro language whose output is URDF."""
     namespace = element.tag.partition("}")[0]
     return "xacro" in namespace or any("${" in value for value in element.attrib.values())
 
 
 def _name_elements(root: Element, tag: str) -> dict[str, Element]:
-    """Returns the elements of a tag below the root, by their names, which must differ."""
+    """Returns the elements with a certain tag below the root, by name.
+
+    Raises:
+        ScenarioError: An element has no name, or two have the same name.
+    """
     elements: dict[str, Element] = {}
     for n, element in enumerate(root.findall(tag), 1):
         name = element.get("name", "")
@@ -375,7 +422,12 @@ def _name_elements(root: Element, tag: str) -> dict[str, Element]:
 
 
 def _read_tree(root: Element) -> _Robot:
-    """Returns the tree of links and joints; refuses graphs that are not trees."""
+    """Returns the tree of links and joints.
+
+    Raises:
+        ScenarioError: The links and joints do not form trees: a link hangs on two joints, or on
+            itself.
+    """
     links = _name_elements(root, "link")
     above: dict[str, _Edge] = {}
     below: dict[str, list[_Edge]] = {name: [] for name in links}
@@ -389,6 +441,8 @@ def _read_tree(root: Element) -> _Robot:
             )
         above[edge.child] = edge
         below[edge.parent].append(edge)
+
+    # A link that cannot be reached from any root is part of a loop.
     robot = _Robot(links, above, below)
     roots = [name for name in links if name not in above]
     rooted_links = {name for root_name in roots for name, _ in _walk(robot, root_name)}
@@ -404,7 +458,13 @@ def _read_tree(root: Element) -> _Robot:
 
 
 def _read_edge(name: str, element: Element, links: Mapping[str, Element]) -> _Edge:
-    """Returns a joint of the file with its type and the two links that it connects."""
+    """Returns a joint of the file, with its type and the two links that it connects.
+
+    Args:
+        name: Name of the joint.
+        element: XML element of the joint.
+        links: Elements of all links, by name.
+    """
     subject = _joint(name)
     kind = element.get("type", "")
     if kind not in _KINDS:
@@ -425,7 +485,11 @@ def _read_edge(name: str, element: Element, links: Mapping[str, Element]) -> _Ed
 
 
 def _walk(robot: _Robot, root: str) -> Iterator[tuple[str, bool]]:
-    """Yields `root` and each link below it, and whether a joint below `root` moves the link."""
+    """Yields a link and all links below it, in depth-first order.
+
+    Yields:
+        The name of a link, and whether any joint between `root` and the link can move.
+    """
     waiting = [(root, False)]
     while waiting:
         name, is_moved = waiting.pop()
@@ -440,14 +504,27 @@ def _walk(robot: _Robot, root: str) -> Iterator[tuple[str, bool]]:
 
 
 def _check_end(robot: _Robot, end: str, link: str) -> str:
-    """Returns a link's name; refuses a name that the robot lacks. `end`: "base" or "tip"."""
+    """Returns the name of the link that a caller chose as base or tip.
+
+    Args:
+        robot: The robot.
+        end: "base" or "tip", for error messages.
+        link: Name of the link. Empty if the caller chose none.
+
+    Raises:
+        ScenarioError: The robot has no such link.
+    """
     if link and link not in robot.links:
         _refuse(end, f"there is no {_link(link)}{suggest_nearest(link, list(robot.links))}")
     return link
 
 
 def _find_base(robot: _Robot) -> str:
-    """Returns the only link that hangs on no joint."""
+    """Returns the only link that hangs on no joint.
+
+    Raises:
+        ScenarioError: There are several such links.
+    """
     roots = [name for name in robot.links if name not in robot.above]
     if len(roots) > 1:
         _refuse(
@@ -458,7 +535,11 @@ def _find_base(robot: _Robot) -> str:
 
 
 def _find_tip(robot: _Robot, base: str) -> str:
-    """Returns the only leaf that moves with respect to the base."""
+    """Returns the only link that moves with respect to the base and carries no other link.
+
+    Raises:
+        ScenarioError: There is no such link, or there are several.
+    """
     leaves = [
         name for name, is_moved in _walk(robot, base) if is_moved and not robot.below[name]
     ]
@@ -474,7 +555,12 @@ def _find_tip(robot: _Robot, base: str) -> str:
 
 
 def _find_path(robot: _Robot, base: str, tip: str) -> list[_Edge]:
-    """Returns the joints from the base to the tip; refuses joints that an arm cannot have."""
+    """Returns the joints from the base to the tip.
+
+    Raises:
+        ScenarioError: The tip is not below the base, a joint is of a type that an arm cannot
+            have, or there are too few or too many moving joints.
+    """
     path: list[_Edge] = []
     name = tip
     while name != base:
@@ -485,6 +571,7 @@ def _find_path(robot: _Robot, base: str, tip: str) -> list[_Edge]:
             )
         path.append(robot.above[name])
         name = path[-1].parent
+
     for edge in path:
         if edge.kind in ("floating", "planar"):
             _refuse(
@@ -498,6 +585,7 @@ def _find_path(robot: _Robot, base: str, tip: str) -> list[_Edge]:
                 "follows another joint (<mimic>), which has no torque of its own: make it "
                 f"fixed, or give a tip before it, such as {_quote(edge.parent)}",
             )
+
     moving = sum(edge.moves for edge in path)
     if not 1 <= moving <= MAX_JOINTS:
         _refuse(
@@ -505,16 +593,24 @@ def _find_path(robot: _Robot, base: str, tip: str) -> list[_Edge]:
             f"{count_nouns(moving, 'joint moves', 'joints move')} between them, must be 1 "
             f"to {MAX_JOINTS}: name others",
         )
+    # The path was followed from the tip to the base.
     return path[::-1]
 
 
 def _walk_carried(
     robot: _Robot, moving: _Edge, path: Sequence[_Edge], notes: list[str]
 ) -> Iterator[tuple[str, _Pose]]:
-    """Yields every link between a joint of the path and the next joint of the path.
+    """Yields all links that one joint of the arm moves, up to the next moving joint of the arm.
+
+    Args:
+        robot: The robot.
+        moving: The joint.
+        path: Joints of the arm.
+        notes: Receives a sentence about each joint that is held at zero.
 
     Yields:
-        The name of a link, and its frame in that of the link that the joint moves.
+        The name of a link, and its frame expressed in the frame of the link that the joint
+        moves.
     """
     on_path = {edge.name for edge in path}
     waiting = [(moving.child, _Pose())]
@@ -539,14 +635,17 @@ def _read_bodies(
     inertias: _Inertias,
     notes: list[str],
 ) -> Iterator[_LinkBody]:
-    """Yields the bodies of links, in the frame of the moving link that carries them.
+    """Yields the inertias of links, in the frame of the moving link that carries them.
+
+    A link without mass yields nothing. An impossible mass of a link on the way to the tip is
+    refused; other links with an impossible mass are left out with a note.
 
     Args:
-        robot: the robot.
-        carried: the names of the links, and their frames in that of the moving link.
-        path: the joints of the arm.
-        inertias: the changes that the scenario makes.
-        notes: receives a sentence on each doubtful link.
+        robot: The robot.
+        carried: Names of the links, and their frames expressed in the frame of the moving link.
+        path: Joints of the arm.
+        inertias: Changes that the scenario makes.
+        notes: Receives a sentence about each doubtful link.
     """
     leading_links = {edge.child for edge in path}
     for name, pose in carried:
@@ -556,6 +655,7 @@ def _read_bodies(
         inertial = _read_inertial(robot.links[name], name, supplied)
         if inertial is None:
             continue
+
         problem = _find_mass_problem(inertial)
         if problem and supplied is not None:
             key = "mass_kg" if supplied.inertia_kg_m2 is None else "inertia_kg_m2"
@@ -565,6 +665,8 @@ def _read_bodies(
         if name in leading_links and inertial.lacks and supplied is None:
             advice = _advise_key(name, "inertia_kg_m2")
             _refuse(_link(name), f"its <inertial> has no <inertia>; {advice}")
+
+        # The other links do not lead to the tip, or have what the scenario states.
         if problem:
             notes.append(
                 f"{_link(name)} does not lead to the end link and is left out: {problem}"
@@ -587,11 +689,19 @@ def _read_body(
     inertias: _Inertias,
     notes: list[str],
 ) -> _LinkBody:
-    """Returns the body of a link, balanced if its inertia is impossible and may be balanced.
+    """Returns the inertia of a link, balanced if it is impossible and the scenario permits it.
+
+    Args:
+        name: Name of the link.
+        pose: Frame of the link, expressed in the frame of the moving link that carries it.
+        inertial: Inertia in the frame of the link.
+        path: Joints of the arm.
+        inertias: Changes that the scenario makes.
+        notes: Receives a sentence if the inertia is balanced.
 
     Raises:
-        ScenarioError: no body can have the inertia, and the scenario gave it, or the link leads
-            to the end link.
+        ScenarioError: The inertia is impossible, and the scenario states it or the link leads
+            to the tip.
     """
     mass, centre, tensor, _ = inertial
     moments = _principal_moments(tensor)
@@ -599,6 +709,7 @@ def _read_body(
     problem = _find_moments_problem(moments, -slack, slack)
     if not problem:
         return _LinkBody(name, _move_body(mass, centre, tensor, pose))
+
     if inertias.balance:
         tensor = balance_tensor(tensor)
         least, middle, most = _principal_moments(tensor)
@@ -611,17 +722,23 @@ def _read_body(
         raise ScenarioError(problem, path=f"{_key(name)}.inertia_kg_m2")
     if any(edge.child == name for edge in path):
         _refuse(_link(name), f"{problem}; {_advise_balance(name, path)}")
+
+    # `_lump_bodies` decides whether the link counts as stated or as a point.
     stated = _move_body(mass, centre, tensor, pose)
     point = _move_body(mass, centre, _POINT_TENSOR, pose)
     return _LinkBody(name, stated, point, problem)
 
 
 def _advise_key(name: str, key: str) -> str:
+    """Returns the advice to state a key of a link's inertia in the scenario."""
     return f"give {key} in [arm.{_key(name)}]"
 
 
 def _advise_balance(name: str, path: Sequence[_Edge]) -> str:
-    """Returns the remedies for a link on the path whose moments no body can have."""
+    """Returns the possible remedies for an impossible inertia on the way to the tip.
+
+    The last link can also be cut off by ending the arm at the link before it.
+    """
     remedies = ["set arm.balance_inertia = true", _advise_key(name, "inertia_kg_m2")]
     moving_edges = [edge for edge in path if edge.moves]
     if len(moving_edges) > 1 and moving_edges[-1].child == name:
@@ -631,7 +748,7 @@ def _advise_balance(name: str, path: Sequence[_Edge]) -> str:
 
 
 def _note_supplied(name: str, supplied: LinkInertia) -> str:
-    """Returns the note on a link whose mass or inertia the scenario gives."""
+    """Returns the note about a link whose mass or inertia the scenario states."""
     if supplied.mass_kg == 0.0:
         return f"{_link(name)}: the scenario leaves its mass out"
     keys = ", ".join(supplied.list_given_keys())
@@ -641,13 +758,13 @@ def _note_supplied(name: str, supplied: LinkInertia) -> str:
 def _read_joint(
     edge: _Edge, pose: _Pose, inertia: BodyParameters, notes: list[str]
 ) -> UrdfJoint:
-    """Returns a joint of the arm.
+    """Returns a moving joint of the arm.
 
     Args:
-        edge: the joint of the file.
-        pose: its frame in that of the previous moving link.
-        inertia: the body that it moves.
-        notes: receives a sentence on limits that the file does not state.
+        edge: Joint of the file.
+        pose: Frame of the joint, expressed in the frame of the previous moving link.
+        inertia: Inertial parameters of the body that the joint moves.
+        notes: Receives a sentence about limits that the file does not state.
     """
     subject = _joint(edge.name)
     axis = _child(edge.element, "axis", subject)
@@ -678,7 +795,11 @@ def _read_joint(
 
 
 def _read_friction(edge: _Edge, subject: str) -> tuple[float, float]:
-    """Returns the viscous and the Coulomb friction of a joint; 0 if not stated."""
+    """Returns the viscous and the Coulomb friction of a joint, 0 if they are not stated.
+
+    Raises:
+        ScenarioError: A friction is negative.
+    """
     dynamics = _child(edge.element, "dynamics", subject)
     friction = [0.0, 0.0]
     for n, key in enumerate(("damping", "friction")):
@@ -694,7 +815,14 @@ def _read_friction(edge: _Edge, subject: str) -> tuple[float, float]:
 
 
 class _JointLimits(NamedTuple):
-    """Limits of a joint: of its position, rad or m, its effort and its velocity."""
+    """Limits of a joint.
+
+    Attributes:
+        lower: Smallest position, in rad or m.
+        upper: Largest position, in rad or m.
+        effort: Largest torque or force, in N m or N.
+        velocity: Largest speed, in rad/s or m/s.
+    """
 
     lower: float
     upper: float
@@ -703,9 +831,18 @@ class _JointLimits(NamedTuple):
 
 
 def _read_limits(edge: _Edge, subject: str, notes: list[str]) -> _JointLimits:
-    """Returns the limits of a joint, infinite where the file does not state them.
+    """Returns the limits of a joint. Limits that the file does not state are infinite.
 
-    A limit of 0 counts as not stated, because exporters write 0 for limits that they lack.
+    A limit of 0 counts as not stated, because programs that export URDF write 0 if they do not
+    know a limit. A limit above `MAX_QUANTITY` counts as infinite.
+
+    Args:
+        edge: Joint of the file.
+        subject: Name of the joint in error messages.
+        notes: Receives a sentence about limits that are not stated.
+
+    Raises:
+        ScenarioError: A limit is negative, or the positions contradict each other.
     """
     limit = _child(edge.element, "limit", subject)
     values = []
@@ -715,12 +852,14 @@ def _read_limits(edge: _Edge, subject: str, notes: list[str]) -> _JointLimits:
             value = _read_number(limit, key, subject, math.inf)
         values.append(math.copysign(math.inf, value) if abs(value) > MAX_QUANTITY else value)
     lower, upper, effort, velocity = values
+
     if min(effort, velocity) < 0.0:
         _refuse(
             subject,
             f"its limits of effort and velocity are {effort:g} and {velocity:g}, must be "
             "positive",
         )
+
     unstated = [
         key for key, value in (("effort", effort), ("velocity", velocity)) if value == 0.0
     ]
@@ -731,6 +870,7 @@ def _read_limits(edge: _Edge, subject: str, notes: list[str]) -> _JointLimits:
         unstated.insert(0, "position")
         lower = -math.inf
         upper = math.inf
+
     if lower > upper:
         _refuse(
             subject, f"its lower limit is {lower:g}, must be below the upper one, {upper:g}"
@@ -750,7 +890,11 @@ def _read_limits(edge: _Edge, subject: str, notes: list[str]) -> _JointLimits:
 
 
 def _child(element: Element, tag: str, subject: str) -> Element | None:
-    """Returns the only child element of a tag, or None; refuses several children."""
+    """Returns the only child element with a certain tag. None if there is none.
+
+    Raises:
+        ScenarioError: There are several such elements.
+    """
     children = element.findall(tag)
     if len(children) > 1:
         _refuse(subject, f"has {len(children)} <{tag}>: keep one")
@@ -760,7 +904,18 @@ def _child(element: Element, tag: str, subject: str) -> Element | None:
 def _read_number(
     element: Element, key: str, subject: str, limit: float = MAX_QUANTITY
 ) -> float:
-    """Returns the number of an attribute, whose absolute value is at most `limit`."""
+    """Returns the number in an attribute of an element.
+
+    Args:
+        element: The element.
+        key: Name of the attribute.
+        subject: Link or joint of the element, for error messages.
+        limit: Largest absolute value.
+
+    Raises:
+        ScenarioError: There is no such attribute, or its value is not a number within the
+            limit.
+    """
     text = element.get(key)
     if text is None:
         _refuse(subject, f"its <{element.tag}> has no {key}")
@@ -768,6 +923,14 @@ def _read_number(
 
 
 def _parse_number(text: str, attribute: str, subject: str, limit: float) -> float:
+    """Returns the finite number in a text.
+
+    Args:
+        text: The text.
+        attribute: Element and attribute, for error messages.
+        subject: Link or joint, for error messages.
+        limit: Largest absolute value.
+    """
     stripped = text.strip() if len(text) <= MAX_NUMBER_LENGTH else ""
     value = float(stripped) if _NUMBER.fullmatch(stripped) else math.nan
     if not math.isfinite(value):
@@ -783,7 +946,7 @@ def _parse_number(text: str, attribute: str, subject: str, limit: float) -> floa
 def _read_vector(
     element: Element, key: str, subject: str, limit: float = MAX_QUANTITY
 ) -> Three:
-    """Returns the three numbers of an attribute, with absolute values of at most `limit`."""
+    """Returns the three numbers in an attribute of an element, see `_read_number`."""
     texts = element.get(key, "").split()
     attribute = f"{element.tag} {key}"
     if len(texts) != 3:
@@ -796,7 +959,13 @@ def _read_vector(
 
 
 def _read_origin(parent: Element, subject: str) -> _Pose:
-    """Returns the frame that an <origin> states; without it, the frame of its parent."""
+    """Returns the frame that the element <origin> of a joint or inertia states.
+
+    Without this element, the frame is that of the parent.
+
+    Raises:
+        ScenarioError: The element has an unknown attribute, or a number is wrong.
+    """
     origin = _child(parent, "origin", subject)
     if origin is None:
         return _Pose()
@@ -811,7 +980,8 @@ def _read_origin(parent: Element, subject: str) -> _Pose:
     if "xyz" in origin.attrib:
         offset = _read_vector(origin, "xyz", subject, MAX_OFFSET_M)
     angles = _read_vector(origin, "rpy", subject) if "rpy" in origin.attrib else _ORIGIN
-    # R_z(yaw) R_y(pitch) R_x(roll)
+
+    # The rotation is R_z(yaw) R_y(pitch) R_x(roll); s and c are sines and cosines.
     (sr, cr), (sp, cp), (sy, cy) = map(_plain_sincos, angles)
     rotation = (
         (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
@@ -825,13 +995,14 @@ def _read_origin(parent: Element, subject: str) -> _Pose:
 
 
 class _Inertial(NamedTuple):
-    """The inertia of a link in the link's frame.
+    """Inertia of a link, in the frame of the link.
 
     Attributes:
-        mass: kg; 0 if it is not stated.
-        centre: the centre of mass, with the axes of the tensor.
-        tensor: about the centre of mass, kg m^2; zero if it is not stated.
-        lacks: what neither the file nor the scenario states: "mass", "inertia" or "".
+        mass: Mass, in kg. 0 if it is not stated.
+        centre: Frame with the centre of mass as its origin, and with the axes of the tensor.
+        tensor: Inertia about the centre of mass, in kg m^2. Zero if it is not stated.
+        lacks: Quantity that neither the file nor the scenario states: "mass" or "inertia".
+            Empty if both are stated.
     """
 
     mass: float
@@ -842,15 +1013,20 @@ class _Inertial(NamedTuple):
 
 _TENSOR_KEYS = ("ixx", "ixy", "iyy", "ixz", "iyz", "izz")
 _POINT_TENSOR = fill_tensor((0.0,) * 6)
+"""Inertia of a point of mass about itself."""
 
 
 def _read_inertial(link: Element, name: str, supplied: LinkInertia | None) -> _Inertial | None:
-    """Returns the inertia of a link, or None if the link has no body.
+    """Returns the inertia of a link. None if the link has no mass.
 
     Args:
-        link: the element of the link.
-        name: the name of the link.
-        supplied: the inertia that the scenario gives; None: the file alone counts.
+        link: XML element of the link.
+        name: Name of the link.
+        supplied: Inertia that the scenario states. Its keys replace those of the file. None if
+            the scenario states nothing.
+
+    Raises:
+        ScenarioError: The scenario states an inertia without a mass, or a number is wrong.
     """
     supplied = supplied or LinkInertia()
     inertial = _child(link, "inertial", _link(name))
@@ -868,6 +1044,7 @@ def _read_inertial(link: Element, name: str, supplied: LinkInertia | None) -> _I
                 path=f"{_key(name)}.mass_kg",
             )
         return None
+
     mass = supplied.mass_kg
     centre = _Pose()
     tensor = None
@@ -880,6 +1057,7 @@ def _read_inertial(link: Element, name: str, supplied: LinkInertia | None) -> _I
     if supplied.com_m is not None:
         x, y, z = supplied.com_m
         centre = _Pose(centre.rotation, (x, y, z))
+
     lacks = ""
     if mass is None:
         lacks = "mass"
@@ -891,9 +1069,17 @@ def _read_inertial(link: Element, name: str, supplied: LinkInertia | None) -> _I
 def _read_stated_inertial(
     inertial: Element, name: str, supplied: LinkInertia
 ) -> tuple[float | None, _Pose, Matrix | None]:
-    """Returns mass, frame and tensor of an <inertial>.
+    """Returns the mass, the frame and the tensor of an <inertial> element.
 
-    Elements that the scenario replaces are not read, so that their problems do not matter.
+    Parts that the scenario replaces are not read, so that errors in them do not matter.
+
+    Args:
+        inertial: The element.
+        name: Name of the link.
+        supplied: Inertia that the scenario states.
+
+    Returns:
+        Mass in kg, frame of the centre of mass, and tensor in kg m^2. None for missing parts.
     """
     subject = _link(name)
     mass = supplied.mass_kg
@@ -911,7 +1097,7 @@ def _read_stated_inertial(
 
 
 def _find_mass_problem(inertial: _Inertial) -> str:
-    """Returns why a mass is impossible, or ""."""
+    """Returns the reason why the mass of a link is impossible. Empty if it is possible."""
     if inertial.lacks == "mass":
         return "its <inertial> has no <mass>"
     if inertial.mass < 0.0:
@@ -922,11 +1108,14 @@ def _find_mass_problem(inertial: _Inertial) -> str:
 
 
 def _read_payload(payload: UrdfPayload, fixed: Sequence[_Edge]) -> BodyParameters:
-    """Returns the parameters of the payload in the frame of the last moving link.
+    """Returns the inertial parameters of the payload in the frame of the last moving link.
 
     Args:
-        payload: the payload, in the frame of the tip.
-        fixed: the fixed joints from the last moving link to the tip.
+        payload: The payload, in the frame of the tip.
+        fixed: Fixed joints from the last moving link to the tip.
+
+    Raises:
+        ScenarioError: The moments of inertia of the payload are impossible.
     """
     pose = _Pose()
     for edge in fixed:
@@ -942,41 +1131,54 @@ def _read_payload(payload: UrdfPayload, fixed: Sequence[_Edge]) -> BodyParameter
 
 
 def _principal_moments(tensor: Matrix) -> list[float]:
-    """Returns the eigenvalues of a tensor in ascending order, for checks and notes only."""
+    """Returns the eigenvalues of an inertia tensor in ascending order.
+
+    Their last bits may differ between machines, so they are used for checks and notes only.
+    """
     return [float(moment) for moment in np.linalg.eigvalsh(np.array(tensor))]
 
 
 def _find_moments_problem(moments: Sequence[float], bound: float, slack: float) -> str:
-    """Returns why no body can have three principal moments of inertia, or "".
+    """Returns the reason why three principal moments of inertia are impossible.
+
+    The moments of a body are positive, and none exceeds the sum of the other two.
 
     Args:
-        moments: the moments in ascending order, kg m^2.
-        bound: the least moment that is allowed, kg m^2.
-        slack: how far the triangle inequality may be violated, kg m^2.
+        moments: Moments in ascending order, in kg m^2.
+        bound: Smallest permitted moment, in kg m^2.
+        slack: Permitted violation of the triangle inequality, in kg m^2.
+
+    Returns:
+        Part of a sentence. Empty if the moments are possible.
     """
-    least, middle, most = moments
+    smallest, middle, largest = moments
     stated = (
-        f"its principal moments of inertia are {least:.4g}, {middle:.4g} and {most:.4g} kg m^2"
+        f"its principal moments of inertia are {smallest:.4g}, {middle:.4g} and {largest:.4g} "
+        "kg m^2"
     )
-    if least < bound:
+    if smallest < bound:
         return f"{stated}, and all must be positive"
-    if most - least - middle > slack:
+    if largest - smallest - middle > slack:
         return f"{stated}, and none of a body's moments exceeds the sum of the other two"
     return ""
 
 
 def _move_body(mass: float, centre: _Pose, tensor: Matrix, pose: _Pose) -> BodyParameters:
-    """Returns the parameters of a body in another frame than that of its link.
+    """Returns the inertial parameters of a body in another frame.
 
-    The tensor is turned, R I R^T, and moved by the parallel axis theorem.
+    The tensor I about the centre of mass is rotated, R I R^T, and moved to the origin of the
+    other frame by the parallel axis theorem.
 
     Args:
-        mass: kg.
-        centre: the centre of mass and the axes of the tensor, in the frame of the link.
-        tensor: about the centre of mass, kg m^2.
-        pose: the frame of the link in the other frame.
+        mass: Mass, in kg.
+        centre: Frame of the centre of mass with the axes of the tensor, in the frame of the
+            link.
+        tensor: Inertia about the centre of mass, in kg m^2.
+        pose: Frame of the link, expressed in the other frame.
     """
+    # Rows of the rotation R, and the centre of mass in the other frame.
     (r0, r1, r2), (x, y, z) = pose @ centre
+    # Columns of I R^T. The entries of R I R^T follow row by row.
     columns = (apply(tensor, r0), apply(tensor, r1), apply(tensor, r2))
     (xx, xy, xz) = apply(columns, r0)
     (_, yy, yz) = apply(columns, r1)
@@ -998,16 +1200,22 @@ def _move_body(mass: float, centre: _Pose, tensor: Matrix, pose: _Pose) -> BodyP
 def _lump_bodies(edge: _Edge, bodies: Sequence[_LinkBody], notes: list[str]) -> BodyParameters:
     """Returns the sum of the bodies that one joint moves.
 
-    The links off the path whose moments no body can have count as stated if the sum is a body,
-    else as points of mass.
+    Links that do not lead to the tip may have impossible moments of inertia. They count as
+    stated if the sum is a possible body all the same. Otherwise they count as points of mass.
+
+    Args:
+        edge: The joint.
+        bodies: Inertias of the links, in the frame of the joint.
+        notes: Receives a sentence about each link with impossible moments.
 
     Raises:
-        ScenarioError: the sum is not a body with mass and extent.
+        ScenarioError: The sum is not a body with mass and extent.
     """
     subject = f"{_link(edge.child)}, which {_joint(edge.name)} moves"
     if not bodies:
         advice = f"give mass_kg and inertia_kg_m2 in [arm.{_key(edge.child)}]"
         _refuse(subject, f"has no <inertial>, and nothing fixed to it has one; {advice}")
+
     total = _add_bodies([body.body for body in bodies])
     problem = _find_sum_problem(total)
     doubtful_bodies = [body for body in bodies if body.point is not None]
@@ -1018,6 +1226,7 @@ def _lump_bodies(edge: _Edge, bodies: Sequence[_LinkBody], notes: list[str]) -> 
     if problem:
         key = "mass_kg" if total[0] < LEAST_MASS_KG else "inertia_kg_m2"
         _refuse(subject, f"{problem}; {_advise_key(edge.child, key)}")
+
     for body in doubtful_bodies:
         counts = f"as a point of {body.body[0]:g} kg" if as_points else "as stated"
         notes.append(
@@ -1028,15 +1237,19 @@ def _lump_bodies(edge: _Edge, bodies: Sequence[_LinkBody], notes: list[str]) -> 
 
 
 def _add_bodies(bodies: Sequence[BodyParameters]) -> BodyParameters:
+    """Returns the sum of the inertial parameters of bodies in the same frame."""
     total = bodies[0]
-    # Added one by one: the built-in sum rounds differently from Python 3.12 on.
+    # The built-in `sum` rounds differently from Python 3.12 on.
     for body in bodies[1:]:
         total = tuple(a + b for a, b in zip(total, body, strict=True))
     return total
 
 
 def _find_sum_problem(total: BodyParameters) -> str:
-    """Returns why the sum of the bodies at a joint is not a body with extent, or ""."""
+    """Returns the reason why the sum of the bodies at a joint is impossible.
+
+    Empty if it is a body with mass and extent.
+    """
     mass = total[0]
     if mass < LEAST_MASS_KG:
         return f"has {mass:g} kg with all that is fixed to it, and a body that moves needs mass"
