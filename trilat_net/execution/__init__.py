@@ -1,1 +1,1 @@
-"""Run `Site.step` in virtual time, again from a log, or from a log with changed settings."""
+"""Executes sites in virtual time: anew, from a log, or from a log with changed settings."""

@@ -1,10 +1,11 @@
-"""Check a log by executing it again: one finding for each check.
+"""Checks a log by executing its run again, and reports one finding for each check.
 
-The checks are: records complete, integrity, user laws, executed again, external arms, scenario
-hash, and comparison with virtual time.
+The checks are: Are records missing? Is the file as it was written? Which control laws of users
+does it name? Does a repeated execution give the same records? Were arms external? Is the
+scenario the one whose hash is stated? Does virtual time give the same records?
 
 Invariant:
-    - Every finding on an execution rests on an execution made by this process.
+    - Every finding about an execution is based on an execution in this process.
 """
 
 import itertools
@@ -28,15 +29,15 @@ MAX_GAPS_NAMED = 60
 
 @dataclass(frozen=True, repr=False)
 class LogCheckReport(CheckReport):
-    """The findings of all checks of a log.
+    """Findings of all checks of a log.
 
-    The report passes if the log is as it was written, enough records were judged, and every
-    execution agrees with the log.
+    The report passes if the log is unchanged since it was written, enough records could be
+    judged, and every execution agrees with the log.
 
     Attributes:
-        log: the log.
-        result: the result of executing the log again.
-        findings: one finding per check.
+        log: The log.
+        result: Result of executing the log again.
+        findings: One finding for each check.
     """
 
     log: Log
@@ -50,11 +51,11 @@ class LogCheckReport(CheckReport):
 
     @property
     def identical(self) -> int:
-        """Number of executed records that agree with the log in every computed field."""
+        """Number of executed records in which every computed field agrees with the log."""
         return self.result.identical
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns plain values, with the keys of `trilat verify --json`."""
+        """Returns the report as plain values, with the keys of `trilat verify --json`."""
         result = self.result
         first_difference = None
         if result.first is not None:
@@ -84,6 +85,7 @@ class LogCheckReport(CheckReport):
 
 
 def _to_range(gap: tuple[str, int, int]) -> dict[str, Any]:
+    """Returns a range of ticks as plain values."""
     site, first, last = gap
     return {"site": site, "first": first, "last": last}
 
@@ -96,19 +98,20 @@ def run_log_checks(
     min_coverage: float = MIN_COVERAGE,
     resume_every: int = 0,
 ) -> LogCheckReport:
-    """Executes a log again and returns the findings of all checks.
+    """Executes a log again, and returns the findings of all checks.
 
     Args:
-        log: the log.
-        virtual: whether the log is also compared with virtual time.
-        progress: called now and then with the amount of work done and the total.
-        min_coverage: smallest share of the ticks of every site that must be judged; a log with
-            a smaller share fails even if all judged records agree.
-        resume_every: see `verify`.
+        log: The log.
+        virtual: If True, the log is also compared with virtual time.
+        progress: Function that is called now and then with the amount of work done and the
+            total.
+        min_coverage: Smallest fraction of the ticks of every site that must be judged. A log
+            with a smaller fraction fails even if all judged records agree.
+        resume_every: See `verify`.
 
     Raises:
-        LogError: a record cannot be read.
-        ScenarioError: a user law that may run cannot be constructed.
+        LogError: A record cannot be read.
+        ScenarioError: A user's control law that may run cannot be created.
     """
     result = verify(log, progress, min_coverage=min_coverage, resume_every=resume_every)
     findings = list(_check_log(log, result, virtual=virtual, progress=progress))
@@ -118,14 +121,14 @@ def run_log_checks(
 def check_log_files(
     sources: Sequence[str], min_coverage: float, allowed: CodeConsents
 ) -> list[Finding]:
-    """Checks a log in files, in a worker process, and returns the findings.
+    """Checks a log in a worker process, and returns the findings.
 
-    A user law that cannot be constructed is a failed finding.
+    A user's control law that cannot be created gives a failed finding instead of an error.
 
     Args:
-        sources: the files.
-        min_coverage: smallest share of the ticks of every site that must be judged.
-        allowed: the code from outside that may run in this process.
+        sources: Files of the log.
+        min_coverage: Smallest fraction of the ticks of every site that must be judged.
+        allowed: Permissions for code of users in this process.
     """
     allowed_code.update(allowed)
     log = open_log(*sources)
@@ -138,11 +141,22 @@ def check_log_files(
 def _check_log(
     log: Log, result: VerifyResult, *, virtual: bool, progress: Progress | None
 ) -> Iterator[Finding]:
-    # the recorded sites of an open-loop rerun
-    others = [name for name in log.sites if name not in log.executed_sites]
+    """Yields the finding of each check that applies to a log.
+
+    Args:
+        log: The log.
+        result: Result of executing the log again.
+        virtual: If True, the log is also compared with virtual time.
+        progress: Function that reports the progress of this comparison.
+    """
+    # A log may be the result of a rerun in which only some sites were executed. The records of
+    # the others were copied.
+    copied_sites = [name for name in log.sites if name not in log.executed_sites]
     recorded = ""
-    if others:
-        recorded = f"{' and '.join(others)} {'stand' if len(others) > 1 else 'stands'}"
+    if copied_sites:
+        verb = "stand" if len(copied_sites) > 1 else "stands"
+        recorded = f"{' and '.join(copied_sites)} {verb}"
+
     yield _check_coverage(log, result)
     yield Finding("integrity", result.integrity.text, result.integrity.passed)
     for law in find_user_laws(log.scenario):
@@ -159,6 +173,7 @@ def _check_log(
         yield Finding(
             "scenario", "is not the one whose hash the log names: it was changed", False
         )
+
     if not virtual:
         return
     if result.withheld:
@@ -180,11 +195,17 @@ def _check_log(
 def _check_virtual_time(
     log: Log, result: VerifyResult, progress: Progress | None
 ) -> Iterator[Finding]:
+    """Yields the findings of the comparison with virtual time.
+
+    The log is compared with a run in which samples arrive as in the log. It is also compared
+    with a run in which samples arrive at once, unless that is another run by its nature.
+    """
     comparison = compare_with_virtual(log, progress)
-    # the arrivals in a gap are unknown, so a difference after it is excused
+    # The arrivals in a gap are unknown, so a difference after the first gap is excused.
     first_gap = min((first for _, first, _ in result.gaps), default=None)
     label = "virtual time fed with the log's arrivals"
     yield _check_comparison(label, comparison.fed, first_gap)
+
     reason = ""
     if log.scenario.external:
         reason = "an arm was external"
@@ -193,6 +214,7 @@ def _check_virtual_time(
     if reason and log.driver != "virtual":
         yield Finding("plain virtual time", f"is another run: {reason}", True)
         return
+
     late = comparison.late
     lost = comparison.lost
     absent = count_nouns(len(late), "late sample")
@@ -205,22 +227,35 @@ def _check_virtual_time(
 
 
 def _check_coverage(log: Log, result: VerifyResult) -> Finding:
+    """Returns the finding on missing records. It fails if too few could be judged."""
     coverage = result.coverage
-    in_file = sum(len(log[name]) for name in coverage.expected)
-    text = f"{in_file}/{sum(coverage.expected.values())} in the file"
-    text += f"; {coverage.describe(result.min_coverage)}" if coverage.expected else ""
-    text += f"; {', '.join(result.withheld)} not judged" if result.withheld else ""
+    records_in_file = sum(len(log[name]) for name in coverage.expected)
+    expected_records = sum(coverage.expected.values())
+    parts = [f"{records_in_file}/{expected_records} in the file"]
+    if coverage.expected:
+        parts.append(coverage.describe(result.min_coverage))
+    if result.withheld:
+        parts.append(f"{', '.join(result.withheld)} not judged")
     if log.unknown_ends:
-        text += f"; {describe_unknown_ends(log.unknown_ends)}"
+        parts.append(describe_unknown_ends(log.unknown_ends))
     if log.damaged:
-        text += f"; damaged in {len(log.damaged)} place{'s' * (len(log.damaged) > 1)}"
+        plural = "s" if len(log.damaged) > 1 else ""
+        parts.append(f"damaged in {len(log.damaged)} place{plural}")
     elif not log.complete:
-        text += "; the file was not finished"
-    enough = not coverage.expected or coverage.share >= result.min_coverage
-    return Finding("records", text, enough and not log.damaged)
+        parts.append("the file was not finished")
+
+    has_coverage = not coverage.expected or coverage.share >= result.min_coverage
+    return Finding("records", "; ".join(parts), has_coverage and not log.damaged)
 
 
 def _check_execution(result: VerifyResult, recorded: str) -> Finding:
+    """Returns the finding on the repeated execution.
+
+    Args:
+        result: Result of the execution.
+        recorded: Subject and verb of a sentence on sites whose records were copied, such as
+            "m1 stands". Empty if all sites were executed.
+    """
     method = "tick by tick to 1e-9: another platform made it"
     if result.whole_run:
         method = "whole runs, bit for bit"
@@ -237,20 +272,30 @@ def _check_execution(result: VerifyResult, recorded: str) -> Finding:
         text += f"; {result.unjudged} behind gaps could not be judged"
     if result.first:
         text += f"; {result.differing} differ, the first: {result.first}"
+
     if not result.records:
         return Finding("executed again", "no records to execute", False, not result.withheld)
     return Finding("executed again", text, result.agreed)
 
 
 def _describe_gaps(gaps: Sequence[tuple[str, int, int]]) -> str:
-    """Returns the ranges of ticks of each site, `MAX_GAPS_NAMED` of them at most."""
+    """Returns the ranges of ticks of each site as a text, such as "m1 3-7, 12; s 5".
+
+    At most `MAX_GAPS_NAMED` ranges are listed. The others are counted.
+
+    Args:
+        gaps: Site, first tick and last tick of each range.
+    """
     texts = []
     remaining = MAX_GAPS_NAMED
-    for site, group in itertools.groupby(gaps, key=lambda gap: gap[0]):
-        ranges = [f"{first}-{last}" if last > first else f"{first}" for _, first, last in group]
+    for site, site_gaps in itertools.groupby(gaps, key=lambda gap: gap[0]):
+        ranges = []
+        for _, first, last in site_gaps:
+            ranges.append(f"{first}-{last}" if last > first else f"{first}")
         if remaining > 0:
             texts.append(f"{site} {', '.join(ranges[:remaining])}")
         remaining -= len(ranges)
+
     text = "; ".join(texts)
     if remaining < 0:
         text += f" and {count_nouns(-remaining, 'more range')}, which --json names"
@@ -260,7 +305,14 @@ def _describe_gaps(gaps: Sequence[tuple[str, int, int]]) -> str:
 def _check_comparison(
     label: str, comparison: RecordComparison, excused_from: int | None
 ) -> Finding:
-    """Returns the finding of a comparison; a difference at or after `excused_from` passes."""
+    """Returns the finding of a comparison with another execution.
+
+    Args:
+        label: Name of the check.
+        comparison: The comparison.
+        excused_from: Tick from which differences are expected and do not fail the check. None
+            if there is no such tick.
+    """
     first = comparison.first
     text = f"{comparison.identical}/{count_nouns(comparison.records, 'record')} identical"
     if first is None:

@@ -1,13 +1,13 @@
-"""Run a scenario in virtual time: without clocks, processes or a real network.
+"""Runs a scenario in virtual time: without real clocks, processes or a network.
 
-A counter replaces the clock and a simulated network replaces the message bus. The log of the
-run holds the records, link statistics and events of every site, as the log of a live session
-does.
+A counter takes the place of the clock, and a simulated network takes the place of the message
+bus. The log of the run has the same form as the log of a live session: it contains the records
+of every tick, link statistics and events of every site.
 
 Invariant:
-    - A site advances only by `Site.step`. Ticks run in order of nominal time; ticks of the same
-      time run in the order in which the scenario lists the sites.
-    - Two runs of one scenario with one seed therefore write the same file, byte for byte.
+    - A site advances only by `Site.step`. Ticks are executed in the order of their nominal
+      times. Ticks of the same time are executed in the order of the sites in the scenario.
+    - Therefore two runs of a scenario with the same seed write the same file, byte for byte.
     - A message of an older schema version is written in the present version. A message of the
       present version keeps its bytes.
 """
@@ -59,16 +59,17 @@ from .virtual_network import Network, PromptNetwork
 
 
 class SiteEntry(NamedTuple):
-    """One message to be written into a log. Entries are written in order of `t_ns`.
+    """One message that is to be written to a log.
 
     Attributes:
-        site: name of the site that sends the message.
-        t_ns: nominal time of the message, ns since the epoch.
-        sent_ns: time at which the site sent the message, ns since the epoch.
-        channel: channel of the site: "state", "link" or "event".
-        sequence: tick of a record or of statistics, number of an event.
-        payload: the encoded message.
-        message: the decoded message.
+        site: Name of the site that sends the message.
+        t_ns: Nominal time of the message, in ns after the epoch (the common start time).
+            Messages are written in this order.
+        sent_ns: Time at which the site sent the message, in ns after the epoch.
+        channel: Channel of the site: "state" for records, "link" for statistics, or "event".
+        sequence: Tick of a record or of statistics, or number of an event.
+        payload: Encoded message.
+        message: Decoded message.
     """
 
     site: str
@@ -81,21 +82,23 @@ class SiteEntry(NamedTuple):
 
 
 class SiteChannels:
-    """The channels of one site in a log that is written now, and their accounts.
+    """Channels of one site in a log that is being written.
 
-    The `make_…` methods turn ticks and messages into entries, and `write` writes an entry.
+    The `make_…` methods convert ticks and messages to entries, and `write` writes an entry to
+    the log. An account for each channel counts the messages, so that the log can state whether
+    any are missing.
 
     Args:
-        scenario: the scenario of the log.
-        session: name of the session of the log.
-        site: name of the site.
-        boot: number of the site's start, which every message of the site states.
+        scenario: Scenario of the log.
+        session: Name of the session of the log.
+        site: Name of the site.
+        boot: Number that identifies this start of the site. Every message contains it.
 
     Attributes:
-        peers: names of the site's peers, in scenario order.
-        keys: key of each channel.
-        accounts: account of the messages of each channel.
-        ticks: number of ticks that the site has executed.
+        peers: Names of the other sites, in the order of the scenario.
+        keys: Key of each channel, under which its messages are published.
+        accounts: Account of the messages of each channel.
+        ticks: Number of ticks that the site has executed.
     """
 
     def __init__(self, scenario: Scenario, session: str, site: str, boot: int) -> None:
@@ -118,13 +121,13 @@ class SiteChannels:
         """Returns the entries that follow the record of an executed tick.
 
         Args:
-            output: the record of the tick.
-            stats: the link statistics of the tick, if statistics are due.
-            law_failure: the error of the user law that changed the site's mode, if any.
+            output: Record of the tick.
+            stats: Link statistics, if they are due in this tick.
+            law_failure: Error of a user's control law that changed the site's mode, if any.
 
         Returns:
-            The entry of the statistics and the entry of an event that states a change of mode,
-            as far as the tick has them.
+            An entry for the statistics, and an entry for an event if the mode of the site has
+            changed.
         """
         self.ticks = output.tick + 1
         self._last_ns = output.t_ns
@@ -138,6 +141,7 @@ class SiteChannels:
         return entries
 
     def _make_mode_entry(self, output: TickRecord, law_failure: Exception | None) -> SiteEntry:
+        """Returns the event of a change of the site's mode, for example after a fault."""
         if output.mode is Mode.DIVERGED:
             text = describe_divergence(self._site, output)
             return self.make_new_event_entry("diverged", text, output.t_ns)
@@ -145,7 +149,15 @@ class SiteChannels:
         return self.make_new_event_entry("mode", text, output.t_ns)
 
     def _exclude_skipped_ticks(self, tick: int, cmd: Sequence[str]) -> None:
-        """Excludes from the accounts the ticks before `tick` that the site skipped by `cmd`."""
+        """Tells the accounts that messages of skipped ticks are not missing.
+
+        A site skips ticks if its loop has fallen behind; a command in the next record says how
+        many.
+
+        Args:
+            tick: Tick of that record.
+            cmd: Texts of the commands in the record.
+        """
         skipped = count_skipped_ticks(cmd)
         if not skipped:
             return
@@ -154,13 +166,24 @@ class SiteChannels:
             self.accounts[channel].mark_unpublished(*numbers)
 
     def make_end_entry(self, t_ns: int | None = None) -> SiteEntry:
-        """Returns the entry of the end event, by default at the time of the last tick."""
+        """Returns the event of the end of the site.
+
+        Args:
+            t_ns: Time of the event, in ns after the epoch. By default, the time of the last
+                tick.
+        """
         end_ns = self._last_ns if t_ns is None else t_ns
         text = f"{self._site} made {count_nouns(self.ticks, 'tick')}"
         return self.make_new_event_entry("end", text, end_ns)
 
     def make_new_event_entry(self, kind: str, text: str, t_ns: int) -> SiteEntry:
-        """Returns the entry of a new event of the site, which gets the next event number."""
+        """Returns the entry of a new event of the site, with the next event number.
+
+        Args:
+            kind: Kind of the event, for programs.
+            text: Sentence of the event, for people.
+            t_ns: Time of the event, in ns after the epoch.
+        """
         number = self._event_count
         self._event_count += 1
         event = Event(
@@ -175,11 +198,11 @@ class SiteChannels:
         return self.make_event_entry(event, number)
 
     def make_record_entry(self, state: State, payload: bytes) -> SiteEntry:
-        """Returns the entry of a record, which is encoded again if its version is older.
+        """Returns the entry of a record. A record of an older version is encoded again.
 
         Args:
-            state: the record.
-            payload: the bytes of the record.
+            state: The record.
+            payload: Bytes of the record.
         """
         self._exclude_skipped_ticks(state.tick, state.cmd)
         sent_ns = state.sent_ns if state.v >= SENT_TIME_SINCE else state.t_ns
@@ -225,7 +248,12 @@ class SiteChannels:
         )
 
     def make_event_entry(self, event: Event, number: int) -> SiteEntry:
-        """Returns the entry of an event. An event without a number gets `number`."""
+        """Returns the entry of an event.
+
+        Args:
+            event: The event.
+            number: Number of the event, if it has none.
+        """
         numbered = event if event.n >= 0 else msgspec.structs.replace(event, n=number)
         payload = encode(msgspec.structs.replace(numbered, v=VERSION))
         t_ns = max(event.t_ns, 0)  # a log has no times before the epoch
@@ -240,7 +268,13 @@ class SiteChannels:
         )
 
     def write(self, entry: SiteEntry, writer: LogWriter, epoch_unix_ns: int = 0) -> None:
-        """Writes an entry into a log whose epoch is `epoch_unix_ns`, and counts the message."""
+        """Writes an entry to a log, and counts it in the account of its channel.
+
+        Args:
+            entry: The entry.
+            writer: Writer of the log.
+            epoch_unix_ns: Unix time of the epoch, in ns.
+        """
         number = number_message(entry.channel, entry.sequence, self._rate_hz)
         self.accounts[entry.channel].receive(number)
         log_ns = min(max(0, epoch_unix_ns + entry.t_ns), MAX_TIME_NS)
@@ -249,7 +283,7 @@ class SiteChannels:
 
 
 def render_accounts(sites: Iterable[SiteChannels]) -> dict[str, str]:
-    """Returns the texts of the accounts of all channels of these sites, by topic."""
+    """Returns the texts of the accounts of all channels of some sites, by topic."""
     return {
         f"/{site.keys[channel]}": f"{account.describe()}, overflowed 0"
         for site in sites
@@ -258,7 +292,13 @@ def render_accounts(sites: Iterable[SiteChannels]) -> dict[str, str]:
 
 
 class SiteTick(NamedTuple):
-    """One tick of one site: the site, its arrivals and its record."""
+    """One executed tick of one site.
+
+    Attributes:
+        site: The site.
+        arrivals: Samples that arrived in this tick.
+        output: Record of the tick.
+    """
 
     site: Site
     arrivals: list[Arrival]
@@ -266,25 +306,28 @@ class SiteTick(NamedTuple):
 
 
 ChangeSchedule = Mapping[str, Mapping[int, Sequence[CoreChange]]]
-"""Changes by site and by the tick at which they take effect."""
+"""Changes, by site and by the tick at which they take effect."""
 PlantSchedule = Mapping[str, Mapping[int, PlantState]]
 """Measured state of each external arm, by site and tick."""
 HandTracks = Mapping[str, Callable[[Site, int], Sequence[float]]]
-"""Per site with a live hand: a function that returns the action of the hand at the site's next
-tick, from the site and the number of that tick.
+"""For each site with a live operator, a function that returns the operator's action in a tick.
+
+Its arguments are the site and the number of the site's next tick.
 """
 
 
 def check_virtual(scenario: Scenario) -> None:
-    """Checks that virtual time can run a scenario, before anything is written.
+    """Checks that a scenario can run in virtual time, before anything is written.
 
     Raises:
-        ScenarioError: an arm is outside of the program, a user law cannot be constructed, or
-            the file of a user law has another hash than the scenario states.
+        ScenarioError: An arm is a real robot, a user's control law cannot be created, or the
+            file of the law has another hash than the scenario states.
     """
-    refuse_external_arms(scenario, set(scenario.external) - set(scenario.outside))
+    simulated_by_user = set(scenario.external) - set(scenario.outside)
+    refuse_external_arms(scenario, simulated_by_user)
     for name, spec in scenario.sites.items():
         if isinstance(spec.control, ImportedLaw):
+            # created only for its checks
             Site(scenario.setup(name))
 
 
@@ -292,18 +335,18 @@ def find_skips(commands: Mapping[int, Sequence[CoreChange]]) -> dict[int, int]:
     """Returns the ranges of ticks that a site skipped.
 
     Args:
-        commands: the changes of the site, by tick; a change states how many ticks were skipped
-            before its own tick.
+        commands: Changes of the site, by tick. A change states how many ticks were skipped just
+            before its tick.
 
     Returns:
-        The first tick after each range, by the first tick of the range.
+        For the first tick of each range, the first tick after the range.
     """
-    return {
-        tick - change.skipped: tick
-        for tick, changes in commands.items()
-        for change in changes
-        if change.skipped
-    }
+    next_ticks = {}
+    for tick, changes in commands.items():
+        for change in changes:
+            if change.skipped:
+                next_ticks[tick - change.skipped] = tick
+    return next_ticks
 
 
 def execute_virtual(
@@ -315,31 +358,33 @@ def execute_virtual(
     hands: HandTracks = {},  # noqa: B006
     plants: Mapping[str, PlantPlayer] = {},
 ) -> Iterator[SiteTick]:
-    """Executes all sites of a scenario in virtual time and yields every tick of every site.
+    """Executes all sites of a scenario in virtual time, and yields every tick of every site.
 
-    Ticks run in order of nominal time; ticks of the same time run in scenario order. A site
-    whose network is not ready waits while other sites run. A run that diverges ends with the
-    ticks of that instant.
+    Ticks are executed in the order of their nominal times, and ticks of the same time in the
+    order of the sites. A site for which samples have not been sent yet waits while other sites
+    are executed. If a site diverges, the run ends with the ticks of that time.
 
     Args:
-        scenario: the scenario.
-        network: the network between the sites; by default every sample arrives at the first
-            tick after its stamp.
-        commands: changes that take effect during the run.
-        measured: measured states of external arms.
-        ends: last tick of each site that executes fewer ticks than the scenario has.
-        hands: actions of live hands; a live hand without an entry does not hold its arm.
-        plants: plants that move the external arms of sites.
+        scenario: The scenario.
+        network: Network between the sites. By default, every sample arrives in the first tick
+            after its time stamp.
+        commands: Changes that take effect during the run.
+        measured: Measured states of external arms.
+        ends: Last tick of each site that executes fewer ticks than the scenario has.
+        hands: Actions of live operators. A live operator without an entry does not hold the
+            arm.
+        plants: Users' programs that move the arms of sites.
 
     Raises:
-        ScenarioError: an arm is external and neither `measured` nor `plants` has it.
-        LawFailed: a user law failed.
-        PlantFailed: a user's plant failed.
+        ScenarioError: An arm is external, and neither `measured` nor `plants` contains it.
+        LawFailed: A user's control law failed.
+        PlantFailed: A user's plant failed.
     """
     refuse_external_arms(scenario, {**measured, **plants})
     if network is None:
         rates_hz = {name: spec.rate_hz for name, spec in scenario.sites.items()}
         network = PromptNetwork(rates_hz)
+
     setups = [scenario.setup(name) for name in scenario.names]
     sites = [Site(setup) for setup in setups]
     tick_counts = [
@@ -347,12 +392,14 @@ def execute_virtual(
         for name in scenario.names
     ]
     skips = [find_skips(commands.get(name, {})) for name in scenario.names]
+    # The next tick of each site as (time in ns, index of the site, tick), in order of time.
     pending = [(0, index, 0) for index in range(len(sites)) if tick_counts[index]]
     last_ns = round(scenario.duration_s * NS_PER_S)
     while pending and pending[0][0] <= last_ns:
         t_ns, index, k = pending.pop(_find_ready(pending, sites, network))
         site = sites[index]
         name = site.name
+
         arrivals = select_peer_channels(network.deliver(name, k), setups[index].links)
         hand = hands[name](site, k) if name in hands else ()
         plant = plants.get(name)
@@ -369,6 +416,7 @@ def execute_virtual(
             plant.move(k, output.tau)
         network.send(name, output)
         yield SiteTick(site, arrivals, output)
+
         if output.mode is Mode.DIVERGED:
             last_ns = t_ns
         next_tick = skips[index].get(k + 1, k + 1)
@@ -383,13 +431,13 @@ def _find_ready(
     """Returns the position in `pending` of the first site that can execute its next tick.
 
     Args:
-        pending: the next tick of each site, as (t_ns, index of the site, tick), in order of
+        pending: Next tick of each site, as (time in ns, index of the site, tick), in order of
             time.
-        sites: the sites, by index.
-        network: the network between the sites.
+        sites: The sites.
+        network: Network between the sites.
 
     Returns:
-        The position; 0 if the network is ready for no site, so that the run always goes on.
+        The position. 0 if no site is ready, so that the run always goes on.
     """
     for position, (_, index, k) in enumerate(pending):
         if network.is_ready(sites[index].name, k):
@@ -398,12 +446,15 @@ def _find_ready(
 
 
 def compute_boot(scenario: Scenario, site: str) -> int:
-    """Returns the boot number of a site in virtual time."""
+    """Returns the number that stands for the start of a site in virtual time.
+
+    It is a function of the scenario, so that repeated runs write the same log.
+    """
     return compute_virtual_boot(scenario.sha256, site)
 
 
 class _VirtualChannels(SiteChannels):
-    """The channels of one site of a virtual run, written while the run is executed."""
+    """Channels of one site of a virtual run, written while the run is executed."""
 
     def __init__(self, scenario: Scenario, site: Site, writer: LogWriter) -> None:
         boot = compute_boot(scenario, site.name)
@@ -413,7 +464,7 @@ class _VirtualChannels(SiteChannels):
         self._stats = LoopStats(site, boot)
 
     def write_tick(self, arrivals: list[Arrival], output: TickRecord) -> None:
-        """Writes the record of a tick and the entries that follow the record."""
+        """Writes the record of a tick, and the entries that follow it."""
         payload = encode_state(
             site=self._site,
             boot=self._boot,
@@ -434,7 +485,11 @@ class _VirtualChannels(SiteChannels):
             self.write(entry, self._writer)
 
     def write_hand_events(self, news: list[tuple[int, str]]) -> None:
-        """Writes the events of a live hand, given as (tick, text), and empties the list."""
+        """Writes the events of a live operator, and empties their list.
+
+        Args:
+            news: The events, as pairs of a tick and a sentence.
+        """
         for k, text in news:
             t_ns = k * NS_PER_S // self._rate_hz
             self.write(self.make_new_event_entry("hand", text, t_ns), self._writer)
@@ -451,27 +506,29 @@ def write_virtual_log(
     hands: HandTracks = {},  # noqa: B006
     commands: ChangeSchedule = {},  # noqa: B006
 ) -> bool:
-    """Runs a scenario in virtual time and writes the log of the run.
+    """Runs a scenario in virtual time, and writes the log of the run.
 
-    The log is finished however the run ends: after the last tick, by `stopped`, or by an error.
+    The log is completed in any case: after the last tick, after `stopped` returns True, and
+    after an error.
 
     Args:
-        scenario: the scenario.
-        stream: where the log is written; the stream stays open.
-        network: the network between the sites, see `execute_virtual`.
-        stopped: the run ends after the first tick at which this returns True.
-        views_hz: rate of the standard channels for viewers, Hz, see `log.ros2.viz_channels`.
-        hands: actions of live hands, see `execute_virtual`; they replace hands that the
-            scenario names as programs.
-        commands: changes that take effect during the run.
+        scenario: The scenario.
+        stream: Stream to which the log is written. It is not closed.
+        network: Network between the sites, see `execute_virtual`.
+        stopped: Function that is called after each tick. The run ends if it returns True.
+        views_hz: Rate of the additional channels for viewers, in Hz, see
+            `log.ros2.viz_channels`.
+        hands: Actions of live operators, see `execute_virtual`. They replace the programs that
+            the scenario names as operators.
+        commands: Changes that take effect during the run.
 
     Returns:
-        True if the run stayed within its limits, False if it diverged.
+        True if all sites stayed within their limits, False if one diverged.
 
     Raises:
-        LogError: the disk refused to store the log.
-        ScenarioError: virtual time cannot run the scenario; nothing is written.
-        LawFailed: a user law failed; the log holds an event with the reason.
+        LogError: The disk refused to store the log.
+        ScenarioError: The scenario cannot run in virtual time. Nothing has been written.
+        LawFailed: A user's control law failed. The log contains an event with the reason.
     """
     check_virtual(scenario)
     hand_players = make_hand_players(scenario)
@@ -480,6 +537,7 @@ def write_virtual_log(
         name: player.track for name, player in hand_players.items()
     }
     tracks.update(hands)
+
     writer = LogWriter(
         stream=stream,
         scenario=scenario,
@@ -508,7 +566,8 @@ def write_virtual_log(
                     break
     except CodeFailed as failure:
         if failure.site not in members:
-            # the event needs a site, and the law that failed cannot be constructed again
+            # The event needs the channels of the site. The site is created without its law,
+            # because the law failed when it was created.
             without_law = Site(scenario.setup(failure.site)._replace(law_factory=None))
             members[failure.site] = _VirtualChannels(scenario, without_law, writer)
         member = members[failure.site]
@@ -533,24 +592,24 @@ def record_virtual(
     views_hz: float = VIZ_HZ,
     hands: HandTracks = {},  # noqa: B006
 ) -> bool:
-    """Runs a scenario in virtual time and writes the log of the run into a file.
+    """Runs a scenario in virtual time, and writes the log of the run to a file.
 
     Args:
-        scenario: the scenario.
-        path: the file.
-        force: whether an existing file is replaced.
-        stopped: the run ends after the first tick at which this returns True.
-        views_hz: rate of the standard channels for viewers, Hz.
-        hands: actions of live hands, see `execute_virtual`.
+        scenario: The scenario.
+        path: The file.
+        force: If True, an existing file is replaced.
+        stopped: Function that is called after each tick. The run ends if it returns True.
+        views_hz: Rate of the additional channels for viewers, in Hz.
+        hands: Actions of live operators, see `execute_virtual`.
 
     Returns:
-        True if the run stayed within its limits, False if it diverged.
+        True if all sites stayed within their limits, False if one diverged.
 
     Raises:
-        UsageError: the file exists, or cannot be created.
-        LogRefused: the disk refused to store the log; the error names the part that is kept.
-        ScenarioError: virtual time cannot run the scenario; no file is written.
-        LawFailed: a user law failed; the file is finished with the ticks before the failure.
+        UsageError: The file exists, or cannot be created.
+        LogRefused: The disk refused to store the log. The error names the part that is kept.
+        ScenarioError: The scenario cannot run in virtual time. No file is written.
+        LawFailed: A user's control law failed. The file contains the ticks before the failure.
     """
     with LogFile(path, force=force) as stream:
         return write_virtual_log(
@@ -559,11 +618,11 @@ def record_virtual(
 
 
 class SimulatedLog(Log):
-    """The log of a run in virtual time, held in memory. `save` writes it into a file.
+    """Log of a run in virtual time, held in memory. `save` writes it to a file.
 
     Args:
-        write: runs the scenario and writes its log into a stream, with the standard channels
-            for viewers at a rate, Hz.
+        write: Function that runs the scenario, and writes its log to a stream. Its arguments
+            are the stream and the rate of the additional channels for viewers, in Hz.
     """
 
     def __init__(self, write: Callable[[Sink, float], object]) -> None:
@@ -574,18 +633,18 @@ class SimulatedLog(Log):
         self._write = write
 
     def save(self, path: str | Path, *, force: bool = False) -> Path:
-        """Writes the log into a file, as `trilat sim -o` does, and returns its path.
+        """Writes the log to a file, as `trilat sim -o` does, and returns its path.
 
-        The scenario runs a second time, because the file also has the standard channels for
+        The scenario runs a second time, because the file additionally contains channels for
         viewers.
 
         Args:
-            path: the file.
-            force: whether an existing file is replaced.
+            path: The file.
+            force: If True, an existing file is replaced.
 
         Raises:
-            UsageError: the file exists, or cannot be created.
-            LogRefused: the disk refused to store the log.
+            UsageError: The file exists, or cannot be created.
+            LogRefused: The disk refused to store the log.
         """
         with LogFile(Path(path), force=force) as stream:
             self._write(stream, VIZ_HZ)
@@ -597,7 +656,16 @@ def simulate_scenario(
     *,
     hands: HandTracks = {},  # noqa: B006
 ) -> SimulatedLog:
-    """Runs a scenario in virtual time and returns its log, see `write_virtual_log`."""
+    """Runs a scenario in virtual time, and returns its log.
+
+    Args:
+        scenario: The scenario.
+        hands: Actions of live operators, see `execute_virtual`.
+
+    Raises:
+        ScenarioError: The scenario cannot run in virtual time.
+        LawFailed: A user's control law failed.
+    """
 
     def write(stream: Sink, views_hz: float) -> None:
         write_virtual_log(scenario, stream, views_hz=views_hz, hands=hands)

@@ -1,9 +1,13 @@
-"""Compare a log with virtual time, and find the samples that arrived late or were lost.
+"""Compares a log with virtual time, and finds the samples that arrived late or were lost.
+
+A sample is the state that a site publishes in one tick. A receiver uses it when it is due, that
+is after the delay of the link.
 
 Invariant (L2):
-    - A run in virtual time that gets the arrivals of a log equals that log at every tick.
-    - A plain run in virtual time, over a prompt network, equals the log until the first sample
-      arrives after its due tick or is lost in the network.
+    - If a run in virtual time receives the samples in the ticks in which they arrived according
+      to a log, it equals the log in every tick.
+    - A run in virtual time in which all samples arrive at once equals the log up to the first
+      sample that arrived after it was due, or was lost in the network.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -39,9 +43,9 @@ class RecordComparison(NamedTuple):
     """Agreement of the records of a log with another execution.
 
     Attributes:
-        records: number of compared records.
-        identical: number of records whose computed fields all have equal bits.
-        first: the difference at the earliest tick; None if all records are identical.
+        records: Number of compared records.
+        identical: Number of records in which all computed fields have the same bits.
+        first: Difference in the earliest tick. None if all records are identical.
     """
 
     records: int
@@ -50,15 +54,17 @@ class RecordComparison(NamedTuple):
 
 
 class LateSample(NamedTuple):
-    """A sample of a peer that had not arrived at a site when it was due.
+    """Sample of a peer that had not arrived at a site when it was due.
+
+    Samples that are lost according to the model of the link are not due, and do not count.
 
     Attributes:
-        site: name of the receiver.
-        peer: name of the sender.
-        tick: tick of the sample, at the rate of the sender.
-        due_tick: tick of the receiver at which the sample was due.
-        arrived_tick: tick of the receiver at which the sample arrived; None if it was lost in
-            the network. Samples that the model of the link loses are not late.
+        site: Name of the receiver.
+        peer: Name of the sender.
+        tick: Tick in which the sender published the sample.
+        due_tick: Tick of the receiver in which the sample was due.
+        arrived_tick: Tick of the receiver in which the sample arrived. None if it was lost in
+            the network.
     """
 
     site: str
@@ -68,6 +74,7 @@ class LateSample(NamedTuple):
     arrived_tick: int | None
 
     def __str__(self) -> str:
+        """Returns a sentence about the sample."""
         outcome = "never came"
         if self.arrived_tick is not None:
             outcome = f"came at tick {self.arrived_tick}"
@@ -81,9 +88,10 @@ def compare_records(
     """Compares every record of a log with another execution, bit for bit.
 
     Args:
-        log: the log.
-        executed: the name of the site and the record of every executed tick, in any order.
-        arrivals: whether the arrivals (their CRC) have to be equal as well.
+        log: The log.
+        executed: Name of the site and record of every executed tick, in any order. Ticks that
+            the log does not contain are skipped.
+        arrivals: If True, the checksums of the arrivals must be equal as well.
     """
     by_tick = {name: log[name].by_tick for name in log.sites}
     records = 0
@@ -94,6 +102,7 @@ def compare_records(
             state = by_tick[site].get(output.tick)
             if state is None:
                 continue
+
             records += 1
             computed = output if arrivals else output._replace(rx_crc=state.rx_crc)
             peers = log[site].peers
@@ -109,10 +118,11 @@ def compare_records(
 
 
 def find_absent_samples(log: Log) -> list[LateSample]:
-    """Returns every sample that had not arrived when it was due, in order of due ticks.
+    """Returns every sample that had not arrived when it was due, in the order of the due ticks.
 
-    A sample that never arrived counts as lost if the first record at or after its due tick
-    still uses an older sample.
+    The records do not say whether a sample was lost, or arrived in a tick whose record is
+    missing. A sample that no record lists counts as lost if the first record from its due tick
+    on still uses an older sample.
     """
     absent: list[LateSample] = []
     for name in log.sites:
@@ -121,6 +131,7 @@ def find_absent_samples(log: Log) -> list[LateSample]:
 
 
 def _find_absent_at_site(log: Log, name: str) -> list[LateSample]:
+    """Returns the samples that had not arrived at one site when they were due."""
     part = log[name]
     commands = log.commands(name)
     peer_ticks = [log.scenario.ticks(peer) for peer in part.peers]
@@ -130,11 +141,13 @@ def _find_absent_at_site(log: Log, name: str) -> list[LateSample]:
     ]
     # only the links of the site are used, so its law is left out
     site = Site(log.scenario.setup(name)._replace(law_factory=None))
-    checked = [0] * len(part.peers)  # per peer the number of samples looked at so far
+    checked = [0] * len(part.peers)  # for each peer, the number of samples examined so far
     absent = []
     for state in part.states:
         for command in commands.get(state.tick, ()):
             site.apply_change(command, state.t_ns)
+
+        # samples that arrived in this tick, but were due earlier
         for peer, tick, _ in state.rx:
             # a damaged record may list any peer and tick
             exists = 0 <= peer < len(peer_ticks) and 0 <= tick < peer_ticks[peer]
@@ -150,6 +163,8 @@ def _find_absent_at_site(log: Log, name: str) -> list[LateSample]:
                     arrived_tick=state.tick,
                 )
             )
+
+        # samples that were sent before this tick and never arrived
         for peer, sender in enumerate(part.peers):
             newest = state.t_ns * site.peer_rate_hz(peer) // NS_PER_S
             sent = min(newest, log.last_ticks[sender]) + 1
@@ -173,19 +188,20 @@ def _find_absent_at_site(log: Log, name: str) -> list[LateSample]:
 
 
 def _uses_older(part: SiteLog, sender: str, tick: int, due_tick: int) -> bool:
-    """True if the first record from `due_tick` on uses a sample older than `tick`."""
+    """True if the first record from `due_tick` on uses a sample that is older than `tick`."""
     row = int(np.searchsorted(part.tick, due_tick))
     return bool((part.used[sender][row : row + 1] < tick).any())
 
 
 class VirtualComparison(NamedTuple):
-    """A log compared with two runs of its scenario in virtual time.
+    """Comparison of a log with two runs of its scenario in virtual time.
 
     Attributes:
-        fed: comparison with the run that gets the arrivals of the log. They must be equal.
-        plain: comparison with the run over a prompt network, which is equal until the first
-            late or lost sample. Empty if an arm is external, because no plain run exists.
-        absent: samples that arrived late or never, in order of due ticks.
+        fed: Comparison with the run in which samples arrive as in the log. They must be equal.
+        plain: Comparison with the run in which samples arrive at once. They must be equal up to
+            the first late or lost sample. Without records if an arm is external, because its
+            motion is known only for the recorded run.
+        absent: Samples that arrived late or never, in the order of the due ticks.
     """
 
     fed: RecordComparison
@@ -194,28 +210,30 @@ class VirtualComparison(NamedTuple):
 
     @property
     def late(self) -> list[LateSample]:
-        """The samples that arrived late."""
+        """Samples that arrived late."""
         return [sample for sample in self.absent if sample.arrived_tick is not None]
 
     @property
     def lost(self) -> list[LateSample]:
-        """The samples that never arrived."""
+        """Samples that never arrived."""
         return [sample for sample in self.absent if sample.arrived_tick is None]
 
     @property
     def excused_from(self) -> int | None:
-        """First tick at which plain virtual time may differ; None if no sample was late."""
+        """First tick in which the plain run may differ. None if no sample was late or lost."""
         return self.absent[0].due_tick if self.absent else None
 
 
 def compare_with_virtual(log: Log, progress: Progress | None = None) -> VirtualComparison:
-    """Compares a log with its scenario in virtual time, with its arrivals and without.
+    """Compares a log with two runs of its scenario in virtual time.
 
-    Both runs end at the last record of the log.
+    In the first run, samples arrive as in the log; in the second run, they arrive at once. Both
+    runs end at the last record of the log.
 
     Args:
-        log: the log.
-        progress: called now and then with the number of executed ticks and their total.
+        log: The log.
+        progress: Function that is called now and then with the number of executed ticks and
+            their total.
     """
     scenario = _cut_to_records(log)
     total = 2 * sum(map(scenario.ticks, scenario.names))
@@ -255,9 +273,9 @@ def compare_with_virtual(log: Log, progress: Progress | None = None) -> VirtualC
 
 
 def _read_arrivals(log: Log, name: str) -> Mapping[int, Sequence[ArrivalEntry]]:
-    """Returns the arrivals at a site by tick.
+    """Returns the arrivals at a site, by tick.
 
-    Arrivals in gaps are assumed, unless too many records are missing.
+    Arrivals in gaps of the log are assumed, unless too many records are missing.
     """
     part = log[name]
     rates_hz = [log.scenario.sites[peer].rate_hz for peer in part.peers]
@@ -268,7 +286,7 @@ def _read_arrivals(log: Log, name: str) -> Mapping[int, Sequence[ArrivalEntry]]:
 
 
 def _cut_to_records(log: Log) -> Scenario:
-    """Returns the scenario of a log with a duration that ends at the last record."""
+    """Returns the scenario of a log, shortened so that it ends at the last record."""
     ends_s = [
         (log[name].last_tick + 1) / log[name].rate_hz for name in log.sites if len(log[name])
     ]
@@ -277,5 +295,5 @@ def _cut_to_records(log: Log) -> Scenario:
 
 
 def simulate_without_operators(log: Log) -> Log:
-    """Runs the experiment of a log in virtual time without operators and returns that log."""
+    """Returns the log of a run of the same experiment in virtual time, without operators."""
     return virtual.simulate_scenario(_cut_to_records(log).without_hands())

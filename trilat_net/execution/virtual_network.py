@@ -1,16 +1,18 @@
-"""Simulated networks: at which tick of the receiver each sample arrives.
+"""Simulates the network between sites: in which tick of the receiver each sample arrives.
 
-`PromptNetwork` delivers a sample at the first tick after its stamp. `RecordedNetwork` delivers
-samples at the ticks that a log recorded (`read_deliveries`), completes where records are
-missing (`complete_deliveries`), or moves to other tick rates (`retime_deliveries`).
+A sample is the state that a site publishes in one tick of its control loop. `PromptNetwork`
+delivers it in the first tick after it was sent. `RecordedNetwork` delivers samples in the ticks
+that a log recorded (`read_deliveries`). If records are missing from the log, their arrivals are
+estimated (`complete_deliveries`). If the sites now have other tick rates, the arrivals are
+converted (`retime_deliveries`).
 
 Invariant:
-    - Delay belongs to the link (L2). A network only decides at which tick a sample arrives. If
-      a sample arrives before the tick at which it is due, the numbers of the run do not depend
-      on that tick.
-    - A recorded sample is delivered at the tick at which the log says that it arrived.
-    - A sample is never delivered at a tick at which the log excludes its arrival. At ticks
-      without a record an arrival is assumed, and the tick counts as unrecorded.
+    - The delay is a property of the link (L2): the receiver holds each sample until it is due.
+      A network only decides when a sample arrives. If it arrives before it is due, the results
+      do not depend on the tick of the arrival.
+    - A recorded sample is delivered in the tick in which it arrived according to the log.
+    - A sample is never delivered in a tick in which it did not arrive according to the log. In
+      ticks without a record, arrivals are assumed, and the ticks are marked as unrecorded.
 """
 
 from bisect import bisect_left
@@ -28,23 +30,23 @@ from .resumption import ArrivalEntry, make_arrival
 
 
 class Network(Protocol):
-    """The network between the sites of a virtual run."""
+    """Interface of a network between the sites of a virtual run."""
 
     def send(self, sender: str, output: TickRecord) -> None:
-        """Accepts the record of one tick of a sender for delivery to its peers."""
+        """Accepts the record of one tick of a sender, for delivery to the other sites."""
 
     def is_ready(self, receiver: str, k: int) -> bool:
-        """True if every sample that arrives at tick `k` of a receiver has been sent."""
+        """True if all samples that arrive in tick `k` of a receiver have been sent."""
 
     def deliver(self, receiver: str, k: int) -> list[Arrival]:
-        """Returns the samples that arrive at tick `k` of a receiver, in order."""
+        """Returns the samples that arrive in tick `k` of a receiver, in their order."""
 
 
 class PromptNetwork:
-    """Delivers every sample at the first tick of the receiver after the sample's stamp.
+    """Network that delivers each sample in the receiver's first tick after the sample was sent.
 
     Args:
-        rates: tick rate of each site, Hz.
+        rates: Tick rate of each site, in Hz.
     """
 
     def __init__(self, rates: Mapping[str, int]) -> None:
@@ -55,17 +57,20 @@ class PromptNetwork:
         }
 
     def send(self, sender: str, output: TickRecord) -> None:
-        """See `Network`."""
+        """Stores the record until each other site has received it."""
         for receiver, queues in self._in_transit.items():
             if receiver != sender:
                 queues[sender].append(output)
 
     def is_ready(self, receiver: str, k: int) -> bool:  # noqa: ARG002 - see `Network`
-        """Returns True: the sites run in order of time, so every earlier sample was sent."""
+        """Returns True.
+
+        The sites run in the order of time, so all earlier samples have been sent.
+        """
         return True
 
     def deliver(self, receiver: str, k: int) -> list[Arrival]:
-        """See `Network`."""
+        """Returns the stored samples that were sent before tick `k`."""
         now_ns = k * NS_PER_S // self._rates[receiver]
         arrivals = []
         for index, queue in enumerate(self._in_transit[receiver].values()):
@@ -77,11 +82,13 @@ class PromptNetwork:
 
 
 class RecordedNetwork:
-    """Delivers samples at the ticks that a log recorded, with the content of the running sites.
+    """Network that delivers samples in the ticks that a log recorded.
+
+    Only the times come from the log. The content of a sample is that of the running sender.
 
     Args:
-        schedule: the arrivals of each site, by tick.
-        peers: the peers of each site, in scenario order.
+        schedule: Arrivals at each site, by tick.
+        peers: Names of the peers of each site, in the order of the scenario.
     """
 
     def __init__(
@@ -92,18 +99,19 @@ class RecordedNetwork:
         self._schedule = schedule
         self._peers = peers
         self._sent: dict[tuple[str, int], TickRecord] = {}
-        # per receiver the tick checked last, and how many of its arrivals were sent by then
+        # For each receiver, the tick that `is_ready` checked last, and the number of its arrivals
+        # that had been sent then, which need not be checked again.
         self._checked = dict.fromkeys(schedule, (0, 0))
 
     def send(self, sender: str, output: TickRecord) -> None:
-        """See `Network`."""
+        """Stores the record under its sender and tick."""
         self._sent[sender, output.tick] = output
 
     def is_ready(self, receiver: str, k: int) -> bool:
-        """See `Network`.
+        """True if all samples that arrive in tick `k` of a receiver have been sent.
 
-        A site whose loop ran late in the log received samples of later times than its own tick,
-        so the senders of these samples have to run first.
+        In a live session, a site whose loop ran late may have received samples with later times
+        than that of its own tick. The senders of such samples must run first.
         """
         peers = self._peers[receiver]
         entries = self._schedule[receiver].get(k, ())
@@ -118,10 +126,11 @@ class RecordedNetwork:
         return sent_count == len(entries)
 
     def deliver(self, receiver: str, k: int) -> list[Arrival]:
-        """See `Network`. A sample that its sender did not produce does not arrive.
+        """Returns the samples that arrive in tick `k` of a receiver.
 
-        After a gap of the log more samples may be assumed to arrive than a tick accepts
-        (`MAX_ARRIVALS`); then the newest of them arrive.
+        A sample that its sender has not produced does not arrive. After a gap in the log, more
+        samples may be assumed to arrive than a tick accepts (`MAX_ARRIVALS`); then only the
+        newest are returned.
         """
         peers = self._peers[receiver]
         arrivals = []
@@ -133,14 +142,14 @@ class RecordedNetwork:
 
 
 class Deliveries(NamedTuple):
-    """The arrivals at one site, by tick.
+    """Arrivals at one site, by tick.
 
     Attributes:
-        entries: the arrivals of each tick, in order.
-        unrecorded: ticks between `first` and `last` that have no record, so that their arrivals
-            are assumed.
-        first: first tick with a record.
-        last: last tick with a record; -1 without records.
+        entries: Arrivals of each tick, in order.
+        unrecorded: Ticks between `first` and `last` without a record. Their arrivals are
+            assumed.
+        first: First tick with a record.
+        last: Last tick with a record. -1 if there are no records.
     """
 
     entries: dict[int, Sequence[ArrivalEntry]]
@@ -150,7 +159,11 @@ class Deliveries(NamedTuple):
 
 
 def read_deliveries(part: SiteLog) -> Deliveries:
-    """Returns the arrivals at a site that its records list."""
+    """Returns the arrivals at a site that its records list.
+
+    Args:
+        part: Records of the site.
+    """
     counts, rows = part.arrivals
     arrivals = rows.tolist()
     entries: dict[int, Sequence[ArrivalEntry]] = {}
@@ -172,20 +185,21 @@ def read_deliveries(part: SiteLog) -> Deliveries:
 def complete_deliveries(
     part: SiteLog, rates_hz: Sequence[int], ends: Sequence[int]
 ) -> Deliveries:
-    """Returns the arrivals at a site for every tick from its first record to its last.
+    """Returns the arrivals at a site for every tick from its first record to its last one.
 
-    At a tick without a record, samples are assumed to arrive that no record lists and that can
-    have arrived there: after the sample was sent, after the last earlier sample that a record
-    lists, and before the first later sample that a record lists. Among these ticks the nearest
-    to the median delay of the link is chosen.
+    If the record of a tick is missing, the log does not say which samples arrived in it. A
+    sample that no record lists is assumed to have arrived in such a tick, if one is possible:
+    after the sample was sent, after the arrival of the last earlier sample that a record lists,
+    and before the arrival of the first later one. Of several possible ticks, the one is chosen
+    whose delay is nearest to the median delay of the link.
 
     Args:
-        part: the records of the site.
-        rates_hz: tick rates of its peers, Hz.
-        ends: last ticks of its peers.
+        part: Records of the site.
+        rates_hz: Tick rates of its peers, in Hz.
+        ends: Last ticks of its peers.
 
     Raises:
-        LogError: fewer than half of these ticks have a record.
+        LogError: Fewer than half of the ticks have a record.
     """
     recorded = read_deliveries(part)
     ticks = recorded.last + 1 - recorded.first
@@ -196,6 +210,7 @@ def complete_deliveries(
             f"{part.name} has records of {len(recorded.entries)} of "
             f"{count_nouns(ticks, 'tick')}: too few to execute what lies between"
         )
+
     unrecorded = [
         tick for tick in range(recorded.first, recorded.last) if tick not in recorded.entries
     ]
@@ -211,6 +226,7 @@ def complete_deliveries(
         )
         for tick, entry in arrivals:
             assumed.setdefault(tick, []).append(entry)
+
     entries = dict(recorded.entries)
     for tick, tick_entries in assumed.items():
         entries[tick] = sorted(tick_entries)
@@ -218,10 +234,15 @@ def complete_deliveries(
 
 
 def _find_first_arrivals(deliveries: Deliveries, peer: int) -> dict[int, tuple[int, int]]:
-    """Returns when each sample of a peer arrived first.
+    """Returns when each sample of a peer arrived for the first time.
+
+    Args:
+        deliveries: Arrivals at the receiver.
+        peer: Index of the sender among the receiver's peers.
 
     Returns:
-        By the tick of the sample: the tick of its first arrival, and its latency, us.
+        For the tick of each sample, the tick of its first arrival and its latency in
+        microseconds.
     """
     first_arrivals: dict[int, tuple[int, int]] = {}
     for k in sorted(deliveries.entries):
@@ -239,18 +260,18 @@ def _assume_arrivals(
     peer_hz: int,
     end: int,
 ) -> Iterator[tuple[int, list[int]]]:
-    """Yields the assumed arrivals of the samples of one peer that no record lists.
+    """Yields the assumed arrivals of those samples of one peer that no record lists.
 
     Args:
-        recorded: the arrivals that the records list.
-        unrecorded: the ticks without a record, ascending.
-        rate_hz: tick rate of the receiver, Hz.
-        peer: index of the sender among the receiver's peers.
-        peer_hz: tick rate of the sender, Hz.
-        end: last tick of the sender.
+        recorded: Arrivals that the records list.
+        unrecorded: Ticks without a record, in ascending order.
+        rate_hz: Tick rate of the receiver, in Hz.
+        peer: Index of the sender among the receiver's peers.
+        peer_hz: Tick rate of the sender, in Hz.
+        end: Last tick of the sender.
 
     Yields:
-        The tick of the arrival, and its entry as in a record's `rx`.
+        The tick of the arrival, and its entry in the form of a record's `rx`.
     """
     first_arrivals = _find_first_arrivals(recorded, peer)
     listed = sorted(first_arrivals)
@@ -261,30 +282,42 @@ def _assume_arrivals(
     lag_ns = median_low(lags_ns) if lags_ns else NS_PER_S // rate_hz
     latencies_us = [latency_us for _, latency_us in first_arrivals.values()]
     latency_us = median_low(latencies_us) if latencies_us else 0
+
     newest = min(end, recorded.last * peer_hz // rate_hz)
     for sample in range(newest + 1):
         stamp_ns = sample * NS_PER_S // peer_hz
-        due = -(-(stamp_ns + lag_ns) * rate_hz // NS_PER_S)  # rounded up to a tick
-        if sample in first_arrivals or due < recorded.first:
+        expected_tick = _round_up_to_tick(stamp_ns + lag_ns, rate_hz)
+        if sample in first_arrivals or expected_tick < recorded.first:
             continue
-        # the arrivals of the samples before and after it, which may have overtaken each other
+
+        # The sample arrived between the samples before and after it. These may have overtaken
+        # each other, so either may be the earlier arrival.
         index = bisect_left(listed, sample)
-        before = recorded.first
+        arrival_before = recorded.first
         if index > 0:
-            before = first_arrivals[listed[index - 1]][0]
-        after = recorded.last
+            arrival_before = first_arrivals[listed[index - 1]][0]
+        arrival_after = recorded.last
         if index < len(listed):
-            after = first_arrivals[listed[index]][0]
-        earliest = max(min(before, after), sample * rate_hz // peer_hz + 1)
+            arrival_after = first_arrivals[listed[index]][0]
+        first_tick_after_stamp = sample * rate_hz // peer_hz + 1
+        earliest = max(min(arrival_before, arrival_after), first_tick_after_stamp)
+        latest = max(arrival_before, arrival_after)
+
+        # Choose the possible tick that is nearest to the expected one.
         start = bisect_left(unrecorded, earliest)
-        stop = bisect_left(unrecorded, max(before, after) + 1)
+        stop = bisect_left(unrecorded, latest + 1)
         if start < stop:
-            position = min(max(bisect_left(unrecorded, due), start), stop - 1)
+            position = min(max(bisect_left(unrecorded, expected_tick), start), stop - 1)
             tick = unrecorded[position]
             previous_tick = unrecorded[max(position - 1, start)]
-            if abs(previous_tick - due) < abs(tick - due):
+            if abs(previous_tick - expected_tick) < abs(tick - expected_tick):
                 tick = previous_tick
             yield tick, [peer, sample, latency_us]
+
+
+def _round_up_to_tick(t_ns: int, rate_hz: int) -> int:
+    """Returns the first tick at or after a time, in exact integer arithmetic."""
+    return -(-t_ns * rate_hz // NS_PER_S)
 
 
 def retime_deliveries(
@@ -294,18 +327,18 @@ def retime_deliveries(
     rates_hz: Sequence[int],
     new_rates_hz: Sequence[int],
 ) -> Deliveries:
-    """Returns the arrivals over the same network for sites that tick at other rates.
+    """Returns the arrivals over the same network for sites with other tick rates.
 
-    Each sample of the rerun has a model: the last sample of the log that was not stamped later.
-    The sample takes as long from its stamp to the tick that receives it as its model did. If
-    the model never arrived, the sample does not arrive either.
+    For each sample of the new run, the last sample of the log that was not sent later serves as
+    its model. The new sample takes as long from its time stamp to the tick of its arrival as
+    the model did. If the model never arrived, the new sample does not arrive either.
 
     Args:
-        deliveries: the arrivals at the site in the log.
-        rate_hz: tick rate of the site in the log, Hz.
-        new_rate_hz: tick rate of the site in the rerun, Hz.
-        rates_hz: tick rates of its peers in the log, Hz.
-        new_rates_hz: tick rates of its peers in the rerun, Hz.
+        deliveries: Arrivals at the site in the log.
+        rate_hz: Tick rate of the site in the log, in Hz.
+        new_rate_hz: Tick rate of the site in the new run, in Hz.
+        rates_hz: Tick rates of its peers in the log, in Hz.
+        new_rates_hz: Tick rates of its peers in the new run, in Hz.
     """
     end_ns = deliveries.last * NS_PER_S // rate_hz
     entries: dict[int, list[ArrivalEntry]] = {}
@@ -313,13 +346,14 @@ def retime_deliveries(
         first_arrivals = _find_first_arrivals(deliveries, peer)
         for sample in range(end_ns * new_hz // NS_PER_S + 1):
             stamp_ns = sample * NS_PER_S // new_hz
+            # the last sample m of the log with the stamp m * NS_PER_S // old_hz <= stamp_ns
             model = ((stamp_ns + 1) * old_hz - 1) // NS_PER_S
             if model not in first_arrivals:
                 continue
             arrival_tick, latency_us = first_arrivals[model]
             arrival_ns = arrival_tick * NS_PER_S // rate_hz
             lag_ns = arrival_ns - model * NS_PER_S // old_hz
-            tick = -(-(stamp_ns + lag_ns) * new_rate_hz // NS_PER_S)  # rounded up to a tick
+            tick = _round_up_to_tick(stamp_ns + lag_ns, new_rate_hz)
             entries.setdefault(tick, []).append((peer, sample, latency_us))
     return Deliveries(
         entries=dict(entries),
