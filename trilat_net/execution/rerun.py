@@ -1,15 +1,16 @@
-"""Execute sites of a log again with changed settings and compare the result with the log.
+"""Executes sites of a log again with changed settings, and compares the result with the log.
 
     result = rerun("run.mcap", replace=["s"], set={"control.Kd": 5})
     result.sites["s"].error_rms_rad, result.after["s"].q
 
-In open loop only the replaced sites are executed, and the recorded sites do not react to them.
-In closed loop every site is executed, over the network that the log recorded.
+In open loop, only the replaced sites are executed; the other sites keep their records and do
+not react. In closed loop, every site is executed, and samples take as long through the network
+as they did in the log.
 
 Invariant:
-    - Without changes, open loop and closed loop both reproduce the log, bit for bit.
-    - Both values of a figure, in the log and in the rerun, cover the same instants: those at
-      which the log has a record and the rerun executed a tick.
+    - Without changed settings, both modes reproduce the log, bit for bit.
+    - A figure is compared between log and rerun at the same times: those for which the log
+      contains a record and the rerun executed a tick.
 """
 
 import io
@@ -56,35 +57,42 @@ from .virtual import SiteChannels, SiteEntry, render_accounts
 
 
 class LogAndRerun(NamedTuple):
-    """One figure: its value in the log (`before`) and its value in the rerun (`after`)."""
+    """One figure, before and after the change of settings.
+
+    Attributes:
+        before: Value in the log.
+        after: Value in the rerun.
+    """
 
     before: float
     after: float
 
 
 class SiteEffect(NamedTuple):
-    """The effect of a rerun on one site. Figures are None if no instant could be compared.
+    """Effect of a rerun on one site. Figures are None if no record could be compared.
 
     Attributes:
-        site: name of the site.
-        executed: number of executed ticks.
-        compared: number of executed ticks at whose time the log has a record.
-        identical: number of compared ticks whose computed fields all have the bits of the
-            record. With changed settings the CRC of the arrivals is not compared.
-        stands: number of records that are kept as they are, because the log does not hold
-            enough to execute their ticks.
-        assumed: number of executed ticks without a record, whose arrivals are assumed.
-        lacking: number of samples that arrived and whose content is not in the log.
-        first: the first difference from the log; None if there is no difference or if rates
-            changed.
-        diverged_at_s: time at which the site left its limits, s; None if it did not.
-        q_rms_rad: root mean square of q minus the logged q, of the joint with the largest
-            value, rad.
-        q_max_rad: largest |q minus the logged q| of any joint, rad.
-        q_max_at_s: time of that largest difference, s.
-        error_rms_rad: root mean square of e, Eq. (9), of the joint with the largest value, rad.
-        error_max_rad: largest |e| of any joint, rad.
-        torque_max_nm: largest |tau| of any joint, Eq. (13), N m.
+        site: Name of the site.
+        executed: Number of executed ticks.
+        compared: Number of executed ticks for whose time the log contains a record.
+        identical: Number of compared ticks in which all computed fields have the same bits as
+            in the log. If settings were changed, the checksum of the arrivals is not compared.
+        stands: Number of records that were copied, because the log does not contain enough to
+            execute their ticks.
+        assumed: Number of executed ticks without a record in the log. Their arrivals were
+            assumed.
+        lacking: Number of samples that arrived, but whose content is missing from the log.
+        first: First difference from the log. None if there is no difference, or if tick rates
+            were changed.
+        diverged_at_s: Time at which the site left its limits, in s. None if it did not.
+        q_rms_rad: Root mean square of the change of q, for the joint with the largest value, in
+            rad.
+        q_max_rad: Largest absolute change of q of any joint, in rad.
+        q_max_at_s: Time of this largest change, in s.
+        error_rms_rad: Root mean square of the synchronisation error e, Eq. (9), for the joint
+            with the largest value, in rad.
+        error_max_rad: Largest |e| of any joint, in rad.
+        torque_max_nm: Largest absolute torque of any joint, Eq. (13), in N m.
     """
 
     site: str
@@ -105,14 +113,14 @@ class SiteEffect(NamedTuple):
 
 
 class LinkEffect(NamedTuple):
-    """The effect of a rerun on one link: the age of the sample that the receiver uses.
+    """Effect of a rerun on one link: the age of the sample that the receiver uses.
 
-    Ages cover the ticks at which a sample is in use both in the log and in the rerun.
+    Ages are taken in the ticks in which a sample is in use both in the log and in the rerun.
 
     Attributes:
-        link: name of the link, as in "m1->s".
-        age_mean_ms: mean age, ms.
-        age_max_ms: largest age, ms.
+        link: Name of the link, for example "m1->s".
+        age_mean_ms: Mean age, in ms.
+        age_max_ms: Largest age, in ms.
     """
 
     link: str
@@ -121,18 +129,18 @@ class LinkEffect(NamedTuple):
 
     @property
     def differs(self) -> bool:
-        """True if the ages of samples differ from those in the log."""
+        """True if the ages in the rerun differ from those in the log."""
         return any(pair.before != pair.after for pair in (self.age_mean_ms, self.age_max_ms))
 
 
 class _CommonRecords(NamedTuple):
-    """The records of a site in a log and in its rerun, paired by their times.
+    """Records of a site in a log and in its rerun, paired by their times.
 
     Attributes:
-        before: the records of the log.
-        after: the records of the rerun.
-        before_rows: rows of `before` whose time `after` has as well, shape (K,).
-        after_rows: the rows of `after` of the same times, shape (K,).
+        before: Records of the log.
+        after: Records of the rerun.
+        before_rows: Rows of `before` whose times also occur in `after`, shape (K,).
+        after_rows: Rows of `after` with the same times, shape (K,).
     """
 
     before: SiteLog
@@ -141,7 +149,12 @@ class _CommonRecords(NamedTuple):
     after_rows: Ints
 
     def compare(self, figure: Callable[[Array], float], field: str) -> LogAndRerun:
-        """Returns a figure of a field of the paired records, in the log and in the rerun."""
+        """Computes a figure from the paired records, in the log and in the rerun.
+
+        Args:
+            figure: Function that computes the figure from values of shape (K, n).
+            field: Name of the field of the records that contains the values.
+        """
         before = figure(getattr(self.before, field)[self.before_rows])
         after = figure(getattr(self.after, field)[self.after_rows])
         return LogAndRerun(before, after)
@@ -150,14 +163,15 @@ class _CommonRecords(NamedTuple):
 def compare_site_rerun(
     log: Log, request: RerunRequest, site: RerunSite, ticks: Sequence[RerunTick]
 ) -> tuple[SiteEffect, list[LinkEffect]]:
-    """Returns the effect of a rerun on a site and on the links over which it receives.
+    """Returns the effect of a rerun on a site, and on the links over which the site receives.
 
     Args:
-        log: the log.
-        request: the rerun.
-        site: the executed site, after its last tick.
-        ticks: the ticks of that site.
+        log: The log.
+        request: Sites and settings of the rerun.
+        site: The executed site, after its last tick.
+        ticks: Ticks of this site.
     """
+    # Copied records are neither executed nor compared.
     executed = [tick for tick in ticks if not tick.kept]
     records = _pair_records(log, request, site.name, executed)
     diverged_at_s = None
@@ -176,6 +190,7 @@ def compare_site_rerun(
     )
     if not len(records.before_rows):
         return effect, []
+
     links = _compare_links(log, request, records)
     with np.errstate(over="ignore"):  # a damaged log holds any finite numbers
         before_q = records.before.q[records.before_rows]
@@ -196,6 +211,14 @@ def compare_site_rerun(
 def _pair_records(
     log: Log, request: RerunRequest, name: str, executed: Sequence[RerunTick]
 ) -> _CommonRecords:
+    """Returns the records of a site with the same times in the log and in its rerun.
+
+    Args:
+        log: The log.
+        request: Sites and settings of the rerun.
+        name: Name of the site.
+        executed: Executed ticks of the site.
+    """
     before = log[name]
     after = SiteLog(
         name=name,
@@ -211,33 +234,46 @@ def _pair_records(
 
 
 def _compute_rms(values: Array) -> float:
-    """Returns the root mean square of the column for which it is largest; `values` (K, n)."""
+    """Returns the largest root mean square of all columns of an array.
+
+    Args:
+        values: Values, shape (K, n), with a column for each joint.
+    """
     largest = _find_largest(values)
     if not 0.0 < largest < np.inf:
         return largest
-    # scaled by the largest value, so that no square overflows
+    # The values are scaled by the largest one, so that no square overflows.
     mean_squares = np.mean(np.square(values / largest), axis=0)
     return largest * float(np.sqrt(mean_squares).max())
 
 
 def _find_largest(values: Array) -> float:
+    """Returns the largest absolute value."""
     return float(np.abs(values).max())
 
 
 def _compare_links(
     log: Log, request: RerunRequest, records: _CommonRecords
 ) -> list[LinkEffect]:
+    """Returns the effect of a rerun on the links over which a site receives.
+
+    Args:
+        log: The log.
+        request: Sites and settings of the rerun.
+        records: Paired records of the receiver.
+    """
     effects = []
     for peer in records.before.peers:
         before_hz = log.scenario.sites[peer].rate_hz
         after_hz = request.scenario.sites[peer].rate_hz
         before_ms = 1e3 * records.before.age_s(peer, before_hz)[records.before_rows]
         after_ms = 1e3 * records.after.age_s(peer, after_hz)[records.after_rows]
-        known = ~(np.isnan(before_ms) | np.isnan(after_ms))
-        if not known.any():
+        # NaN means that no sample is in use yet.
+        has_ages = ~(np.isnan(before_ms) | np.isnan(after_ms))
+        if not has_ages.any():
             continue
-        before_ms = before_ms[known]
-        after_ms = after_ms[known]
+        before_ms = before_ms[has_ages]
+        after_ms = after_ms[has_ages]
         mean = LogAndRerun(float(before_ms.mean()), float(after_ms.mean()))
         largest = LogAndRerun(float(before_ms.max()), float(after_ms.max()))
         effects.append(LinkEffect(f"{peer}->{records.before.name}", mean, largest))
@@ -246,14 +282,14 @@ def _compare_links(
 
 @dataclass(frozen=True, repr=False)
 class Rerun(Result):
-    """A log and its rerun.
+    """A log and the result of executing it again.
 
     Attributes:
-        before: the log.
-        request: the sites that were executed, with which changes.
-        ticks: every tick of every executed site, in the order of execution.
-        sites: the effect on each executed site, by name.
-        links: the effect on each link to an executed site, by the name of the link.
+        before: The log.
+        request: Executed sites and changed settings.
+        ticks: Every tick of every executed site, in the order of execution.
+        sites: Effect on each executed site, by name.
+        links: Effect on each link to an executed site, by the name of the link.
     """
 
     before: Log
@@ -263,34 +299,34 @@ class Rerun(Result):
     links: dict[str, LinkEffect]
 
     def headline(self) -> str:
-        """Returns the mode of the rerun, its executed sites and its changes in one line."""
+        """Returns a line with the mode of the rerun, its executed sites and its changes."""
         changes = "; ".join(describe_rerun_changes(self.request)) or "nothing changed"
         executed = f"{self.request.mode}, {', '.join(self.request.replaced)} executed"
         return f"{self.before.source}: {executed}, {changes}"
 
     @cached_property
     def after(self) -> Log:
-        """The rerun as a log: the executed sites as computed, other sites as recorded."""
+        """The rerun as a log: executed sites as computed, and the other sites as recorded."""
         stream = io.BytesIO()
         self.write(stream)
         stream.seek(0)
         return open_log(stream)
 
     def write(self, stream: Sink, views_hz: float = 0.0) -> None:
-        """Writes the rerun as a log into a stream, which stays open.
+        """Writes the rerun as a log to a stream, which is not closed.
 
-        Executed sites are written as they were computed, without measured values (timing, round
-        trips). Recorded sites are copied byte for byte. The file names its source log by its
-        SHA-256, the executed sites and the changes. The scenario in the file is that of the
+        The records of executed sites contain no measured values, such as computing times and
+        round trips. Recorded sites are copied byte for byte. The file states the SHA-256 hash
+        of its source log, the executed sites and the changes. Its scenario is that of the
         rerun.
 
         Args:
-            stream: where the log is written.
-            views_hz: rate of the standard channels for viewers, Hz, see `LogWriter`.
+            stream: Stream to which the log is written.
+            views_hz: Rate of the additional channels for viewers, in Hz, see `LogWriter`.
 
         Raises:
-            LogError: the epoch that the log states is not a time.
-            LogRefused: the disk refused to store the log.
+            LogError: The start time that the log states is not a time.
+            LogRefused: The disk refused to store the log.
         """
         log = self.before
         request = self.request
@@ -305,6 +341,7 @@ class Rerun(Result):
             facts=collect_rerun_metadata(log, request),
             views_hz=views_hz,
         )
+
         channels: dict[str, SiteChannels] = {}
         entries = []
         for name in log.sites:
@@ -315,27 +352,28 @@ class Rerun(Result):
             else:
                 site_ticks = [tick for tick in self.ticks if tick.site == name]
                 entries.append(_make_executed_entries(site_ticks, channels[name]))
+
         for entry in merge(*entries, key=lambda entry: entry.t_ns):
             channels[entry.site].write(entry, writer, epoch_unix_ns)
         writer.finish(render_accounts(channels.values()))
 
     def save(self, path: Path, *, force: bool = False) -> None:
-        """Writes the rerun, with the standard channels for viewers, as a log into a file.
+        """Writes the rerun as a log to a file, with additional channels for viewers.
 
         Args:
-            path: the file.
-            force: whether an existing file is replaced.
+            path: The file.
+            force: If True, an existing file is replaced.
 
         Raises:
-            UsageError: the file exists, or cannot be created.
-            LogRefused: the disk refused to store the log.
+            UsageError: The file exists, or cannot be created.
+            LogRefused: The disk refused to store the log.
         """
         with LogFile(path, force=force) as stream:
             self.write(stream, VIZ_HZ)
 
     @property
     def diverged(self) -> bool:
-        """True if a site left its limits in the rerun that had not left them in the log."""
+        """True if a site left its limits in the rerun, but not in the log."""
         return any(
             effect.diverged_at_s is not None and self.before[name].states[-1].mode != "diverged"
             for name, effect in self.sites.items()
@@ -348,10 +386,11 @@ class Rerun(Result):
 
     @property
     def broken(self) -> bool:
-        """True if the rerun differs from the log although it must equal it, bit for bit.
+        """True if the rerun differs from the log, although it should have the same bits.
 
-        It must if the log is of this platform, nothing was changed, and no executed site is a
-        recorded site of an earlier rerun.
+        The bits should be the same if the log was made on this platform, no setting was
+        changed, and the log contains everything that its sites received. The last condition
+        fails for a log that is an open-loop rerun itself.
         """
         same_platform = self.before.session.get("fingerprint") == compute_fingerprint()
         executable = set(self.request.replaced) <= set(self.before.executed_sites)
@@ -360,15 +399,15 @@ class Rerun(Result):
 
     @property
     def notes(self) -> list[str]:
-        """Limits of the result, a sentence each."""
+        """Sentences about the limits of the result."""
         return list(_describe_limits(self))
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a row per executed site."""
+        """Returns the plain values of each executed site."""
         return list(self.to_dict()["sites"].values())
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns plain values, with the keys of `trilat rerun --json`, which end in a unit."""
+        """Returns the result as plain values, with the keys of `trilat rerun --json`."""
         return {
             "log": self.before.source,
             "mode": self.request.mode,
@@ -392,25 +431,26 @@ def rerun(
     closed_loop: bool = False,
     progress: Progress | None = None,
 ) -> Rerun:
-    """Executes sites of a log again and compares them with it, as `trilat rerun` does.
+    """Executes sites of a log again and compares them with the log, as `trilat rerun` does.
 
     >>> result = tn.rerun(tn.simulate("two_sites", duration_s=0.1), ["s"], {"control.Kd": 5})
     >>> result.identical
     False
 
     Args:
-        log: the log, or its path.
-        replace: the sites to execute; all other sites stay as recorded and do not react.
-        set: changes of settings of these sites, as in `{"control.Kd": 5}`.
-        closed_loop: whether all sites are executed.
-        progress: called now and then with the number of executed ticks and an upper bound of
-            their total.
+        log: The log, or its path.
+        replace: Names of the sites to execute. All other sites keep their records and do not
+            react.
+        set: Changed settings of these sites, for example `{"control.Kd": 5}`.
+        closed_loop: If True, all sites are executed, and `replace` must be empty.
+        progress: Function that is called now and then with the number of executed ticks, and an
+            upper bound of their total.
 
     Raises:
-        LogError: the log cannot be read, or does not hold enough to execute the sites.
-        UsageError: the sites are not named, or are named in two ways.
-        ScenarioError: there is no such site, or a change is not valid or cannot have an effect.
-        CodeWithheld: the law of an executed site is code from outside that may not run.
+        LogError: The log cannot be read, or does not contain enough to execute the sites.
+        UsageError: The sites are not named, or are named in two ways.
+        ScenarioError: There is no such site, or a change is not valid or cannot have an effect.
+        CodeWithheld: The control law of an executed site is code that may not run.
     """
     before = log if isinstance(log, Log) else open_log(log)
     names = [replace] if isinstance(replace, str) else list(replace)
@@ -428,7 +468,11 @@ def rerun(
 
 
 def _parse_epoch(log: Log) -> int:
-    """Returns the Unix time of tick 0 that a log states, ns."""
+    """Returns the Unix time of the start of a log's session, in ns.
+
+    Raises:
+        LogError: The text that the log states is not a time.
+    """
     text = log.session.get("epoch_unix_ns", "0")
     if not text.isdecimal() or int(text) > MAX_TIME_NS:
         raise LogError(f"{log.source}: its epoch_unix_ns is no time: {text[:40]!r}")
@@ -436,8 +480,9 @@ def _parse_epoch(log: Log) -> int:
 
 
 def collect_rerun_metadata(log: Log, request: RerunRequest) -> dict[str, str]:
-    """Returns the session metadata that name the source log, the executed sites and changes."""
-    files = filter(Path.is_file, map(Path, log.sources))  # a log in memory has no file
+    """Returns the metadata of a rerun's log: its source log, executed sites and changes."""
+    # A log in memory has no file.
+    files = filter(Path.is_file, map(Path, log.sources))
     digests = {path: digest_file(path) for path in files}
     return {
         "rerun_mode": request.mode,
@@ -450,7 +495,7 @@ def collect_rerun_metadata(log: Log, request: RerunRequest) -> dict[str, str]:
 
 
 def _copy_recorded(log: Log, name: str, channels: SiteChannels) -> Iterator[SiteEntry]:
-    """Yields the entries of a recorded site, in order of time."""
+    """Yields the entries of a site whose records are copied, in the order of time."""
     part = log[name]
     events = [event for event in log.events if event.member == name]
     events.sort(key=lambda event: event.t_ns)  # events before the epoch come first
@@ -468,7 +513,7 @@ def _copy_recorded(log: Log, name: str, channels: SiteChannels) -> Iterator[Site
 def _make_executed_entries(
     ticks: Sequence[RerunTick], channels: SiteChannels
 ) -> Iterator[SiteEntry]:
-    """Yields the entries of an executed site, in order of time."""
+    """Yields the entries of an executed site, in the order of time."""
     for tick in ticks:
         state = decode(tick.payload, State, READABLE)
         yield channels.make_record_entry(state, tick.payload)
@@ -478,26 +523,33 @@ def _make_executed_entries(
 
 
 def _to_plain_value(value: Any) -> Any:
-    """Returns a value for JSON: named tuples as dicts, infinite numbers and NaN as None."""
+    """Converts a value for JSON.
+
+    A named tuple becomes a dictionary. Infinite numbers and NaN become None.
+    """
     if hasattr(value, "_asdict"):
         return {key: _to_plain_value(item) for key, item in value._asdict().items()}
     return finite_or_none(value) if isinstance(value, float) else value
 
 
 def _describe_limits(result: Rerun) -> Iterator[str]:
-    """Yields sentences on what the result of a rerun does not cover."""
+    """Yields sentences about facts that limit the result of a rerun."""
     log = result.before
     request = result.request
     if request.recorded and request.changes:
         sites = " and ".join(request.recorded)
-        are, do = ("are", "they do") if len(request.recorded) > 1 else ("is", "it does")
-        yield f"{sites} {are} as recorded: nothing is changed there, and {do} not react"
+        if len(request.recorded) > 1:
+            yield f"{sites} are as recorded: nothing is changed there, and they do not react"
+        else:
+            yield f"{sites} is as recorded: nothing is changed there, and it does not react"
+
     foreign_sites = [name for name in request.replaced if name not in log.executed_sites]
     if foreign_sites:
         yield (
             f"this file is a rerun itself: its {', '.join(foreign_sites)} received samples "
             "that are not in it"
         )
+
     other_platform = log.session.get("fingerprint") != compute_fingerprint()
     if other_platform and not request.changes and not result.identical:
         yield (
@@ -514,6 +566,13 @@ def _describe_limits(result: Rerun) -> Iterator[str]:
 
 
 def _describe_site_limits(effect: SiteEffect, absent_ticks: int) -> Iterator[str]:
+    """Yields sentences about facts that limit the result for one site.
+
+    Args:
+        effect: Effect of the rerun on the site.
+        absent_ticks: Number of ticks that the site did not execute in the live session, because
+            it had left.
+    """
     name = effect.site
     if effect.stands:
         kept = count_nouns(effect.stands, "record stands as it is", "records stand as they are")
@@ -535,8 +594,13 @@ def _describe_site_limits(effect: SiteEffect, absent_ticks: int) -> Iterator[str
 
 
 def _describe_later_changes(result: Rerun) -> Iterator[str]:
-    """Yields sentences on changed links and shares that change again during the run."""
+    """Yields sentences about links and dominance factors that change again during the run.
+
+    A changed setting then applies only up to that time.
+    """
     keys = [change.key for change in result.request.changes]
+
+    # Links, or sites whose dominance factors change, in the timeline or by requests in the log.
     owners = [change.link or change.dominance for change in result.request.scenario.timeline]
     for name in result.request.replaced:
         for commands in result.before.commands(name).values():
@@ -547,6 +611,8 @@ def _describe_later_changes(result: Rerun) -> Iterator[str]:
                     owners.append(name)
                 else:
                     owners.append(f"{result.before[name].peers[command.peer]}->{name}")
+
+    # The dictionary removes duplicates and keeps the order.
     for owner in dict.fromkeys(owners):
         prefix = f"links.{owner}." if "->" in owner else f"dominance.{owner}."
         if any(key.startswith(prefix) for key in keys):

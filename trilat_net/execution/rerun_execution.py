@@ -1,16 +1,17 @@
-"""Resolve a request for a rerun, and execute its sites over the network of the log.
+"""Checks the request for a rerun of a log, and executes the sites of the rerun.
 
-Only executed sites can be changed. A setting that concerns no executed site is refused. A
-setting that concerns executed and recorded sites changes only the executed sites, and the
-result reports that.
+A rerun executes some or all sites of a log again, possibly with changed settings. Only executed
+sites can be changed: a setting that concerns only recorded sites is refused. A setting that
+concerns both kinds of sites changes only the executed ones, and the result reports this.
 
 Invariant:
     - A site advances only by `Site.step`.
-    - A site receives the samples of recorded peers as logged and the samples of executed peers
-      as computed now, each at the tick at which the log says that it arrived.
-    - Without changes a site resumes after a gap from two consecutive records. Where the log
-      does not hold enough to execute a tick, its record is kept.
-    - With changes a site executes the ticks of a gap, with assumed arrivals.
+    - A site receives the recorded samples of recorded peers, and the newly computed samples of
+      executed peers. Each sample arrives in the tick in which it arrived according to the log.
+    - Without changed settings, the execution stops at a gap of the log, and resumes after two
+      consecutive records. If the log does not contain enough to execute a tick, its record is
+      copied.
+    - With changed settings, the ticks of a gap are executed with assumed arrivals.
 """
 
 import bisect
@@ -52,19 +53,19 @@ from .virtual_network import (
 )
 
 RerunOverrides = Mapping[str, Any] | Sequence[str]
-"""Changed settings, as a mapping from keys to values or as texts "KEY=VALUE"."""
+"""Changed settings, either by key or as texts "KEY=VALUE"."""
 
 _TEXT_KEYS = ("name", "title", "about", "assumed", "expect")
 """Keys of a scenario that describe it and have no effect on a run."""
 
 
 class ChangedValue(NamedTuple):
-    """A value that a rerun changes.
+    """A value of the scenario that a rerun changes.
 
     Attributes:
-        key: dotted path of the value in the resolved scenario.
-        before: the value in the log.
-        after: the value in the rerun.
+        key: Dotted path of the value in the resolved scenario.
+        before: Value in the log.
+        after: Value in the rerun.
     """
 
     key: str
@@ -74,16 +75,16 @@ class ChangedValue(NamedTuple):
 
 @dataclass(frozen=True)
 class RerunRequest:
-    """A rerun: its sites, its scenario and its changes.
+    """A checked request: which sites are executed again, and with which settings.
 
     Attributes:
-        original: the scenario of the log.
-        scenario: the scenario of the rerun: with changes for the executed sites, and that of
-            the log for the recorded sites.
-        replaced: the executed sites, in scenario order.
-        recorded: the recorded sites, in scenario order.
-        changes: the changed values.
-        without_effect: requested changes of recorded sites, which have no effect.
+        original: Scenario of the log.
+        scenario: Scenario of the rerun. It contains the changes for the executed sites; the
+            recorded sites are as in the log.
+        replaced: Names of the executed sites, in the order of the scenario.
+        recorded: Names of the other sites, in the order of the scenario.
+        changes: Changed values.
+        without_effect: Requested changes that concern recorded sites, and have no effect.
     """
 
     original: Scenario
@@ -95,24 +96,24 @@ class RerunRequest:
 
     @property
     def mode(self) -> str:
-        """The mode: "closed loop" if every site is executed, else "open loop"."""
+        """Mode of the rerun: "closed loop" if every site is executed, otherwise "open loop"."""
         return "open loop" if self.recorded else "closed loop"
 
 
 def resolve_rerun_request(
     log: Log, replace: Sequence[str], overrides: RerunOverrides, *, closed_loop: bool
 ) -> RerunRequest:
-    """Validates a request for a rerun and resolves its scenario.
+    """Checks the request for a rerun, and returns it with the resolved scenario.
 
     Args:
-        log: the log.
-        replace: names of the sites to execute.
-        overrides: changed settings, as `load_scenario` accepts them.
-        closed_loop: whether all sites are executed.
+        log: The log.
+        replace: Names of the sites to execute.
+        overrides: Changed settings, in the form that `load_scenario` accepts.
+        closed_loop: If True, all sites are executed.
 
     Raises:
-        UsageError: the sites are not named, or are named in two ways.
-        ScenarioError: there is no such site, or a change is not valid or cannot have an effect.
+        UsageError: The sites are not named, or are named in two ways.
+        ScenarioError: There is no such site, or a change is not valid or cannot have an effect.
     """
     original = log.scenario
     names = original.names
@@ -123,14 +124,17 @@ def resolve_rerun_request(
     if not closed_loop and not replace:
         hint = f"--replace NAME (of {', '.join(names)}), or --closed-loop for all of them"
         raise UsageError(f"which sites shall be executed? Give {hint}")
+
     for name in replace:
         find_site(original, name)
     replaced = tuple(name for name in names if closed_loop or name in replace)
     _refuse_external_sites(original, replaced)
     recorded = tuple(name for name in names if name not in replaced)
+
     for text in overrides:  # keys of a mapping, or texts like KEY=VALUE
         key = text if isinstance(overrides, Mapping) else text.partition("=")[0].strip()
         _check_key(key, replaced, recorded)
+
     requested = load_scenario(original, overrides)
     _check_frame(original, requested, recorded)
     scenario = requested
@@ -149,6 +153,10 @@ def resolve_rerun_request(
 
 
 def _refuse_external_sites(original: Scenario, replaced: Sequence[str]) -> None:
+    """Refuses to execute a site whose arm is a real robot or a user's program.
+
+    How this arm would have reacted to other torques is not known.
+    """
     for name in original.external:
         if name not in replaced:
             continue
@@ -163,7 +171,13 @@ def _refuse_external_sites(original: Scenario, replaced: Sequence[str]) -> None:
 
 
 def _check_key(key: str, replaced: Sequence[str], recorded: Sequence[str]) -> None:
-    """Refuses a key that has no effect in a rerun."""
+    """Refuses a changed key that cannot have an effect in a rerun.
+
+    Args:
+        key: Dotted path of the key.
+        replaced: Names of the executed sites.
+        recorded: Names of the other sites.
+    """
     group, _, rest = key.partition(".")
     if group in _TEXT_KEYS:
         raise ScenarioError(
@@ -189,7 +203,10 @@ def _check_key(key: str, replaced: Sequence[str], recorded: Sequence[str]) -> No
 
 
 def _check_frame(original: Scenario, requested: Scenario, recorded: Sequence[str]) -> None:
-    """Refuses other sites, a longer duration, and other tick rates in open loop."""
+    """Refuses changes that the arrivals in the log do not cover.
+
+    These are other sites, a longer duration, and in open loop other tick rates.
+    """
     if requested.names != original.names:
         raise ScenarioError(
             f"a rerun has the sites of the log, {', '.join(original.names)}", path="sites"
@@ -214,7 +231,11 @@ def _check_frame(original: Scenario, requested: Scenario, recorded: Sequence[str
 def _join_scenarios(
     original: Scenario, requested: Scenario, recorded: Sequence[str]
 ) -> Scenario:
-    """Returns the requested scenario, with the original settings of the recorded sites."""
+    """Returns the requested scenario, but with the original settings of the recorded sites.
+
+    The settings of a site include the links over which it receives, and the planned changes of
+    these links and of its dominance factors.
+    """
 
     def choose(site: str) -> Scenario:
         return original if site in recorded else requested
@@ -236,6 +257,7 @@ def _join_scenarios(
 
 
 def _find_changes(original: Scenario, other: Scenario) -> list[ChangedValue]:
+    """Returns the values that differ between two scenarios."""
     before = dict(flatten_table(msgspec.to_builtins(original)))
     after = dict(flatten_table(msgspec.to_builtins(other)))
     return [
@@ -246,10 +268,14 @@ def _find_changes(original: Scenario, other: Scenario) -> list[ChangedValue]:
 
 
 def describe_rerun_changes(request: RerunRequest) -> list[str]:
-    """Returns the changes as lines of text; equal changes of several owners share a line."""
+    """Describes the changes of a rerun, with a line for each kind of change.
+
+    If several sites or links are changed in the same way, they share a line.
+    """
     owners: dict[tuple[str, str], list[str]] = {}
     for subject, owner, change in _describe_changes(request):
         owners.setdefault((subject, change), []).append(owner)
+
     lines = []
     for (subject, change), names in owners.items():
         if subject == "link" and len(names) == len(request.scenario.links):
@@ -264,7 +290,12 @@ def describe_rerun_changes(request: RerunRequest) -> list[str]:
 
 
 def _describe_changes(request: RerunRequest) -> Iterator[tuple[str, str, str]]:
-    """Yields subject, owner ("" for the whole scenario) and text of every change."""
+    """Yields the parts of a description for every change.
+
+    Yields:
+        The subject ("link" or the name of a key), its owner (a link or site, or empty for the
+        whole scenario), and the change as a text.
+    """
     described: set[str] = set()
     for change in request.changes:
         group, _, rest = change.key.partition(".")
@@ -284,9 +315,20 @@ def _describe_changes(request: RerunRequest) -> Iterator[tuple[str, str, str]]:
 def _describe_replacement(
     request: RerunRequest, group: str, owner: str, key: str
 ) -> tuple[str, str, str] | None:
-    """Returns subject, owner and text if a link or a law is replaced as a whole; else None.
+    """Describes a change that replaces a link or a control law as a whole.
 
-    A link is described as a whole if its description differs, a law if its kind differs.
+    A link is described as a whole if its short description differs, and a law if its kind
+    differs.
+
+    Args:
+        request: The request.
+        group: First part of the changed key, for example "links".
+        owner: Second part of the key: a link or a site.
+        key: Rest of the key.
+
+    Returns:
+        Subject, owner and text, see `_describe_changes`. None if the change concerns a single
+        value.
     """
     before = request.original
     after = request.scenario
@@ -304,7 +346,7 @@ def _describe_replacement(
 
 
 def _shorten(value: object) -> str:
-    """Returns a value as text; of a list of tables only their number."""
+    """Returns a value as a text. For a list of tables, the text contains only their number."""
     if isinstance(value, list) and value and isinstance(value[0], dict):
         return f"{len(value)} {'entry' if len(value) == 1 else 'entries'}"
     return describe_value(value)
@@ -314,16 +356,16 @@ class RerunTick(NamedTuple):
     """One tick of an executed site.
 
     Attributes:
-        site: name of the site.
-        tick: number of the tick.
-        t_ns: nominal time, ns since the epoch.
-        mode: mode of the site.
-        payload: the record as it would be published; the record of the log if `kept`.
-        same: True if the log has a record of the tick whose computed fields all have the same
-            bits.
-        kept: True if the record of the log is kept, because the log does not hold enough to
-            execute the tick.
-        stats: the statistics of the tick, if statistics are due.
+        site: Name of the site.
+        tick: Number of the tick.
+        t_ns: Nominal time, in ns after the epoch.
+        mode: Mode of the site.
+        payload: Encoded record, as the site would publish it. If `kept`, the record of the log.
+        same: True if the log contains a record of the tick, and all computed fields have the
+            same bits.
+        kept: True if the record was copied, because the log does not contain enough to execute
+            the tick.
+        stats: Link statistics, if they are due in this tick.
     """
 
     site: str
@@ -337,24 +379,28 @@ class RerunTick(NamedTuple):
 
 
 class RerunSite:
-    """One executed site of a rerun.
+    """Executes one site of a rerun, tick by tick.
+
+    The state of the site is certain if it follows from the ticks before. It becomes uncertain
+    after a gap in the log. Then records are copied until two consecutive records determine the
+    state again.
 
     Args:
-        log: the log.
-        request: the rerun.
-        name: name of the site.
-        deliveries: the arrivals at the site.
-        samples: the samples of all sites, by site and tick. Samples of executed peers appear
-            while they are computed.
+        log: The log.
+        request: Sites and settings of the rerun.
+        name: Name of the site.
+        deliveries: Arrivals at the site.
+        samples: Samples of all sites, by site and tick. The samples of executed sites appear in
+            it while they are computed.
 
     Attributes:
-        name: name of the site.
-        k: the next tick.
-        output: record of the last tick.
-        deliveries: the arrivals at the site.
-        first: the first difference from the records of the log.
-        lacking: number of samples that arrived and are not in the log.
-        diverged: True once the site left its limits.
+        name: Name of the site.
+        k: Next tick.
+        output: Record of the last tick.
+        deliveries: Arrivals at the site.
+        first: First difference from the records of the log.
+        lacking: Number of samples that arrived, but whose content is missing from the log.
+        diverged: True after the site has left its limits.
     """
 
     output: TickRecord
@@ -388,7 +434,7 @@ class RerunSite:
             links=setup.links,
         )
         self._last_tick = min(deliveries.last, scenario.ticks(name) - 1)
-        # at another rate no tick has the time of a record
+        # At another rate, records and ticks have different times and cannot be compared.
         same_rate = self._site.rate_hz == part.rate_hz
         self._recorded_ticks: list[int] = part.tick.tolist() if same_rate else []
         self._rows = {tick: row for row, tick in enumerate(self._recorded_ticks)}
@@ -398,19 +444,19 @@ class RerunSite:
 
     @property
     def is_done(self) -> bool:
-        """True if the site executes no more ticks."""
+        """True if the site has executed its last tick."""
         return self.diverged or self.k > self._last_tick
 
     @property
     def t_ns(self) -> int:
-        """Nominal time of the next tick, ns since the epoch."""
+        """Nominal time of the next tick, in ns after the epoch."""
         return self.k * NS_PER_S // self._site.rate_hz
 
     def execute_tick(self) -> RerunTick:
-        """Executes the next tick, or keeps the record of the log.
+        """Executes the next tick, or copies its record if it cannot be executed.
 
         Raises:
-            LogError: the log lists more changes than a site accepts, or holds an impossible
+            LogError: The log lists more changes than a site accepts, or contains an impossible
                 record.
         """
         row = self._rows.get(self.k)
@@ -425,14 +471,16 @@ class RerunSite:
                 tick = self._keep_record(row)
         except (ValueError, OverflowError) as error:
             raise LogError(f"{self.name}, tick {self.k}: {error}") from None
+
         self.diverged = tick.mode is Mode.DIVERGED
         self.k += 1
-        if not (self._changed and self._certain) and self.k not in self._rows:
+        executes_gaps = self._changed and self._certain
+        if not executes_gaps and self.k not in self._rows:
             self._skip_gap()
         return tick
 
     def _skip_gap(self) -> None:
-        """Continues at the next record, or ends after the last record."""
+        """Continues at the next record of the log. Ends if there is no further record."""
         index = bisect.bisect_right(self._recorded_ticks, self.k)
         self.k = self._last_tick + 1
         if index < len(self._recorded_ticks):
@@ -440,7 +488,11 @@ class RerunSite:
         self._certain = False
 
     def _execute(self, row: int | None) -> RerunTick:
-        """Executes the next tick and compares it with its record, if the log has a record."""
+        """Executes the next tick, and compares it with the record of the log.
+
+        Args:
+            row: Row of the record. None if the log does not contain a record of the tick.
+        """
         arrivals, missing = self._inputs.find_arrivals(self.deliveries.entries.get(self.k, ()))
         arrivals = arrivals[:MAX_ARRIVALS]
         self._inputs.add_lacking(missing)
@@ -449,14 +501,16 @@ class RerunSite:
         hand: Sequence[float] = ()
         if self._site.layout.hand == self._part.layout.hand:
             hand = find_recorded_hand(self._part, self._site, self.k)
+
         output = self._site.step(TickInput(self.k, arrivals, changes, hand=hand))
         stats = self._stats.pop_stats(output) if self._stats.is_due(self.k) else None
+
         same = False
         if row is not None:
             state = self._part.states[row]
             comparable = output
             if self._changed or missing:
-                # the CRC covers samples that are changed or that the log lacks
+                # The checksum covers samples that have changed, or that the log lacks.
                 comparable = output._replace(rx_crc=state.rx_crc)
             same = equal_record(state, comparable, self._part.peers)
             if not same and not self._changed and self._inputs.is_uncertain(state, output):
@@ -469,6 +523,7 @@ class RerunSite:
                     equal=equal_bits,
                     channel=self._channel,
                 )
+
         self.output = output
         payload = encode_state(
             site=self.name,
@@ -491,7 +546,13 @@ class RerunSite:
         )
 
     def _keep_record(self, row: int) -> RerunTick:
-        """Returns the tick of a record of the log, which is not executed."""
+        """Copies the record of the next tick, which is not executed.
+
+        The state of the site becomes uncertain.
+
+        Args:
+            row: Row of the record.
+        """
         self._certain = False
         output = read_output(self._part.states[row], self._part.peers)
         self.output = output
@@ -508,22 +569,24 @@ class RerunSite:
 
 
 MEMORY_S = 120
-"""Time for which computed samples are kept for delivery, s. No queue holds a sample for longer.
+"""Time for which computed samples are kept for delivery, in s.
+
+No sample is in transit for longer.
 """
 
 
 class RerunExecution:
-    """The execution of all sites of a rerun.
+    """Executes all sites of a rerun together.
 
     Args:
-        log: the log.
-        request: the rerun.
+        log: The log.
+        request: Sites and settings of the rerun.
 
     Attributes:
-        sites: the executed sites, by name.
+        sites: The executed sites, by name.
 
     Raises:
-        LogError: the log does not hold enough to execute the sites.
+        LogError: The log does not contain enough to execute the sites.
     """
 
     def __init__(self, log: Log, request: RerunRequest) -> None:
@@ -533,7 +596,8 @@ class RerunExecution:
         samples: dict[str, Mapping[int, ReceivedMotion]] = {
             name: log[name].by_tick for name in request.recorded
         }
-        samples |= self._recent  # filled while the sites are executed
+        # The computed samples are added to these dictionaries during the execution.
+        samples |= self._recent
         self.sites = {
             name: RerunSite(
                 log=log,
@@ -546,6 +610,14 @@ class RerunExecution:
         }
 
     def _find_deliveries(self, name: str) -> Deliveries:
+        """Returns the arrivals at a site in the rerun.
+
+        Without changed settings, they are those of the records. Otherwise the arrivals in gaps
+        are assumed, and all arrivals are converted if tick rates were changed.
+
+        Raises:
+            LogError: Too many records are missing, or a site that joined late has another rate.
+        """
         part = self._log[name]
         original = self._log.scenario
         scenario = self._request.scenario
@@ -572,14 +644,15 @@ class RerunExecution:
         )
 
     def run(self, progress: Progress | None = None) -> Iterator[RerunTick]:
-        """Executes all sites and yields every tick, in order of time as far as arrivals allow.
+        """Executes all sites, and yields every tick.
 
-        A site that left its limits executes no more ticks. With changes all sites end at that
-        time.
+        The ticks are in the order of time, except that a site waits for the samples that it
+        receives. A site that leaves its limits executes no further ticks. If settings were
+        changed, all sites end at that time.
 
         Args:
-            progress: called now and then with the number of executed ticks and an upper bound
-                of their total.
+            progress: Function that is called now and then with the number of executed ticks,
+                and an upper bound of their total.
         """
         sites = list(self.sites.values())
         total = sum(site.deliveries.last + 1 - site.deliveries.first for site in sites)
@@ -589,6 +662,7 @@ class RerunExecution:
         )
         executed = 0
         last_ns = None
+
         while pending and (last_ns is None or pending[0][0] <= last_ns):
             t_ns, index, _ = pending.pop(self._find_ready(pending))
             site = sites[index]
@@ -604,7 +678,7 @@ class RerunExecution:
                 progress(executed, total)
 
     def _keep_sample(self, site: RerunSite) -> None:
-        """Keeps the last record of a site for its peers, and drops the oldest sample."""
+        """Keeps the last record of a site for its peers, and removes one that is too old."""
         output = site.output
         recent = self._recent[site.name]
         recent[output.tick] = make_arrival(0, output.tick, output)
@@ -612,14 +686,26 @@ class RerunExecution:
             del recent[next(iter(recent))]
 
     def _find_ready(self, pending: Sequence[tuple[int, int, int]]) -> int:
-        """Returns the position of the first tick whose arrivals are computed; else 0."""
+        """Returns the position of the first pending tick whose arrivals have been computed.
+
+        The result is 0 if there is no such tick, so that the execution always goes on.
+
+        Args:
+            pending: Next tick of each site, as (time in ns, index of the site, tick), in order
+                of time.
+        """
         for position, (_, index, k) in enumerate(pending):
             if self._is_ready(self._request.replaced[index], k):
                 return position
         return 0
 
     def _is_ready(self, receiver: str, k: int) -> bool:
-        """True if every arrival of a site's next tick is computed, or never will be."""
+        """True if every sample that arrives in a tick has been computed, or never will be.
+
+        Args:
+            receiver: Name of the site.
+            k: The tick.
+        """
         peers = self._log[receiver].peers
         for peer, tick, _ in self.sites[receiver].deliveries.entries.get(k, ()):
             sender = self.sites.get(peers[peer])

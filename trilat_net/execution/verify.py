@@ -1,14 +1,17 @@
-"""Verify a log: execute every site again and compare every computed field of every record.
+"""Verifies a log: executes every site again, and compares every computed field of every record.
+
+A record is the logged result of one tick of a site's control loop. The inputs of the tick, such
+as the samples that arrived, are in the log as well, so that the tick can be computed again.
 
 Invariant (L3, L5):
-    - `Site.step` gets its inputs from the log alone, besides user control laws, which the log
-      names by hash.
-    - On the platform that recorded the log (equal fingerprint) whole runs are executed, and
-      they must agree bit for bit.
-    - On another platform each tick is recomputed from the two records before it, and numbers a
-      and b agree if |a - b| <= 1e-9 (1 + |a|).
-    - A gap is reported. After a gap the execution resumes from two consecutive records. Records
-      that cannot be judged are counted, never reported as differences.
+    - `Site.step` gets its inputs only from the log, and its code from the program and from
+      files of users' control laws, whose hashes are in the log.
+    - On the platform on which the log was recorded (equal fingerprint), whole runs are
+      executed, and must agree with the log bit for bit.
+    - On another platform, rounding differs. Each tick is then computed from the two records
+      before it, and two numbers a and b agree if |a - b| <= 1e-9 (1 + |a|).
+    - Gaps of the log are reported. After a gap, the execution resumes from two consecutive
+      records. Records that cannot be judged are counted, but never reported as differences.
 """
 
 from array import array
@@ -43,21 +46,21 @@ from ..scenario.run_changes import count_skipped_ticks
 from .resumption import ArrivalEntry, RecordedInputs, read_output
 
 TOLERANCE = 1e-9
-"""Across platforms, a and b count as equal if |a - b| <= TOLERANCE (1 + |a|)."""
+"""Numbers a and b of different platforms count as equal if |a - b| <= TOLERANCE (1 + |a|)."""
 
 NumberEquality = Callable[[float, float], bool]
-"""Decides whether a logged and a computed number count as equal."""
+"""Function that decides whether a logged and a computed number count as equal."""
 
 
 class RecordDifference(NamedTuple):
-    """A field of a record that differs from the execution.
+    """Field of a record that differs from the execution.
 
     Attributes:
-        site: name of the site.
-        tick: tick of the record.
-        field: name of the field; of a vector with the index of the number, as in "q[1]".
-        logged: the value in the record.
-        computed: the value of the execution.
+        site: Name of the site.
+        tick: Tick of the record.
+        field: Name of the field. For a vector with the index of the number, for example "q[1]".
+        logged: Value in the record.
+        computed: Value of the execution.
     """
 
     site: str
@@ -67,29 +70,30 @@ class RecordDifference(NamedTuple):
     computed: Any
 
     def __str__(self) -> str:
+        """Returns a text about the difference."""
         logged = _format_value(self.logged)
         computed = _format_value(self.computed)
-        place = f"{self.site}, tick {self.tick}, {self.field}"
-        return f"{place}: logged {logged}, computed {computed}"
+        location = f"{self.site}, tick {self.tick}, {self.field}"
+        return f"{location}: logged {logged}, computed {computed}"
 
 
 def _format_value(value: object) -> str:
-    """Returns a value as text; of a float with its bits."""
+    """Returns a value as a text. The text of a floating-point number also shows its bits."""
     return f"{value!r} ({value.hex()})" if isinstance(value, float) else repr(value)
 
 
 def equal_bits(a: float, b: float) -> bool:
-    """True if two numbers have the same bits (-0.0 is not 0.0)."""
+    """True if two numbers have the same bits. Unlike `==`, it distinguishes -0.0 from 0.0."""
     return a.hex() == b.hex()
 
 
 def equal_to_tolerance(a: float, b: float) -> bool:
-    """True if two numbers agree to `TOLERANCE`, as on two platforms."""
+    """True if two numbers agree within `TOLERANCE`, as those of two platforms should."""
     return abs(a - b) <= TOLERANCE * (1.0 + abs(a))
 
 
 def describe_law_failure(failure: LawFailed) -> RecordDifference:
-    """Returns the difference of a user law that fails now but did not fail in the log."""
+    """Returns the difference that a user's law fails now, but did not fail in the log."""
     return RecordDifference(
         site=failure.site,
         tick=failure.tick or 0,
@@ -103,14 +107,20 @@ _get_vectors = attrgetter(*STATE_VECTORS, "mem")
 
 
 def _pack_vectors(record: State | TickRecord) -> bytes:
+    """Returns the bytes of all vectors of a record, which can be compared at once."""
     return array("d", chain.from_iterable(_get_vectors(record))).tobytes()
 
 
 def equal_record(logged: State, computed: TickRecord, peers: tuple[str, ...]) -> bool:
     """True if every computed field of a record has the same bits as in the execution.
 
-    This comparison is fast, because nearly all records are identical. `find_first_difference`
-    names the field of a record that is not.
+    Nearly all records are equal. Therefore this comparison is optimised for speed, and
+    `find_first_difference` finds the field of a record that is not equal.
+
+    Args:
+        logged: Record in the log.
+        computed: Record of the execution.
+        peers: Names of the site's peers, in the order of the scenario.
     """
     return (
         _pack_vectors(logged) == _pack_vectors(computed)
@@ -130,14 +140,14 @@ def find_first_difference(
     equal: NumberEquality,
     channel: LawChannel = LawChannel(),  # noqa: B008
 ) -> RecordDifference | None:
-    """Returns the first field in which a record differs from an execution, or None.
+    """Returns the first field in which a record differs from the execution, or None.
 
     Args:
-        logged: the record in the log.
-        computed: the record of the execution.
-        peers: names of the site's peers, in scenario order.
-        equal: decides whether two numbers count as equal.
-        channel: the names of the numbers that the site's law sends.
+        logged: Record in the log.
+        computed: Record of the execution.
+        peers: Names of the site's peers, in the order of the scenario.
+        equal: Function that decides whether two numbers count as equal.
+        channel: Layout of the vectors that the site's control law sends, with their names.
     """
     comparisons = _compare_fields(
         logged=logged, computed=computed, peers=peers, equal=equal, channel=channel
@@ -161,11 +171,16 @@ def _compare_fields(
     equal: NumberEquality,
     channel: LawChannel,
 ) -> Iterator[tuple[str, Any, Any, bool]]:
-    """Yields name, logged value, computed value and equality of every field of a record."""
+    """Compares every field of a record with the execution, see `find_first_difference`.
+
+    Yields:
+        Name of the field, logged value, computed value, and whether they are equal.
+    """
     mode = MODE_WORDS[computed.mode]
     yield "tick", logged.tick, computed.tick, logged.tick == computed.tick
     yield "t_ns", logged.t_ns, computed.t_ns, logged.t_ns == computed.t_ns
     yield "mode", logged.mode, mode, logged.mode == mode
+
     channel_names = [f"ch.{entry}" for entry in channel.entries(peers)]
     for vector in STATE_VECTORS:
         logged_numbers = getattr(logged, vector)
@@ -180,6 +195,7 @@ def _compare_fields(
             names[: len(channel_names)] = channel_names[:logged_count]
         for name, a, b in zip(names, logged_numbers, computed_numbers, strict=True):
             yield name, float(a), b, equal(float(a), b)
+
     used = dict(zip(peers, computed.used, strict=True))
     for peer in sorted({*logged.used, *used}):
         logged_tick = logged.used.get(peer)
@@ -187,6 +203,7 @@ def _compare_fields(
         yield f"used[{peer}]", logged_tick, computed_tick, logged_tick == computed_tick
     yield "rx (its CRC-32)", logged.rx_crc, computed.rx_crc, logged.rx_crc == computed.rx_crc
     yield "cmd", logged.cmd, computed.cmd, logged.cmd == computed.cmd
+
     same_numbers = all(
         equal(float(a), float(b)) for a, b in zip(logged.mem, computed.mem, strict=False)
     )
@@ -196,24 +213,24 @@ def _compare_fields(
 
 @dataclass(slots=True)
 class VerifyResult:
-    """The result of executing a log again. Counts are numbers of records.
+    """Result of executing a log again. Counts are numbers of records.
 
     Attributes:
-        whole_run: True if whole runs were executed and bits compared; False if single ticks
-            were executed and numbers compared to 1e-9.
-        coverage: per site the number of judged ticks and the number of ticks of the run.
-        min_coverage: smallest share of the ticks of every site that must be judged.
-        integrity: whether the log is as it was written.
-        records: records that were looked at.
-        identical: records that agree with the execution in every computed field.
-        unjudged: records after gaps that could not be judged.
-        differing: records that differ from the execution.
-        first: the difference at the earliest tick.
-        gaps: ranges of missing ticks, as (site, first, last).
-        absences: ranges of ticks between two starts of a site, which the site did not execute,
+        whole_run: True if whole runs were executed, and bits were compared. False if single
+            ticks were executed, and numbers were compared within a tolerance.
+        coverage: For each site, the number of judged ticks and the number of ticks of the run.
+        min_coverage: Smallest fraction of the ticks of every site that must be judged.
+        integrity: Whether the log is unchanged since it was written.
+        records: Records that were examined.
+        identical: Records in which every computed field agrees with the execution.
+        unjudged: Records after gaps that could not be judged.
+        differing: Records that differ from the execution.
+        first: Difference in the earliest tick. None if there is no difference.
+        gaps: Ranges of missing ticks, as (site, first, last).
+        absences: Ranges of ticks that a site did not execute because it had left the session,
             as (site, first, last).
-        withheld: sites that were not executed, because their law may not run. All other
-            numbers cover only the other sites.
+        withheld: Names of the sites that were not executed, because their control law may not
+            run. They are not included in the other numbers.
     """
 
     whole_run: bool
@@ -231,17 +248,17 @@ class VerifyResult:
 
     @property
     def agreed(self) -> bool:
-        """True if no judged record differs, even if few records were judged."""
+        """True if no judged record differs, no matter how few records were judged."""
         return self.first is None
 
     @property
     def passed(self) -> bool:
-        """True if the log agrees with its execution, is covered enough, and is as written."""
+        """True if the log agrees with the execution, is unchanged, and was judged enough."""
         enough = not self.withheld and self.coverage.share >= self.min_coverage
         return self.agreed and enough and self.integrity.passed
 
     def add(self, other: "VerifyResult") -> None:
-        """Adds the result of other sites, which were executed from another log."""
+        """Adds the result for other sites, which were executed from another log."""
         self.records += other.records
         self.identical += other.identical
         self.unjudged += other.unjudged
@@ -258,11 +275,12 @@ class VerifyResult:
             self.integrity = other.integrity
 
     def add_difference(self, difference: RecordDifference) -> None:
-        """Counts a record that differs."""
+        """Counts a record that differs, and keeps the difference if it is the earliest one."""
         self.differing += 1
         self._keep_first(difference)
 
     def _keep_first(self, difference: RecordDifference | None) -> None:
+        """Keeps a difference if it is in the earliest tick so far."""
         if difference is not None and (self.first is None or difference.tick < self.first.tick):
             self.first = difference
 
@@ -272,21 +290,23 @@ PROGRESS_EVERY = 256
 
 
 class SiteVerifier:
-    """Executes one site from its records and compares each record with the execution.
+    """Executes one site from its records, and compares each record with the execution.
 
-    The state of the executed site is certain while it follows from the records before. It
-    becomes uncertain at a gap, and when the site uses a sample that the log lacks; two
-    consecutive records make it certain again. Arrivals inside a gap are unknown: samples that
-    no record lists are assumed to have arrived there. While such a sample is in use, a
-    difference counts as unjudged. The same holds for a sample that arrived and whose own record
-    is missing.
+    The state of the executed site is certain as long as it follows from the records before. It
+    becomes uncertain at a gap of the log, and if the site uses a sample that the log does not
+    contain. Two consecutive records make it certain again.
+
+    The arrivals during a gap are not known. Samples that no record lists may have arrived
+    there, so this is assumed. While such a sample is in use, a difference is not counted as a
+    difference, but the record as unjudged. The same holds for a sample that arrived, but whose
+    own record is missing.
 
     Args:
-        log: the log.
-        site: name of the site.
-        by_tick: the records of all sites, by site and tick.
-        result: receives the counts and differences.
-        resume_every: see `verify`.
+        log: The log.
+        site: Name of the site.
+        by_tick: Records of all sites, by site and tick.
+        result: Receives the counts and differences.
+        resume_every: See `verify`.
     """
 
     def __init__(
@@ -304,16 +324,18 @@ class SiteVerifier:
         self._channel = setup.channel
         self._site = Site(setup)
         self._external = site in log.scenario.external
-        # a site that glides holds by a reference of its own, unless its law reflects forces
+        # Under the stale rule "glide", the reference of a holding site does not depend on the
+        # peers, unless its law reflects forces.
         reflects = setup.law_factory is not None or any(setup.gains.k_f)
         self._detached = setup.on_stale.action is StaleAction.GLIDE and not reflects
         self._starts = {boot: first for first, boot in log.starts.get(site, ())}
         self._absences = {last + 1: first for first, last in log.absences.get(site, ())}
         self._last_tick = log.last_ticks[site]
         self._boot: int | None = None
-        self._start_row = 0  # row of the first record of the present start of the site
+        # Row of the first record, first tick and applied changes of the current start (boot).
+        self._start_row = 0
         self._start_tick = 0
-        self._applied: list[CoreChange] = []  # changes since that start
+        self._applied: list[CoreChange] = []
         self._resume_every = resume_every
         self._equal = equal_bits if result.whole_run else equal_to_tolerance
         self._certain = True
@@ -330,7 +352,8 @@ class SiteVerifier:
         """Executes every record of the site.
 
         Args:
-            report: called now and then with the number of records of all sites so far.
+            report: Function that is called now and then with the number of records of all sites
+                so far.
         """
         result = self._result
         name = self._log.name
@@ -340,11 +363,14 @@ class SiteVerifier:
             if report is not None and row % PROGRESS_EVERY == 0:
                 report(result.records)
             result.records += 1
+
+            # The tick of the previous record is repeated.
             if state.tick == next_tick - 1 and state.boot not in self._starts:
                 result.add_difference(
                     self._make_difference(state, "tick", state.tick, next_tick)
                 )
                 continue
+
             is_other_boot = state.boot != self._boot and state.boot in self._starts
             if self._boot is None or is_other_boot:
                 next_tick = self._change_start(row, next_tick)
@@ -353,12 +379,18 @@ class SiteVerifier:
                 self._certain = False
             next_tick = state.tick + 1
             self._execute_record(row, state)
+
         result.coverage.judged[name] = result.records - result.unjudged - judged_before
         if next_tick <= self._last_tick:
             result.gaps.append((name, next_tick, self._last_tick))
 
     def _execute_record(self, row: int, state: State) -> None:
-        """Executes a record if the state of the site is certain, and counts the record."""
+        """Executes the tick of a record if the site's state is certain, and counts the record.
+
+        Args:
+            row: Row of the record.
+            state: The record.
+        """
         result = self._result
         try:
             if self._resume_every and state.tick % self._resume_every == 0:
@@ -388,20 +420,24 @@ class SiteVerifier:
             result.add_difference(difference)
 
     def _can_resume(self, row: int) -> bool:
-        """True if the records before a record suffice to restore the state of the site."""
+        """True if the records before a row suffice to restore the state of the site."""
         if self._law_failed or row - 2 < self._start_row:
             return False
         return self._inputs.can_resume(row, detached=self._detached)
 
     def _change_start(self, row: int, next_tick: int) -> int:
-        """Changes to the start of the site that sent a record.
+        """Continues with another start (boot) of the site, to which a record belongs.
+
+        A site that left the session and returned has several starts. The ticks between two
+        starts are absences or gaps.
 
         Args:
-            row: row of the record.
-            next_tick: the tick expected next.
+            row: Row of the record.
+            next_tick: Tick that was expected next.
 
         Returns:
-            The tick expected next: the first tick of the start, if the log states that tick.
+            Tick that is expected next. It is the first tick of the start, if the log states
+            this tick.
         """
         name = self._log.name
         self._boot = self._log.states[row].boot
@@ -409,12 +445,16 @@ class SiteVerifier:
         first = self._starts.get(self._boot)
         if first is None or first < next_tick:
             return next_tick
-        absent = max(self._absences.get(first, first), next_tick)
-        if next_tick < absent:
-            self._result.gaps.append((name, next_tick, absent - 1))
-        if absent < first:
-            self._result.absences.append((name, absent, first - 1))
-        self._inputs.pop_changes(first - 1)  # these concern the start before
+
+        # The ticks before the absence are missing from the log.
+        first_absent = max(self._absences.get(first, first), next_tick)
+        if next_tick < first_absent:
+            self._result.gaps.append((name, next_tick, first_absent - 1))
+        if first_absent < first:
+            self._result.absences.append((name, first_absent, first - 1))
+
+        # The remaining changes before this tick concern the previous start.
+        self._inputs.pop_changes(first - 1)
         self._applied.clear()
         self._site = Site(self._setup)
         self._site.start_at(first)
@@ -423,9 +463,14 @@ class SiteVerifier:
         return first
 
     def _replace_site(self, row: int, state: State) -> None:
-        """Replaces the site by a new site that is restored from the records before a record.
+        """Replaces the site by a new one that is restored from the two records before a row.
 
-        State that a law keeps besides its `memory` is lost by that, so the log shows it.
+        A law must keep all its state in its `memory`, which the records contain. Other state is
+        lost by the replacement, so that the following records differ and the fault is found.
+
+        Args:
+            row: Row of the next record.
+            state: The next record.
         """
         if not self._certain or not self._can_resume(row):
             return
@@ -439,12 +484,16 @@ class SiteVerifier:
     def _make_difference(
         self, state: State, field: str, logged: Any, computed: Any
     ) -> RecordDifference:
+        """Returns a difference of a field of a record."""
         return RecordDifference(
             site=state.site, tick=state.tick, field=field, logged=logged, computed=computed
         )
 
     def _find_other_sender(self, state: State) -> RecordDifference | None:
-        """Returns the difference if a record is of another start or site; else None."""
+        """Returns the difference if a record belongs to another start or site.
+
+        None if it does not.
+        """
         name = self._log.name
         if state.boot != self._boot:
             difference = self._make_difference(state, "boot", state.boot, self._boot)
@@ -454,16 +503,24 @@ class SiteVerifier:
         return None
 
     def _verify_record(self, row: int, state: State) -> None:
-        """Executes the tick of a record and compares the record with the execution."""
+        """Executes the tick of a record, and compares the record with the execution.
+
+        Args:
+            row: Row of the record.
+            state: The record.
+        """
         result = self._result
         states = self._log.states
         peers = self._log.peers
         difference = self._find_other_sender(state)
+
+        # On another platform, each tick is computed from the two records before it.
         follows_two = row - 2 >= self._start_row and states[row - 2].tick == state.tick - 2
         if follows_two and not result.whole_run:
             before = read_output(states[row - 2], peers)
             last = read_output(states[row - 1], peers)
             self._site.restore_state(before, last)
+
         arrivals, missing = self._inputs.find_arrivals(state.rx)
         invalid_arrival = None
         if missing:
@@ -471,6 +528,7 @@ class SiteVerifier:
             arrivals, missing = self._inputs.find_arrivals(entries)
             self._inputs.add_lacking(missing)
         changes, invalid_change = self._parse_changes(state.tick)
+
         plant_state = None
         if self._external:
             plant_state = PlantState(state.q, state.qd, state.tau_x, state.bodies)
@@ -482,8 +540,10 @@ class SiteVerifier:
             hand=state.hand,
         )
         output = self._site.step(tick_input)
-        if missing:  # the CRC of a sample that the log lacks cannot be checked
+        if missing:
+            # The checksum includes samples that the log lacks, so it cannot be checked.
             output = output._replace(rx_crc=state.rx_crc)
+
         difference = invalid_change or invalid_arrival or difference
         if difference is None and not equal_record(state, output, peers):
             difference = find_first_difference(
@@ -503,11 +563,11 @@ class SiteVerifier:
             result.add_difference(difference)
 
     def _parse_changes(self, tick: int) -> tuple[list[CoreChange], RecordDifference | None]:
-        """Returns the changes up to a tick that were not executed yet.
+        """Returns the changes up to a tick that have not been executed yet.
 
         Returns:
-            The changes before the first invalid change, and the difference of that change, if
-            there is an invalid change.
+            The changes before the first invalid one, and the difference that reports the
+            invalid one. None in place of the difference if all changes are valid.
         """
         changes: list[CoreChange] = []
         for change_tick, text in self._inputs.pop_changes(tick):
@@ -528,11 +588,14 @@ class SiteVerifier:
     def _check_arrivals(
         self, state: State
     ) -> tuple[Sequence[ArrivalEntry], RecordDifference | None]:
-        """Returns the arrivals of a record that are possible.
+        """Returns the possible arrivals of a record.
+
+        An arrival is impossible if there is no such peer, or if the peer never executed such a
+        tick.
 
         Returns:
-            The arrivals before the first impossible arrival, and the difference of that
-            arrival, if there is an impossible arrival.
+            The arrivals before the first impossible one, and the difference that reports it.
+            None in place of the difference if all arrivals are possible.
         """
         samples = self._inputs.samples
         ends = self._inputs.ends
@@ -554,22 +617,25 @@ def verify(
     min_coverage: float = MIN_COVERAGE,
     resume_every: int = 0,
 ) -> VerifyResult:
-    """Executes every site of a log again and compares the records with the execution.
+    """Executes every site of a log again, and compares the records with the execution.
 
-    The recorded sites of an open-loop rerun are compared with the log of which the rerun was
-    made, and are executed from that log, if that log is beside this log.
+    In an open-loop rerun, some sites were executed with changed settings, and the records of
+    the others were copied from a source log. The copied records are compared with the source
+    log, and these sites are executed from the source log. This requires that the source log is
+    in the same folder.
 
     Args:
-        log: the log.
-        progress: called now and then with the number of executed records and their total.
-        min_coverage: smallest share of the ticks of every site that must be judged.
-        resume_every: at every tick divisible by this number the site is replaced by a new site
-            that is restored from the records, which reveals state that a law keeps besides its
-            `memory`; 0: never.
+        log: The log.
+        progress: Function that is called now and then with the number of executed records and
+            their total.
+        min_coverage: Smallest fraction of the ticks of every site that must be judged.
+        resume_every: In every tick that is divisible by this number, the site is replaced by a
+            new one that is restored from the records. This reveals state that a law keeps
+            outside of its `memory`. 0 means never.
 
     Raises:
-        LogError: a record cannot be read.
-        ScenarioError: a user law that may run cannot be constructed.
+        LogError: A record cannot be read.
+        ScenarioError: A user's control law that may run cannot be created.
     """
     result = _make_result(log, min_coverage)
     with process.pause_gc():
@@ -579,19 +645,21 @@ def verify(
         _execute_sites(
             log=log, sites=sites, result=result, report=report, resume_every=resume_every
         )
-        others = [name for name in log.sites if name not in sites]
-        source = open_rerun_source(log) if others else None
+
+        copied_sites = [name for name in log.sites if name not in sites]
+        source = open_rerun_source(log) if copied_sites else None
         if source is not None:
-            for name in others:
+            for name in copied_sites:
                 _compare_with_source(log[name], source[name], result)
             source_result = _make_result(source, min_coverage)
-            source_sites = [name for name in source.executed_sites if name in others]
+            source_sites = [name for name in source.executed_sites if name in copied_sites]
             _execute_sites(source, source_sites, source_result)
             result.add(source_result)
     return result
 
 
 def _make_result(log: Log, min_coverage: float) -> VerifyResult:
+    """Returns an empty result for a log. The integrity of the log is already judged."""
     return VerifyResult(
         whole_run=log.session.get("fingerprint") == compute_fingerprint(),
         coverage=Coverage({}, {site: log.expected_ticks(site) for site in log.sites}),
@@ -607,12 +675,24 @@ def _execute_sites(
     report: Callable[[int], None] | None = None,
     resume_every: int = 0,
 ) -> None:
+    """Executes some sites of a log, and adds the counts and differences to a result.
+
+    Sites whose control law may not run are left out.
+
+    Args:
+        log: The log.
+        sites: Names of the sites.
+        result: Receives the counts and differences.
+        report: Function that is called now and then with the number of records so far.
+        resume_every: See `verify`.
+    """
     by_tick = {name: log[name].by_tick for name in log.sites}
     withheld_laws = [law for law in find_user_laws(log.scenario) if not law.allowed]
     withheld = [name for law in withheld_laws for name in law.sites if name in sites]
     result.withheld += withheld
     for name in withheld:
         result.coverage.expected.pop(name, None)
+
     for name in sites:
         if name in withheld:
             continue
@@ -623,7 +703,13 @@ def _execute_sites(
 
 
 def _compare_with_source(recorded: SiteLog, source: SiteLog, result: VerifyResult) -> None:
-    """Adds the first difference between a recorded site of a rerun and its source log."""
+    """Adds the first difference between copied records and those of the source log.
+
+    Args:
+        recorded: Records of the site in the rerun.
+        source: Records of the site in the source log.
+        result: Receives the difference.
+    """
     if recorded.payloads == source.payloads:
         return
     for copied, original in zip_longest(recorded.states, source.states):
@@ -643,11 +729,10 @@ def _compare_with_source(recorded: SiteLog, source: SiteLog, result: VerifyResul
 
 
 def open_rerun_source(log: Log) -> Log | None:
-    """Returns the log of which a rerun was made.
+    """Opens the source log of a rerun, if it is in the same folder as the rerun.
 
     Returns:
-        The log in the folder of the rerun, if its files have the names and digests that the
-        rerun states; else None.
+        The log. None if its files are missing, or do not have the hashes that the rerun states.
     """
     names = log.session.get("rerun_of", "").split()
     digests = log.session.get("rerun_of_sha256", "").split()

@@ -99,8 +99,8 @@ class RecordedNetwork:
         self._schedule = schedule
         self._peers = peers
         self._sent: dict[tuple[str, int], TickRecord] = {}
-        # For each receiver, the tick that `is_ready` checked last, and the number of its arrivals
-        # that had been sent then, which need not be checked again.
+        # For each receiver, the tick that `is_ready` checked last, and the number of arrivals
+        # that had been sent then. These need not be checked again.
         self._checked = dict.fromkeys(schedule, (0, 0))
 
     def send(self, sender: str, output: TickRecord) -> None:
