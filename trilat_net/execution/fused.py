@@ -1,17 +1,18 @@
-"""Runs of all sites of a scenario in one compiled loop, without a log.
+"""Executes runs of all sites of a scenario in one compiled loop, without writing a log.
 
-The loop runs at about 1000 times real time. In place of records it keeps the peaks of every
-50 ms, and sums over the run.
+The loop runs about 1000 times faster than real time. In place of records, it stores the largest
+values of every interval of 50 ms, and sums over the run. It is used for parameter studies and
+for twins: repeated runs with a small disturbance.
 
 Invariant:
-    - The result equals that of `execution.virtual` with its default network, bit for bit.
-      Scenarios that the compiled loop cannot run are refused.
+    - The results equal those of `execution.virtual` with its default network, bit for bit.
+      Scenarios that the compiled loop cannot execute are refused.
     - A run with the inputs of a log equals the recorded run, bit for bit. A sample that arrived
-      before its own stamp is delivered at the first tick after the stamp, because no sample is
-      in use earlier (L2).
+      before its own time stamp (the clocks of two computers may differ) is delivered in the
+      first tick after the stamp, because it is not used earlier (L2).
     - `FusedRun.scale_difference` mixes only the floating-point numbers of two states. Counters,
-      times and modes become those of the other run, and numbers that are equal in both runs
-      keep their bits.
+      times and modes are copied from the other run. Numbers that are equal in both runs keep
+      their bits.
 """
 
 import math
@@ -54,7 +55,10 @@ from ..scenario.validate import refuse_external_arms
 
 
 def _mark_floats(dtype: np.dtype[np.generic]) -> NDArray[np.bool_]:
-    """Returns, for each eight bytes of a data type, True if they are a float."""
+    """Returns, for each eight bytes of a data type, whether they are a floating-point number.
+
+    The fields of all data types of the kernel are multiples of eight bytes.
+    """
     if dtype.fields is None:
         return np.full(max(1, dtype.itemsize // 8), dtype.base.kind == "f")
     is_float = np.zeros(dtype.itemsize // 8, dtype=bool)
@@ -66,10 +70,13 @@ def _mark_floats(dtype: np.dtype[np.generic]) -> NDArray[np.bool_]:
 
 
 class RunState:
-    """The arrays that a run changes, as 64-bit integers in the memory of the run.
+    """All arrays that change during a run, viewed as 64-bit integers.
+
+    The views share the memory of the run, so that a change of the state changes the run.
+    Integers are used because equal integers mean equal bits.
 
     Args:
-        arrays: the arrays.
+        arrays: The arrays.
     """
 
     def __init__(self, arrays: Sequence[NDArray[np.generic]]) -> None:
@@ -79,26 +86,28 @@ class RunState:
             if not array.size:
                 continue
             flat = array.reshape(-1).view(np.int64)
-            # changes of a copy would not reach the run
+            # If `reshape` had made a copy, changes would not reach the run.
             assert np.shares_memory(flat, array)
             self._bits.append(flat)
             self._floats.append(np.tile(_mark_floats(array.dtype), array.size))
 
     def scale_difference(self, other: "RunState", factor: float) -> None:
-        """Multiplies the difference to another state of the same scenario by a factor.
+        """Multiplies the difference from another state of the same scenario by a factor.
 
-        The state becomes other + factor (state - other). With factor 0 it gets the bits of the
-        other state. Numbers that would not be finite become those of the other state.
+        The state becomes other + factor (state - other). With the factor 0, it is an exact copy
+        of the other state. Numbers that would not be finite are copied from the other state.
 
         Args:
-            other: the other state.
-            factor: the factor.
+            other: The other state.
+            factor: The factor.
         """
         arrays = zip(self._bits, other._bits, self._floats, strict=True)
         for bits, other_bits, is_float in arrays:
             if factor == 0.0:
                 bits[:] = other_bits
                 continue
+
+            # Only numbers that differ are computed. Rounding would change the others.
             changed = np.flatnonzero((bits != other_bits) & is_float)
             x = bits.view(np.float64)[changed]
             y = other_bits.view(np.float64)[changed]
@@ -108,15 +117,15 @@ class RunState:
 
 
 def check_fusable(scenario: Scenario, plants: Collection[str] = ()) -> None:
-    """Checks that the compiled loop can run a scenario.
+    """Checks that the compiled loop can execute a scenario.
 
     Args:
-        scenario: the scenario.
-        plants: names of the sites whose external arm is moved by a plant.
+        scenario: The scenario.
+        plants: Names of the sites whose external arms are moved by users' programs.
 
     Raises:
-        ScenarioError: another arm is external, or one site is so much slower than another site
-            that too many samples would arrive in one of its ticks.
+        ScenarioError: Another arm is external, or the tick rates differ so much that too many
+            samples would arrive in one tick of the slowest site.
     """
     refuse_external_arms(scenario, plants)
     ratio = _find_largest_ratio(scenario)
@@ -136,18 +145,18 @@ def _find_largest_ratio(scenario: Scenario) -> int:
 
 
 class HandActor(Protocol):
-    """A live hand in a compiled run."""
+    """Interface of a live operator, who moves an arm, in a compiled run."""
 
     def compute_actions(self, k: int, end: int, arrays: SiteArrays) -> Array:
-        """Returns the actions of the hand from tick `k` until it has to see the arm again.
+        """Returns the operator's actions from tick `k` until the arm's state is needed again.
 
         Args:
-            k: the first tick.
-            end: the tick before which the actions end in any case.
-            arrays: the arrays of the site before tick `k`.
+            k: First tick.
+            end: Tick before which the actions end at the latest.
+            arrays: State of the site before tick `k`.
 
         Returns:
-            The actions, a row per tick, as `HandInForce`.
+            A row per tick, with the numbers of `HandInForce`.
         """
 
 
@@ -155,11 +164,12 @@ class RunTotals(NamedTuple):
     """Figures of a whole run.
 
     Attributes:
-        rms_error_rad: RMS of e of the worst joint of all sites, rad.
-        effort_nm: RMS over sites and joints of tau - G(q), the torque beyond the torque against
-            gravity, N m.
-        force_peak_n: largest force of a wall, N; None without a wall.
-        walls_j: work of the environments on the arms, J; None without an environment.
+        rms_error_rad: Root mean square of the synchronisation error e, for the joint of all
+            sites with the largest value, in rad.
+        effort_nm: Root mean square over sites and joints of tau - G(q), the torque without the
+            part that compensates gravity, in N m.
+        force_peak_n: Largest force of a wall, in N. None if there is no wall.
+        walls_j: Work of the environments on the arms, in J. None if there is no environment.
     """
 
     rms_error_rad: float
@@ -169,14 +179,14 @@ class RunTotals(NamedTuple):
 
 
 class RunInputs(NamedTuple):
-    """The inputs of a recorded run, for a run that has to equal it.
+    """Inputs of a recorded run, with which the run can be repeated.
 
     Attributes:
-        feed: arrivals of samples, and actions of live hands.
-        changes: changes during the run in order of time, as (tick before which the site applies
-            the change, index of the site, change).
-        late_ns: largest time from the stamp of a sample to its arrival, ns.
-        longest_us: longest delay that a change gave to a link, us.
+        feed: Arrivals of samples, and actions of live operators.
+        changes: Changes during the run in the order of time, as (tick before which the site
+            applies the change, index of the site, change).
+        late_ns: Largest time from the stamp of a sample to its arrival, in ns.
+        longest_us: Longest delay that a change gave to a link, in us.
     """
 
     feed: ReplayedInputs
@@ -186,10 +196,10 @@ class RunInputs(NamedTuple):
 
 
 def make_prompt_inputs(sites: int) -> RunInputs:
-    """Returns the inputs of a run with prompt samples and without live hands.
+    """Returns the inputs of a run in which samples arrive at once, and no live operator acts.
 
     Args:
-        sites: number of sites.
+        sites: Number of sites.
     """
     feed = ReplayedInputs(
         first=np.zeros((sites, max(sites - 1, 1), 0), np.int64),
@@ -201,26 +211,29 @@ def make_prompt_inputs(sites: int) -> RunInputs:
 
 
 class FusedRun:
-    """A run of all sites of a scenario in a compiled loop.
+    """Run of all sites of a scenario in a compiled loop.
 
-    Compiled laws run in the loop. Laws in plain Python are called between its stages, tick by
-    tick. The loop pauses before the ticks at which a hand has to see its arm, and after every
-    tick of a site whose arm is moved by a plant.
+    Compiled control laws are executed in the loop. Laws in plain Python are called between the
+    stages of a tick. The loop also pauses before each tick for which an operator's program
+    needs the state of the arm, and after each tick of a site whose arm is moved by a user's
+    program.
 
     Args:
-        scenario: the scenario.
-        settled_rad: a site is settled while its |e| is smaller than this, rad.
-        keep: number of last records of each site that are kept for `pop_records`.
-        inputs: inputs of a recorded run, which is executed again; hands then do not act.
-        hands: live hands by site, in place of those that the scenario names as programs.
-        plants: plants that move external arms, by site.
+        scenario: The scenario.
+        settled_rad: A site counts as settled while |e| of all joints is below this limit, in
+            rad.
+        keep: Number of recent records of each site that are stored for `pop_records`.
+        inputs: Inputs of a recorded run that is repeated. The scenario's programs then do not
+            act as operators, because their actions are part of the inputs.
+        hands: Live operators by site. They replace the programs that the scenario names.
+        plants: Users' programs that move external arms, by site.
 
     Attributes:
-        ran_s: time up to which `advance_to` has executed the run, s.
+        ran_s: Time up to which `advance_to` has executed the run, in s.
 
     Raises:
-        ScenarioError: the loop cannot run the scenario, see `check_fusable`, or a law cannot be
-            constructed.
+        ScenarioError: The loop cannot execute the scenario, see `check_fusable`, or a law
+            cannot be created.
     """
 
     def __init__(
@@ -258,24 +271,27 @@ class FusedRun:
         joints = max(max(layout.joints, layout.shared) for layout in self._layouts)
         self._peaks = np.full((count, 0, 3 * joints), -1.0)
         self._sums: RowArray = np.zeros(count, sums_dtype(joints))
-        # the torque sources of a site are its hands, then its environment
+        # The torque sources of a site are its operators, followed by its environment.
         self._sums["first_environment"] = [
             len(spec.hands) if spec.environment else -1 for spec in scenario.sites.values()
         ]
         self._plants = {i: plants[name] for i, name in enumerate(names) if name in plants}
         self._torque_columns = {i: self._layouts[i].columns()["tau"] for i in self._plants}
-        # By site: the first tick that `pop_records` has not returned yet, the tick after the
-        # last action of the hand, and the tick of the plant.
+        # For each site: the first tick that `pop_records` has not returned yet, the tick after
+        # the last action of the operator, and the tick up to which the plant has moved.
         self._popped_ticks = [0] * count
         self._action_ends: dict[int, int] = {}
         self._plant_ticks = dict.fromkeys(self._plants, 0)
         self._selected: dict[int, SiteArrays] = {}
 
     def _allocate_records(self, keep: int) -> RecentRecords:
-        """Returns memory for the last records of every site; their number is a power of two.
+        """Allocates memory for the recent records of every site.
 
-        Records are kept for `pop_records`, until the slowest peer has received them, and until
-        the latest sample of a recorded run has arrived.
+        A record must be stored until `pop_records` returns it, until the slowest peer has
+        received it, and, in a repeated run, until the latest sample has arrived.
+
+        Returns:
+            Arrays for as many records per site as are needed, rounded up to a power of two.
         """
         count = len(self._layouts)
         fastest_hz = int(self._progress["rate_hz"].max())
@@ -291,7 +307,12 @@ class FusedRun:
     def _connect_hands(
         self, hands: Mapping[str, HandActor], setups: Sequence[SiteSetup]
     ) -> None:
-        """Connects live hands to their sites and prepares the feed for their actions."""
+        """Connects live operators to their sites, and allocates memory for their actions.
+
+        Args:
+            hands: Live operators, by site.
+            setups: Setups of the sites.
+        """
         rows = [-1] * len(setups)
         sizes = []
         for i, setup in enumerate(setups):
@@ -307,7 +328,7 @@ class FusedRun:
         self._inputs = self._inputs._replace(feed=feed)
 
     def _plug_laws(self, setups: Sequence[SiteSetup]) -> None:
-        """Constructs the user laws of all sites and connects them to the arrays of the run."""
+        """Creates the users' control laws, and connects them to the arrays of the run."""
         self._laws: dict[int, PlainLaw | CompiledLaw] = {}
         self._law_arrays: LawArrays | None = None
         if self._tables.channel is None:
@@ -321,6 +342,8 @@ class FusedRun:
                 law = setup.law_factory(setup.law_context())
                 channel = sent[i, : setup.channel.record_size]
                 self._laws[i] = plug_law(law, setup, arrays, channel)
+
+        # The loop calls a compiled law by its address, with its numbers as a row of one array.
         compiled = {i: law for i, law in self._laws.items() if isinstance(law, CompiledLaw)}
         addresses = np.zeros(count, dtype=np.int64)
         row_size = max((len(law.row) for law in compiled.values()), default=0)
@@ -332,15 +355,15 @@ class FusedRun:
         self._law_arrays = LawArrays(addresses, rows, sent)
 
     def step_to(self, last_ns: int) -> None:
-        """Executes the planned ticks up to a time, and applies the changes before that time.
+        """Executes the planned ticks up to a time, and applies the changes up to that time.
 
-        A diverged run stays as it is.
+        Nothing happens if a site has diverged.
 
         Args:
-            last_ns: the time, ns since the epoch.
+            last_ns: The time, in ns after the epoch.
 
         Raises:
-            LawFailed: a plugged law failed.
+            LawFailed: A user's control law failed.
         """
         rates_hz = [int(progress["rate_hz"]) for progress in self._progress]
         while self._changes and self.diverged_s is None:
@@ -355,9 +378,12 @@ class FusedRun:
             self._step_until(last_ns)
 
     def _step_until(self, last_ns: int) -> None:
-        """Executes the planned ticks up to a time, in pieces between actions of programs.
+        """Executes the planned ticks up to a time, in pieces between the calls of programs.
 
-        Within a piece no hand has to see its arm and no plant moves.
+        Within a piece, no operator's program needs the state of an arm, and no plant moves.
+
+        Args:
+            last_ns: The time, in ns after the epoch.
         """
         while self.has_programs and self.diverged_s is None:
             pauses_ns = [self._request_actions(i) for i in self._hands]
@@ -371,13 +397,13 @@ class FusedRun:
             self._move_plant(i)
 
     def _move_plant(self, i: int) -> int:
-        """Moves the plant of a site on to the site's next tick.
+        """Moves the plant of a site up to its next tick, and copies the state of the arm.
 
         Args:
-            i: index of the site.
+            i: Index of the site.
 
         Returns:
-            The time of the tick after that tick, ns, at which the plant has to move again.
+            Time at which the plant must move again, in ns. `NEVER_NS` after the last tick.
         """
         k = int(self._progress[i]["tick"])
         plant = self._plants[i]
@@ -389,19 +415,20 @@ class FusedRun:
         site = self.arrays(i).site[0]
         site["q"][:joints] = plant.state.q
         site["qd"][:joints] = plant.state.qd
+        # A plant that does not know the torque of contacts returns an empty tau_x.
         site["sensed"][:joints] = [-torque for torque in plant.state.tau_x] or 0.0
         if self._progress[i]["t_ns"] == NEVER_NS:
             return NEVER_NS
         return tick_ns(k + 1, plant.rate_hz)
 
     def _request_actions(self, i: int) -> int:
-        """Requests the next actions of a hand, if its site has executed the actions before.
+        """Requests the next actions of an operator, if the site has executed the previous ones.
 
         Args:
-            i: index of the site.
+            i: Index of the site.
 
         Returns:
-            The time at which the hand has to see its arm again, ns.
+            Time at which the operator needs the state of the arm again, in ns.
         """
         progress = self._progress[i]
         if progress["t_ns"] == NEVER_NS:
@@ -415,7 +442,14 @@ class FusedRun:
         return tick_ns(self._action_ends[i], int(progress["rate_hz"]))
 
     def _step_piece(self, last_ns: int) -> None:
-        """Executes the planned ticks up to a time, ns, without a pause for programs."""
+        """Executes the planned ticks up to a time, without calling operators or plants.
+
+        Args:
+            last_ns: The time, in ns after the epoch.
+
+        Raises:
+            LawFailed: A user's control law failed.
+        """
         compiled = [law for law in self._laws.values() if isinstance(law, CompiledLaw)]
         try:
             if len(compiled) < len(self._laws):
@@ -437,12 +471,16 @@ class FusedRun:
         except LawFailed:
             raise
         except Exception as error:
-            # any error that a compiled law raises
+            # A compiled law may raise any error. The laws know whether it is theirs.
             failures = [law.find_failure(error) for law in compiled]
             raise next(filter(None, failures), error) from None
 
     def _run_plain_until(self, last_ns: int) -> None:
-        """Executes ticks as `run_until` does, and calls plain laws between the stages."""
+        """Executes ticks as `run_until` does, calling laws in plain Python between the stages.
+
+        Args:
+            last_ns: Time of the last tick, in ns after the epoch.
+        """
         progress = self._progress
         tables = self._tables
         while True:
@@ -475,13 +513,14 @@ class FusedRun:
                     laws=self._law_arrays,
                 )
                 if mode == Mode.DIVERGED:
+                    # The other ticks of this time are still executed.
                     progress[i]["diverged_ns"] = t_ns
                     last_ns = t_ns
 
     def advance_to(self, until_s: float) -> None:
-        """Continues the run to the end of a scenario of `until_s` seconds.
+        """Continues the run to the end of a scenario with a duration of `until_s` seconds.
 
-        A diverged run stays as it is.
+        Nothing happens if a site has diverged, or if the run is already that far.
         """
         if until_s <= self.ran_s or self.diverged_s is not None:
             return
@@ -491,7 +530,11 @@ class FusedRun:
         self.ran_s = until_s if self.diverged_s is None else self.diverged_s
 
     def plan(self, ticks: Sequence[int]) -> None:
-        """Sets the total number of ticks that each site executes, and makes room for them."""
+        """Sets the total number of ticks of each site, and allocates memory for them.
+
+        Args:
+            ticks: Number of ticks of each site.
+        """
         progress: Row
         for progress, count in zip(self._progress, ticks, strict=True):
             progress.ticks = count
@@ -511,7 +554,7 @@ class FusedRun:
 
     @cached_property
     def _state(self) -> RunState:
-        """The arrays of the run that change while it is executed."""
+        """All arrays of the run that change while it is executed."""
         tables = self._tables
         arrays = [self._progress, self._next_samples, *self._sent, self._sums]
         arrays += [array for array in tables if isinstance(array, np.ndarray)]
@@ -523,22 +566,22 @@ class FusedRun:
 
     @property
     def has_programs(self) -> bool:
-        """True if hands or plants that are programs act in the run."""
+        """True if operators or plants in the run are programs."""
         return bool(self._hands or self._plants)
 
     def copy_state(self, other: "FusedRun") -> None:
-        """Copies the state of another run of the same scenario with the same planned ticks."""
+        """Copies the state of another run of the same scenario, with the same planned ticks."""
         self.scale_difference(other, 0.0)
 
     def scale_difference(self, other: "FusedRun", factor: float) -> None:
-        """Multiplies the difference to another run of the same scenario by a factor.
+        """Multiplies the difference from another run of the same scenario by a factor.
 
-        The state becomes other + factor (state - other), see `RunState.scale_difference`. The
-        runs have no programs, because the state of a program is unknown.
+        The state becomes other + factor (state - other), see `RunState.scale_difference`. This
+        is not possible if operators or plants are programs, because their state is not known.
 
         Args:
-            other: the other run, at the same time.
-            factor: the factor.
+            other: The other run, at the same time.
+            factor: The factor.
         """
         assert not self.has_programs
         self._state.scale_difference(other._state, factor)
@@ -552,7 +595,10 @@ class FusedRun:
                 law.restore(mixed.tolist())
 
     def arrays(self, i: int) -> SiteArrays:
-        """Returns the arrays of a site before its next tick, for reading only."""
+        """Returns the arrays of a site before its next tick.
+
+        The caller must not change them.
+        """
         if i not in self._selected:
             self._selected[i] = select_site(self._tables, i, self._layouts[i])
         return self._selected[i]
@@ -561,21 +607,22 @@ class FusedRun:
         """Adds offsets to a field of the state of every site.
 
         Args:
-            field: name of the field.
-            offsets: the offsets, shape (N, n).
+            field: Name of the field.
+            offsets: Offsets, with a row per site, shape (N, n).
         """
         self._tables.site[field][:, 0, : offsets.shape[1]] += offsets
 
     def measure_distance(self, other: "FusedRun", field: str) -> float:
-        """Returns the largest difference of a field of the sites' states from another run."""
+        """Returns the largest absolute difference of a field of the state from another run."""
         difference = self._tables.site[field] - other._tables.site[field]
         return float(np.abs(difference).max())
 
     def run_and_sample(self, until_s: float) -> tuple[Array, Array]:
-        """Continues the run to `until_s` and samples its last quarter at 100 times.
+        """Continues the run to the time `until_s`, and samples its last quarter at 100 times.
 
         Returns:
-            q, shape (100, N, n), rad, and theta_hat, shape (100, N, P).
+            Joint angles q in rad, shape (100, N, n), and estimates theta_hat, shape (100, N,
+            P).
         """
         q = []
         theta_hat = []
@@ -587,13 +634,16 @@ class FusedRun:
 
     @property
     def diverged_s(self) -> float | None:
-        """Time at which the first site left its limits, s; None if no site did."""
+        """Time at which the first site left its limits, in s. None if no site did."""
         ends_ns = [int(end_ns) for end_ns in self._progress["diverged_ns"] if end_ns >= 0]
         return min(ends_ns) / NS_PER_S if ends_ns else None
 
     @property
     def settled_s(self) -> float | None:
-        """Time from which every |e| is below `settled_rad`, s; None if never until the end."""
+        """Time from which |e| of all sites stays below `settled_rad`, in s.
+
+        None if the limit is exceeded in the last tick.
+        """
         last_site = int(np.argmax(self._progress["unsettled_ns"]))
         progress: Row = self._progress[last_site]
         if progress.unsettled_ns < 0:
@@ -604,9 +654,10 @@ class FusedRun:
 
     @property
     def buckets(self) -> tuple[Array, ...]:
-        """The peaks of every 50 ms of each site, see `run_until`, shape (buckets, 3 n) each.
+        """Largest values in every interval of 50 ms, for each site, see `run_until`.
 
-        -1 marks a bucket without a record of the site. The last bucket may be incomplete.
+        Each array has the shape (intervals, 3 n). -1 marks an interval without a record of the
+        site. The last interval may be incomplete.
         """
         buckets = []
         for peaks, progress in zip(self._peaks, self._progress, strict=True):
@@ -617,7 +668,10 @@ class FusedRun:
 
     @property
     def maxima(self) -> tuple[Array, ...]:
-        """Largest |e|, rad, and |qd|, rad/s, of each bucket, shape (buckets, 2) each."""
+        """Largest |e| in rad and |qd| in rad/s in each interval, for each site.
+
+        Each array has the shape (intervals, 2).
+        """
         return tuple(map(max_over_joints, self.buckets))
 
     @property
@@ -628,6 +682,7 @@ class FusedRun:
         joints = self._tables.site["joints"][:, 0]
         mean_effort = np.mean(sums["effort"] / (joints * ticks))
         mean_errors = sums["errors"] / ticks[:, None]
+
         force_peak_n = None
         if self._has_wall:
             force_peak_n = float(sums["force_peak_n"].max())
@@ -643,23 +698,23 @@ class FusedRun:
 
     @property
     def _has_wall(self) -> bool:
-        """True if the environment of some site has a wall."""
+        """True if the environment of any site contains a wall."""
         specs = self._scenario.sites.values()
         return any(isinstance(part, Wall) for spec in specs for part in spec.environment)
 
     @property
     def q(self) -> Array:
-        """Joint angles after the last tick, shape (N, n), rad."""
+        """Joint angles after the last tick, in rad, shape (N, n)."""
         return np.array(self._tables.site["q"][:, 0])
 
     @property
     def theta_hat(self) -> Array:
-        """Estimates after the last tick, shape (N, P)."""
+        """Estimated parameters after the last tick, shape (N, P)."""
         return np.array(self._tables.site["theta_hat"][:, 0])
 
     @property
     def memories(self) -> list[Array]:
-        """Memory of each site's user law after the last tick; empty for other laws."""
+        """Memory of each site's user law after the last tick. Empty for built-in laws."""
         memories = []
         for i in range(len(self._progress)):
             law = self._laws.get(i)
@@ -668,16 +723,16 @@ class FusedRun:
 
     @property
     def tau_x(self) -> list[Array]:
-        """The exogenous torque of each site's last record, shape (n,) each, N m."""
+        """Torque from outside in the last record of each site, in N m, shape (n,) each."""
         pairs = zip(self.records, self._layouts, strict=True)
         return [row[layout.columns()["tau_x"]] for row, layout in pairs]
 
     def pop_records(self) -> list[tuple[IntArray, Array]]:
-        """Returns the records of each site since the last call, as far as they are kept.
+        """Returns the records of each site since the last call, as far as they are stored.
 
         Returns:
-            Per site the nominal times, shape (K,), ns, and the records, shape (K, floats), with
-            the columns of `Layout.columns`.
+            For each site, the nominal times in ns, shape (K,), and the records, shape (K,
+            floats), with the columns of `Layout.columns`.
         """
         records = []
         pages = self._sent.t_ns.shape[1]
@@ -693,7 +748,7 @@ class FusedRun:
 
     @property
     def records(self) -> Array:
-        """Last record of each site, with the columns of `Layout.columns`, a row per site."""
+        """Last record of each site, with a row per site and the columns of `Layout.columns`."""
         return np.array([self._last_row(i) for i in range(len(self._progress))])
 
     def _last_row(self, i: int) -> Array:
@@ -705,11 +760,11 @@ class FusedRun:
 
 
 def explain_not_repeatable(log: Log, *, own_laws: bool = False) -> str:
-    """Returns why a run cannot be executed again from its log alone; "" if it can.
+    """Returns the reason why a run cannot be repeated from its log alone. Empty if it can.
 
     Args:
-        log: the log.
-        own_laws: True if laws that are code from outside may run.
+        log: The log.
+        own_laws: True if control laws of users may run.
     """
     scenario = log.scenario
     if scenario.external:
@@ -727,15 +782,19 @@ def explain_not_repeatable(log: Log, *, own_laws: bool = False) -> str:
 
 
 def read_run_inputs(log: Log) -> RunInputs:
-    """Returns the inputs of a run that can be executed again, see `explain_not_repeatable`.
+    """Returns the inputs with which a recorded run can be repeated.
+
+    The run must be repeatable, see `explain_not_repeatable`.
 
     Raises:
-        LogError: the log holds a text that is not a change of the scenario.
+        LogError: The log contains a text that is not a change of the scenario.
     """
     ticks = max(len(log[name]) for name in log.sites)
     changes = _read_changes(log)
     models = [change.model for _, _, change in changes if change.model is not None]
     longest_us = max_delay_us(models, [None] * len(models)) if models else 0
+
+    # In a log of virtual time, all samples arrived at once.
     feed = make_prompt_inputs(len(log.scenario.names)).feed
     late_ns = 0
     if log.driver != "virtual":
@@ -745,7 +804,7 @@ def read_run_inputs(log: Log) -> RunInputs:
 
 
 def _read_changes(log: Log) -> list[tuple[int, int, CoreChange]]:
-    """Returns the changes of all sites in order of time, see `RunInputs`."""
+    """Returns the changes of all sites in the order of time, in the form of `RunInputs`."""
     timed_changes = []
     for i, name in enumerate(log.scenario.names):
         rate_hz = log[name].rate_hz
@@ -757,15 +816,18 @@ def _read_changes(log: Log) -> list[tuple[int, int, CoreChange]]:
 
 
 def _read_arrivals(log: Log, ticks: int) -> tuple[IntArray, IntArray, int]:
-    """Returns the arrivals of a log as a feed has them.
+    """Returns the arrivals of a log in the form of `ReplayedInputs`.
+
+    For each site and peer, the samples are sorted by the tick in which they are delivered. An
+    index states for each tick which sample of this list is the first to be delivered in it.
 
     Args:
-        log: the log.
-        ticks: largest number of ticks of a site.
+        log: The log.
+        ticks: Largest number of ticks of a site.
 
     Returns:
-        `first` and `samples` as in `ReplayedInputs`, and the largest time from the stamp of a
-        sample to its arrival, ns.
+        The index (`first`), the ticks of the samples (`samples`), and the largest time from the
+        stamp of a sample to its arrival, in ns.
     """
     names = log.scenario.names
     most_peers = max(len(names) - 1, 1)
@@ -784,7 +846,7 @@ def _read_arrivals(log: Log, ticks: int) -> tuple[IntArray, IntArray, int]:
             selected = (senders == j) & is_known
             sample_ticks = sent_ticks[selected]
             stamps_ns = sample_ticks * NS_PER_S // log[peer].rate_hz
-            # no sample is in use before the first tick after its stamp (L2)
+            # A sample is not used before the first tick after its stamp (L2).
             earliest = -(-(stamps_ns + 1) * part.rate_hz // NS_PER_S)
             delivery_ticks = np.maximum(arrival_ticks[selected], earliest)
             order = np.argsort(delivery_ticks, kind="stable")
@@ -799,7 +861,13 @@ def _read_arrivals(log: Log, ticks: int) -> tuple[IntArray, IntArray, int]:
 
 
 def _add_hands(feed: ReplayedInputs, log: Log, ticks: int) -> ReplayedInputs:
-    """Returns a feed with the recorded actions of live hands."""
+    """Returns a feed with the recorded actions of live operators.
+
+    Args:
+        feed: The feed.
+        log: The log.
+        ticks: Largest number of ticks of a site.
+    """
     names = log.scenario.names
     setups = [log.scenario.setup(name) for name in names]
     rows = [_find_live_row(setup) for setup in setups]
@@ -814,12 +882,15 @@ def _add_hands(feed: ReplayedInputs, log: Log, ticks: int) -> ReplayedInputs:
 
 
 def _write_actions(feed_actions: Array, k: int, actions: Array) -> None:
-    """Writes actions of a hand into a feed.
+    """Writes actions of an operator into a feed.
+
+    An action contains a target and its rate of change per tick. The feed contains the target
+    and the next target, between which the kernel interpolates.
 
     Args:
-        feed_actions: the actions of one site in a `ReplayedInputs`, shape (K, 1 + 2 size).
-        k: tick of the first action.
-        actions: the actions, a row per tick, as `HandInForce`.
+        feed_actions: Actions of one site in a `ReplayedInputs`, shape (K, 1 + 2 size).
+        k: Tick of the first action.
+        actions: Actions with a row per tick, in the form of `HandInForce`.
     """
     count = (actions.shape[1] - 3) // 2
     size = (feed_actions.shape[1] - 1) // 2
@@ -832,15 +903,16 @@ def _write_actions(feed_actions: Array, k: int, actions: Array) -> None:
 
 
 def _count_coordinates(setup: SiteSetup) -> int:
-    """Returns the number of coordinates of a site's live hand, see `HandInForce`.
+    """Returns the number of coordinates of a site's live operator.
 
-    An action has grip, number and source, then the target and the rate of each coordinate.
+    An action contains the three numbers grip, number and source, followed by the target and the
+    rate of each coordinate, see `HandInForce`.
     """
     return (setup.layout.hand - 3) // 2
 
 
 def _find_live_row(setup: SiteSetup) -> int:
-    """Returns the index of the live hand among a site's torque sources; -1 without one."""
+    """Returns the index of the live operator among a site's torque sources, or -1."""
     for index, source in enumerate(setup.actors):
         if source.kind in LIVE_KINDS:
             return index

@@ -1,9 +1,13 @@
-"""Recorded inputs of a site, and restoration of its state in the middle of a log.
+"""Provides the recorded inputs of a site, and restores its state in the middle of a log.
+
+A log contains a record for each tick of a site. If records are missing, the site cannot be
+executed through the gap, but it can be restored after the gap.
 
 Invariant (L3):
-    - Two consecutive records and the contents of the links suffice to restore a site.
-    - Arrivals at ticks without a record are unknown. Samples that no record lists are assumed
-      to have arrived at these ticks.
+    - Two consecutive records, and the samples in transit on the links, suffice to restore a
+      site.
+    - The arrivals in ticks without a record are not known. Samples that no record lists are
+      assumed to have arrived in these ticks.
 """
 
 from bisect import bisect_left
@@ -21,27 +25,28 @@ from ..log.site_log import SiteLog
 from ..net.messages import MODES, RESTING_MODES, State
 
 _LOOK_BACK = 100
-"""Number of records before a gap that are searched for the newest sample that had arrived."""
+"""Number of records before a gap in which the newest arrived sample is searched."""
 
 Change = TypeVar("Change")
 
 ArrivalEntry = Sequence[int]
-"""An arrival as in a record's `rx`: index of the peer, tick of its sample, latency in us."""
+"""Arrival in the form of a record's `rx`: index of the peer, tick of its sample, latency in us.
+"""
 
 
 ReceivedMotion = State | Arrival
-"""A sample of a peer: a record, or an arrival that is computed now."""
+"""Sample of a peer: a record of the log, or a newly computed arrival."""
 
 
 def read_output(state: State, peers: tuple[str, ...]) -> TickRecord:
-    """Returns a record in the form in which `Site.step` returned it.
+    """Converts a published record to the form in which `Site.step` returned it.
 
     Args:
-        state: the record, as it was published.
-        peers: names of the site's peers, in scenario order.
+        state: The record.
+        peers: Names of the site's peers, in the order of the scenario.
     """
     mode = MODES.get(state.mode, MODES["diverged"]).mode
-    # a complete memory has more numbers than the pose with which it begins
+    # A complete memory contains more numbers than the pose with which it begins.
     mem = state.mem if len(state.mem) > len(state.q_des) else []
     return TickRecord(
         tick=state.tick,
@@ -72,20 +77,20 @@ def make_arrival(
 ) -> Arrival:
     """Returns the arrival of a peer's sample.
 
-    The arrival has the numbers for all receivers; `select_peer_channels` reduces them to the
-    numbers for one receiver.
+    The arrival contains the numbers that the peer's control law sends to all receivers.
+    `select_peer_channels` selects the numbers for one receiver.
 
     Args:
-        peer: index of the sender among the receiver's peers.
-        tick: tick of the sample.
-        sample: the record of that tick, or an arrival of the sample.
-        latency_us: time from the stamp to the arrival, us.
+        peer: Index of the sender among the receiver's peers.
+        tick: Tick of the sample.
+        sample: Record of that tick, or an earlier arrival of the sample.
+        latency_us: Time from the stamp to the arrival, in us.
     """
     q = sample.q
     qd = sample.qd
     tau_x = sample.tau_x
     if not isinstance(sample, Arrival) and sample.x:
-        # in task space the sites share the motion of the end effector
+        # In task space, the sites share the motion of the end effector.
         q = sample.x
         qd = sample.xd
         tau_x = sample.wrench
@@ -103,11 +108,11 @@ def make_arrival(
 def select_peer_channels(
     arrivals: Sequence[Arrival], links: Sequence[LinkSetup]
 ) -> list[Arrival]:
-    """Returns arrivals with only those numbers of the law channel that are for this site.
+    """Returns arrivals with only those numbers of the sender's law that are for this site.
 
     Args:
-        arrivals: the arrivals, with the whole channel of their senders.
-        links: the links of the receiver, by the index of the peer.
+        arrivals: Arrivals with the numbers for all receivers.
+        links: Links of the receiver, by the index of the peer.
     """
     selected = []
     for arrival in arrivals:
@@ -121,15 +126,17 @@ def select_peer_channels(
 
 
 def find_recorded_hand(part: SiteLog, site: Site, k: int) -> list[float]:
-    """Returns the action of a live hand at tick `k`, from the newest record until that time.
+    """Returns the recorded action of a live operator that applies in tick `k`.
+
+    It is the action in the newest record up to the time of the tick.
 
     Args:
-        part: the records of the site in the log.
-        site: the executed site, whose tick rate may differ from the log's.
-        k: the tick of the executed site.
+        part: Records of the site in the log.
+        site: The executed site, whose tick rate may differ from that in the log.
+        k: Tick of the executed site.
 
     Returns:
-        The action, as `HandInForce`; [] if the site has no live hand.
+        The action, in the form of `HandInForce`. Empty if the site has no live operator.
     """
     if not part.layout.hand:
         return []
@@ -142,20 +149,20 @@ def find_recorded_hand(part: SiteLog, site: Site, k: int) -> list[float]:
 
 
 class RecordedInputs(Generic[Change]):
-    """The recorded inputs of one site: its arrivals and its changes.
+    """Recorded inputs of one site: the samples that arrived, and the changes.
 
     Args:
-        part: the records of the site.
-        samples: the records or arrivals of all sites, by site and tick.
-        ends: last tick of each site.
-        changes: the changes of the site, by tick.
-        links: the links of the site, by the index of the peer.
+        part: Records of the site.
+        samples: Records or arrivals of all sites, by site and tick.
+        ends: Last tick of each site.
+        changes: Changes of the site, by tick.
+        links: Links of the site, by the index of the peer.
 
     Attributes:
-        samples: the samples of each peer, by tick.
-        ends: last tick of each peer.
-        assumed: per peer the ticks of samples that are assumed to have arrived in a gap.
-        lacking: per peer the ticks of samples that arrived but whose record is missing.
+        samples: Samples of each peer, by tick.
+        ends: Last tick of each peer.
+        assumed: For each peer, the ticks of samples that are assumed to have arrived in a gap.
+        lacking: For each peer, the ticks of samples that arrived, but whose record is missing.
     """
 
     def __init__(
@@ -175,7 +182,11 @@ class RecordedInputs(Generic[Change]):
         self.lacking: list[set[int]] = [set() for _ in part.peers]
 
     def pop_changes(self, tick: int) -> list[tuple[int, Change]]:
-        """Returns the changes up to a tick, each with its tick, and removes these changes."""
+        """Removes and returns the changes up to a tick.
+
+        Returns:
+            Pairs of the tick of a change and the change, in the order of time.
+        """
         popped: list[tuple[int, Change]] = []
         while self._changes and self._changes[-1][0] <= tick:
             change_tick, changes = self._changes.pop()
@@ -185,10 +196,14 @@ class RecordedInputs(Generic[Change]):
     def find_arrivals(
         self, entries: Sequence[ArrivalEntry]
     ) -> tuple[list[Arrival], list[ArrivalEntry]]:
-        """Returns the arrivals of entries, and the entries whose sample is missing.
+        """Looks up the samples that arrived.
 
         Args:
-            entries: arrivals as in a record's `rx`.
+            entries: Arrivals in the form of a record's `rx`.
+
+        Returns:
+            The arrivals with their samples, and the entries whose sample is missing from the
+            log.
         """
         arrivals: list[Arrival] = []
         missing: list[ArrivalEntry] = []
@@ -203,18 +218,22 @@ class RecordedInputs(Generic[Change]):
         return select_peer_channels(arrivals, self._links), missing
 
     def add_lacking(self, entries: Sequence[ArrivalEntry]) -> None:
-        """Notes samples that arrived but whose record is missing, as entries of `rx`."""
+        """Remembers samples that arrived, but whose record is missing.
+
+        Args:
+            entries: Arrivals in the form of a record's `rx`.
+        """
         for peer, tick, _ in entries:
             self.lacking[peer].add(tick)
 
     def can_resume(self, row: int, *, detached: bool = False) -> bool:
-        """Returns True if the site can be restored at a record, see `resume`.
+        """True if the site can be restored before the tick of a record, see `resume`.
 
-        The records of the two ticks before have to exist, and the samples in use have to be
-        known. Unknown samples do not matter to a site that rests by a reference of its own.
+        The records of the two ticks before must exist, and the samples in use must be known. A
+        site that rests with a reference of its own does not need the samples.
 
         Args:
-            row: row of the record.
+            row: Row of the record.
             detached: True if the site follows a reference of its own while it rests.
         """
         states = self._part.states
@@ -230,24 +249,25 @@ class RecordedInputs(Generic[Change]):
         return all(used < 0 or used in samples for used, samples in pairs)
 
     def resume(self, site: Site, row: int, changes: Sequence[CoreChange] = ()) -> None:
-        """Restores the state of a site before the tick of a record, where it `can_resume`.
+        """Restores the state of a site before the tick of a record, if it `can_resume`.
 
         Args:
-            site: the site.
-            row: row of the record.
-            changes: changes that the site applied since its last executed tick.
+            site: The site. It is changed.
+            row: Row of the record.
+            changes: Changes of the site since its last executed tick.
         """
         states = self._part.states
         peers = self._part.peers
         for change in changes:
             site.apply_change(change, states[row].t_ns)
+
         before = read_output(states[row - 2], peers)
         last = read_output(states[row - 1], peers)
         in_use: list[Arrival | None] = []
         waiting: list[Arrival] = []
         for peer, used in enumerate(last.used):
             in_use.append(self._find_in_use(peer, used, len(last.q_des)))
-            # a sample older than the sample in use is never used again
+            # A sample that is older than the one in use is never used again.
             self.lacking[peer] = {tick for tick in self.lacking[peer] if tick >= used}
             rate_hz = site.peer_rate_hz(peer)
             certain, self.assumed[peer] = self._find_waiting(row, peer, used, rate_hz)
@@ -255,22 +275,24 @@ class RecordedInputs(Generic[Change]):
             arrivals, missing = self.find_arrivals([(peer, tick, 0) for tick in waiting_ticks])
             self.add_lacking(missing)
             waiting += arrivals
+
         site.restore_links(states[row].tick, in_use, waiting[-MAX_ARRIVALS:])
         site.restore_state(before, last)
 
     def _find_in_use(self, peer: int, used: int, size: int) -> Arrival | None:
-        """Returns the sample of a peer that is in use, or None before the first sample.
+        """Returns the sample of a peer that is in use. None before the first sample.
 
         Args:
-            peer: index of the peer.
-            used: tick of the sample; -1 before the first sample.
-            size: number of coordinates of the sample.
+            peer: Index of the peer.
+            used: Tick of the sample. -1 before the first sample.
+            size: Number of coordinates of the sample.
         """
         sample = self.samples[peer].get(used)
         if sample is None:
             if used < 0:
                 return None
-            # only a site that rests by a reference of its own can resume without the sample
+            # Only a site that rests with a reference of its own is resumed without the sample.
+            # It does not use the zeros.
             unknown = (0.0,) * size
             sample = Arrival(peer, used, unknown, unknown)
             self.lacking[peer].add(used)
@@ -278,11 +300,11 @@ class RecordedInputs(Generic[Change]):
         return select_peer_channels([arrival], self._links)[0]
 
     def is_uncertain(self, state: State, output: TickRecord) -> bool:
-        """Returns True if the arrival or content of a sample in use is not in the log.
+        """True if the arrival of a sample in use is assumed, or its content is missing.
 
         Args:
-            state: a record of the site.
-            output: the same tick as executed.
+            state: Record of the site.
+            output: Result of executing the same tick.
         """
         for peer, name in enumerate(self._part.peers):
             logged = state.used.get(name, -1)
@@ -295,18 +317,18 @@ class RecordedInputs(Generic[Change]):
     def _find_waiting(
         self, row: int, peer: int, used: int, rate_hz: int
     ) -> tuple[set[int], set[int]]:
-        """Returns the samples newer than the sample in use that arrived before a record.
+        """Returns the samples newer than the one in use that arrived before a record.
 
         Args:
-            row: row of the record.
-            peer: index of the peer.
-            used: tick of the sample in use.
-            rate_hz: tick rate of the peer, Hz.
+            row: Row of the record.
+            peer: Index of the peer.
+            used: Tick of the sample in use.
+            rate_hz: Tick rate of the peer, in Hz.
 
         Returns:
-            Ticks of samples that certainly arrived: an earlier record lists them. Ticks of
-            samples that probably arrived: no record lists them, and they are older than the
-            record or than the first sample that a later record lists.
+            Ticks of the samples that certainly arrived, because an earlier record lists them,
+            and ticks of samples that probably arrived. No record lists the latter, and they are
+            older than the record or than the first sample that a later record lists.
         """
         states = self._part.states
         t_ns = states[row].t_ns
@@ -315,10 +337,11 @@ class RecordedInputs(Generic[Change]):
         next_listed = self.ends[peer] + 1
         if position < len(listing.rows):
             next_listed = listing.first_ticks[position]
+        # The last sample before t_ns: the first tick at or after t_ns, less one.
         last_sent = -(-t_ns * rate_hz // NS_PER_S) - 1
         newest_probable = max(last_sent, next_listed - 1)
         newest_listed = self._find_newest_listed(row, peer)
-        # a sample waits no longer than the longest delay of any link
+        # A sample does not wait longer than the longest permitted delay.
         oldest = (t_ns - MAX_DELAY_US * 1000) * rate_hz // NS_PER_S
         start = max(used + 1, oldest)
         newest = min(max(newest_probable, newest_listed), self.ends[peer])
@@ -334,7 +357,11 @@ class RecordedInputs(Generic[Change]):
         return certain, probable
 
     def _find_newest_listed(self, row: int, peer: int) -> int:
-        """Returns the newest sample of a peer in the records before a row; -1 without one."""
+        """Returns the newest sample of a peer in the last records before a row.
+
+        Returns:
+            Tick of the sample. -1 if these records list no sample of the peer.
+        """
         newest = -1
         for state in self._part.states[max(0, row - _LOOK_BACK) : row]:
             for sender, tick, _ in state.rx:
@@ -344,11 +371,11 @@ class RecordedInputs(Generic[Change]):
 
     @cached_property
     def _listings(self) -> "list[_PeerListing]":
-        """The records that list samples, by the index of the peer."""
+        """For each peer, the records that list its samples."""
         listings = [_PeerListing({}, [], []) for _ in self.samples]
         for row, state in enumerate(self._part.states):
             for peer, tick, _ in state.rx:
-                # a damaged record may list any peer
+                # A damaged record may list any peer.
                 if not 0 <= peer < len(listings):
                     continue
                 listing = listings[peer]
@@ -360,12 +387,12 @@ class RecordedInputs(Generic[Change]):
 
 
 class _PeerListing(NamedTuple):
-    """The records of a site that list samples of one peer.
+    """Records of a site that list samples of one peer.
 
     Attributes:
-        first_rows: row of the first record that lists a sample, by the tick of the sample.
-        rows: rows of the records that list a sample of the peer, ascending.
-        first_ticks: per row of `rows` the tick of the first sample that the record lists.
+        first_rows: For the tick of each sample, the row of the first record that lists it.
+        rows: Rows of all records that list a sample of the peer, in ascending order.
+        first_ticks: For each of these rows, the tick of the first sample that the record lists.
     """
 
     first_rows: dict[int, int]

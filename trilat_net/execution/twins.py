@@ -1,17 +1,18 @@
-"""Twins of a run: copies that are displaced a little and executed together with the run.
+"""Executes twins of a run: repetitions with a small disturbance, side by side with the run.
 
-The difference between a twin and its run shows whether small displacements grow or decay.
+The difference between a twin and the run shows whether small disturbances grow or decay. The
+disturbance is called a push: a small displacement of the state at one time.
 
-A difference that has grown is scaled down again (Benettin, Galgani, Giorgilli and Strelcyn,
-Meccanica 15, 1980): every number x of the twin's state, past samples included, becomes
-x_run + factor (x - x_run), and the logarithm of the factor is added to the growth. A twin whose
-difference has decayed to the rounding of the numbers is displaced again.
+A difference that has become large is scaled down again (Benettin, Galgani, Giorgilli and
+Strelcyn, Meccanica 15, 1980). Every number x of the twin's state, including the samples in
+transit, becomes x_run + factor (x - x_run), and the logarithm of the factor is added to the
+growth. If the difference has decayed to rounding errors, the twin is pushed again.
 
 Invariant:
-    - The run is executed again from its own inputs and compared with its records, bit for bit.
-    - A twin gets the same arrivals, changes, hands and random delays as the run. The difference
-      is therefore the effect of the push alone.
-    - The difference is computed by two complete runs, not by a linear model.
+    - The run is executed again from its recorded inputs, and compared with its records.
+    - A twin receives the same arrivals, changes, actions of operators and random delays as the
+      run. Therefore the difference is the effect of the push alone.
+    - The difference is computed from two complete nonlinear runs, not from a linear model.
 """
 
 import math
@@ -31,29 +32,29 @@ from ..scenario import Scenario
 from .fused import FusedRun, RunInputs, explain_not_repeatable, read_run_inputs
 
 PUSH_RAD = 1e-6
-"""The usual size of a push, rad."""
+"""Usual size of a push, in rad."""
 LARGEST = 1e-4
-"""Largest difference, rad or rad/s, at the end of a window.
+"""Largest difference at the end of a window, in rad or rad/s.
 
-A larger difference is scaled down if it also exceeds ten times its push.
+A larger difference is scaled down if it also exceeds ten times the size of the push.
 """
 SMALLEST = 1e-12
-"""A difference smaller than this is lost in the rounding of the numbers."""
+"""Difference below which rounding errors dominate, in rad/s."""
 WINDOWS = 16
 """Number of windows of a run. Differences are scaled down or displaced again at their ends."""
 
 
 class Push(NamedTuple):
-    """A displacement of the state of a twin.
+    """Small displacement of the state of a twin.
 
     Attributes:
-        name: description of the push, as "1e-06 rad at m1 joint 1".
-        field: the displaced field: "q", rad; "qd", rad/s; or "theta_hat".
-        by: the displacement of each site and number, shape (N, n).
-        at_s: time of the push, s since the epoch.
-        again: True if a twin whose difference has decayed is pushed again at the end of a
-            window; otherwise the twin ends there.
-        largest: a difference larger than this is scaled down; math.inf: never.
+        name: Description of the push, for example "1e-06 rad at m1 joint 1".
+        field: Displaced field of the state: "q" in rad, "qd" in rad/s, or "theta_hat".
+        by: Displacement of each number of each site, shape (N, n).
+        at_s: Time of the push, in s after the epoch.
+        again: If True, a twin whose difference has decayed is pushed again at the end of a
+            window. Otherwise the twin ends.
+        largest: Difference beyond which it is scaled down. Infinite if it is never scaled down.
     """
 
     name: str
@@ -65,21 +66,22 @@ class Push(NamedTuple):
 
 
 class TwinPath(NamedTuple):
-    """The difference of a twin from its run, in intervals of 50 ms.
+    """Difference between a twin and the run, in intervals of 50 ms.
+
+    The run has K intervals, and all sites together have J joints.
 
     Attributes:
-        push: the push of the twin.
-        t_s: ends of the intervals, shape (K,), s.
-        largest: logarithm of the largest difference of velocity in an interval, rad/s, of each
-            of the J joints of all sites, as if the difference had never been scaled down, shape
-            (K, J); -inf where the twin and the run are equal.
-        last: difference at the last tick of an interval as it was computed, shape (K, J),
-            rad/s.
-        scale: logarithm of the factor that converts `last` to the unscaled difference, shape
-            (K,).
-        pushed: indices in `t_s` of the intervals in which the twin was pushed.
-        died: index in `t_s` from which the difference is only rounding; None if the twin was
-            pushed again or its difference is larger.
+        push: Push of the twin.
+        t_s: Ends of the intervals, in s, shape (K,).
+        largest: Natural logarithm of the largest difference of velocity of each joint in each
+            interval, in rad/s, shape (K, J). It is computed as if the difference had never been
+            scaled down. -inf if the twin and the run are equal.
+        last: Difference in the last tick of each interval, in rad/s, shape (K, J). It includes
+            the scaling.
+        scale: Natural logarithm of the factor that removes the scaling from `last`, shape (K,).
+        pushed: Indices of the intervals in which the twin was pushed.
+        died: Index of the interval from which the difference consists only of rounding errors.
+            None if there is no such interval, or if the twin was pushed again.
     """
 
     push: Push
@@ -92,13 +94,13 @@ class TwinPath(NamedTuple):
 
 
 class Twins(NamedTuple):
-    """The twins of a run.
+    """All twins of a run.
 
     Attributes:
-        paths: the difference of each twin from the run.
-        joints: names of the joints of all sites, as in "m1 joint 1".
-        speed: largest speed of each joint of the run in an interval, shape (K, J), rad/s.
-        same: True if the run that was executed again has the bits of the records.
+        paths: Difference of each twin from the run.
+        joints: Names of the joints of all sites, for example "m1 joint 1".
+        speed: Largest speed of each joint of the run in each interval, in rad/s, shape (K, J).
+        same: True if the repeated run has the same bits as the records.
     """
 
     paths: Sequence[TwinPath]
@@ -108,7 +110,7 @@ class Twins(NamedTuple):
 
 
 def list_joints(scenario: Scenario) -> tuple[str, ...]:
-    """Returns the names of all joints, site by site."""
+    """Returns the names of all joints, site by site, for example "m1 joint 1"."""
     joints = []
     for name in scenario.names:
         count = scenario.layout(name).joints
@@ -117,12 +119,17 @@ def list_joints(scenario: Scenario) -> tuple[str, ...]:
 
 
 def choose_pushes(scenario: Scenario, count: int) -> list[Push]:
-    """Returns `count` pushes of different joints and estimates.
+    """Returns a number of pushes of different joints and estimates.
 
-    The pushes are: one of all estimates, if a site learns; up to three of all joints in a
-    random direction, with sizes around `PUSH_RAD`; and one of each joint. Random pushes of
-    different sizes reveal growth that depends on the size of the motion.
+    The order is: one push of all estimated parameters if a site learns; up to three pushes of
+    all joints in random directions, with sizes around `PUSH_RAD`; then one push of each joint.
+    The random pushes have different sizes, because growth may depend on the amplitude.
+
+    Args:
+        scenario: The scenario.
+        count: Largest number of pushes.
     """
+    # The target of "m1 joint 1" is "m1.q1".
     joint_targets = [joint.replace(" joint ", ".q") for joint in list_joints(scenario)]
     targets = []
     learns = any(scenario.gains(name).law is Law.ADAPTIVE for name in scenario.names)
@@ -132,6 +139,7 @@ def choose_pushes(scenario: Scenario, count: int) -> list[Push]:
     random_factors = (1.0, 1e-3, 1e3)[:random_count]
     targets += [("q", factor * PUSH_RAD) for factor in random_factors]
     targets += [(target, PUSH_RAD) for target in joint_targets]
+
     pushes = []
     for target, size in targets[:count]:
         push = parse_push(scenario, target, size)
@@ -140,11 +148,11 @@ def choose_pushes(scenario: Scenario, count: int) -> list[Push]:
 
 
 LEAST_PUSH = 1e-11
-"""A smaller push is lost in the rounding of the numbers."""
+"""Smallest size of a push. A smaller push would be lost in rounding errors."""
 MOST_PUSH = 1.0
-"""A larger push makes another run."""
+"""Largest size of a push. A larger push would not be a small disturbance."""
 _TARGET = re.compile(r"(?:([a-z][a-z0-9_]*)\.)?(qd?|theta)([1-9]\d*)?")
-"""Target of a push: optional site, kind, and optional number from 1."""
+"""Matches the target of a push: optional site, kind, and optional number, counted from 1."""
 
 
 def parse_push(
@@ -152,25 +160,26 @@ def parse_push(
 ) -> Push:
     """Returns the push of a target such as "m1.q1", "s.qd2", "m2.theta3" or "m1.q".
 
-    A target without a number means all numbers of that kind, in a random direction. A target
-    without a site means all sites. The twin is pushed once. A difference that begins larger
-    than `LARGEST` is never scaled down.
+    Without a number, all joints (or estimates) of the site are pushed in a random direction.
+    Without a site, those of all sites are. The twin is pushed only once. A difference that is
+    larger than `LARGEST` from the beginning is never scaled down.
 
     Args:
-        scenario: the scenario.
-        target: the target.
-        size: size of the push: rad, rad/s, or the unit of an estimate.
-        at_s: time of the push, s since the epoch.
+        scenario: The scenario.
+        target: The target.
+        size: Size of the push, in rad, rad/s, or the unit of an estimate.
+        at_s: Time of the push, in s after the epoch.
 
     Raises:
-        UsageError: the scenario has no such target, or the size is out of range.
+        UsageError: The scenario has no such target, or the size is out of range.
     """
     match = _TARGET.fullmatch(target)
     if match is None:
         raise UsageError(_describe_targets(scenario, target))
+
     site, kind, number = match.groups()
     counts = _count_estimates(scenario) if kind == "theta" else _count_joints(scenario)
-    owners = []
+    owners = []  # indices of the sites that are pushed
     for i, name in enumerate(scenario.names):
         if site in (None, name) and counts[i] >= int(number or 1):
             owners.append(i)
@@ -181,6 +190,7 @@ def parse_push(
             f"--push {target}={size:g}: the size of a push is from {LEAST_PUSH:g} to "
             f"{MOST_PUSH:g}"
         )
+
     generator = np.random.Generator(np.random.Philox(0))
     displacements = np.zeros((len(counts), max(counts)))
     for i in owners:
@@ -189,6 +199,7 @@ def parse_push(
         else:
             direction = generator.uniform(-1.0, 1.0, counts[i])
         displacements[i, : counts[i]] = size * direction
+
     return Push(
         name=f"{size:g} {_describe_target(site, kind, number)}",
         field="theta_hat" if kind == "theta" else kind,
@@ -200,7 +211,7 @@ def parse_push(
 
 
 def _describe_target(site: str | None, kind: str, number: str | None) -> str:
-    """Returns the target of a push behind its size, as in "rad at m1 joint 1"."""
+    """Returns the unit and target of a push as a text, for example "rad at m1 joint 1"."""
     noun = "estimate" if kind == "theta" else "joint"
     unit = {"q": "rad at", "qd": "rad/s at", "theta": "of"}[kind]
     if number:
@@ -216,7 +227,7 @@ def _count_joints(scenario: Scenario) -> list[int]:
 
 
 def _count_estimates(scenario: Scenario) -> list[int]:
-    """Returns the number of estimated parameters of each site; 0 for laws that do not learn."""
+    """Returns the number of estimated parameters of each site. 0 for laws that do not learn."""
     counts = []
     for name in scenario.names:
         learns = scenario.gains(name).law is Law.ADAPTIVE
@@ -225,7 +236,7 @@ def _count_estimates(scenario: Scenario) -> list[int]:
 
 
 def _describe_targets(scenario: Scenario, target: str) -> str:
-    """Returns an error text that names the targets of a push in a scenario."""
+    """Returns the error message for a wrong target, which lists the possible targets."""
     sites = []
     for name, estimates in zip(scenario.names, _count_estimates(scenario), strict=True):
         joints = scenario.layout(name).joints
@@ -238,16 +249,16 @@ def _describe_targets(scenario: Scenario, target: str) -> str:
 
 
 def run_twins(log: Log, pushes: Sequence[Push], *, own_laws: bool = False) -> Twins:
-    """Executes the run of a log again, and a twin of the run for every push.
+    """Executes the run of a log again, together with a twin for every push.
 
     Args:
-        log: the log.
-        pushes: the pushes.
-        own_laws: True if laws that are code from outside may run.
+        log: The log.
+        pushes: The pushes.
+        own_laws: True if control laws of users may run.
 
     Raises:
-        NotRepeatable: the run cannot be executed again, or differs from its records here.
-        LogError: a record cannot be read.
+        NotRepeatable: The run cannot be repeated, or the repeated run differs from the records.
+        LogError: A record cannot be read.
     """
     reason = explain_not_repeatable(log, own_laws=own_laws)
     if reason:
@@ -263,11 +274,16 @@ def run_twins(log: Log, pushes: Sequence[Push], *, own_laws: bool = False) -> Tw
 
 
 def run_virtual_twins(scenario: Scenario, pushes: Sequence[Push], duration_s: float) -> Twins:
-    """Runs a scenario in virtual time, and a twin of the run for every push.
+    """Runs a scenario in virtual time, together with a twin for every push.
+
+    Args:
+        scenario: The scenario.
+        pushes: The pushes.
+        duration_s: Duration of the run, in s.
 
     Raises:
-        ScenarioError: virtual time cannot run the scenario.
-        NotRepeatable: a push is not within the run.
+        ScenarioError: The scenario cannot run in virtual time.
+        NotRepeatable: The time of a push is not within the run.
     """
     rates_hz = [scenario.sites[name].rate_hz for name in scenario.names]
     ticks = [max(1, round(duration_s * rate_hz)) for rate_hz in rates_hz]
@@ -277,12 +293,15 @@ def run_virtual_twins(scenario: Scenario, pushes: Sequence[Push], duration_s: fl
 class _TwinRuns:
     """A run and its twins, executed side by side.
 
+    The run is divided into windows. At the end of each window, the differences of the twins are
+    scaled down or pushed again if necessary.
+
     Args:
-        scenario: the scenario.
-        pushes: the push of each twin.
-        ticks: number of ticks of each site.
-        inputs: inputs of a recorded run.
-        log: the log of the recorded run, whose records the run has to equal.
+        scenario: The scenario.
+        pushes: Push of each twin.
+        ticks: Number of ticks of each site.
+        inputs: Inputs of a recorded run that is repeated. None for a new run.
+        log: Log of the recorded run, with which the repeated run is compared.
     """
 
     def __init__(
@@ -307,10 +326,11 @@ class _TwinRuns:
             run.plan(ticks)
         self._run = runs[0]
         self._twins = runs[1:]
+
         twins = len(pushes)
         buckets = math.ceil(self._ends_s[-1] * BUCKETS_PER_S) + 1
         joints = len(self._joints)
-        # The arrays of the paths of all twins, see `TwinPath`.
+        # Arrays of the paths of all twins, see `TwinPath`. A bucket is an interval of 50 ms.
         self._largest = np.full((twins, buckets, joints), -np.inf)
         self._last = np.zeros((twins, buckets, joints))
         self._scales = np.zeros((twins, buckets))
@@ -322,7 +342,7 @@ class _TwinRuns:
         self._same = True
 
     def run(self) -> Twins:
-        """Executes all runs and returns the differences of the twins."""
+        """Executes the run and its twins, and returns the differences."""
         for n, push in enumerate(self._pushes):
             if push.at_s == 0.0:
                 self._push(n, 0.0)
@@ -345,7 +365,11 @@ class _TwinRuns:
         return Twins(paths, self._joints, self._speed, self._same)
 
     def _execute_window(self, end_s: float) -> None:
-        """Executes the run and its twins to the end of a window."""
+        """Executes the run and its twins to the end of a window, and measures the differences.
+
+        Args:
+            end_s: End of the window, in s.
+        """
         last_ns = math.ceil(end_s * NS_PER_S) - 1
         self._run.step_to(last_ns)
         records = self._run.pop_records()
@@ -359,7 +383,7 @@ class _TwinRuns:
             if is_pushed and self._died[n] is None:
                 twin.step_to(last_ns)
                 self._measure_difference(n, records, twin.pop_records())
-                # the state of a program cannot be copied
+                # The state of a user's program cannot be copied or scaled.
                 if not twin.has_programs:
                     self._renew_difference(n, end_s)
             elif not is_pushed and self._pushes[n].at_s <= end_s:
@@ -367,14 +391,24 @@ class _TwinRuns:
                 self._push(n, end_s)
 
     def _push(self, n: int, at_s: float) -> None:
-        """Displaces the state of twin `n` at a time, s."""
+        """Displaces the state of a twin.
+
+        Args:
+            n: Index of the twin.
+            at_s: Time of the push, in s.
+        """
         push = self._pushes[n]
         self._twins[n].displace(push.field, push.by)
         self._pushed[n].append(round(at_s * BUCKETS_PER_S))
         self._scale[n] = 0.0
 
     def _compare_with_log(self, log: Log, records: Sequence[tuple[Ints, Array]]) -> None:
-        """Refuses a run that differs from the records of its log by more than rounding."""
+        """Refuses a repeated run that differs from its log by more than rounding errors.
+
+        Args:
+            log: The log.
+            records: Times and records of each site since the last call.
+        """
         for name, layout, (t_ns, rows) in zip(log.sites, self._layouts, records, strict=True):
             part = log[name]
             columns = layout.columns()
@@ -396,21 +430,22 @@ class _TwinRuns:
         records: Sequence[tuple[Ints, Array]],
         twin_records: Sequence[tuple[Ints, Array]],
     ) -> Iterator[tuple[tuple[Ints, ...], Ints, Array, Array]]:
-        """Yields the velocities of each site in a window, with the intervals of 50 ms.
+        """Yields the velocities of each site in a window, divided into intervals of 50 ms.
 
         Args:
-            records: times and records of each site of the run.
-            twin_records: times and records of each site of a twin.
+            records: Times and records of each site of the run.
+            twin_records: Times and records of each site of a twin.
 
         Yields:
-            The cells of an array (K, J) that the site fills, the first row of each interval,
-            and the velocities of the run and of the twin, rad/s, a row per tick.
+            The cells of an array of shape (K, J) to which the site belongs, the first row of
+            each interval, and the velocities of the run and of the twin in rad/s, with a row
+            per tick.
         """
         column = 0
         sites = zip(self._layouts, records, twin_records, strict=True)
         for layout, (t_ns, rows), (twin_ns, twin_rows) in sites:
             qd = layout.columns()["qd"]
-            # a run that diverged ends before its twin, or after it
+            # If one of them diverged, it ends before the other.
             count = min(len(t_ns), len(twin_ns))
             if count:
                 buckets = t_ns[:count] * BUCKETS_PER_S // NS_PER_S
@@ -426,7 +461,13 @@ class _TwinRuns:
         records: Sequence[tuple[Ints, Array]],
         twin_records: Sequence[tuple[Ints, Array]],
     ) -> None:
-        """Adds the differences of a twin in a window to its path."""
+        """Adds the differences of a twin in a window to its path.
+
+        Args:
+            n: Index of the twin.
+            records: Times and records of each site of the run.
+            twin_records: Times and records of each site of the twin.
+        """
         for cells, starts, qd, twin_qd in self._split_buckets(records, twin_records):
             difference = twin_qd - qd
             peaks = np.maximum.reduceat(np.abs(difference), starts, axis=0)
@@ -437,11 +478,14 @@ class _TwinRuns:
             self._scales[n, cells[0].reshape(-1)] = self._scale[n]
 
     def _renew_difference(self, n: int, end_s: float) -> None:
-        """Scales down a large difference; pushes or ends a twin without a difference.
+        """Scales down a difference that has become large, or reacts to one that has decayed.
+
+        A decayed difference consists only of rounding errors. The twin is then pushed again, or
+        ends.
 
         Args:
-            n: index of the twin.
-            end_s: end of the window, s.
+            n: Index of the twin.
+            end_s: End of the window, in s.
         """
         twin = self._twins[n]
         push = self._pushes[n]
@@ -451,7 +495,8 @@ class _TwinRuns:
         distance = max(distance_q, distance_qd)
         size = float(np.abs(push.by).max())
         largest = max(push.largest, 10.0 * size)
-        # velocities alone decide on a decay: a twin may rest at another position
+
+        # Only velocities show a decay, because a twin may come to rest at another position.
         last_second = self._largest[n, max(0, bucket - BUCKETS_PER_S) : bucket]
         recent = last_second.max(initial=-np.inf) - self._scale[n]
         decayed = recent < math.log(SMALLEST)
@@ -471,12 +516,16 @@ class _TwinRuns:
 
 
 def _plan_windows(end_s: float, pushes: Sequence[Push]) -> Array:
-    """Returns the ends of the windows of a run, s, ascending.
+    """Returns the ends of the windows of a run, in s, in ascending order.
 
-    The windows end at multiples of 50 ms and at the times of the pushes.
+    Windows end at multiples of 50 ms, and at the times of the pushes.
+
+    Args:
+        end_s: Duration of the run, in s.
+        pushes: Push of each twin.
 
     Raises:
-        NotRepeatable: a push is not within the run.
+        NotRepeatable: The time of a push is not within the run.
     """
     if any(not 0.0 <= push.at_s < end_s for push in pushes):
         raise NotRepeatable(
@@ -489,7 +538,7 @@ def _plan_windows(end_s: float, pushes: Sequence[Push]) -> Array:
 
 
 SAME_RUN = 1e-7
-"""Largest difference, rad, rad/s or N m, of a run from its records.
+"""Largest permitted difference of a repeated run from its records, in rad, rad/s or N m.
 
-The last bits differ if the run is executed on another platform.
+Rounding errors differ if the log was recorded on another platform.
 """
