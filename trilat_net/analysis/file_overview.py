@@ -1,13 +1,14 @@
-"""Gives an overview of MCAP files, and summarises runs, without executing anything again.
+"""Gives an overview of MCAP files, and summarises recorded runs.
 
-The overview has the files' layout, channels, gaps and message rates; for a trilat-net log also
-the health of its session, loops, links and clocks. The summary of a run is the content of
-`summary.json`.
+`info` lists the layout, the channels, the gaps and the message rates of any MCAP file. For a
+log of this program it adds the health of the session, of the control loops, of the links and of
+the clocks. `summarise_run` computes the content of `summary.json` of a run. Neither executes
+the run again.
 
 Invariant:
-    - The inventory decodes no message, so that any MCAP file has one. If a log cannot be
-      opened, the overview has the reason.
-    - Gaps are counted only in channels with consecutive numbers.
+    - The inventory of a file decodes no message, so that it works for any MCAP file. If a log
+      cannot be opened, the overview states the reason.
+    - Gaps are counted only in channels whose messages have consecutive numbers.
     - Keys end in their unit. A quantity that the log does not determine is None, never NaN.
 """
 
@@ -54,13 +55,18 @@ from .timeline import find_mode_intervals, list_changes
 MOST_LISTED_GAPS = 1000
 """Largest number of gaps that are listed per channel."""
 
-
 Absences = Mapping[str, Sequence[tuple[int, int]]]
-"""Ticks that a site skipped, as spans (first, last), by site."""
+"""Ticks during which a site was absent from the session, as spans (first, last), by site."""
 
 
 class _Messages(NamedTuple):
-    """The messages of a channel, in the order of the file."""
+    """Numbers of all messages of a channel, in the order of the file.
+
+    Attributes:
+        log_ns: Times at which the recorder received the messages, in ns.
+        sequence: Sequence numbers, which are the ticks in the channels of sites.
+        size: Sizes of the payloads, in bytes.
+    """
 
     log_ns: "array[int]"
     sequence: "array[int]"
@@ -68,18 +74,19 @@ class _Messages(NamedTuple):
 
 
 class FileInventory:
-    """Content of a file, or of all files of one log.
+    """Content of an MCAP file, or of all files of one log.
 
     Args:
-        paths: the files.
-        progress: called with the number of bytes read so far, and of all bytes.
+        paths: The files.
+        progress: Function that is called with the number of bytes read so far and with the
+            number of all bytes.
 
     Attributes:
-        files: facts of every file, with keys that end in their unit.
-        metadata: metadata records of all files, by name; a later file replaces an earlier one.
+        files: Facts of every file, with keys that end in their unit.
+        metadata: Metadata records of all files, by name. A later file replaces an earlier one.
 
     Raises:
-        LogError: a file cannot be read, or is no MCAP file.
+        LogError: A file cannot be read, or is no MCAP file.
     """
 
     def __init__(self, paths: Sequence[Path], progress: Progress | None = None) -> None:
@@ -98,7 +105,7 @@ class FileInventory:
             bytes_before += path.stat().st_size
 
     def _read_file(self, path: Path, reader: McapReader) -> None:
-        """Adds the content of a file."""
+        """Adds the channels, the message numbers and the facts of a file."""
         for topic, payload, log_ns, _, sequence in reader.messages():
             messages = self._messages[topic]
             messages.log_ns.append(log_ns)
@@ -130,12 +137,14 @@ class FileInventory:
         rates_hz: Mapping[str, int],
         absences: Absences,
     ) -> dict[str, JsonObject]:
-        """Returns the facts of every channel by topic.
+        """Returns the facts of every channel, by topic.
+
+        Gaps are counted only in channels of one session, whose tick rates are known.
 
         Args:
-            session: name of the session whose channels' gaps are counted.
-            rates_hz: tick rates of the session's sites.
-            absences: ticks that the sites skipped.
+            session: Name of the session. Empty to count no gaps.
+            rates_hz: Tick rates of the session's sites.
+            absences: Ticks during which the sites were absent.
         """
         topics_in_order = dict.fromkeys([*self._channel_infos, *self._messages])
         channels = {}
@@ -188,33 +197,36 @@ def _count_gaps(
     rates_hz: Mapping[str, int],
     absences: Absences,
 ) -> JsonObject:
-    """Returns the gaps of a channel with consecutive numbers; None for those of other channels.
+    """Counts the messages that are missing from a channel, and those that it has twice.
+
+    Only the records and the link statistics of a site have consecutive numbers. Ticks during
+    which the site was absent are not missing.
 
     Args:
-        topic: topic of the channel.
-        sequence: tick of every message, in the order of the file.
-        session: name of the session.
-        rates_hz: tick rates of the session's sites.
-        absences: ticks that the sites skipped.
+        topic: Topic of the channel.
+        sequence: Tick of every message, in the order of the file.
+        session: Name of the session.
+        rates_hz: Tick rates of the session's sites.
+        absences: Ticks during which the sites were absent.
+
+    Returns:
+        The number of missing messages, the gaps as spans of message numbers, and the number of
+        duplicates. All are None for channels without consecutive numbers.
     """
     key = topics.parse_key(topic.removeprefix("/"))
-    if (
-        key is None
-        or key.session != session
-        or key.member not in rates_hz
-        or key.channel not in (topics.STATE, topics.LINK)
-    ):
+    if key is None or key.session != session or key.member not in rates_hz:
         return {"missing": None, "gaps": None, "duplicates": None}
+    if key.channel not in (topics.STATE, topics.LINK):
+        return {"missing": None, "gaps": None, "duplicates": None}
+
     account = Account()
     rate_hz = rates_hz[key.member]
     for tick in sequence:
         account.receive(number_message(key.channel, tick, rate_hz))
-    # ticks that the site skipped are not missing
-    for first, last in absences.get(key.member, ()):
-        account.mark_unpublished(
-            count_messages(key.channel, last + 1, rate_hz),
-            count_messages(key.channel, first, rate_hz),
-        )
+    for first_tick, last_tick in absences.get(key.member, ()):
+        next_number = count_messages(key.channel, last_tick + 1, rate_hz)
+        first_number = count_messages(key.channel, first_tick, rate_hz)
+        account.mark_unpublished(next_number, first_number)
     return {
         "missing": account.missing,
         "gaps": account.gaps[:MOST_LISTED_GAPS],
@@ -224,43 +236,48 @@ def _count_gaps(
 
 @dataclass(frozen=True, repr=False)
 class FileOverview(Result):
-    """Content of a file, or of the parts of one log; see `info`."""
+    """Content of an MCAP file, or of the parts of one log, returned by `info`.
+
+    Attributes:
+        facts: The content as plain values, with the keys of `trilat log info --json`.
+    """
 
     facts: JsonObject
 
     def headline(self) -> str:
-        """Returns the names of the files, and the number of messages."""
+        """Returns the names of the files and the number of their messages, in one line."""
         messages = sum(channel["messages"] for channel in self.facts["channels"].values())
         paths = ", ".join(file["path"] for file in self.facts["files"])
         return f"{paths}: {count_nouns(messages, 'message')}"
 
     def to_dict(self) -> JsonObject:
-        """Returns plain values, with the keys of `trilat log info --json`."""
+        """Returns the content as plain values, with the keys of `trilat log info --json`."""
         return self.facts
 
     def to_rows(self) -> list[JsonObject]:
-        """Returns a row per channel."""
+        """Returns a row of plain values for each channel."""
         return [
             {"topic": topic, **channel} for topic, channel in self.facts["channels"].items()
         ]
 
 
 def info(*files: str | Path, progress: Progress | None = None) -> FileOverview:
-    """Returns the content of an MCAP file, or of the parts of one log, as `trilat log info`.
+    """Returns the content of an MCAP file, or of the parts of one log.
 
-    `kind` is "trilat" for a trilat-net log that could be opened. Otherwise it is "mcap", with
-    the reason in `problem`.
+    `trilat log info` shows the same. The key `kind` is "trilat" for a log of this program that
+    could be opened. Otherwise it is "mcap", and `problem` states the reason if the file looks
+    like such a log.
 
     >>> path = tn.simulate("two_sites", duration_s=0.1).save("short.mcap")
     >>> tn.info(path).to_dict()["sites"]["m"]["records"]
     100
 
     Args:
-        files: the file, or the parts of one log.
-        progress: called with the amount of work done so far, and in all.
+        files: The file, or the parts of one log.
+        progress: Function that is called with the work done so far and with the whole work.
 
     Raises:
-        LogError: a file cannot be read, or is no MCAP file.
+        LogError: A file cannot be read, or is no MCAP file.
     """
     paths = [Path(file) for file in files]
 
@@ -294,7 +311,7 @@ def info(*files: str | Path, progress: Progress | None = None) -> FileOverview:
 
 
 def _describe_log(log: Log) -> JsonObject:
-    """Returns the facts of a trilat-net log: of its session, sites and links."""
+    """Returns the facts of a log of this program: of its session, its sites and its links."""
     links = {}
     for site in log.sites:
         for peer in log[site].peers:
@@ -309,11 +326,15 @@ def _describe_log(log: Log) -> JsonObject:
 
 _PROVENANCE = ("commit", "commit_dirty", "fingerprint", "platform", "python", "schema_version")
 _LAST_EPOCH_NS = 253_402_300_799 * NS_PER_S
-"""The last second of the year 9999, the latest time of `datetime`."""
+"""The last second of the year 9999 in Unix time, the latest time that `datetime` represents."""
 
 
 def describe_session(log: Log) -> JsonObject:
-    """Returns the facts of a log's session."""
+    """Returns the facts of a log's session as plain values.
+
+    They are the start time, the length, the ends that the sites reported, the scenario, and the
+    versions of the programs that made the log.
+    """
     session = log.session
     scenario = log.scenario
     epoch_ns = _parse_number(session.get("epoch_unix_ns", ""))
@@ -356,7 +377,10 @@ def describe_session(log: Log) -> JsonObject:
 
 
 def describe_site_health(log: Log, site: str) -> JsonObject:
-    """Returns the facts of a site's records and of its loop."""
+    """Returns the facts of a site's records and of the timing of its control loop.
+
+    The timing is None in virtual time, in which no clock is read.
+    """
     part = log[site]
     spec = log.scenario.sites[site]
     is_timed = log.driver == "live"
@@ -374,23 +398,32 @@ def describe_site_health(log: Log, site: str) -> JsonObject:
 
 
 def describe_link_health(log: Log, peer: str, site: str) -> JsonObject:
-    """Returns the facts of the directed link peer -> site."""
+    """Returns the facts of the link from a peer to a site.
+
+    They are the delay that the scenario states, the age of the samples in use, the measured
+    one-way delay, the offset of the clocks, and the last counts that the site published. A fact
+    that the log does not contain is None.
+    """
     clock = summarise_clock(log, peer, site)
-    stats = log.link_stats(site)[-1:]
-    counts = ("accepted", "lost", "late", "superseded", "duplicate", "refused")
     one_way_us = np.zeros(0, dtype=np.int64)  # not measured in virtual time
     version = _parse_number(log.session.get("schema_version", "")) or 0
     if log.driver == "live" and version >= ONE_WAY_SCHEMA_VERSION:
         arrivals = log[site].arrivals[1]
         is_from_peer = arrivals[:, 0] == log[site].peers.index(peer)
         one_way_us = arrivals[is_from_peer, 2]
+
+    counts: JsonObject = dict.fromkeys(
+        ("accepted", "lost", "late", "superseded", "duplicate", "refused")
+    )
+    for last_stats in log.link_stats(site)[-1:]:
+        counts = {name: getattr(last_stats, name).get(peer) for name in counts}
     return {
         "stated": log.scenario.links[f"{peer}->{site}"].describe(),
         "age_ms": compute_percentiles(sample_ages_ns(log, peer, site), unit=1e6),
         "one_way_ms": compute_percentiles(one_way_us, unit=1e3),
         "clock_offset_us": None if clock is None else clock.offset_us,
         "clock_bound_us": None if clock is None else clock.bound_us,
-        **{name: getattr(stats[0], name).get(peer) if stats else None for name in counts},
+        **counts,
     }
 
 
@@ -403,12 +436,15 @@ def compute_percentiles(
     shares: Mapping[str, float] = PERCENTILES,
     unit: float = 1.0,
 ) -> dict[str, float] | None:
-    """Returns percentiles by name; None without values.
+    """Computes percentiles, by name.
 
     Args:
-        values: the values.
-        shares: percentage by name.
-        unit: unit of the result, by which the values are divided.
+        values: The values.
+        shares: Percentage of each percentile, by name.
+        unit: Unit of the result, by which the values are divided.
+
+    Returns:
+        The percentiles. None without values.
     """
     array = np.asarray(values)
     if not array.size:
@@ -418,7 +454,11 @@ def compute_percentiles(
 
 
 def count_executed_ticks(log: Log, site: str) -> int | None:
-    """Returns the number of ticks of a site by its last `end` event; None without one."""
+    """Returns the number of ticks that a site executed, according to its last event "end".
+
+    Returns:
+        The number. None if the site published no such event.
+    """
     end_ticks = [
         event.ticks for event in log.events if event.kind == "end" and event.member == site
     ]
@@ -426,21 +466,24 @@ def count_executed_ticks(log: Log, site: str) -> int | None:
 
 
 def count_overruns(part: SiteLog) -> int:
-    """Returns the number of ticks that started later than a whole period."""
+    """Returns the number of ticks that started later than a whole tick period."""
     return int(np.count_nonzero(part.late_us >= 1e6 / part.rate_hz))
 
 
 def _parse_number(text: str) -> int | None:
-    """Returns the number that a text of at most 19 decimal digits stands for; else None."""
+    """Parses a number of at most 19 decimal digits. Returns None for any other text."""
     return int(text) if text.isascii() and text.isdigit() and len(text) < 20 else None
 
 
 def summarise_run(log: Log, twin: Log | None = None) -> JsonObject:
-    """Returns the numbers of a log, which may be torn, short or empty, for `summary.json`.
+    """Returns the numbers of a recorded run, for `summary.json`.
+
+    The log may be torn, short or empty. Numbers that it does not determine are None.
 
     Args:
-        log: the log of a run.
-        twin: log of the same run without operators, if there is one.
+        log: The log of the run.
+        twin: Log of the same run without operators, from which the effect of the operators is
+            computed. None if there is no such log.
     """
     sites = {site: _summarise_site(log, site, twin) for site in log.sites}
     settling_times_s = [site["settle_s"] for site in sites.values()]
@@ -489,7 +532,13 @@ def summarise_run(log: Log, twin: Log | None = None) -> JsonObject:
 
 
 def _summarise_site(log: Log, site: str, twin: Log | None) -> JsonObject:
-    """Returns the numbers of a site for `summary.json`."""
+    """Returns the numbers of a site for `summary.json`.
+
+    Args:
+        log: The log of the run.
+        site: Name of the site.
+        twin: Log of the same run without operators, or None.
+    """
     part = log[site]
     spec = log.scenario.sites[site]
     at_end = np.zeros(0, dtype=bool)
@@ -500,6 +549,7 @@ def _summarise_site(log: Log, site: str, twin: Log | None) -> JsonObject:
         displacement = operator_displacement(log, twin, site)[2]
     executed = count_executed_ticks(log, site)
     expected = log.scenario.ticks(site)
+    ticks = expected if executed is None else executed
     late_us = compute_percentiles(part.late_us, _LATENESS_PERCENTILES)
     busy_us = compute_percentiles(part.busy_us)
     at_limit = np.abs(part.tau) >= spec.limits.tau_limit_nm
@@ -514,7 +564,7 @@ def _summarise_site(log: Log, site: str, twin: Log | None) -> JsonObject:
         "records": len(part),
         "expected_ticks": expected,
         "made_ticks": executed,
-        "missing": max(0, (expected if executed is None else executed) - len(part)),
+        "missing": max(0, ticks - len(part)),
         "diverged_at_s": part.diverged_s,
         "modes": [interval._asdict() for interval in find_mode_intervals(part)],
         "q_end_rad": part.q[-1].tolist() if len(part) else None,
@@ -532,7 +582,12 @@ def _summarise_site(log: Log, site: str, twin: Log | None) -> JsonObject:
 
 
 def _summarise_link(log: Log, link: LinkSummary) -> JsonObject:
-    """Returns the numbers of a link for `summary.json`."""
+    """Returns the numbers of a link for `summary.json`.
+
+    Args:
+        log: The log of the run.
+        link: Summary of the link.
+    """
     counts = link.counts
     clock = summarise_clock(log, link.peer, link.site)
     stated = []
@@ -569,6 +624,6 @@ def _summarise_link(log: Log, link: LinkSummary) -> JsonObject:
 
 
 def _largest_magnitude(values: ArrayLike) -> float | None:
-    """Returns the largest absolute value; None without values."""
+    """Returns the largest absolute value. None without values."""
     array = np.abs(np.asarray(values))
     return float(array.max()) if array.size else None

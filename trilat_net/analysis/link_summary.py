@@ -1,16 +1,22 @@
-"""Summarises every directed link of a run: delays, loss, bursts, sample counts and clocks.
+"""Summarises the links of a recorded run: their delays, losses, sample counts and clocks.
 
-The effective delay is the age of the sample in use at a tick (age of information, Kaul, Yates
-and Gruteser 2012). docs/definitions.md defines each quantity.
+A link is the directed connection from one site (the peer) to another. The peer publishes a
+sample of its state in every tick, and the receiving site uses the newest sample that has
+arrived and is due. The effective delay of the link is the age of the sample in use at a tick
+(age of information; Kaul, Yates and Gruteser 2012). docs/definitions.md defines each quantity.
+
+The program itself delays samples, to emulate a network. The delay of each sample is a function
+of the seed, the link and the number of the sample. This module computes these delays again from
+the scenario, and compares them with the recorded arrivals.
 
 Invariant:
     - A quantity that the log does not determine is None.
-    - Clock estimates are those in force while the session ran, without later improvement.
-    - The predicted delivery of a sample is a function of seed, link and index (L4). The log's
-      scenario and the changes that its records name determine it, also for samples that never
-      arrived.
-    - A record names its inputs (L3). Samples that only a missing record could name stay
-      unknown, and count neither as arrived nor as missing.
+    - Estimates of clocks are those that were used while the session ran. They are not improved
+      later.
+    - The delays of samples that never arrived are known too (rule L4 of docs/design.md),
+      because the scenario and the recorded changes of the link determine them.
+    - A record names the samples that it received (rule L3). If that record is missing, it is
+      unknown whether they arrived, and they count neither as arrived nor as missing.
 """
 
 from typing import NamedTuple
@@ -32,17 +38,18 @@ from .timeline import StatedModel, list_changes, list_stated_models
 
 
 class PredictedDelivery(NamedTuple):
-    """Delivery of the samples 0 to M - 1 of a link's peer, as the link's model predicts it.
+    """Delivery of the samples 0 to M - 1 of a link, as the delay model of the link predicts it.
 
-    Times are in ns since the epoch.
+    Times are in ns after the start of the session.
 
     Attributes:
-        stamp_ns: stamps of the samples, shape (M,).
-        due_ns: times at which the samples are due, shape (M,); `LOST` for a lost sample.
-        drawn_ns: times at which they would be due by the model's own delay alone, without
-            duplicates, order and play-out, shape (M,).
-        measured: True if no delay is injected, so that a sample is due at once, shape (M,).
-        copies: number of duplicates that the link makes.
+        stamp_ns: Times at which the peer sent the samples, shape (M,).
+        due_ns: Times at which the samples come into use, shape (M,). `LOST` for a lost sample.
+        drawn_ns: Times at which they would come into use because of the delay alone, without
+            duplicates, reordering and play-out buffer, shape (M,).
+        measured: True if the delay is that of the real network, so that a sample is due as soon
+            as it arrives, shape (M,).
+        copies: Number of duplicates that the link makes.
     """
 
     stamp_ns: Ints
@@ -59,17 +66,20 @@ class PredictedDelivery(NamedTuple):
 
     @property
     def drawn_ms(self) -> Array:
-        """The injected delays of the samples that are not lost, in ms."""
+        """Delays that the program adds to the samples that are not lost, in ms."""
         delivered = ~self.lost & ~self.measured
         return (self.drawn_ns[delivered] - self.stamp_ns[delivered]) / 1e6
 
     def release(self, rate_hz: int) -> Ints:
         """Returns the receiver's ticks at which the samples come into use, shape (M,).
 
-        A sample comes into use at this tick if it has arrived; `LOST` for a lost sample.
+        A sample comes into use at this tick if it has arrived by then.
 
         Args:
-            rate_hz: the receiver's tick rate.
+            rate_hz: Tick rate of the receiver.
+
+        Returns:
+            The ticks. `LOST` for a lost sample.
         """
         ticks = first_ticks(np.maximum(self.due_ns, self.stamp_ns + 1), rate_hz)
         return np.where(self.lost, LOST, ticks)
@@ -81,10 +91,16 @@ def predict_delivery(
     site: str,
     count: int,
 ) -> PredictedDelivery:
-    """Returns the predicted delivery of the first `count` samples of the link peer -> site.
+    """Computes when the first samples of the link from a peer to a site are due.
+
+    Args:
+        log: The log of the run, which contains the scenario and the changes of the link.
+        peer: Name of the sender.
+        site: Name of the receiver.
+        count: Number of samples.
 
     Raises:
-        LogError: a record names a change that is not valid.
+        LogError: A record names a change that is not valid.
     """
     links = log.scenario.setup(site).links
     setup = next(link for link in links if link.peer == peer)
@@ -96,15 +112,19 @@ def predict_delivery(
         if command.peer == peer_index and command.model is not None
     ]
     schedule = LinkSchedule(setup, ordered_models)
+    models = schedule.models
+    due_ns = schedule.draw(count)
+
+    # The same link without duplicates, reordering and play-out buffer. It is computed only if
+    # it differs.
     delay_alone = LinkSchedule(setup, ordered_models)
     delay_alone.models["duplicate"] = 0.0
     delay_alone.models["in_order"] = 0
     delay_alone.models["playout_us"] = 0
-    models = schedule.models
-    due_ns = schedule.draw(count)
     drawn_ns = due_ns
     if not np.array_equal(delay_alone.models, models):
         drawn_ns = delay_alone.draw(count)
+
     stamp_ns = np.arange(count, dtype=np.int64) * NS_PER_S // setup.rate_hz
     model_index = np.searchsorted(models["from_ns"][1:], stamp_ns, side="right")
     return PredictedDelivery(
@@ -117,14 +137,14 @@ def predict_delivery(
 
 
 class Arrivals(NamedTuple):
-    """Arrivals over a link, in the order of the records.
+    """Arrivals of samples over a link, in the order of the records.
 
     Attributes:
-        tick: the receiver's ticks, shape (A,).
-        sample: indices of the samples, shape (A,).
-        delay_us: one-way delays in the records, shape (A,).
-        refused: number of further arrivals with a stamp out of range, or of a tick that the
-            sender never makes.
+        tick: Ticks in which the receiver accepted the samples, shape (A,).
+        sample: Numbers of the samples, shape (A,).
+        delay_us: One-way delays in the records, shape (A,), in microseconds.
+        refused: Number of further arrivals whose time stamp is out of range, or whose tick the
+            sender never executes.
     """
 
     tick: Ints
@@ -134,13 +154,21 @@ class Arrivals(NamedTuple):
 
     @property
     def first(self) -> "Arrivals":
-        """The first arrival of each sample, by sample."""
+        """The first arrival of each sample, ordered by sample."""
         sample, rows = np.unique(self.sample, return_index=True)
         return Arrivals(self.tick[rows], sample, self.delay_us[rows], self.refused)
 
 
 def read_arrivals(log: Log, site: str) -> dict[str, Arrivals]:
-    """Returns the arrivals at a site by peer."""
+    """Reads the arrivals at a site from its records.
+
+    Args:
+        log: The log of the run.
+        site: Name of the receiver.
+
+    Returns:
+        The arrivals, by peer.
+    """
     part = log[site]
     counts, entries = part.arrivals
     all_ticks = np.repeat(part.tick, counts)
@@ -170,9 +198,9 @@ def count_sent(log: Log, peer: str, newest: int) -> int:
     """Returns the number of samples that a peer has sent, as far as the log shows.
 
     Args:
-        log: the log of a run.
-        peer: name of the peer.
-        newest: index of the newest sample that arrived anywhere; -1 if none did.
+        log: The log of the run.
+        peer: Name of the peer.
+        newest: Number of the newest sample that arrived anywhere. -1 if no sample did.
     """
     part = log[peer]
     end_ticks = [
@@ -188,28 +216,34 @@ def mark_judged_samples(
     stamp_ns: Ints,
     arrivals: Arrivals,
 ) -> Bools:
-    """Returns the samples of which it is known whether they arrived, shape (M,).
+    """Finds the samples of which it is known whether they arrived.
 
-    These are the samples that arrived, those older than the newest arrival, and those older
-    than the slowest arrival took. Samples that may have arrived in a tick whose record is
-    missing are excluded.
+    A sample that did not arrive counts as lost only if it could have arrived before the end of
+    the run: it is older than the newest arrival, or it was sent so early that the slowest
+    arrival would have been in time. It is unknown whether a sample arrived if the record of a
+    tick in which it may have arrived is missing.
 
     Args:
-        log: the log of a run.
-        site: the receiver.
-        stamp_ns: stamps of the samples 0 to M - 1, ns since the epoch.
-        arrivals: first arrivals of the samples.
+        log: The log of the run.
+        site: Name of the receiver.
+        stamp_ns: Times at which the samples 0 to M - 1 were sent, in ns after the start.
+        arrivals: First arrivals of the samples.
+
+    Returns:
+        True for each sample whose fate is known, shape (M,).
     """
     part = log[site]
     count = len(stamp_ns)
     if not len(part):
         return np.zeros(count, dtype=np.bool_)
+
     earliest_tick = first_ticks(stamp_ns + 1, part.rate_hz)
     slowest_ticks = int((arrivals.tick - earliest_tick[arrivals.sample]).max(initial=0))
     newest = int(arrivals.sample.max(initial=-1))
     last_tick = min(int(part.tick[-1]), log.scenario.ticks(site) - 1)
     is_older_than_newest = np.arange(count) <= newest
     judged: Bools = is_older_than_newest | (earliest_tick + slowest_ticks <= last_tick)
+
     is_missing = np.ones(last_tick + 1, dtype=np.bool_)
     is_missing[part.tick[part.tick <= last_tick]] = False
     missing_ticks = np.flatnonzero(is_missing)
@@ -226,7 +260,7 @@ MOST_AGE_BINS = 50
 """Largest number of bins of a histogram of ages."""
 
 ONE_WAY_SCHEMA_VERSION = 2
-"""First schema version whose records have the one-way delay of an arrival."""
+"""First version of the log format whose records contain the one-way delay of an arrival."""
 
 
 class ValueStatistics(NamedTuple):
@@ -242,12 +276,12 @@ class ValueStatistics(NamedTuple):
 
 
 class AgeHistogram(NamedTuple):
-    """Number of ticks by age, in bins of equal width.
+    """Number of ticks by the age of the sample in use, in bins of equal width.
 
     Attributes:
-        first_ms: lower edge of the first bin.
-        width_ms: width of a bin.
-        ticks: number of ticks in each bin.
+        first_ms: Lower edge of the first bin, in ms.
+        width_ms: Width of a bin, in ms.
+        ticks: Number of ticks in each bin.
     """
 
     first_ms: float
@@ -256,10 +290,21 @@ class AgeHistogram(NamedTuple):
 
 
 class ClockSummary(NamedTuple):
-    """The clock of a link's sender against the receiver's: `clock.*` of docs/definitions.md.
+    """The clock of a link's sender, compared with the receiver's.
 
-    `drift_ppm`, `drift_bound_ppm` and `rtt_min_us` are None without an estimate. `faults`
-    counts the steps of a clock.
+    docs/definitions.md defines the quantities under `clock.*`.
+
+    Attributes:
+        offset_us: Last estimate of the sender's clock minus the receiver's, in microseconds.
+        offset_first_us: First estimate.
+        drift_ppm: Rate of the sender's clock against the receiver's, minus 1. None without an
+            estimate.
+        drift_bound_ppm: Largest possible error of the drift. None without an estimate.
+        bound_us: Largest possible error of the last estimate of the offset.
+        bound_p50_us: Median of this error over the run.
+        bound_max_us: Maximum of this error over the run.
+        rtt_min_us: Shortest round trip of a query for the clock. None without a reply.
+        faults: Number of detected steps of a clock.
     """
 
     offset_us: int
@@ -274,12 +319,21 @@ class ClockSummary(NamedTuple):
 
     @property
     def shared(self) -> bool:
-        """True if both ends read the same clock."""
+        """True if both ends read the same clock, because they run on the same machine."""
         return self.bound_max_us == 0 and self.offset_us == 0
 
 
 def summarise_clock(log: Log, peer: str, site: str) -> ClockSummary | None:
-    """Returns the estimates of a peer's clock at a site; None in virtual time."""
+    """Returns the estimates of a peer's clock that a site made during a session.
+
+    Args:
+        log: The log of the run.
+        peer: Name of the peer.
+        site: Name of the site that estimated the clock.
+
+    Returns:
+        The estimates. None in virtual time, or if the site published none.
+    """
     stats = [report for report in log.link_stats(site) if peer in report.offset_us]
     if not stats:
         return None
@@ -306,7 +360,22 @@ def summarise_clock(log: Log, peer: str, site: str) -> ClockSummary | None:
 
 
 class SampleCounts(NamedTuple):
-    """Sample counts of a link by the receiver's records: `samples.*` of docs/definitions.md."""
+    """Numbers of samples of a link, according to the receiver's records.
+
+    docs/definitions.md defines them under `samples.*`.
+
+    Attributes:
+        sent: Samples that the peer sent.
+        judged: Samples of which it is known whether they arrived.
+        arrived: Samples that arrived, each counted once.
+        missing: Judged samples that did not arrive.
+        lost: Samples that arrived, but that the emulated network loses.
+        late: Samples that arrived after the tick in which they should have come into use.
+        superseded: Samples that came too late to be used, because a newer sample was in use.
+        duplicate: Further arrivals of samples that had arrived before.
+        copies: Duplicates that the emulated network makes.
+        refused: Arrivals whose time stamp is out of range.
+    """
 
     sent: int
     judged: int
@@ -321,24 +390,25 @@ class SampleCounts(NamedTuple):
 
 
 class LinkSummary(NamedTuple):
-    """Summary of the directed link peer -> site; docs/definitions.md ("Links") defines it.
+    """Summary of the directed link from a peer to a site.
 
-    A quantity that the log does not determine is None.
+    docs/definitions.md ("Links") defines the quantities. A quantity that the log does not
+    determine is None.
 
     Attributes:
-        peer: the sender.
-        site: the receiver.
-        stated: the models in force, over time.
-        drawn_ms: delays that these models gave to the samples.
-        age_ms: effective delay that the controller saw.
-        ages: histogram of the effective delay.
-        first_use_s: time at which the first sample came into use, in s.
-        ticks_without_new: share of ticks at which no new sample came into use.
-        silence_ms: longest time between two new samples in use.
-        counts: sample counts.
-        loss: share of judged samples that could not come into use.
-        burst: mean number of successive samples that were lost.
-        one_way_us: measured one-way delays.
+        peer: Name of the sender.
+        site: Name of the receiver.
+        stated: Delay models of the link over time, as the scenario and the changes state them.
+        drawn_ms: Delays that these models gave to the samples.
+        age_ms: Effective delay: the age of the sample in use.
+        ages: Histogram of the effective delay.
+        first_use_s: Time at which the first sample came into use, in s.
+        ticks_without_new: Share of ticks in which no new sample came into use.
+        silence_ms: Longest time between two new samples in use.
+        counts: Numbers of samples.
+        loss: Share of judged samples that could not come into use.
+        burst: Mean number of successive samples that were lost.
+        one_way_us: Measured one-way delays.
     """
 
     peer: str
@@ -362,14 +432,18 @@ class LinkSummary(NamedTuple):
 
     @property
     def plain(self) -> bool:
-        """True if one constant delay describes the whole link."""
+        """True if one constant delay describes everything that the link did."""
         counts = self.counts
         is_as_stated = counts is None or not (counts.late or counts.missing)
         return is_as_stated and has_one_constant_delay(self.stated)
 
 
 def has_one_constant_delay(states: list[StatedModel]) -> bool:
-    """True if a link's models give every sample the same delay, and lose no sample."""
+    """Returns True if a link gives every sample the same delay, and loses no sample.
+
+    Args:
+        states: Delay models of the link over time.
+    """
     link = states[0].link
     is_constant = link.to_core_model().kind == DelayKind.CONSTANT
     is_lossless = not (link.loss or link.duplicate or link.outages_s)
@@ -379,8 +453,11 @@ def has_one_constant_delay(states: list[StatedModel]) -> bool:
 def summarise_links(log: Log) -> list[LinkSummary]:
     """Returns a summary of every link, by receiver and then by peer, in scenario order.
 
+    Args:
+        log: The log of the run.
+
     Raises:
-        LogError: a record names a change that is not valid.
+        LogError: A record names a change that is not valid.
     """
     changed = list_changes(log)
     arrivals_by_site = {site: read_arrivals(log, site) for site in log.sites}
@@ -407,7 +484,10 @@ def summarise_links(log: Log) -> list[LinkSummary]:
 
 
 def sample_ages_ns(log: Log, peer: str, site: str) -> Ints:
-    """Returns the age of the sample in use at every tick from the first sample on, in ns."""
+    """Returns the age of the sample in use at every tick, in ns.
+
+    Ticks before the first sample came into use are left out.
+    """
     part = log[site]
     used = part.used[peer]
     has_sample = used >= 0
@@ -416,7 +496,7 @@ def sample_ages_ns(log: Log, peer: str, site: str) -> Ints:
 
 
 def compute_statistics(values: ArrayLike) -> ValueStatistics | None:
-    """Returns the statistics of numbers; None without numbers."""
+    """Returns the statistics of numbers. None without numbers."""
     array = np.asarray(values, dtype=np.float64)
     if not array.size:
         return None
@@ -435,12 +515,15 @@ def compute_statistics(values: ArrayLike) -> ValueStatistics | None:
 
 
 def bin_ages(age_ns: Ints) -> AgeHistogram | None:
-    """Returns a histogram of ages in at most `MOST_AGE_BINS` bins; None without ages.
+    """Returns a histogram of ages in at most `MOST_AGE_BINS` bins.
 
-    The width of a bin is 1, 2 or 5 times a power of ten, from 10 us on.
+    The width of a bin is 1, 2 or 5 times a power of ten, and at least 10 microseconds.
 
     Args:
-        age_ns: ages, shape (K,), ns.
+        age_ns: Ages, shape (K,), in ns.
+
+    Returns:
+        The histogram. None without ages.
     """
     if not len(age_ns):
         return None
@@ -465,30 +548,35 @@ def _summarise_link(
     sent: int,
     arrivals: Arrivals,
 ) -> LinkSummary:
-    """Returns the summary of the link peer -> site.
+    """Returns the summary of the link from a peer to a site.
 
     Args:
-        log: the log of a run.
-        states: models of the link over time.
-        peer: the sender.
-        site: the receiver.
-        sent: number of samples that the peer sent.
-        arrivals: arrivals over the link.
+        log: The log of the run.
+        states: Delay models of the link over time.
+        peer: Name of the sender.
+        site: Name of the receiver.
+        sent: Number of samples that the peer sent.
+        arrivals: Arrivals over the link.
     """
     part = log[site]
     used = part.used[peer]
     delivery = predict_delivery(log, peer, site, sent)
     age_ns = sample_ages_ns(log, peer, site)
+
+    # losses, and bursts of successive losses
     first = arrivals.first
     is_judged = mark_judged_samples(log, site, delivery.stamp_ns, first)
     for first_skipped, last_skipped in log.absences.get(peer, ()):
-        is_judged[first_skipped : last_skipped + 1] = False  # the peer made none of these
+        is_judged[first_skipped : last_skipped + 1] = False  # the peer sent none of these
     has_not_arrived = np.ones(len(is_judged), dtype=np.bool_)
     has_not_arrived[first.sample] = False
     is_lost = (has_not_arrived | delivery.lost) & is_judged
     lost = int(np.count_nonzero(is_lost))
     judged = int(np.count_nonzero(is_judged))
-    bursts = int(np.count_nonzero(is_lost[1:] & ~is_lost[:-1])) + int(is_lost[:1].any())
+    later_bursts = int(np.count_nonzero(is_lost[1:] & ~is_lost[:-1]))
+    bursts = later_bursts + int(is_lost[:1].any())
+
+    # ticks without a new sample, and the longest silence
     ticks_without_new = None
     is_successive = (np.diff(part.tick) == 1) & (used[:-1] >= 0)
     if is_successive.any():
@@ -500,6 +588,7 @@ def _summarise_link(
         new_ticks = part.tick[np.flatnonzero(np.diff(used, prepend=-1))]
         edges = np.append(new_ticks, part.tick[-1] + 1)
         silence_ms = float(np.diff(edges * NS_PER_S // part.rate_hz).max()) / 1e6
+
     counts = None
     one_way_us = None
     if len(part):
@@ -536,21 +625,22 @@ def _count_samples(
     arrivals: Arrivals,
     judged: int,
 ) -> SampleCounts:
-    """Returns the sample counts of a link.
+    """Counts the samples of a link by what happened to them, see `SampleCounts`.
 
     Args:
-        part: log of the receiver.
-        used: index of the sample in use at every record, shape (K,).
-        delivery: predicted delivery of all samples.
-        arrivals: arrivals over the link.
-        judged: number of judged samples.
+        part: Log of the receiver.
+        used: Number of the sample in use at every record, shape (K,).
+        delivery: Predicted delivery of all samples.
+        arrivals: Arrivals over the link.
+        judged: Number of samples of which it is known whether they arrived.
     """
     first = arrivals.first
     release_tick = delivery.release(part.rate_hz)[first.sample]
     is_lost = delivery.lost[first.sample]
     is_injected = ~delivery.measured[first.sample]
     is_late = ~is_lost & is_injected & (first.tick > release_tick)
-    # the newest sample wins: at the tick that releases a sample, it or a newer sample is in use
+    # A sample is superseded if a newer one is in use at the tick in which it could come into
+    # use: the receiver always uses the newest sample.
     use_tick = np.maximum(release_tick, first.tick)
     row = np.minimum(np.searchsorted(part.tick, use_tick), len(part) - 1)
     is_recorded = part.tick[row] == use_tick

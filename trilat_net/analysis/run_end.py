@@ -1,17 +1,24 @@
 """Judges a run by its end: stable, not stable, or open.
 
-The judged part is the second half of the run. If an operator acts or the loop changes within
-this half, the time after the last action or change is judged instead, provided that it is long
-enough. `envelope_trend` defines the trends of |e| and |qd| over the judged part. A sustained
-oscillation of any size is steady. Decaying modes beat, so that a steady joint may receive its
-energy from a faster joint of the coupled sites that decays: the steady joint is then undecided.
+The judgement uses the errors e of the sites (the differences from what they follow) and the
+joint velocities qd, and no theory. The largest |e| and |qd| of every joint in intervals of
+1 / 20 s are its envelopes. The trends of these envelopes over the second half of the run, which
+`envelope_trend` defines, decide the behaviour of the joint: it converges, decays, oscillates,
+drifts or grows.
+
+If an operator acts or the loop changes within this half, the time after the last action or
+change is judged instead, provided that it is long enough.
+
+A sustained oscillation of any size is steady. However, several modes that all decay may beat,
+so that a joint is steady for a while because it receives energy from a faster joint of the
+coupled sites. If such a faster joint decays, the steady joint is undecided.
 
 Invariant:
     - All commands use the judgement of this module (docs/definitions.md, "Stable").
     - Each joint of each site is judged separately, and the worst joint decides.
     - A judgement describes the record and predicts nothing.
-    - Further knowledge of a whole log (V, the roots at its end pose) may make a stable run
-      open, never the reverse.
+    - Further knowledge about a run (its energy function V, the roots at its end pose) may turn
+      a stable run into an open one, never the reverse.
 """
 
 import math
@@ -36,49 +43,52 @@ from .site_signals import SETTLED_ERROR_RAD
 from .torque_sources import compute_operator_script
 
 SETTLED_SPEED_RAD_S = 1e-2
-"""Largest speed of the last second of a converged run, rad/s: the arms have come to rest."""
+"""Largest speed in the last second of a run whose arms have come to rest, in rad/s."""
 
 STATIC_SPEED_RAD_S = 2e-3
-"""Largest speed in a static window, rad/s: the torques on an arm balance each other."""
+"""Largest speed of an arm at which its torques count as balanced, in rad/s."""
 
 EQUILIBRIUM_SPEED_RAD_S = 1e-5
-"""Largest speed of the last second of a run that ends in an equilibrium, rad/s.
+"""Largest speed in the last second of a run that ends in an equilibrium, in rad/s.
 
-The loop can be linearised there.
+The loop can be linearised at such an end.
 """
 
 AGREEMENT_RAD = 2e-2
-"""Sites whose angles of a joint differ by more than this do not agree, rad."""
+"""Largest difference between the angles of a joint at which sites count as agreeing, in rad."""
 
 THROWN_RAD = 0.5 * math.pi
-"""Arms without an operator that end further than this from all start poses were thrown, rad."""
+"""Largest distance from all start poses at which an arm may end without an operator, in rad.
+
+An arm that ends further away was thrown by its controller.
+"""
 
 DRIFT_RAD = 0.05
-"""A joint that moves by more than this in one direction over the judged half may drift, rad.
+"""Least motion in one direction over the judged half that counts as a drift, in rad.
 
 A joint that is slow enough to be at rest, but moves by more than `SETTLED_ERROR_RAD`, is
 undecided.
 """
 
 FORCE_NM = 1e-3
-"""A larger torque of an operator or environment at the end may hold sites apart, N m."""
+"""Least torque of an operator or environment at the end that may hold sites apart, in N m."""
 HELD_SHARE = 0.02
-"""Sites are held apart by such a torque if an error exceeds this share of their distance."""
+"""Least error of sites that a torque holds apart, as a share of the distance of the sites."""
 
 LEAST_JUDGED_S = 2.0
-"""Least time after the last action or change for this time to be judged by itself, s."""
+"""Shortest time after the last action or change that is judged by itself, in s."""
 LEAST_JUDGED_SHARE = 0.1
-"""Least share of the run that this time must have.
+"""Shortest such time as a share of the run.
 
 If the time is shorter, the second half is judged, although it contains the action or change.
 """
 
 MIN_SIGN_CHANGES = 6
-"""Least number of changes of sign in the second half of a run that show a period."""
+"""Least number of changes of sign in the second half of a run that show an oscillation."""
 
 
 class Stability(StrEnum):
-    """The judgement of a run; the value is the word for people."""
+    """The judgement of a run. The value is the word for people."""
 
     STABLE = "stable"
     NOT_STABLE = "not stable"
@@ -86,7 +96,7 @@ class Stability(StrEnum):
 
 
 class EndBehaviour(StrEnum):
-    """Behaviour of a run at its end, from best to worst; the value is the text for people."""
+    """Behaviour of a run at its end, from best to worst. The value is the text for people."""
 
     CONVERGED = "converged"
     DECAYS = "decaying"
@@ -113,24 +123,27 @@ _FALLING = (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY)
 
 
 class RunEnd(NamedTuple):
-    """End of a run, of all of its sites or of some of them.
+    """End of a run: its behaviour and the numbers on which the behaviour is based.
+
+    The object describes all sites of the run, or a single joint while the joints are compared.
 
     Attributes:
-        behaviour: behaviour of the worst joint.
-        error: trend of that joint's |e|.
-        speed: trend of that joint's |qd|.
-        end_error_rad: largest |e| of the last second, of all joints.
-        end_speed_rad_s: largest |qd| of the last second, of all joints.
-        where: name of the worst joint; "" if there is no joint.
-        reasons: sentences on everything that leaves the run open.
-        operator_acts: True if an operator acts in the judged part, instead of only holding.
-        diverged_at_s: time at which the first site left its limits; None if no site did.
-        frequency_hz: frequency of a bounded oscillation; None otherwise.
-        missing_sites: sites without any record, which leave the run undecided.
-        error_unit: unit of |e|: "rad", or "m" in task space.
-        counts_from_s: time from which the run counts, in s: the second half from there on is
-            judged.
-        quiet_from_s: time from which nobody acts and the loop does not change, in s.
+        behaviour: Behaviour of the worst joint.
+        error: Trend of that joint's |e|.
+        speed: Trend of that joint's |qd|.
+        end_error_rad: Largest |e| of the last second, of all joints.
+        end_speed_rad_s: Largest |qd| of the last second, of all joints.
+        where: Name of the worst joint. Empty if there are no records.
+        reasons: Sentences on everything that leaves the run open.
+        operator_acts: True if an operator changes its action in the judged part, instead of
+            only holding an arm.
+        diverged_at_s: Time at which the first site exceeded its limits. None if no site did.
+        frequency_hz: Frequency of a bounded oscillation. None otherwise.
+        missing_sites: Sites without any record, which leave the run undecided.
+        error_unit: Unit of |e|: "rad", or "m" if the sites follow positions in task space.
+        counts_from_s: Time from which the run counts, in s. The second half of the time after
+            it is judged.
+        quiet_from_s: Time from which no operator acts and the loop does not change, in s.
     """
 
     behaviour: EndBehaviour
@@ -150,7 +163,10 @@ class RunEnd(NamedTuple):
 
     @property
     def stability(self) -> Stability:
-        """The judgement; motion that an operator may cause is open, unless a site diverged."""
+        """The judgement of the run.
+
+        Motion that an operator may have caused is left open, unless a site diverged.
+        """
         stability = self.behaviour.stability
         if stability is not Stability.NOT_STABLE:
             return Stability.OPEN if self.reasons else stability
@@ -161,11 +177,12 @@ class RunEnd(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The behaviour with its numbers, and the reasons; part of the certificate's JSON."""
+        """The behaviour with its numbers, and the reasons, as in the certificate's JSON."""
         return "; ".join([self._behaviour_text, *self.reasons])
 
     @property
     def _behaviour_text(self) -> str:
+        """A sentence on the behaviour, with its numbers."""
         behaviour = self.behaviour
         if self.diverged_at_s is not None:
             return f"diverged at {self.diverged_at_s:.4g} s: a joint passed its qd_limit_rad_s"
@@ -195,15 +212,15 @@ class RunTrace(NamedTuple):
     """The data from which the end of a run is judged, per site in scenario order.
 
     Attributes:
-        buckets: for every interval of 1 / `BUCKETS_PER_S` since the epoch, the largest |e| and
-            |qd| and the last q of every joint, shape (K, 3 n); -1 for an interval without a
-            record. There may be columns for more joints than the site has. A site's last
-            interval may be incomplete, and no trend uses it.
-        tau_x: torque of operator and environment at the last record, shape (n,), N m.
-        diverged_at_s: time at which the first site left its limits; None if no site did.
-        pushed_until_s: time at which an operator whose action is not in the scenario last
-            pushed, in s; 0 if none did.
-        changed_until_s: time at which a command last changed the loop, in s; 0 if none did.
+        buckets: For every interval of 1 / `BUCKETS_PER_S` since the start of the session, the
+            largest |e| and |qd| and the last angle q of every joint, shape (K, 3 n). The values
+            are -1 in an interval without a record. There may be columns for more joints than
+            the site has. The last interval of a site may be incomplete, and no trend uses it.
+        tau_x: Torque of operator and environment at the last record, shape (n,), in N m.
+        diverged_at_s: Time at which the first site exceeded its limits. None if no site did.
+        pushed_until_s: Last time at which an operator pushed whose action is not part of the
+            scenario, in s. 0 if none did.
+        changed_until_s: Last time at which a command changed the loop, in s. 0 if none did.
     """
 
     buckets: Sequence[Array]
@@ -224,16 +241,21 @@ def reduce_to_buckets(
     q: Array,
     into: Array,
 ) -> Array:
-    """Returns buckets with further records of a site added.
+    """Adds further records of a site to the envelopes from which the end of its run is judged.
 
-    In task space e has as many columns as the task. Missing columns of e, qd or q are zero.
+    In task space e has as many columns as the task has coordinates. Columns that e, qd or q
+    lack are filled with zeros.
 
     Args:
-        bucket: index of each record's bucket, ascending, shape (K,).
-        e: errors, shape (K, n).
-        qd: joint velocities, shape (K, n), rad/s.
-        q: joint angles, shape (K, n), rad.
-        into: buckets of all earlier records; may be changed in place, and have spare rows.
+        bucket: Index of the interval of each record, ascending, shape (K,).
+        e: Errors, shape (K, n).
+        qd: Joint velocities, shape (K, n), in rad/s.
+        q: Joint angles, shape (K, n), in rad.
+        into: Envelopes of all earlier records, see `RunTrace`. They may be changed in place,
+            and may have spare rows.
+
+    Returns:
+        The envelopes with the new records.
     """
     if not len(bucket):
         return into
@@ -264,7 +286,7 @@ def reduce_to_buckets(
 
 
 def trace_log(log: Log) -> RunTrace:
-    """Returns the data from which the end of a log's run is judged."""
+    """Returns the data from which the end of a recorded run is judged."""
     buckets = []
     tau_x = []
     push_times_s = []
@@ -294,7 +316,10 @@ def trace_log(log: Log) -> RunTrace:
 def _find_unscripted_push_s(log: Log, part: SiteLog) -> float:
     """Returns the last time at which an operator outside the scenario pushed a site, in s.
 
-    Such operators act on external arms, or are live hands. Returns 0 if none pushed.
+    Operators act outside the scenario if they move an arm that is not simulated, or act live.
+
+    Returns:
+        The time. 0 if no such operator pushed.
     """
     pushed = np.zeros(len(part), dtype=np.bool_)
     if part.name in log.scenario.external:
@@ -305,7 +330,10 @@ def _find_unscripted_push_s(log: Log, part: SiteLog) -> float:
 
 
 def classify_log_end(log: Log) -> RunEnd:
-    """Returns the end of a log's run; the ends of torn and empty logs are undecided."""
+    """Judges the end of a recorded run.
+
+    The end of a torn or empty log is undecided. A bounded oscillation gets its frequency.
+    """
     end = classify_run_end(log.scenario, trace_log(log))
     if end.behaviour is not EndBehaviour.BOUNDED:
         return end
@@ -314,7 +342,16 @@ def classify_log_end(log: Log) -> RunEnd:
 
 
 def classify_run_end(scenario: Scenario, trace: RunTrace) -> RunEnd:
-    """Returns the end of a run from its trace."""
+    """Judges the end of a run.
+
+    The worst joint of all sites decides. A run that is stable by the trends of its joints is
+    left open if its sites do not agree, if arms fell, or if the loop changed until shortly
+    before the end.
+
+    Args:
+        scenario: Scenario of the run.
+        trace: Envelopes of the run, see `RunTrace`.
+    """
     sites = _split_buckets(scenario, trace)
     # the last interval may be incomplete
     count = max(min(map(len, sites)) - 1, 0)
@@ -363,7 +400,10 @@ def classify_run_end(scenario: Scenario, trace: RunTrace) -> RunEnd:
 
 
 def _split_buckets(scenario: Scenario, trace: RunTrace) -> list[Array]:
-    """Returns |e|, |qd| and q of each site over the buckets, shape (K, 3, n) each."""
+    """Returns |e|, |qd| and q of each site in every interval, shape (K, 3, n) each.
+
+    Spare columns of `RunTrace.buckets` are removed.
+    """
     sites = []
     for arm, buckets in zip(scenario.arms.values(), trace.buckets, strict=True):
         joints = max(arm.counts.joints, arm.counts.shared)
@@ -376,13 +416,14 @@ def _split_buckets(scenario: Scenario, trace: RunTrace) -> list[Array]:
 
 
 def _choose_judged_part(t_s: Array, acted_s: float) -> tuple[int, bool]:
-    """Returns the start of the part of a run of which the second half is judged.
+    """Chooses the part of a run of which the second half is judged.
 
-    An action in the second half shortens this part, if enough time follows the action.
+    Normally this is the whole run. An action in the second half shortens the part, so that its
+    second half begins after the action, if enough time follows the action.
 
     Args:
-        t_s: times of the run, in s.
-        acted_s: time of the last action, in s.
+        t_s: Times of the run, in s.
+        acted_s: Time of the last action, in s.
 
     Returns:
         Row at which the part starts.
@@ -409,21 +450,23 @@ def _find_worst_joint(
     columns: Sequence[Array],
     sites: Sequence[Array],
 ) -> RunEnd:
-    """Returns the end of the joint with the worst behaviour, and of these the fastest.
+    """Returns the end of the joint with the worst behaviour.
 
-    The largest |e| and |qd| of the last second are those of all joints.
+    Of several joints with the worst behaviour the fastest one is returned. The largest |e| and
+    |qd| of the last second are those of all joints.
 
     Args:
-        scenario: scenario of the run.
-        t_s: times of the judged part and the part before it, shape (K,), s.
+        scenario: Scenario of the run.
+        t_s: Times of the judged part and the part before it, shape (K,), in s.
         columns: |e|, |qd| and q at these times by site, shape (K, 3, n) each.
-        sites: |e|, |qd| and q over the whole run by site.
+        sites: |e|, |qd| and q over the whole run by site, shape (K, 3, n) each.
     """
-    # all envelopes are fitted together: |e| and then |qd| of each site
+    # All envelopes are fitted together: |e| and then |qd| of each site.
     envelopes = []
     for site in columns:
         envelopes += [site[:, 0], site[:, 1]]
     fits = iter(fit_envelopes(t_s, np.hstack(envelopes)))
+
     ends = []
     for name, judged, whole in zip(scenario.names, columns, sites, strict=True):
         last_second = whole[-BUCKETS_PER_S:, :2]
@@ -442,6 +485,8 @@ def _find_worst_joint(
             )
             behaviour = _judge_joint(scenario, end, judged[:, :, joint], t_s)
             ends.append(end._replace(behaviour=behaviour))
+
+    # Some behaviours depend on the other joints of coupled sites.
     end_s = float(t_s[-1]) if len(t_s) else 0.0
     joint_counts = [site.shape[2] for site in sites]
     owners = np.repeat(np.arange(len(sites)), joint_counts)
@@ -457,6 +502,7 @@ def _find_worst_joint(
         )
         for n in coasting:
             ends[n] = ends[n]._replace(behaviour=EndBehaviour.COASTS)
+
     from_best_to_worst = list(EndBehaviour)
 
     def rank(end: RunEnd) -> tuple[int, float]:
@@ -475,13 +521,13 @@ def _judge_joint(
     motion: Array,
     t_s: Array,
 ) -> EndBehaviour:
-    """Returns the behaviour of a joint.
+    """Returns the behaviour of a joint, by itself.
 
     Args:
-        scenario: scenario of the run.
-        end: trends and last values of the joint.
+        scenario: Scenario of the run.
+        end: Trends and last values of the joint.
         motion: |e|, |qd| and q of the joint over the judged part, shape (K, 3).
-        t_s: times of the judged part, shape (K,), s.
+        t_s: Times of the judged part, shape (K,), in s.
     """
     speed = end.speed
     # a joint below the floor is too slow for a trend
@@ -508,15 +554,18 @@ def _judge_joint(
 
 
 def _find_fed_joints(joints: Sequence[RunEnd], owners: Ints, group: Sequence[int]) -> list[int]:
-    """Returns the steady joints of coupled sites that may receive energy from a faster joint.
+    """Finds the steady joints that may receive energy from a faster joint of the coupled sites.
 
     Modes that decay at several frequencies beat, so that a joint may be steady for a while
     although all modes decay.
 
     Args:
-        joints: ends of all joints.
-        owners: index of each joint's site.
-        group: indices of the coupled sites.
+        joints: Ends of all joints.
+        owners: Index of each joint's site.
+        group: Indices of the coupled sites.
+
+    Returns:
+        Indices of these joints. They are slower than some joint whose speed falls.
     """
     members = np.flatnonzero(np.isin(owners, group)).tolist()
     falling = [joints[n] for n in members if joints[n].speed.trend in _FALLING]
@@ -533,18 +582,21 @@ def _find_coasting_joints(
     group: Sequence[int],
     end_s: float,
 ) -> list[int]:
-    """Returns the drifting joints of coupled sites that nothing brakes.
+    """Finds the drifting joints of coupled sites that nothing brakes.
 
-    An arm is free if no hand and no environment acts on it at the end. Nothing brakes the sites
-    if the law of a free arm has no spring to a peer, since the other sites follow this arm. The
-    same holds if all arms are free, and all laws take energy from the links only.
+    An arm is free if no operator and no environment acts on it at the end. Nothing brakes the
+    sites if the law of a free arm has no spring to a peer, since the other sites follow this
+    arm. The same holds if all arms are free, and all laws take energy from the links only.
 
     Args:
-        scenario: scenario of the run.
-        joints: ends of all joints.
-        owners: index of each joint's site.
-        group: indices of the coupled sites.
-        end_s: end of the run, in s.
+        scenario: Scenario of the run.
+        joints: Ends of all joints.
+        owners: Index of each joint's site.
+        group: Indices of the coupled sites.
+        end_s: End of the run, in s.
+
+    Returns:
+        Indices of these joints. Empty if something brakes the sites.
     """
     specs = [scenario.sites[scenario.names[site]] for site in group]
     free_laws = []
@@ -552,16 +604,18 @@ def _find_coasting_joints(
         actors = [source.actor for source in (*spec.hands, *spec.environment)]
         if not any(actor.start_s <= end_s < actor.end_s for actor in actors):
             free_laws.append(spec.control)
+
     brakeless = []
     all_have_springs = True
     for law in free_laws:
         has_damping = any(getattr(law, "d", ()))
         if law.books_energy and not has_damping:
             brakeless.append(law)
-        has_spring = any(getattr(law, "K", (1.0,)))
+        has_spring = any(getattr(law, "K", (1.0,)))  # laws without a gain K have springs
         all_have_springs &= has_spring
     if len(brakeless) != len(specs) and all_have_springs:
         return []
+
     coasting = []
     for n in np.flatnonzero(np.isin(owners, group)).tolist():
         drifts = joints[n].behaviour is EndBehaviour.DRIFTS
@@ -580,28 +634,28 @@ def _classify_joint(
     still: bool,
     rests: bool,
 ) -> EndBehaviour:
-    """Returns the behaviour of a joint by the trends of its |e| and |qd|.
+    """Returns the behaviour of a joint according to the trends of its |e| and |qd|.
 
-    Errors that grow while the joint gets no faster are undecided: a drift may start, or they
-    follow from an operator's last action. A speed that grows is growth even without an error,
-    because arms that swing in unison have no error. A motion at a small speed may last, or
-    grow.
+    - A speed that grows is growth even without an error, because arms that swing in unison have
+      no error.
+    - Errors that grow while the joint gets no faster are undecided: a drift may start, or the
+      errors follow from an operator's last action.
+    - The speed of a joint that hardly moves has no meaningful trend.
 
     Args:
-        error: trend of |e|.
-        speed: trend of |qd|.
-        end_error_rad: largest |e| of the last second.
-        end_speed_rad_s: largest |qd| of the last second.
-        still: True if the speed decays, or is at the floor.
+        error: Trend of |e|.
+        speed: Trend of |qd|.
+        end_error_rad: Largest |e| of the last second.
+        end_speed_rad_s: Largest |qd| of the last second.
+        still: True if the speed decays, or is at the floor of its rounding errors.
         rests: True if the joint is slow, and its speed falls, even if only slightly. The speed
-            of an external arm need not fall.
+            of an arm that is not simulated need not fall.
     """
     if speed.trend is EnvelopeTrend.GROWS:
         return EndBehaviour.GROWS
     if error.trend is EnvelopeTrend.GROWS:
         return EndBehaviour.UNDECIDED
     if not rests and not still:
-        # the trend of a joint that hardly moves says nothing
         if end_speed_rad_s <= SETTLED_SPEED_RAD_S:
             return EndBehaviour.UNDECIDED
         if speed.trend is EnvelopeTrend.HARDLY:
@@ -627,23 +681,26 @@ def _refine_by_motion(
     *,
     still: bool,
 ) -> EndBehaviour:
-    """Returns the behaviour of a joint, refined by the direction of its motion.
+    """Refines the behaviour of a joint by the direction of its motion.
 
-    A joint drifts if it moves by at least an eighth of its way in each quarter of the judged
-    half, always in one direction, and if its mean speed is at least half of its largest speed:
-    a joint that swings on its way does not drift. A bounded oscillation changes its sign. A
-    joint that is slow enough to be at rest, but moves in one direction, is undecided.
+    - A joint drifts if it moves in one direction in each quarter of the judged half, by at
+      least an eighth of the whole way each. Its mean speed must be at least half of its largest
+      speed: a joint that swings on its way does not drift.
+    - A bounded oscillation must change its sign often enough, and is undecided otherwise.
+    - A joint that is slow enough to be at rest, but moves in one direction, is undecided.
 
     Args:
-        behaviour: behaviour by the trends.
-        q: joint angle, shape (K,), rad.
-        speed: largest |qd| since the time before, shape (K,), rad/s.
-        t_s: times, shape (K,), s.
-        still: True if the speed decays, or is at the floor.
+        behaviour: Behaviour according to the trends.
+        q: Joint angle, shape (K,), in rad.
+        speed: Largest |qd| since the time before, shape (K,), in rad/s.
+        t_s: Times, shape (K,), in s.
+        still: True if the speed decays, or is at the floor of its rounding errors.
     """
     may_rest = behaviour is EndBehaviour.CONVERGED and not still
-    if not (behaviour in _MAY_DRIFT or may_rest) or len(t_s) < BUCKETS_PER_S:
+    may_move = behaviour in _MAY_DRIFT or may_rest
+    if not may_move or len(t_s) < BUCKETS_PER_S:
         return behaviour
+
     middle_s = 0.5 * (t_s[0] + t_s[-1])
     half = int(np.searchsorted(t_s, middle_s))
     quarters = np.linspace(half, len(t_s) - 1, 5).round().astype(int)
@@ -656,6 +713,7 @@ def _refine_by_motion(
     half_s = t_s[-1] - t_s[half]
     largest_speed = speed[half:].max()
     is_direct = total >= 0.5 * half_s * largest_speed
+
     if is_one_way and is_direct:
         if total >= DRIFT_RAD:
             return EndBehaviour.DRIFTS
@@ -676,7 +734,14 @@ def _count_sign_changes(values: Array) -> int:
 
 
 def find_coupled_sites(scenario: Scenario) -> list[list[int]]:
-    """Returns the groups of sites that shares connect, at any time and in either direction."""
+    """Groups the sites that follow each other at any time, directly or through further sites.
+
+    Args:
+        scenario: Scenario of the run, with the changes of its dominance factors.
+
+    Returns:
+        Indices of the sites of each group.
+    """
     total_shares = scenario.alpha.copy()
     for change in scenario.timeline:
         if not change.dominance:
@@ -699,12 +764,15 @@ def _find_disagreement(
     t_s: Array,
     columns: Sequence[Array],
 ) -> Iterable[str]:
-    """Yields a sentence for each group of coupled sites that end far apart without being held.
+    """Yields a sentence for each group of coupled sites that do not agree at the end.
+
+    Sites agree if the angles of their joints are nearly equal. Sites that are still approaching
+    each other, or that an operator or environment holds apart, are not reported.
 
     Args:
-        scenario: scenario of the run.
-        trace: trace of the run.
-        t_s: times of the judged part, shape (K,), s.
+        scenario: Scenario of the run.
+        trace: Envelopes of the run, see `RunTrace`.
+        t_s: Times of the judged part, shape (K,), in s.
         columns: |e|, |qd| and q at these times by site, shape (K, 3, n) each.
     """
     for group in find_coupled_sites(scenario):
@@ -719,6 +787,8 @@ def _find_disagreement(
         (fit,) = fit_envelopes(t_s, envelope)
         is_approaching = fit.trend is EnvelopeTrend.DECAYS
 
+        # A torque at the end holds the sites apart if the errors are large enough, or if the
+        # sites that it holds are nearly as far apart as all sites.
         largest_torque = max(np.abs(trace.tau_x[n]).max() for n in group)
         largest_error = max(columns[n][-1, 0].max() for n in group)
         is_held = largest_torque > FORCE_NM and largest_error > HELD_SHARE * end_distance
@@ -726,7 +796,6 @@ def _find_disagreement(
         holds = _find_held_sites(scenario, trace, joint, float(t_s[-1]))
         held_q = end_q[holds[group]]
         if len(held_q):
-            # the held sites are nearly as far apart as all sites
             is_held |= bool(end_distance - np.ptp(held_q) < AGREEMENT_RAD)
 
         if end_distance > AGREEMENT_RAD and not (is_approaching or is_held):
@@ -739,7 +808,10 @@ def _find_disagreement(
 
 
 def _compares_sites_by_error(scenario: Scenario, sites: Iterable[str]) -> bool:
-    """True if |e| itself shows whether some sites agree."""
+    """Returns True if |e| itself shows whether some sites agree.
+
+    Otherwise their joint angles must be compared.
+    """
     for site in sites:
         compares_positions = scenario.sites[site].control.compares_positions
         if compares_positions or scenario.arms[site].shares_pose:
@@ -753,17 +825,20 @@ def _find_held_sites(
     joint: int,
     end_s: float,
 ) -> NDArray[np.bool_]:
-    """Returns the sites at which a joint is held at the end, by the stiffness of a source.
+    """Finds the sites at which an operator or environment holds a joint at the end of the run.
 
-    A hand holds its arm even if its torque is zero, because the arm is then at the hand's
-    target. An environment holds an arm only while the arm touches it. User-written sources are
-    assumed to hold.
+    A source of torque holds an arm if it has a stiffness. An operator does so even if its
+    torque is zero, because the arm is then at the operator's target. An environment holds an
+    arm only while the arm touches it. Sources that a user wrote are assumed to hold.
 
     Args:
-        scenario: scenario of the run.
-        trace: trace of the run.
-        joint: index of the joint.
-        end_s: end of the run, in s.
+        scenario: Scenario of the run.
+        trace: Envelopes of the run, see `RunTrace`.
+        joint: Index of the joint.
+        end_s: End of the run, in s.
+
+    Returns:
+        True for each site at which the joint is held, in scenario order.
     """
     held = np.zeros(len(scenario.names), dtype=np.bool_)
     for n, (spec, tau_x) in enumerate(zip(scenario.sites.values(), trace.tau_x, strict=True)):
@@ -782,10 +857,12 @@ def _find_held_sites(
 
 
 def _find_odd_pose(scenario: Scenario, sites: Sequence[Array]) -> Iterable[str]:
-    """Yields a sentence if arms ended hanging, or far from every start pose without a push.
+    """Yields a sentence if arms end in a pose that a controller should not have brought about.
+
+    Such arms hang down, or are far from every start pose although nobody pushed.
 
     Args:
-        scenario: scenario of the run.
+        scenario: Scenario of the run.
         sites: |e|, |qd| and q over the whole run by site, shape (K, 3, n) each.
     """
     starts = [np.array(spec.q0_rad) for spec in scenario.sites.values()]
@@ -796,8 +873,9 @@ def _find_odd_pose(scenario: Scenario, sites: Sequence[Array]) -> Iterable[str]:
         verb = "hangs" if len(hanging) == 1 else "hang"
         yield f"{', '.join(hanging)} {verb}: the arms fell"
         return
-    # for each site, the largest distance of a joint from the range of the start poses of all
-    # arms with as many joints
+
+    # For each site, the largest distance of a joint from the range of the start poses of all
+    # arms with as many joints.
     distances = []
     for end in ends:
         similar = np.array([q for q in starts if len(q) == len(end)])
@@ -814,11 +892,11 @@ def _find_odd_pose(scenario: Scenario, sites: Sequence[Array]) -> Iterable[str]:
 
 
 def find_hanging_sites(scenario: Scenario, ends: Mapping[str, Array]) -> list[str]:
-    """Returns the sites whose arms hang at the end, but did not hang at the start.
+    """Finds the sites whose arms hang down at the end, but did not hang down at the start.
 
     Args:
-        scenario: scenario of the run.
-        ends: last joint angles of the sites to be judged, shape (n,) each, rad.
+        scenario: Scenario of the run.
+        ends: Last joint angles of the sites to be judged, shape (n,) each, in rad.
     """
     hanging = []
     for site, q in ends.items():
@@ -833,7 +911,15 @@ def find_hanging_sites(scenario: Scenario, ends: Mapping[str, Array]) -> list[st
 def find_last_operator_action(scenario: Scenario, span_s: float) -> float:
     """Returns the last time before `span_s` at which an operator changed its action, in s.
 
-    Returns 0 if no operator ever did.
+    The action is known from the scenario, which states what each operator does over time.
+    Operators who act live are not part of it. An operator who only holds an arm does not act.
+
+    Args:
+        scenario: Scenario of the run.
+        span_s: Length of the run, in s.
+
+    Returns:
+        The time. 0 if no operator ever changed its action.
     """
     t_s = np.arange(0.0, span_s, 1.0 / BUCKETS_PER_S)
     last_s = 0.0
@@ -858,10 +944,17 @@ def find_last_operator_action(scenario: Scenario, span_s: float) -> float:
 
 
 def find_last_change(scenario: Scenario, span_s: float) -> float:
-    """Returns the last time before `span_s` at which the loop changed, in s; 0 if it never did.
+    """Returns the last time before `span_s` at which the loop changed, in s.
 
-    Changes are those of the timeline, and the starts and ends of environments. A change with a
-    ramp lasts until the end of its ramp.
+    Changes are those of the scenario's timeline, and the starts and ends of environments. A
+    change with a ramp lasts until the end of its ramp.
+
+    Args:
+        scenario: Scenario of the run.
+        span_s: Length of the run, in s.
+
+    Returns:
+        The time. 0 if the loop never changed.
     """
     changes = [change for change in scenario.timeline if change.at_s < span_s]
     change_times_s = [0.0, *(change.at_s + change.ramp_s for change in changes)]
@@ -873,9 +966,13 @@ def find_last_change(scenario: Scenario, span_s: float) -> float:
 
 
 def _find_frequency_hz(parts: list[SiteLog]) -> float | None:
-    """Returns the frequency of the fastest joint in the second half, by its changes of sign.
+    """Estimates the frequency of an oscillation from the changes of sign of the fastest joint.
 
-    Returns None if the joint changes its sign too rarely.
+    Args:
+        parts: Logs of all sites. The second half of each is used.
+
+    Returns:
+        The frequency in Hz. None if the joint changes its sign too rarely.
     """
 
     def find_speeds(part: SiteLog) -> Array:

@@ -1,7 +1,12 @@
-"""Lists what happened in a run, over time: changes, link models, modes of sites and alarms.
+"""Lists what happened in a run over time: changes, link models, modes of sites, and alarms.
+
+A change is a command that alters the run: another delay of a link, other dominance factors
+(the weights with which a site follows its peers), or an order to a site such as "stop". A mode
+is what a site does in a tick: it follows its peers, holds its position, brakes or returns.
 
 Invariant:
-    - Every entry comes from the scenario or from a record; none is inferred from a trajectory.
+    - Every entry comes from the scenario or from a record. No entry is inferred from the motion
+      of the arms.
 """
 
 from collections.abc import Sequence
@@ -25,15 +30,15 @@ from ..scenario.scenario_types import Change
 
 
 class AppliedChange(NamedTuple):
-    """A change or an order, and the site that carried it out.
+    """A change that a site carried out, from the scenario or from a command during the run.
 
     Attributes:
-        change: the change of a link or of a site's dominance factors, or the order, with its
+        change: The change of a link or of dominance factors, or the order to a site, with its
             time.
-        site: the site that carried it out.
-        taken_at_tick: tick of the record that names the change; None for a change of the
-            scenario.
-        sentence: a sentence for people, with the name of whoever ordered the change, if known.
+        site: The site that carried it out.
+        taken_at_tick: Tick of the record that names the change. None for a change that was
+            planned in the scenario.
+        sentence: A sentence for people. It names whoever ordered the change, if known.
     """
 
     change: Change
@@ -43,12 +48,12 @@ class AppliedChange(NamedTuple):
 
     @property
     def subject(self) -> str:
-        """The subject of the change: a link "j->i", the shares of a site, or a site."""
+        """What was changed: a link "j->i", a site, or the dominance factors of a site."""
         return self.change.link or self.change.site or f"shares of {self.change.dominance}"
 
     @property
     def text(self) -> str:
-        """The state after the change."""
+        """The state after the change, as a phrase."""
         change = self.change
         if change.order:
             order = change.order.replace("_", " ")
@@ -60,12 +65,12 @@ class AppliedChange(NamedTuple):
 
 
 class ModeInterval(NamedTuple):
-    """An interval in which a site held, braked or returned.
+    """An interval during which a site did not follow its peers: it held, braked or returned.
 
     Attributes:
-        mode: the mode.
-        from_s: time of the first tick in this mode, in s.
-        to_s: time of the first tick after it, or end of the site's last period, in s.
+        mode: Name of the mode.
+        from_s: Time of the first tick in this mode, in s.
+        to_s: Time of the first tick after it, or the end of the site's last period, in s.
     """
 
     mode: str
@@ -74,24 +79,34 @@ class ModeInterval(NamedTuple):
 
     @property
     def meaning(self) -> ModeMeaning:
-        """The meaning of the mode."""
+        """What a site does in this mode."""
         return MODES[self.mode]
 
 
 class StatedModel(NamedTuple):
-    """A link model, and the first stamp to which it applies, in s after the epoch."""
+    """The delay model that the scenario or a change states for a link, from some time on.
+
+    Attributes:
+        from_s: The model applies to samples that were sent from this time on, in s after the
+            start of the session.
+        link: The model.
+    """
 
     from_s: float
     link: LinkBase
 
 
 def list_changes(log: Log) -> list[AppliedChange]:
-    """Returns all changes before the end of the run, in the order in which they took effect.
+    """Lists all changes before the end of a run, in the order in which they took effect.
 
-    Ticks that a site skipped are included if they were so many that the site held.
+    The records also name ticks that a site had to skip. Such an entry is included only if the
+    site skipped so many ticks that it held its position.
+
+    Args:
+        log: The log of the run.
 
     Raises:
-        LogError: a record names a change that is not valid.
+        LogError: A record names a change that is not valid.
     """
     applied = [
         AppliedChange(change, find_owner(change), None, describe_change(change))
@@ -112,11 +127,11 @@ def list_changes(log: Log) -> list[AppliedChange]:
                     sentence = describe_event(event.kind, event.text, event.command)
                 applied.append(AppliedChange(change, site, tick, sentence))
     end_s = recorded_end_s(log)
-    shown = [
-        entry
-        for entry in applied
-        if entry.change.at_s < end_s and not 0 < entry.change.ticks <= HELD_OVERRUN_TICKS
-    ]
+    shown = []
+    for entry in applied:
+        is_short_skip = 0 < entry.change.ticks <= HELD_OVERRUN_TICKS
+        if entry.change.at_s < end_s and not is_short_skip:
+            shown.append(entry)
     return sorted(shown, key=lambda entry: entry.change.at_s)
 
 
@@ -125,12 +140,12 @@ def list_stated_models(
     link: str,
     changed: Sequence[AppliedChange],
 ) -> list[StatedModel]:
-    """Returns the models of a link: the one at the start, and one after every change.
+    """Lists the delay models of a link: the one at the start, and one after every change.
 
     Args:
-        log: the log of a run.
-        link: name of the link, "j->i".
-        changed: changes of the run.
+        log: The log of the run.
+        link: Name of the link, "j->i".
+        changed: Changes of the run, from `list_changes`.
     """
     later_models = [
         StatedModel(entry.change.at_s, entry.change.after)
@@ -141,7 +156,10 @@ def list_stated_models(
 
 
 def recorded_end_s(log: Log) -> float:
-    """Returns the end of a run in s: that of the last record's period, or the planned end."""
+    """Returns the end of a run in s: the end of the period of the last record.
+
+    Without any record it is the planned end.
+    """
     parts = [log[site] for site in log.sites]
     recorded = [part for part in parts if len(part)]
     ends_s = [float(part.t_s[-1]) + 1.0 / part.rate_hz for part in recorded]
@@ -149,10 +167,18 @@ def recorded_end_s(log: Log) -> float:
 
 
 def find_mode_intervals(part: SiteLog) -> list[ModeInterval]:
-    """Returns the intervals in which a site held, braked or returned, in order."""
+    """Finds the intervals in which a site held, braked or returned, in order.
+
+    Args:
+        part: Log of the site.
+
+    Returns:
+        The intervals. Empty if the site followed its peers all the time.
+    """
     modes: list[str] = part.mode.tolist()
     if all(MODES[mode].follows for mode in modes):
         return []
+
     times_s = np.append(part.t_s, part.t_s[-1] + 1.0 / part.rate_hz).tolist()
     intervals = []
     first = 0
@@ -165,14 +191,16 @@ def find_mode_intervals(part: SiteLog) -> list[ModeInterval]:
 
 
 class RaisedAlarm(NamedTuple):
-    """An alarm of a site under the rule `glide`: the site held, was stopped, or was in fault.
+    """An alarm of a site: it held its position, was stopped, or had a fault.
+
+    Only sites whose rule for silent peers (`on_stale` of the scenario) is "glide" raise alarms.
 
     Attributes:
-        site: name of the site.
-        word: name of the alarm.
-        reason: reason of the alarm.
-        from_s: start of the alarm, in s.
-        to_s: end of the alarm, in s.
+        site: Name of the site.
+        word: Name of the alarm.
+        reason: Reason of the alarm.
+        from_s: Start of the alarm, in s.
+        to_s: End of the alarm, in s.
     """
 
     site: str
@@ -182,12 +210,19 @@ class RaisedAlarm(NamedTuple):
     to_s: float
 
     def __str__(self) -> str:
+        """Returns the alarm as a line of text."""
         return f"{self.site} {self.word} {self.from_s:.3f}-{self.to_s:.3f} s: {self.reason}"
 
 
 def list_alarms(log: Log) -> list[RaisedAlarm]:
-    """Returns the alarms of all sites, in order; that of a stop names whoever ordered it."""
-    orderers = {
+    """Lists the alarms of all sites, in the order of their start.
+
+    An alarm because of an ordered stop names whoever ordered it.
+
+    Raises:
+        LogError: A record names a change that is not valid.
+    """
+    requesters = {
         (entry.site, entry.taken_at_tick): find_requester(entry.sentence)
         for entry in list_changes(log)
     }
@@ -207,7 +242,7 @@ def list_alarms(log: Log) -> list[RaisedAlarm]:
             )
             if alarm is None:
                 continue
-            orderer = orderers.get((site, state.tick), "")
-            reason = f"ordered by {orderer}" if orderer else alarm.reason
+            requester = requesters.get((site, state.tick), "")
+            reason = f"ordered by {requester}" if requester else alarm.reason
             raised.append(RaisedAlarm(site, alarm.word, reason, from_s=from_s, to_s=to_s))
     return sorted(raised, key=lambda alarm: alarm.from_s)

@@ -1,25 +1,29 @@
-"""Characteristic roots of loops with delays: the solutions s of Delta(s) v = 0.
+"""Computes the characteristic roots of a linear control loop with delays.
 
-Roots are refined by Newton's method in the form of successive linear problems: solve
-Delta(s) v = mu Delta'(s) v and subtract the smallest mu from s. The method converges
-quadratically for simple roots. It does so for multiple roots too if they have as many vectors,
-as in loops of identical sites. Ruhe, "Algorithms for the nonlinear eigenvalue problem", SIAM J.
-Numerical Analysis 10 (1973).
+The roots are the solutions s of Delta(s) v = 0 with a vector v that is not zero. The loop is
+stable if all roots have a negative real part. A loop with delays has infinitely many roots;
+this module computes the rightmost ones, in two steps:
 
-First guesses for the continuous loop are the eigenvalues of the Chebyshev pseudospectral
-discretisation of the infinitesimal generator. Its order doubles until the wanted roots agree.
-Breda, Maset and Vermiglio, "Pseudospectral differencing methods for characteristic roots of
-delay differential equations", SIAM J. Scientific Computing 27 (2005); nodes after Trefethen,
-"Spectral Methods in MATLAB" (2000).
+1. Guesses for the continuous loop are the eigenvalues of the Chebyshev pseudospectral
+   discretisation of the infinitesimal generator. Its order doubles until the wanted roots
+   agree. Breda, Maset and Vermiglio, "Pseudospectral differencing methods for characteristic
+   roots of delay differential equations", SIAM J. Scientific Computing 27 (2005); nodes after
+   Trefethen, "Spectral Methods in MATLAB" (2000).
+2. Newton's method refines the guesses, in the form of successive linear problems: solve
+   Delta(s) v = mu Delta'(s) v and subtract the smallest mu from s. The method converges
+   quadratically for simple roots, and for multiple roots if they have as many vectors, as in
+   loops of identical sites. Ruhe, "Algorithms for the nonlinear eigenvalue problem", SIAM J.
+   Numerical Analysis 10 (1973).
 
 `limit_blas_threads` keeps OpenBLAS on one thread for these small matrices. OpenBLAS otherwise
-divides products of a hundred rows among all cores and busy-waits for them, which takes a
+divides products of a hundred rows among all cores and waits for them actively, which takes a
 hundred times as long if another process occupies a core.
 
 Invariant:
     - A root solves the equation to rounding, for every discretisation that supplies its guess.
-    - Roots that are zero for every delay (shared poses, estimates without excitation) are
-      counted, and never called the rightmost.
+    - Some roots are zero for every delay, because the equations do not change if all arms are
+      shifted, or if an estimate changes that nothing excites. Such roots are counted, and never
+      called the rightmost.
 """
 
 import ctypes
@@ -41,34 +45,37 @@ from .linear_loop import LinearLoop
 Complex = NDArray[np.complex128]
 
 SAME_ROOT_TOLERANCE = 1e-8
-"""Roots that differ by less, relative to 1 + abs(s), count as the same root."""
+"""Largest difference of two guesses of the same root, relative to 1 + abs(s)."""
 STABILITY_EDGE_PER_S = 1e-6
-"""A rightmost root closer to the imaginary axis than this counts as on the axis, 1/s."""
+"""Largest distance from the imaginary axis of a root that counts as on the axis, in 1/s."""
 ROOT_RESIDUAL_TOLERANCE = 1e-12
-"""Largest residual of a root, relative to the size of Delta's terms."""
+"""Largest residual of a root, relative to the norms of the terms of Delta."""
 _MAX_NEWTON_STEPS = 30
 """Largest number of Newton steps from one guess."""
 _STEP_TOLERANCE = 1e-9
-"""Newton's method stops after a step this small, relative to 1 + abs(s).
+"""Size of a step after which Newton's method stops, relative to 1 + abs(s).
 
 The remaining error is about the square of the step.
 """
 _SAME_VALUE = 1e-11
-"""Singular values of Delta this small, relative to its terms, belong to the same root."""
+"""Largest singular value of Delta at a root, relative to the norms of the terms of Delta.
+
+The number of singular values below this limit is the multiplicity of the root.
+"""
 _MAX_DISTANCE_PER_S = 1e6
-"""Newton's method has failed once it is this far from its guess, 1/s."""
+"""Distance from the guess at which Newton's method has failed, in 1/s."""
 ZERO_SHARE = 1e-12
-"""A singular value this small, relative to the largest, is zero."""
+"""Largest singular value that counts as zero, relative to the largest one."""
 _LONGEST_CHAIN = 4
-"""The longest Jordan chain at zero that is searched."""
+"""Length of the longest Jordan chain of roots at zero that is searched."""
 NAMED_SHARE = 0.3
-"""States with at least this share of the largest participation are named."""
+"""Least participation of a state that is named with a root, relative to the largest one."""
 _INITIAL_ORDER = 12
-"""Degree of the polynomials of the first discretisation."""
+"""Degree of the polynomials in the first discretisation."""
 MAX_GENERATOR_SIZE = 1600
-"""Rows of the largest discretisation, whose eigenvalues take some seconds."""
+"""Number of rows of the largest discretisation, whose eigenvalues take some seconds."""
 _ROOT_AGREEMENT = 1e-9
-"""Roots of two orders agree if they differ by less, relative to 1 + abs(s)."""
+"""Largest difference of roots of two orders that agree, relative to 1 + abs(s)."""
 _BLAS_SYMBOLS = (
     "scipy_openblas_{}_num_threads64_",
     "openblas_{}_num_threads64_",
@@ -79,7 +86,7 @@ _BLAS_SYMBOLS = (
 
 @contextmanager
 def limit_blas_threads() -> Iterator[None]:
-    """Limits NumPy's linear algebra to one thread."""
+    """Limits NumPy's linear algebra to one thread while the context is active."""
     functions = _find_blas_functions()
     if functions is None:
         yield
@@ -95,7 +102,11 @@ def limit_blas_threads() -> Iterator[None]:
 
 @cache
 def _find_blas_functions() -> tuple[Callable[[], int], Callable[[int], None]] | None:
-    """Returns the functions that read and set OpenBLAS's number of threads; None: not found."""
+    """Returns the functions that read and set the number of threads of OpenBLAS.
+
+    Returns:
+        The two functions. None if NumPy uses another library.
+    """
     module = getattr(numpy.linalg, "_umath_linalg", None)
     try:
         library = ctypes.CDLL(module.__file__)  # type: ignore[union-attr]
@@ -112,14 +123,17 @@ def _find_blas_functions() -> tuple[Callable[[], int], Callable[[int], None]] | 
 
 
 class Pencil(NamedTuple):
-    """The characteristic matrix Delta(s) = s E - A - sum_k A_k exp(-s T_k).
+    """The matrices of a loop with delays, from which its characteristic matrix follows.
+
+    The loop is E x' = A x + sum_k A_k x(t - T_k). Its characteristic matrix is
+    Delta(s) = s E - A - sum_k A_k exp(-s T_k).
 
     Attributes:
-        A: shape (n, n).
-        delays: T_k, s, shape (K,).
-        Ad: A_k, shape (K, n, n).
-        E: diagonal of E, shape (n,): 1 for a state with a rate, 0 for an algebraic state.
-            None: every state has a rate.
+        A: Matrix of the terms without delay, shape (n, n).
+        delays: Delays T_k, in s, shape (K,).
+        Ad: Matrices A_k of the delayed terms, shape (K, n, n).
+        E: Diagonal of E, shape (n,): 1 for a state with a rate, 0 for a state that an algebraic
+            equation determines. None if every state has a rate.
     """
 
     A: Array
@@ -135,7 +149,7 @@ class Pencil(NamedTuple):
         return np.diag(self.E)
 
     def evaluate(self, s: complex) -> tuple[Complex, Complex]:
-        """Returns Delta(s) and its derivative by s, shape (n, n) each."""
+        """Returns Delta(s) and its derivative with respect to s, shape (n, n) each."""
         E = self.rate_matrix
         exponentials = np.exp(-s * self.delays)
         delayed = exponentials[:, np.newaxis, np.newaxis] * self.Ad
@@ -153,7 +167,7 @@ class Pencil(NamedTuple):
         return float(abs(s) + undelayed + delayed)
 
     def compute_taylor_coefficient(self, power: int) -> Array:
-        """Returns the coefficient of s^power in Delta's Taylor series at 0, shape (n, n)."""
+        """Returns the coefficient of s^power in the Taylor series of Delta at 0, shape (n, n)."""
         undelayed: Array | float = 0.0
         if power == 0:
             undelayed = -self.A
@@ -167,7 +181,7 @@ class Pencil(NamedTuple):
 
     @property
     def delayed_states(self) -> NDArray[np.intp]:
-        """Indices of the states that act after a delay."""
+        """Indices of the states that act on the loop after a delay."""
         effects = np.abs(self.Ad).sum(axis=(0, 1))
         return np.flatnonzero(effects)
 
@@ -175,16 +189,22 @@ class Pencil(NamedTuple):
 MovingPart = tuple[Pencil, tuple[str, ...], int]
 """A loop without its constant states and its states without effect.
 
-The entries are the characteristic matrix, the names of its states, and the number of omitted
+The entries are the matrices of the loop, the names of its states, and the number of omitted
 states, each of which has a root at zero.
 """
 
 
 def extract_moving_part(pencil: Pencil, names: Sequence[str]) -> MovingPart:
-    """Returns the part of a loop without constant states and without states of no effect."""
+    """Removes the states that are constant or act on no other state, see `MovingPart`.
+
+    Args:
+        pencil: Matrices of the loop.
+        names: Names of the states.
+    """
     # entry (i, j): effect of state j on the rate of state i
     delayed_effects = np.abs(pencil.Ad).sum(axis=0)
     effects = np.abs(pencil.A) + delayed_effects
+
     kept = list(range(len(names)))
     while True:
         inner = effects[np.ix_(kept, kept)]
@@ -195,6 +215,7 @@ def extract_moving_part(pencil: Pencil, names: Sequence[str]) -> MovingPart:
             break
         # one state at a time: its removal may leave others without an effect
         del kept[int(idle[0])]
+
     rows, columns = np.ix_(kept, kept)
     Ad = pencil.Ad[:, rows, columns]
     is_used = Ad.any(axis=(1, 2))
@@ -213,9 +234,9 @@ class CharacteristicRoot(NamedTuple):
     """A characteristic root, or a pair of conjugate roots.
 
     Attributes:
-        s: the root with a non-negative imaginary part, 1/s.
-        multiplicity: number of modes that share the root.
-        states: names of the states that participate most, the largest first.
+        s: The root with a non-negative imaginary part, in 1/s.
+        multiplicity: Number of modes that share the root.
+        states: Names of the states that participate most, the largest first.
     """
 
     s: complex
@@ -224,7 +245,7 @@ class CharacteristicRoot(NamedTuple):
 
     @property
     def damping(self) -> float:
-        """Damping ratio, -re / abs(s)."""
+        """Damping ratio, -re(s) / abs(s)."""
         return -self.s.real / abs(self.s)
 
     @property
@@ -241,18 +262,20 @@ class CharacteristicRoot(NamedTuple):
 
 
 class Spectrum(NamedTuple):
-    """The rightmost roots of a loop.
+    """The rightmost characteristic roots of a loop.
 
     Attributes:
-        roots: the rightmost roots that are not zero by structure, by falling real part.
-        zeros: number of roots that are zero by structure.
-        drifting: number of those zeros without a vector of their own; their modes grow with t.
-        dropped: number of guesses from which Newton's method reached no root.
-        order: order of the discretisation that gave the guesses; 0 if none was needed.
-        span_s: the period of delays and tick rates over which the roots are computed, or the
-            analysed span of delays that do not repeat, s; None if all ticks are alike.
-        deviation_per_s: standard deviation of the rightmost root between parts of the span, if
-            delays do not repeat, 1/s.
+        roots: The rightmost roots that are not zero by structure, by falling real part.
+        zeros: Number of roots that are zero by structure.
+        drifting: Number of those zeros without a vector of their own. Their modes grow with
+            time.
+        dropped: Number of guesses from which Newton's method reached no root.
+        order: Order of the discretisation that gave the guesses. 0 if none was needed.
+        span_s: Time over which the roots are computed, in s: the period after which delays and
+            tick rates repeat, or the analysed span of delays that do not repeat. None if all
+            ticks are alike.
+        deviation_per_s: Standard deviation of the rightmost root between parts of the span, in
+            1/s. None if delays repeat.
     """
 
     roots: tuple[CharacteristicRoot, ...]
@@ -265,7 +288,7 @@ class Spectrum(NamedTuple):
 
     @property
     def basis(self) -> str:
-        """A phrase that states the span of the analysis; "" if all ticks are alike."""
+        """A phrase that states the span of the analysis. Empty if all ticks are alike."""
         if self.span_s is None:
             return ""
         if self.deviation_per_s is None:
@@ -275,12 +298,12 @@ class Spectrum(NamedTuple):
 
     @property
     def rightmost(self) -> CharacteristicRoot | None:
-        """The rightmost root that is not zero by structure."""
+        """The rightmost root that is not zero by structure. None if there is none."""
         return self.roots[0] if self.roots else None
 
     @property
     def verdict(self) -> str:
-        """The stability verdict: "stable", "unstable" or "at the edge"."""
+        """The stability of the loop: "stable", "unstable" or "at the edge"."""
         rightmost_per_s = -math.inf
         if self.roots:
             rightmost_per_s = self.roots[0].s.real
@@ -297,12 +320,15 @@ def _solve_for_root(
     guess: complex,
     names: Sequence[str],
 ) -> CharacteristicRoot | None:
-    """Returns the root to which Newton's method converges from a guess; None without one.
+    """Returns the root to which Newton's method converges from a guess.
 
     Args:
-        pencil: the characteristic matrix.
-        guess: first guess of the root, 1/s.
-        names: names of the states.
+        pencil: Matrices of the loop.
+        guess: First guess of the root, in 1/s.
+        names: Names of the states.
+
+    Returns:
+        The root, with its multiplicity and its states. None if the method does not converge.
     """
     s = complex(guess)
     with np.errstate(all="ignore"):
@@ -317,6 +343,7 @@ def _solve_for_root(
             if abs(step) <= _STEP_TOLERANCE * (1.0 + abs(s)):
                 break
         measured = _measure_participation(pencil, s)
+
     if measured is None:
         return None
     multiplicity, participation = measured
@@ -325,6 +352,7 @@ def _solve_for_root(
     shares = np.round(relative, 6)
     falling = np.argsort(-shares, kind="stable")
     states = tuple(names[n] for n in falling if shares[n] >= NAMED_SHARE)
+
     imaginary_part = abs(s.imag)
     if imaginary_part <= SAME_ROOT_TOLERANCE:
         imaginary_part = 0.0
@@ -333,11 +361,16 @@ def _solve_for_root(
 
 
 def _compute_newton_step(pencil: Pencil, s: complex) -> complex | None:
-    """Returns the smallest mu of Delta(s) v = mu Delta'(s) v; None if there is none."""
+    """Returns the smallest mu of Delta(s) v = mu Delta'(s) v.
+
+    Returns:
+        The step. None if there is no finite mu.
+    """
     delta, derivative = pencil.evaluate(s)
     # far to the left, exp(-s T) overflows
     if not np.isfinite(delta).all() or not np.isfinite(derivative).all():
         return None
+
     try:
         if pencil.E is None:
             matrix = np.linalg.solve(derivative, delta)
@@ -348,6 +381,7 @@ def _compute_newton_step(pencil: Pencil, s: complex) -> complex | None:
             mu = mu[np.isfinite(mu)]
     except np.linalg.LinAlgError:
         return None
+
     if not len(mu):
         return None
     smallest = np.argmin(np.abs(mu))
@@ -355,11 +389,14 @@ def _compute_newton_step(pencil: Pencil, s: complex) -> complex | None:
 
 
 def _measure_participation(pencil: Pencil, s: complex) -> tuple[int, Array] | None:
-    """Returns the number of vectors of a root at s, and the participation of each state.
+    """Returns the multiplicity of a root, and the participation of each state in its mode.
 
-    Participation is the modulus of the diagonal of the residue of Delta(s)^-1,
-    V (W' Delta'(s) V)^-1 W' with the null vectors V and W; it does not depend on units.
-    None: s is not a root.
+    Participation is the modulus of the diagonal of the residue of Delta(s)^-1, which is
+    V (W' Delta'(s) V)^-1 W' with the null vectors V and W of Delta(s). It does not depend on
+    the units of the states.
+
+    Returns:
+        The number of null vectors, and the participation, shape (n,). None if s is not a root.
     """
     delta, derivative = pencil.evaluate(s)
     if not np.isfinite(delta).all():
@@ -369,6 +406,7 @@ def _measure_participation(pencil: Pencil, s: complex) -> tuple[int, Array] | No
     residual = float(values[-1]) / scale
     if not residual <= ROOT_RESIDUAL_TOLERANCE:
         return None
+
     is_null = values <= _SAME_VALUE * scale
     count = int(np.sum(is_null))
     W = left[:, -count:]
@@ -383,12 +421,16 @@ def _measure_participation(pencil: Pencil, s: complex) -> tuple[int, Array] | No
 
 
 def count_zero_roots(pencil: Pencil) -> tuple[int, int]:
-    """Returns the number of roots that are zero by structure, and how many of them drift.
+    """Counts the roots that are zero by structure, and how many of them drift.
 
     With Delta(s) = D_0 + s D_1 + s^2 D_2 + ..., the block Toeplitz matrix of D_0 ... D_(m-1)
     has as many null vectors as there are roots at zero, with each Jordan chain counted up to
     length m. When the number no longer rises with m, all roots are counted. Roots in chains
-    longer than 1 drift: their modes grow with t.
+    longer than 1
+    drift: their modes grow with time.
+
+    Returns:
+        The number of roots at zero, and the number of those that drift.
     """
     counts = [0]
     for length in range(1, _LONGEST_CHAIN + 1):
@@ -400,12 +442,14 @@ def count_zero_roots(pencil: Pencil) -> tuple[int, int]:
             # D_k stands on the k-th diagonal below the main diagonal
             diagonal = np.eye(length, k=-power)
             blocks.append(np.kron(diagonal, D))
+
         toeplitz = np.sum(blocks, axis=0)
         values = np.linalg.svd(toeplitz, compute_uv=False)
         is_zero = values <= ZERO_SHARE * values[0]
         counts.append(int(np.sum(is_zero)))
         if counts[-1] == counts[-2]:
             break
+
     zeros = counts[-1]
     vectors = counts[1]
     return zeros, zeros - vectors
@@ -417,28 +461,34 @@ def refine_roots(
     names: Sequence[str],
     wanted: int,
 ) -> tuple[list[CharacteristicRoot], int]:
-    """Returns the rightmost `wanted` roots near some guesses, and the count of failures.
+    """Refines guesses of the rightmost roots by Newton's method.
 
-    Two more roots than wanted are refined, because Newton's method may change their order; the
+    Two more roots than wanted are refined, because the method may change their order. The
     remaining guesses are skipped.
 
     Args:
-        pencil: the characteristic matrix.
-        candidates: guesses of nonzero roots, shape (K,), by falling real part.
-        names: names of the states.
-        wanted: number of roots; a conjugate pair counts once.
+        pencil: Matrices of the loop.
+        candidates: Guesses of nonzero roots, shape (K,), by falling real part.
+        names: Names of the states.
+        wanted: Number of roots. A conjugate pair counts once.
+
+    Returns:
+        The rightmost `wanted` roots, and the number of guesses without a root.
     """
     roots: list[CharacteristicRoot] = []
     dropped = 0
     for guess in candidates:
+        # the conjugate of another guess
         if guess.imag < -SAME_ROOT_TOLERANCE * (1.0 + abs(guess)):
             continue
+
         if len(roots) >= wanted + 2:
             break
         root = _solve_for_root(pencil, complex(guess), names)
         if root is None or abs(root.s) < SAME_ROOT_TOLERANCE:
             dropped += 1
             continue
+
         tolerance = SAME_ROOT_TOLERANCE * (1.0 + abs(root.s))
         distances = [abs(root.s - known.s) for known in roots]
         if min(distances, default=math.inf) >= tolerance:
@@ -452,7 +502,7 @@ def refine_roots(
 
 
 def find_moving_part(loop: LinearLoop) -> MovingPart:
-    """Returns the part of a loop without constant states and without states of no effect."""
+    """Returns the matrices of a loop without idle states, see `MovingPart`."""
     delayed_matrices = np.array([term.A for term in loop.delayed])
     # without delays, an empty array of the right shape
     Ad = delayed_matrices.reshape(-1, *loop.A.shape)
@@ -463,11 +513,11 @@ def find_moving_part(loop: LinearLoop) -> MovingPart:
 
 
 def compute_delay_spectrum(loop: LinearLoop, wanted: int = 6) -> Spectrum:
-    """Returns the rightmost roots of a continuous loop.
+    """Computes the rightmost roots of a continuous loop.
 
     Args:
-        loop: the loop.
-        wanted: number of roots; a conjugate pair or a multiple root counts once.
+        loop: The loop.
+        wanted: Number of roots. A conjugate pair or a multiple root counts once.
     """
     with limit_blas_threads():
         pencil, names, idle_count = find_moving_part(loop)
@@ -480,6 +530,7 @@ def compute_delay_spectrum(loop: LinearLoop, wanted: int = 6) -> Spectrum:
                 dropped=0,
                 order=0,
             )
+
         has_delays = len(pencil.delays) > 0
         order = _INITIAL_ORDER if has_delays else 0
         previous_roots = None
@@ -504,9 +555,9 @@ def _guess_roots(pencil: Pencil, order: int, zeros: int) -> Complex:
     """Returns guesses of the nonzero roots, by falling real part.
 
     Args:
-        pencil: the characteristic matrix.
-        order: order of the discretisation; 0 for a loop without delays.
-        zeros: number of roots at zero.
+        pencil: Matrices of the loop.
+        order: Order of the discretisation. 0 for a loop without delays.
+        zeros: Number of roots at zero.
     """
     matrix = discretise_generator(pencil, order) if order else pencil.A
     if pencil.E is not None:
@@ -521,12 +572,13 @@ def _guess_roots(pencil: Pencil, order: int, zeros: int) -> Complex:
 
 
 def _eliminate_states(matrix: Array, E: Array) -> Array:
-    """Returns the matrix of the states with a rate, without algebraic states.
+    """Eliminates the states that algebraic equations determine from a matrix.
 
-    From 0 = M_aa x_a + M_ar x_r follows the Schur complement M_rr - M_ra M_aa^-1 M_ar.
+    From 0 = M_aa x_a + M_ar x_r follows the Schur complement M_rr - M_ra M_aa^-1 M_ar, where a
+    stands for the algebraic states and r for those with a rate.
 
     Args:
-        matrix: matrix M of all states; the discretised history follows the loop's states.
+        matrix: Matrix M of all states. The discretised history follows the loop's states.
         E: 1 for a state with a rate, 0 for an algebraic state, of the loop's states.
     """
     algebraic = np.flatnonzero(E == 0.0)
@@ -540,7 +592,7 @@ def _eliminate_states(matrix: Array, E: Array) -> Array:
 
 
 def _agree(previous: list[CharacteristicRoot], roots: list[CharacteristicRoot]) -> bool:
-    """True if every root is close to a root of the previous order."""
+    """Returns True if every root is close to a root of the previous order."""
     if len(roots) < len(previous):
         return False
     for root in roots:
@@ -552,22 +604,24 @@ def _agree(previous: list[CharacteristicRoot], roots: list[CharacteristicRoot]) 
 
 
 def discretise_generator(pencil: Pencil, order: int) -> Array:
-    """Returns the discretised infinitesimal generator of a loop with delays.
+    """Returns the infinitesimal generator of a loop with delays, discretised to a matrix.
 
     Its states are the states of the loop, and then the history of the delayed states at the
-    Chebyshev nodes over [-T_max, 0].
+    Chebyshev nodes over the time from -T_max to 0, with the longest delay T_max.
 
     Args:
-        pencil: the characteristic matrix, with at least one delay.
-        order: degree of the interpolating polynomials.
+        pencil: Matrices of the loop, with at least one delay.
+        order: Degree of the interpolating polynomials.
     """
     delayed = pencil.delayed_states
     longest_s = float(pencil.delays.max())
     n = len(pencil.A)
     c = len(delayed)
+
     size = n + order * c
     generator = np.zeros((size, size))
     generator[:n, :n] = pencil.A
+
     # x in [-1, 1] stands for the time from -T_max to 0
     x = 1.0 - 2.0 * pencil.delays / longest_s
     interpolation = chebyshev_interpolation(order, x)
@@ -575,6 +629,7 @@ def discretise_generator(pencil: Pencil, order: int) -> Array:
         delayed_columns = Ad[:, delayed]
         generator[:n, delayed] += weights[0] * delayed_columns
         generator[:n, n:] += np.kron(weights[1:], delayed_columns)
+
     # the history moves along the nodes: its rate is its derivative by time
     differentiation = chebyshev_differentiation(order)
     transport = differentiation[1:] * (2.0 / longest_s)
@@ -591,11 +646,11 @@ def chebyshev_nodes(order: int) -> Array:
 
 
 def chebyshev_interpolation(order: int, x: Array) -> Array:
-    """Returns the matrix that takes values at the nodes to their interpolation at x.
+    """Returns the matrix that interpolates values at the Chebyshev nodes at other points.
 
     Args:
-        order: degree of the polynomial.
-        x: points in [-1, 1], shape (K,).
+        order: Degree of the polynomial.
+        x: Points in [-1, 1], shape (K,).
 
     Returns:
         Matrix of shape (K, order + 1).
@@ -608,7 +663,13 @@ def chebyshev_interpolation(order: int, x: Array) -> Array:
 
 
 def chebyshev_differentiation(order: int) -> Array:
-    """Returns the matrix that takes values at the nodes to their polynomial's derivatives."""
+    """Returns the matrix that turns values at the Chebyshev nodes into derivatives.
+
+    The derivatives are those of the interpolating polynomial at the nodes.
+
+    Args:
+        order: Degree of the polynomial.
+    """
     nodes = chebyshev_nodes(order)
     basis_at_nodes = chebvander(nodes, order)
     derivatives = chebder(np.eye(order + 1))

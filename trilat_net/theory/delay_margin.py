@@ -1,10 +1,15 @@
-"""The delay margin: common delays of all links for which the continuous loop is stable.
+"""Computes the delay margin: the common delays of all links for which the loop is stable.
 
-With the delay T on all links, j w is a root of the loop if det(I - exp(-j w T) G(j w)) = 0.
-G(j w) consists of the delayed rows of (j w I - A)^-1 A_d. Such a root exists if and only if
-G(j w) has an eigenvalue of modulus 1 with the phase w T modulo 2 pi. With rising T, a pair of
-roots moves to the right if the modulus of this eigenvalue falls with w, and to the left if it
-rises.
+The loop is x' = A x + A_d x(t - T), with the same delay T on all links. Only some states act
+after a delay. A root of the loop lies on the imaginary axis at j w if
+
+    det(I - exp(-j w T) G(j w)) = 0,
+
+where G(j w) consists of the delayed states' rows of (j w I - A)^-1 A_d. Such a root exists if
+and only if G(j w) has an eigenvalue of modulus 1 with the phase w T modulo 2 pi. If T
+increases, a pair of roots moves to the right if the modulus of this eigenvalue falls with w,
+and to the left if it rises. Counting these crossings from a small delay on gives the number of
+unstable roots for every delay.
 
 Sources:
     - Chen, Gu and Nett, "A new method for computing delay margins for stability of linear delay
@@ -14,7 +19,7 @@ Sources:
 
 Invariant:
     - Crossings of the imaginary axis are searched over frequency and not over delay, so that no
-      crossing is hidden between two delays.
+      crossing is missed between two delays.
 """
 
 import math
@@ -30,30 +35,30 @@ from . import characteristic_roots
 from .linear_loop import DelayedTerm, LinearLoop
 
 MAX_COMMON_DELAY_S = 10.0
-"""The longest common delay that is searched."""
+"""Longest common delay that is searched, in s."""
 _LISTED_INTERVALS = 3
 """Largest number of intervals that the description lists one by one."""
 _POINTS = 600
-"""Frequencies of the grid, in addition to the frequencies near the loop's modes."""
+"""Number of frequencies of the grid, in addition to those near the loop's modes."""
 _LOWEST = 1e-4
-"""The lowest frequency, relative to the highest frequency at which a crossing is possible."""
+"""Lowest frequency of the grid, relative to the highest one at which a crossing is possible."""
 _BISECTIONS = 60
 """Largest number of bisections that locate a crossing."""
 _OUTSIDE = 1.0 + 1e-9
-"""Moduli above this lie outside the unit circle.
+"""Largest modulus of an eigenvalue that does not lie outside the unit circle.
 
-The difference from 1 allows for rounding: the modulus of a lossless line is 1 at every
+The difference from 1 allows for rounding: the modulus of a line without losses is 1 at every
 frequency.
 """
 
 
 class AxisCrossing(NamedTuple):
-    """A crossing of the imaginary axis by one or more pairs of roots.
+    """A crossing of the imaginary axis by one or more pairs of roots, as the delay increases.
 
     Attributes:
-        delay_s: the common delay, s.
-        omega_rad_s: the frequency, rad/s.
-        pairs: number of pairs that cross to the right with rising delay; negative: to the left.
+        delay_s: The common delay, in s.
+        omega_rad_s: Frequency of the crossing, in rad/s.
+        pairs: Number of pairs that cross to the right. Negative for crossings to the left.
     """
 
     delay_s: float
@@ -62,13 +67,13 @@ class AxisCrossing(NamedTuple):
 
 
 class DelayInterval(NamedTuple):
-    """An interval of delays for which a loop is stable.
+    """An interval of common delays for which a loop is stable.
 
     Attributes:
-        low_s: lower end, s; 0 if the loop is stable without delay.
-        high_s: upper end, s; `MAX_COMMON_DELAY_S` if no root crosses before.
-        low: the crossing at the lower end, or None.
-        high: the crossing at the upper end, or None.
+        low_s: Lower end, in s. 0 if the loop is stable without delay.
+        high_s: Upper end, in s. `MAX_COMMON_DELAY_S` if no root crosses before.
+        low: Crossing at the lower end. None if there is none.
+        high: Crossing at the upper end. None if there is none.
     """
 
     low_s: float
@@ -78,9 +83,10 @@ class DelayInterval(NamedTuple):
 
     @property
     def description(self) -> str:
-        """The ends and the frequency at the upper end; "" if the interval has no ends."""
+        """The ends, and the frequency at the upper end. Empty if the interval has no ends."""
         if self.low is None and self.high is None:
             return ""
+
         low_ms = 1e3 * self.low_s
         high_ms = 1e3 * self.high_s
         start = "" if self.low is None else f"from {low_ms:.4g} ms "
@@ -91,12 +97,14 @@ class DelayInterval(NamedTuple):
 
 
 class DelayMargin(NamedTuple):
-    """The common delays for which a loop is stable.
+    """The common delays for which a loop is stable, see `find_delay_margin`.
 
     Attributes:
-        intervals: by rising delay; empty if the loop is unstable for every delay.
-        crossings: all crossings up to `MAX_COMMON_DELAY_S`, by rising delay.
-        lossless: True if waves run without losses: roots are on the axis for every delay.
+        intervals: Intervals of delays, by rising delay. Empty if the loop is unstable for every
+            delay.
+        crossings: All crossings up to `MAX_COMMON_DELAY_S`, by rising delay.
+        lossless: True if waves run along lines without losses, so that some roots are on the
+            imaginary axis for every delay.
     """
 
     intervals: tuple[DelayInterval, ...]
@@ -116,6 +124,7 @@ class DelayMargin(NamedTuple):
         texts = [interval.description for interval in self.intervals]
         if texts == [""]:
             return f"stable for every common delay up to {MAX_COMMON_DELAY_S:g} s"
+
         listed = ", ".join(texts[:_LISTED_INTERVALS])
         more = ""
         if len(texts) > _LISTED_INTERVALS:
@@ -125,7 +134,12 @@ class DelayMargin(NamedTuple):
 
 
 def set_common_delay(loop: LinearLoop, delay_s: float) -> LinearLoop:
-    """Returns a loop with the same delay, s, on all of its links."""
+    """Returns a loop with the same delay on all of its links.
+
+    Args:
+        loop: The loop.
+        delay_s: The delay, in s. With 0 the loop has no delayed terms.
+    """
     if not loop.delayed:
         return loop
     delayed_A = np.sum([term.A for term in loop.delayed], axis=0)
@@ -139,18 +153,21 @@ def set_common_delay(loop: LinearLoop, delay_s: float) -> LinearLoop:
 
 
 def find_delay_margin(loop: LinearLoop) -> DelayMargin:
-    """Returns the common delays for which a loop is stable; the loop's own delays are ignored.
+    """Finds the common delays for which a loop is stable. Its own delays are ignored.
 
-    Unstable roots are counted at half the first crossing's delay. Every crossing then changes
-    the count by the roots that cross.
+    The unstable roots are counted at half the delay of the first crossing. From there on, every
+    crossing changes the count by the number of roots that cross.
     """
     crossings, lossless = find_axis_crossings(loop)
     if lossless:
         return DelayMargin((), (), lossless)
+
     delays_s = [crossing.delay_s for crossing in crossings]
     first_s = min(delays_s, default=0.2)
     start_s = 0.5 * min(first_s, 0.2)
     unstable_roots = _count_unstable_roots(set_common_delay(loop, start_s))
+
+    # Walk through the crossings. Each one may end or begin a stable interval.
     intervals: list[DelayInterval] = []
     low: AxisCrossing | None = None
     low_s = 0.0
@@ -166,6 +183,7 @@ def find_delay_margin(loop: LinearLoop) -> DelayMargin:
             low = crossing
             low_s = crossing.delay_s
             stable = True
+
     if stable:
         last_interval = DelayInterval(low_s, MAX_COMMON_DELAY_S, low, None)
         intervals.append(last_interval)
@@ -173,7 +191,10 @@ def find_delay_margin(loop: LinearLoop) -> DelayMargin:
 
 
 def _count_unstable_roots(loop: LinearLoop) -> int:
-    """Returns the number of roots with a positive real part."""
+    """Returns the number of roots with a positive real part.
+
+    More and more of the rightmost roots are computed, until one of them is stable.
+    """
     wanted = 8
     while True:
         roots = characteristic_roots.compute_delay_spectrum(loop, wanted).roots
@@ -182,6 +203,7 @@ def _count_unstable_roots(loop: LinearLoop) -> int:
         if has_stable_root or len(roots) < wanted:
             break
         wanted *= 2
+
     count = 0
     for root in unstable:
         # a root with an imaginary part stands for a conjugate pair
@@ -191,11 +213,12 @@ def _count_unstable_roots(loop: LinearLoop) -> int:
 
 
 def find_axis_crossings(loop: LinearLoop) -> tuple[list[AxisCrossing], bool]:
-    """Returns all crossings of the imaginary axis, and whether the loop is lossless.
+    """Finds all common delays at which roots cross the imaginary axis.
 
-    Crossings are those for a common delay up to `MAX_COMMON_DELAY_S`. A loop is lossless if G
-    has an eigenvalue of modulus 1 at every frequency: then roots are on the axis for every
-    delay, and no crossing is returned.
+    Returns:
+        The crossings for delays up to `MAX_COMMON_DELAY_S`.
+        True if the loop is lossless: G has an eigenvalue of modulus 1 at every frequency, so
+        that roots are on the axis for every delay. There are no crossings then.
     """
     pencil, *_ = characteristic_roots.find_moving_part(set_common_delay(loop, 1.0))
     if not len(pencil.delays):
@@ -209,6 +232,7 @@ def find_axis_crossings(loop: LinearLoop) -> tuple[list[AxisCrossing], bool]:
         is_on_circle = is_not_outside & is_not_inside
         if is_on_circle.any(axis=1).all():
             return [], True
+
         is_outside = moduli > _OUTSIDE
         counts = is_outside.sum(axis=1)
         crossings = []
@@ -220,7 +244,7 @@ def find_axis_crossings(loop: LinearLoop) -> tuple[list[AxisCrossing], bool]:
 
 
 def _merge_crossings(crossings: Sequence[AxisCrossing]) -> list[AxisCrossing]:
-    """Returns sorted crossings, with those of equal delay and frequency merged into one."""
+    """Sorts crossings, and merges those of equal delay and frequency into one."""
     merged: list[AxisCrossing] = []
     for crossing in sorted(crossings):
         if merged and _is_same_crossing(merged[-1], crossing):
@@ -232,7 +256,7 @@ def _merge_crossings(crossings: Sequence[AxisCrossing]) -> list[AxisCrossing]:
 
 
 def _is_same_crossing(last: AxisCrossing, crossing: AxisCrossing) -> bool:
-    """True if two crossings differ in delay and frequency by rounding only."""
+    """Returns True if two crossings differ in delay and frequency by rounding only."""
     delay_difference_s = abs(crossing.delay_s - last.delay_s)
     delay_tolerance_s = 1e-7 * (1e-3 + crossing.delay_s)
     if delay_difference_s > delay_tolerance_s:
@@ -242,7 +266,13 @@ def _is_same_crossing(last: AxisCrossing, crossing: AxisCrossing) -> bool:
 
 
 class _FrequencySweep:
-    """The eigenvalues of G(j w) over the frequency w."""
+    """Eigenvalues of the open-loop frequency response G(j w) over the frequency w.
+
+    `find_axis_crossings` uses them to find the frequencies at which a modulus is 1.
+
+    Args:
+        pencil: Matrices of the loop, with a single delay.
+    """
 
     def __init__(self, pencil: characteristic_roots.Pencil) -> None:
         A = pencil.A
@@ -259,7 +289,7 @@ class _FrequencySweep:
         self._modes: characteristic_roots.Complex = modes.astype(np.complex128)
 
     def build_grid(self) -> Array:
-        """Returns frequencies to evaluate, rad/s, denser about the loop's own modes."""
+        """Returns the frequencies to evaluate, in rad/s. They are denser near the loop's modes."""
         lowest = _LOWEST * self._highest
         even = np.geomspace(lowest, self._highest, _POINTS)
         oscillates = np.abs(self._modes.imag) > 0.0
@@ -273,7 +303,14 @@ class _FrequencySweep:
         return grid
 
     def compute_eigenvalues(self, omega: Array) -> characteristic_roots.Complex:
-        """Returns the eigenvalues of G(j w) for frequencies of shape (K,), shape (K, c)."""
+        """Computes the eigenvalues of the open-loop frequency response G(j w) at many frequencies.
+
+        Args:
+            omega: Frequencies w, shape (K,), in rad/s.
+
+        Returns:
+            Eigenvalues, shape (K, c), where c is the number of states that act after a delay.
+        """
         s = 1j * omega[:, np.newaxis, np.newaxis]
         delta = s * self._rate_matrix - self._A
         Ad = np.broadcast_to(self._Ad, (len(omega), *self._Ad.shape))
@@ -282,16 +319,24 @@ class _FrequencySweep:
         return np.linalg.eigvals(delayed_rows).astype(np.complex128)
 
     def count_outside(self, omega: Array) -> NDArray[np.int64]:
-        """Returns the number of eigenvalues with a modulus above 1, shape (K,)."""
+        """Returns the number of eigenvalues of G(j w) outside the unit circle, shape (K,).
+
+        Args:
+            omega: Frequencies w, shape (K,), in rad/s.
+        """
         moduli = np.abs(self.compute_eigenvalues(omega))
         counts: NDArray[np.int64] = (moduli > _OUTSIDE).sum(axis=1)
         return counts
 
     def find_crossings(self, low: float, high: float) -> list[AxisCrossing]:
-        """Returns all crossings between two frequencies, rad/s, located by bisection."""
+        """Finds all crossings between two frequencies, in rad/s, by bisection.
+
+        The number of eigenvalues outside the unit circle changes at a crossing.
+        """
         ends = self.count_outside(np.array([low, high]))
         if ends[0] == ends[1]:
             return []
+
         for _ in range(_BISECTIONS):
             middle = 0.5 * (low + high)
             count = self.count_outside(np.array([middle]))[0]
@@ -306,20 +351,24 @@ class _FrequencySweep:
                 high = middle
             if high - low <= 1e-13 * high:
                 break
+
         omega = 0.5 * (low + high)
         return self._list_delays(omega, int(ends[0] - ends[1]))
 
     def _list_delays(self, omega: float, pairs: int) -> list[AxisCrossing]:
-        """Returns a crossing for each delay T with w T = phase + 2 pi k, for each eigenvalue.
+        """Lists the delays at which roots are on the imaginary axis at a frequency.
+
+        For each eigenvalue of modulus 1 these are the delays T with w T = phase + 2 pi k.
 
         Args:
-            omega: frequency at which eigenvalues have modulus 1, rad/s.
-            pairs: number of such eigenvalues; positive if roots move to the right.
+            omega: The frequency w, in rad/s.
+            pairs: Number of these eigenvalues. Positive if roots move to the right.
         """
         (values,) = self.compute_eigenvalues(np.array([omega]))
         distances = np.abs(np.abs(values) - 1.0)
         by_distance = np.argsort(distances, kind="stable")
         nearest = values[by_distance[: abs(pairs)]]
+
         sign = 1 if pairs > 0 else -1
         most_turns = int(MAX_COMMON_DELAY_S * omega / (2.0 * math.pi))
         crossings = []

@@ -1,11 +1,16 @@
-"""Values of a scenario's key at which the linear loop becomes stable or unstable.
+"""Finds the values of a scenario's key at which the linear loop becomes stable or unstable.
 
-A scan brackets each edge, and Brent's method finds the zero of the rightmost root's real part.
-The loop is the sampled one for the scheme `digital` and for sampled actors, and the continuous
-one otherwise.
+Such a value is called an edge. The key may be any number of the scenario, such as a gain or a
+delay. The growth rate of the loop is the real part of its rightmost characteristic root: the
+loop is unstable if it is positive. A scan evaluates the growth rate at some values of the key,
+and Brent's method finds its zero between two values of different sign.
+
+The sampled loop, with its ticks, is analysed for the scheme `digital` and for walls and
+operators that act once per tick. The continuous loop is analysed otherwise.
 
 Invariant:
-    - The equilibrium is found once and followed along the key.
+    - The equilibrium is determined once and followed along the key, so that a scan does not
+      jump between different equilibria.
 """
 
 from collections.abc import Iterator, Sequence
@@ -33,12 +38,16 @@ from .operating_point import Equilibrium, OperatingConditions, derive_operating_
 from .site_dynamics import place_arm
 
 EDGE_SCAN_POINTS = 24
+"""Default number of values of the key that a scan evaluates."""
 EDGE_TOLERANCE = 1e-6
-"""Tolerance of an edge, relative to the key's value."""
+"""Largest error of an edge, relative to the key's value."""
 _LOGARITHMIC = 20.0
-"""A range whose ends have a larger ratio is scanned in equal steps of the logarithm."""
+"""Largest ratio of the ends of a range that is scanned in equal steps.
+
+A larger range is scanned in equal steps of the logarithm.
+"""
 _LEAST_PER_S = -1e3
-"""Least real part in Brent's method, 1/s; it replaces -infinity for a loop without roots."""
+"""Least growth rate in Brent's method, in 1/s, which replaces -infinity if nothing moves."""
 _INTEGER_KEYS = ("rate_hz", "seed")
 
 ASSUMED_EQUILIBRIUM_REMARK = (
@@ -53,13 +62,16 @@ def find_rightmost_root(
     *,
     sampled: bool,
 ) -> CharacteristicRoot | None:
-    """Returns the rightmost root about an equilibrium; None if all roots are zero.
+    """Returns the rightmost characteristic root of the loop about an equilibrium.
 
     Args:
-        conditions: the numbers of the loop.
-        rest: the equilibrium.
-        sampled: analyse the sampled loop. The continuous one is analysed all the same if a law
-            is linearised in continuous time only.
+        conditions: The numbers of the loop.
+        rest: The equilibrium.
+        sampled: True to analyse the sampled loop. The continuous loop is analysed all the same
+            if a law can be linearised in continuous time only.
+
+    Returns:
+        The root. None if all roots are zero.
     """
     spectrum = compute_sampled_spectrum(conditions, rest, 1) if sampled else None
     if spectrum is None:
@@ -68,11 +80,16 @@ def find_rightmost_root(
 
 
 def find_deepest_contact(scenario: Scenario, q: Array) -> int | None:
-    """Returns the index of the state that is deepest in a sampled wall; None: no contact.
+    """Finds the state of a run in which an end effector is deepest in a sampled wall.
+
+    A sampled wall computes its torque once per tick.
 
     Args:
-        scenario: the experiment.
-        q: joint angles of all sites in K states, shape (K, N, n), rad.
+        scenario: The experiment.
+        q: Joint angles of all sites in K states, shape (K, N, n), in rad.
+
+    Returns:
+        Index of the state. None if no wall is touched.
     """
     depth_m = np.full(len(q), -np.inf)
     for n, name in enumerate(scenario.names):
@@ -89,23 +106,25 @@ def find_deepest_contact(scenario: Scenario, q: Array) -> int | None:
 
 
 def find_contact_growth(scenario: Scenario, q: Array, theta_hat: Array) -> float:
-    """Returns the growth rate of small motions in contact with sampled walls, 1/s.
+    """Returns the growth rate of small motions in contact with sampled walls, in 1/s.
 
     It is the real part of the sampled loop's rightmost root, at the equilibrium nearest to the
-    state that is deepest in a wall. Arms that chatter leave the wall again and again, so that
-    the mean of their states may have no contact.
+    state that is deepest in a wall. The mean of the states is not used: arms that chatter leave
+    the wall again and again, so that the mean may have no contact.
 
     Args:
-        scenario: the experiment.
-        q: joint angles of all sites in K states, shape (K, N, n), rad.
-        theta_hat: estimates of all sites in these states, shape (K, N, P).
+        scenario: The experiment.
+        q: Joint angles of all sites in K states, shape (K, N, n), in rad.
+        theta_hat: Estimates of all sites in these states, shape (K, N, P).
 
     Returns:
-        The growth rate; -infinity if nothing moves; NaN without contact or a linear loop.
+        The growth rate. -infinity if nothing moves. NaN without contact or without a linear
+        loop.
     """
     deepest = find_deepest_contact(scenario, q)
     if deepest is None:
         return np.nan
+
     try:
         # refuses imported laws, because their memory is not among the arguments
         derive_operating_conditions(scenario, own_laws=False)
@@ -118,12 +137,12 @@ def find_contact_growth(scenario: Scenario, q: Array, theta_hat: Array) -> float
 
 
 class LinearEdge(NamedTuple):
-    """A value at which a loop becomes stable or unstable.
+    """A value of a key at which a loop becomes stable or unstable.
 
     Attributes:
-        key: the scenario's key.
-        value: the key's value at the edge, in its own unit.
-        omega_rad_s: the frequency of the root that crosses, rad/s.
+        key: Key of the scenario.
+        value: Value of the key at the edge, in its own unit.
+        omega_rad_s: Frequency of the root that crosses the imaginary axis, in rad/s.
         stable_above: True if the loop is stable above the value and unstable below.
     """
 
@@ -134,7 +153,14 @@ class LinearEdge(NamedTuple):
 
 
 class EdgeScan(NamedTuple):
-    """The edges along a key from `low` to `high`, by rising value."""
+    """All edges along a key.
+
+    Attributes:
+        key: Key of the scenario.
+        low: Lower end of the scanned range.
+        high: Upper end of the scanned range.
+        edges: The edges, by rising value.
+    """
 
     key: str
     low: float
@@ -143,10 +169,13 @@ class EdgeScan(NamedTuple):
 
 
 def parse_edge_range(text: str) -> tuple[str, float, float]:
-    """Returns the key and the ends of a range such as "control.d=0.1:3".
+    """Parses a key and a range of values, such as "control.d=0.1:3".
+
+    Returns:
+        The key, the lower end and the upper end of the range.
 
     Raises:
-        UsageError: the text is not a range.
+        UsageError: The text is not a range.
     """
     key, _, ends = text.partition("=")
     low, colon, high = ends.partition(":")
@@ -173,28 +202,31 @@ def iterate_linear_edges(
     """Yields all edges that a scan of a key finds, by rising value.
 
     Args:
-        scenario: the experiment.
-        key: the scenario's key, as "control.d".
-        low: lower end of the range.
-        high: upper end of the range.
-        rest: the equilibrium of the scenario, if known; it is followed along the key.
-        points: number of values that the scan evaluates.
-        sampled: analyse the sampled loop. None: only for the scheme `digital`, or if an actor
-            in force is sampled.
+        scenario: The experiment.
+        key: Key of the scenario, such as "control.d".
+        low: Lower end of the range.
+        high: Upper end of the range.
+        rest: Equilibrium of the scenario, if known. It is followed along the key.
+        points: Number of values that the scan evaluates.
+        sampled: True to analyse the sampled loop, False to analyse the continuous loop. None to
+            choose as the module's docstring says.
 
     Raises:
-        ScenarioError: a value is not valid for that key, or the scenario has no linear loop.
-        UsageError: the range is empty.
+        ScenarioError: A value is not valid for that key, or the scenario has no linear loop.
+        UsageError: The range is empty.
     """
-    if not (np.isfinite([low, high]).all() and low < high and points >= 2):
+    is_valid_range = np.isfinite([low, high]).all() and low < high and points >= 2
+    if not is_valid_range:
         raise UsageError(
             f"{key} is scanned from a value to a larger one, not {low:g} to {high:g}"
         )
     growth = _GrowthRate(scenario, key, rest, sampled)
     is_logarithmic = low > 0.0 and high / low > _LOGARITHMIC
-    values = (np.geomspace if is_logarithmic else np.linspace)(low, high, points)
+    choose_values = np.geomspace if is_logarithmic else np.linspace
+    values = choose_values(low, high, points)
     if growth.takes_integers:
         values = np.unique(np.round(values))
+
     previous: _GrowthPoint | None = None
     for value in values.tolist():
         point = _GrowthPoint(value, growth.evaluate(value))
@@ -204,22 +236,35 @@ def iterate_linear_edges(
 
 
 class _GrowthPoint(NamedTuple):
-    """A value of a key and the real part of the rightmost root there, 1/s."""
+    """Growth rate of the loop at a value of a key.
+
+    Attributes:
+        value: Value of the key.
+        growth_per_s: Real part of the rightmost root, in 1/s.
+    """
 
     value: float
     growth_per_s: float
 
     @property
     def is_unstable(self) -> bool:
-        """True if the rightmost root is to the right of the axis."""
+        """True if the rightmost root is to the right of the imaginary axis."""
         return self.growth_per_s > 0.0
 
 
 class _GrowthRate:
-    """The real part of the rightmost root as a function of a key's value.
+    """Growth rate of a loop as a function of a key's value.
+
+    Each evaluation follows the equilibrium from the one of the previous evaluation.
+
+    Args:
+        scenario: The experiment.
+        key: Key of the scenario.
+        rest: Equilibrium of the scenario. None to determine it.
+        sampled: Whether to analyse the sampled loop, see `iterate_linear_edges`.
 
     Attributes:
-        takes_integers: True if the key takes whole numbers.
+        takes_integers: True if the values of the key are whole numbers.
     """
 
     def __init__(
@@ -237,7 +282,7 @@ class _GrowthRate:
         self._root: CharacteristicRoot | None = None
 
     def evaluate(self, value: float) -> float:
-        """Returns the real part at a value, 1/s; -infinity if all roots are zero."""
+        """Returns the growth rate at a value, in 1/s. -infinity if all roots are zero."""
         typed_value = round(value) if self.takes_integers else value
         scenario = load_scenario(self._scenario, {self._key: typed_value})
         conditions = derive_operating_conditions(scenario)
@@ -251,9 +296,15 @@ class _GrowthRate:
     def close_edge(self, left: _GrowthPoint, right: _GrowthPoint) -> LinearEdge:
         """Returns the edge between two values of which exactly one is unstable.
 
+        Keys with whole numbers are searched by bisection, all others by Brent's method.
+
+        Args:
+            left: The smaller value.
+            right: The larger value.
+
         Raises:
-            ScenarioError: a value in between has no linear loop.
-            ValueError: the ends, evaluated again, are both stable or both unstable.
+            ScenarioError: A value in between has no linear loop.
+            ValueError: The ends, evaluated again, are both stable or both unstable.
         """
         low = left.value
         high = right.value
@@ -268,24 +319,25 @@ class _GrowthRate:
             tolerance = 0.25 * EDGE_TOLERANCE * max(abs(low), abs(high))
             edge = brentq(self._evaluate_finite, low, high, xtol=tolerance)
             low = high = float(edge)
+
         self.evaluate(high)
         omega = 0.0 if self._root is None else self._root.s.imag
         return LinearEdge(self._key, 0.5 * (low + high), omega, left.is_unstable)
 
     def _evaluate_finite(self, value: float) -> float:
-        """Returns the real part at a value, at least `_LEAST_PER_S`."""
+        """Returns the growth rate at a value, which is at least `_LEAST_PER_S`."""
         return max(self.evaluate(value), _LEAST_PER_S)
 
 
 class GrowthColumn(NamedTuple):
-    """The growth rate of a loop over the values of a key.
+    """Growth rate of a loop over the values of a key.
 
     Attributes:
-        growth_per_s: real part of the rightmost root at each value; NaN if there is no linear
-            loop, and -infinity if nothing moves.
-        edges: values at which the loop becomes stable or unstable, by the index of the next
+        growth_per_s: Real part of the rightmost root at each value, in 1/s. NaN if there is no
+            linear loop, and -infinity if nothing moves.
+        edges: Values at which the loop becomes stable or unstable, by the index of the next
             smaller value.
-        remarks: remarks on the analysis, without repetition.
+        remarks: Remarks on the analysis, without repetition.
     """
 
     growth_per_s: list[float]
@@ -298,15 +350,15 @@ def compute_growth_column(
     key: str,
     values: Sequence[float],
 ) -> GrowthColumn:
-    """Returns the growth rates of scenarios that differ in one key only.
+    """Computes the growth rates of scenarios that differ in one key only.
 
     The equilibrium is followed from one scenario to the next. An edge is missing if a value
     between its neighbours is not valid for the key.
 
     Args:
-        scenarios: the experiments, by rising value of the key.
-        key: the scenario's key.
-        values: the key's values.
+        scenarios: The experiments, by rising value of the key.
+        key: Key of the scenarios.
+        values: Values of the key.
     """
     rest: Equilibrium | None = None
     column = GrowthColumn([], {}, [])
@@ -339,16 +391,17 @@ def find_root_crossings(
     low: float,
     high: float,
 ) -> tuple[tuple[float, ...], str]:
-    """Returns the values of a key at which the rightmost root crosses the axis, and a remark.
+    """Finds the values of a key at which the loop becomes stable or unstable.
 
     Args:
-        scenario: the experiment; its own value of the key gives the equilibrium.
-        key: the scenario's key.
-        low: lower end of the range.
-        high: upper end of the range.
+        scenario: The experiment. Its own value of the key determines the equilibrium.
+        key: Key of the scenario.
+        low: Lower end of the range.
+        high: Upper end of the range.
 
     Returns:
-        The values, rising, and a remark or "". There are no values without a linear loop.
+        The values, rising. Empty without a linear loop.
+        A remark on the analysis. Empty if there is none.
     """
     try:
         rest, remark = _assume_equilibrium(scenario, None)
@@ -361,10 +414,18 @@ def find_root_crossings(
 def _assume_equilibrium(
     scenario: Scenario, previous: Equilibrium | None
 ) -> tuple[Equilibrium, str]:
-    """Returns an equilibrium, without a run if possible, and a remark or "".
+    """Returns an equilibrium of a scenario, without a simulation if possible.
 
-    Adaptive sites without actors have the mean start pose as their equilibrium. Otherwise it is
-    the one next to the previous equilibrium.
+    Adaptive sites without operators and environments have the mean start pose as their
+    equilibrium. Otherwise it is the equilibrium next to the previous one.
+
+    Args:
+        scenario: The experiment.
+        previous: Equilibrium of a similar scenario, or None.
+
+    Returns:
+        The equilibrium.
+        A remark on the assumption. Empty if none was made.
     """
     sites = derive_operating_conditions(scenario).sites
     is_adaptive = any(site.gains.law is Law.ADAPTIVE for site in sites)

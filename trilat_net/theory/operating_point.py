@@ -1,11 +1,15 @@
-"""The operating point of the linear loop: the conditions at the end of a run.
+"""Determines the operating point at which the control loop is linearised.
 
-A link has an effective delay: the age of its samples at the ticks that use them. With a
+The scenario may change during a run: delays, dominance factors (the weights with which sites
+follow each other) and operators. A linear loop has one set of numbers, which are those at the
+end of the run.
+
+A link has an effective delay: the age of the peer's sample that a site uses in a tick. With a
 constant delay T and equal tick rates 1 / h it is max(1, ceil(T / h)) ticks. In all other cases
 it is the mean over the same random draws that a run makes.
 
 Invariant:
-    - A linear loop has one set of numbers: those in force at the end of the run.
+    - The numbers are those in force at the end of the run.
     - A note reports every number that differed earlier or is random.
     - Numbers that cannot be known before the run are refused.
 """
@@ -41,12 +45,13 @@ class Equilibrium(NamedTuple):
     """The pose about which a loop is linearised, with all sites at rest.
 
     Attributes:
-        q: joint angles, shape (N, n), rad; rows of arms with fewer joints end in zeros.
-        theta_hat: estimates, shape (N, P), also padded with zeros; for a law with known gravity
-            the parameters that the law assumes; for an imported law its memory.
-        how: a phrase that says how the equilibrium was found.
-        residual: the largest remaining acceleration, rad/s^2, or rate of an estimate.
-        notes: remarks on the equilibrium.
+        q: Joint angles, shape (N, n), in rad. Rows of arms with fewer joints end in zeros.
+        theta_hat: Estimates of the arm parameters, shape (N, P), also padded with zeros. For a
+            law with known gravity they are the parameters that the law assumes, for an imported
+            law its memory.
+        how: A phrase that says how the equilibrium was determined.
+        residual: Largest remaining acceleration, in rad/s^2, or rate of an estimate.
+        notes: Remarks on the equilibrium.
     """
 
     q: Array
@@ -57,12 +62,12 @@ class Equilibrium(NamedTuple):
 
 
 class EffectiveDelay(NamedTuple):
-    """Age of the samples in use over the receiver's ticks, s.
+    """Age of the samples that a site uses, over its ticks.
 
     Attributes:
-        mean_s: the mean age.
-        least_s: the smallest age.
-        most_s: the largest age.
+        mean_s: Mean age, in s.
+        least_s: Smallest age, in s.
+        most_s: Largest age, in s.
     """
 
     mean_s: float
@@ -71,16 +76,18 @@ class EffectiveDelay(NamedTuple):
 
 
 class OperatingConditions(NamedTuple):
-    """The numbers from which the linear loop is built.
+    """The numbers from which the linear loop is built, see `derive_operating_conditions`.
 
     Attributes:
-        sites: setups in scenario order, with the actors in force.
-        alpha: dominance matrix, shape (N, N), Eq. (6).
-        age_s: age of the sample of site j that site i uses, shape (N, N), s; 0 if i uses none.
-        notes: remarks on omitted or fixed numbers.
-        varying: True if ages vary; `age_s` then holds their means.
-        laws: the control of each site.
-        links: the link from j to i in force and the key of its random draws, by (i, j).
+        sites: Setups of the sites in scenario order, with the operators and environments in
+            force.
+        alpha: Matrix of dominance factors, shape (N, N), Eq. (6).
+        age_s: Age of the sample of site j that site i uses, shape (N, N), in s. 0 if it uses
+            none.
+        notes: Remarks on numbers that were left out or fixed.
+        varying: True if ages vary during the run. `age_s` then contains their means.
+        laws: Control law of each site.
+        links: The link from j to i in force, and the key of its random draws, by (i, j).
     """
 
     sites: tuple[SiteSetup, ...]
@@ -92,10 +99,10 @@ class OperatingConditions(NamedTuple):
     links: Mapping[tuple[int, int], tuple[LinkBase, int]] = MappingProxyType({})
 
     def find_forms(self, inertia: Sequence[Array] = ()) -> list[LinearForm | None]:
-        """Returns the linear form of each site's law; None if gains describe the law fully.
+        """Returns the linear form of each site's law. None if its gains describe the law fully.
 
         Args:
-            inertia: inertia matrix of each arm, shape (n, n); empty: unit matrices.
+            inertia: Inertia matrix of each arm, shape (n, n). Empty for unit matrices.
         """
         forms: list[LinearForm | None] = []
         for n, law in enumerate(self.laws):
@@ -114,8 +121,8 @@ class OperatingConditions(NamedTuple):
     def coupled_pairs(self) -> list[tuple[int, int]]:
         """Pairs (i, j) of sites for which site i uses the samples of site j.
 
-        Site i uses them if its dominance factor is not zero, or if its law is imported: such a
-        law reads the samples of every peer.
+        Site i uses them if its dominance factor for j is not zero, or if its law is imported:
+        such a law reads the samples of every peer.
         """
         pairs = []
         for i, site in enumerate(self.sites):
@@ -136,15 +143,15 @@ class OperatingConditions(NamedTuple):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the sites, in order."""
+        """Names of the sites, in scenario order."""
         return tuple(site.name for site in self.sites)
 
     @property
     def needs_sampled_loop(self) -> bool:
-        """True if only the sampled loop shows whether the loop is stable.
+        """True if only an analysis with ticks shows whether the loop is stable.
 
-        This is so for the scheme `digital`, for sampled actors, and for ages that vary in a
-        known way, without random draws.
+        This is so for the scheme `digital`, for walls and operators that act once per tick, and
+        for ages that vary in a known way, without random draws.
         """
         has_random_link = any(link.random for link, _ in self.links.values())
         if self.varying and not has_random_link:
@@ -155,7 +162,11 @@ class OperatingConditions(NamedTuple):
         return any(actor.sampled for actor in actors)
 
     def evaluate_rates(self, arguments: Sequence[Array]) -> list[SiteRates]:
-        """Returns the rates of every site at its own arguments, see `evaluate_site_rates`."""
+        """Returns the rates of change of every site's states, see `evaluate_site_rates`.
+
+        Args:
+            arguments: Arguments of each site, in scenario order.
+        """
         pairs = zip(self.sites, arguments, strict=True)
         return [evaluate_site_rates(site, x) for site, x in pairs]
 
@@ -163,14 +174,15 @@ class OperatingConditions(NamedTuple):
 def derive_operating_conditions(
     scenario: Scenario, *, own_laws: bool = True
 ) -> OperatingConditions:
-    """Returns the conditions at the end of a run.
+    """Derives the numbers of the linear loop from a scenario: those at the end of a run.
 
     Args:
-        scenario: the experiment.
-        own_laws: the code of imported laws may be executed.
+        scenario: The experiment.
+        own_laws: True if the code of imported laws may be executed.
 
     Raises:
-        ScenarioError: a law has no linear loop, an arm is external, or a link is measured.
+        ScenarioError: A law has no linear loop, an arm is not simulated, or the delay of a link
+            is measured during the run.
     """
     gains = _find_linear_gains(scenario, own_laws=own_laws)
     notes: list[str] = []
@@ -178,11 +190,13 @@ def derive_operating_conditions(
         _select_final_actors(scenario, name, notes)._replace(gains=gains[name])
         for name in scenario.names
     )
+
     alpha = _find_final_dominance(scenario, sites, notes)
     age_s = np.zeros_like(alpha)
     laws = scenario.controls
     sites = tuple(_build_imported_law(scenario, site, alpha) for site in sites)
     notes += _describe_laws(scenario)
+
     conditions = OperatingConditions(sites, alpha, age_s, (), laws=laws)
     pairs = conditions.coupled_pairs
     if conditions.has_forms:
@@ -191,6 +205,7 @@ def derive_operating_conditions(
             "a law here has states or waves of its own: "
             "it is linearised in continuous time only"
         )
+
     links = {}
     varying = []
     for i, j in pairs:
@@ -203,6 +218,7 @@ def derive_operating_conditions(
         # times of ticks are whole ns, so that constant ages differ by less than this
         if age.most_s > age.least_s + 1e-8:
             varying.append(age)
+
     if varying:
         least_ms = 1e3 * min(age.least_s for age in varying)
         most_ms = 1e3 * max(age.most_s for age in varying)
@@ -220,7 +236,7 @@ def derive_operating_conditions(
 
 
 def _describe_laws(scenario: Scenario) -> list[str]:
-    """Returns remarks on how the laws of a scenario are linearised."""
+    """Returns remarks on how the control laws of a scenario are linearised."""
     notes = []
     laws = scenario.controls
     codes = [law.code if isinstance(law, ImportedLaw) else "" for law in laws]
@@ -236,13 +252,22 @@ def _describe_laws(scenario: Scenario) -> list[str]:
 
 
 def is_constant_link(link: LinkBase) -> bool:
-    """True if a link delays every sample by the same time and loses none."""
+    """Returns True if a link delays every sample by the same time and loses none."""
     has_constant_model = link.to_core_model().kind == DelayKind.CONSTANT
     return has_constant_model and not link.loss and not link.measured
 
 
 def _build_imported_law(scenario: Scenario, site: SiteSetup, alpha: Array) -> SiteSetup:
-    """Returns a setup whose imported law, if any, is built and can be evaluated."""
+    """Makes the imported law of a site ready to be evaluated and differentiated.
+
+    Args:
+        scenario: The experiment.
+        site: Setup of the site.
+        alpha: Matrix of dominance factors, shape (N, N).
+
+    Returns:
+        The setup with the law. The same setup if the law of the site is not imported.
+    """
     law = scenario.sites[site.name].control
     if not isinstance(law, ImportedLaw):
         return site
@@ -255,10 +280,10 @@ def _build_imported_law(scenario: Scenario, site: SiteSetup, alpha: Array) -> Si
 
 
 def _find_linear_gains(scenario: Scenario, *, own_laws: bool) -> dict[str, Gains]:
-    """Returns the gains of each site's law in small motions, by site.
+    """Returns the gains with which each site's law acts on small motions, by site.
 
     Raises:
-        ScenarioError: a law has no linear loop, or an arm is external.
+        ScenarioError: A law has no linear loop, or an arm is not simulated.
     """
     gains_by_site: dict[str, Gains] = {}
     for name, spec in scenario.sites.items():
@@ -280,7 +305,7 @@ def _find_linear_gains(scenario: Scenario, *, own_laws: bool) -> dict[str, Gains
 
 
 def _explain_missing_gains(law: Any) -> str:
-    """Returns the reason why a law has no linear loop."""
+    """Returns the reason why a law has no linear loop, as part of a sentence."""
     if isinstance(law, ImportedLaw):
         return (
             f"{law.code} is known by its code only; "
@@ -295,10 +320,15 @@ def _explain_missing_gains(law: Any) -> str:
 
 
 def _find_final_link(scenario: Scenario, name: str, notes: list[str]) -> LinkBase:
-    """Returns the link in force at the end of the run; adds remarks to `notes`.
+    """Returns the delay model of a link that is in force at the end of the run.
+
+    Args:
+        scenario: The experiment.
+        name: Name of the link, "j->i".
+        notes: List to which remarks on earlier models and on outages are added.
 
     Raises:
-        ScenarioError: the link's delay is measured, and thus unknown before the run.
+        ScenarioError: The delay of the link is measured during the run, and unknown before.
     """
     end_ns = round(scenario.duration_s * 1e9)
     link: LinkBase = scenario.links[name]
@@ -327,10 +357,16 @@ def compute_effective_delay(
     site: str,
     link: LinkBase,
 ) -> EffectiveDelay:
-    """Returns the age of a peer's samples at the ticks of a site that use them.
+    """Computes the age of a peer's samples at the ticks of a site that use them.
+
+    Args:
+        scenario: The experiment.
+        peer: Name of the sender.
+        site: Name of the receiver.
+        link: Delay model of the link between them.
 
     Raises:
-        ScenarioError: no sample ever arrives.
+        ScenarioError: No sample ever arrives.
     """
     site_hz = scenario.sites[site].rate_hz
     peer_hz = scenario.sites[peer].rate_hz
@@ -338,10 +374,12 @@ def compute_effective_delay(
     is_constant = is_constant_link(link)
     if is_constant and site_hz == peer_hz:
         delay_us = max(round(model.location), model.playout_us)
-        # at least one tick, rounded up to whole ticks
-        ticks = max(1, -(-delay_us * site_hz // 1_000_000))
+        # The negated floor division rounds up to whole ticks.
+        whole_ticks = -(-delay_us * site_hz // 1_000_000)
+        ticks = max(1, whole_ticks)
         age_s = ticks / site_hz
         return EffectiveDelay(age_s, age_s, age_s)
+
     duration_s = scenario.duration_s
     if is_constant:
         # ages repeat, so that two seconds beyond the delay show them all
@@ -357,6 +395,7 @@ def compute_effective_delay(
         raise ScenarioError(
             "no sample of it ever arrives", path=f"links.{peer}->{site}", source=scenario.name
         )
+
     first = int(np.argmax(used >= 0))
     tick_ns = np.arange(first, len(used)) * NS_PER_S // site_hz
     sample_ns = used[first:] * NS_PER_S // peer_hz
@@ -373,7 +412,13 @@ def _find_final_dominance(
     sites: tuple[SiteSetup, ...],
     notes: list[str],
 ) -> Array:
-    """Returns the dominance matrix at the end of the run, shape (N, N); adds to `notes`."""
+    """Returns the matrix of dominance factors at the end of the run, shape (N, N).
+
+    Args:
+        scenario: The experiment.
+        sites: Setups of the sites, with the ramps of their factors.
+        notes: List to which remarks on changes are added.
+    """
     alpha = scenario.alpha.copy()
     end_ns = round(scenario.duration_s * 1e9)
     for i, site in enumerate(sites):
@@ -395,14 +440,20 @@ def _find_final_dominance(
 
 
 def _select_final_actors(scenario: Scenario, name: str, notes: list[str]) -> SiteSetup:
-    """Returns a site's setup with the actors in force at the end of the run.
+    """Returns a site's setup with the operators and environments in force at the end of a run.
 
-    A hand is at the end of its motion, and a scripted torque keeps its last value. Chirps and
-    multisines are left out. Each such change adds a remark to `notes`.
+    An operator that moves an arm to a target is at the end of its motion, and a scripted torque
+    keeps its last value. Chirps and multisines are left out.
+
+    Args:
+        scenario: The experiment.
+        name: Name of the site.
+        notes: List to which a remark on each such change is added.
     """
     setup = scenario.setup(name)
     end_s = scenario.duration_s
     present = [actor for actor in setup.actors if actor.start_s <= end_s < actor.end_s]
+
     hands = [actor for actor in present if actor.kind in _HANDS]
     if any(hand.move_end_s > end_s for hand in hands):
         notes.append(
@@ -414,6 +465,7 @@ def _select_final_actors(scenario: Scenario, name: str, notes: list[str]) -> Sit
             f"an operator at {name} still swings at the end: "
             "this torque is left out, because its mean is zero"
         )
+
     scripted = [
         actor
         for actor in present
@@ -424,6 +476,7 @@ def _select_final_actors(scenario: Scenario, name: str, notes: list[str]) -> Sit
         notes.append(
             f"a scripted torque acts on {name} at the end: its value then is kept constant"
         )
+
     user_written = [
         actor._replace(move_end_s=end_s) for actor in present if actor.kind in OWN_KINDS
     ]
@@ -437,7 +490,12 @@ _PERIODIC = (TorqueKind.CHIRP, TorqueKind.MULTISINE)
 
 
 def _evaluate_script(actor: TorqueSource, t_s: float) -> tuple[float, ...]:
-    """Returns the torque of a scripted actor at a time: a sin^2 pulse, or a table's value."""
+    """Returns the torque of a scripted operator at a time.
+
+    Args:
+        actor: The operator, whose torque is a sin^2 pulse or the interpolation of a table.
+        t_s: The time, in s.
+    """
     if actor.table is None:
         x = (t_s - actor.start_s) / (actor.end_s - actor.start_s)
         return tuple(peak * math.sin(math.pi * x) ** 2 for peak in actor.a)

@@ -1,17 +1,23 @@
-"""Port analysis of a teleoperator: passivity, absolute stability and transparency.
+"""Analyses the haptic ports of a teleoperator: passivity, absolute stability, transparency.
 
-Sites that follow in task space have ports at their end effectors, along the followed axes: the
-same loop in other coordinates. With J the Jacobian of a site's followed axes at rest and N a
-basis of the joint motions that leave them unchanged, x = J q and z = N' q replace q. A force F
-on the end effector is the torque J' F, and its velocity is x'. A port has the number of its
-coordinate: 1 to 3 for the position, 4 to 6 for rotations. The state of its position is called
-"q" with that number, as for a joint.
+A port is where an operator or an environment touches an arm: the torque tau that acts on a
+joint, and the joint's velocity qd. The teleoperator is passive at its ports if it never returns
+more energy than it received. It is absolutely stable if it is stable with any passive
+operators. Transparency compares what an operator feels while another site moves freely or is
+clamped.
+
+Sites that follow in task space have ports at their end effectors, along the followed axes. They
+are the same loop in other coordinates. With J the Jacobian of a site's followed axes at rest
+and N a basis of the joint motions that leave these axes unchanged, x = J q and z = N' q replace
+q. A force F on the end effector is the torque J' F, and its velocity is x'. A port has the
+number of its coordinate: 1 to 3 for the position, 4 to 6 for rotations. The state of its
+position is called "q" with that number, as for a joint.
 
 Invariant:
-    - Operators and environments are removed, and their torque at the equilibrium stays as a
+    - Operators and environments are removed. Their torque at the equilibrium stays as a
       constant, so that a held pose can be analysed too.
-    - An unstable loop has no steady oscillations: only its instability counts.
-    - Every result holds for the analysed band.
+    - An unstable loop has no steady oscillations, so that only its instability counts.
+    - Every result holds for the analysed band of frequencies.
 """
 
 from collections.abc import Mapping, Sequence
@@ -55,9 +61,11 @@ from .site_dynamics import compute_following, lay_out_arguments, place_arm
 def freeze_external_torques(
     conditions: OperatingConditions, rest: Equilibrium
 ) -> OperatingConditions:
-    """Returns conditions in which the torque of operators and environments is constant.
+    """Replaces operators and environments by the constant torque that they apply at rest.
 
-    Its value is that at the equilibrium.
+    Args:
+        conditions: The numbers of the loop.
+        rest: The equilibrium.
     """
     arguments = gather_site_arguments(conditions, rest)
     sites = []
@@ -70,7 +78,12 @@ def freeze_external_torques(
 
 
 def linearise_teleoperator(conditions: OperatingConditions, rest: Equilibrium) -> LinearLoop:
-    """Returns the loop without the operators and environments that act at its ports."""
+    """Returns the linear loop without the operators and environments at its ports.
+
+    Args:
+        conditions: The numbers of the loop.
+        rest: The equilibrium.
+    """
     frozen = freeze_external_torques(conditions, rest)
     return move_ports_to_end_effectors(frozen, rest, linearise_loop(frozen, rest))
 
@@ -78,17 +91,22 @@ def linearise_teleoperator(conditions: OperatingConditions, rest: Equilibrium) -
 def build_proof_output(
     conditions: OperatingConditions, loop: LinearLoop
 ) -> port_response.LoopOutput | None:
-    """Returns the output of the paper's passivity proof, or None if there is no proof.
+    """Returns the output of the loop with respect to which the paper proves passivity.
 
-    The output is r_i = qd_i + Lambda (q_i - sum_j alpha_ij q_j(t - T_ij)), Eq. (6), (9), (10).
-    In task space it is J r, with positions in place of q. There is no proof for laws other than
-    the paper's, which have no r, for orientations, and for axes that a peer does not follow.
+    The output is r_i = qd_i + Lambda (q_i - sum_j alpha_ij q_j(t - T_ij)), Eq. (6), (9), (10),
+    with the dominance factors alpha_ij and the delays T_ij. In task space it is J r, with
+    positions in place of q.
+
+    Returns:
+        The output. None if there is no proof: for laws other than the paper's, for
+        orientations, and for axes that a peer does not follow.
     """
     sites = conditions.sites
     if any(site.gains.law is not Law.ADAPTIVE or site.gains.absolute for site in sites):
         return None
     if sites[0].layout.task and sites[0].layout.shared > POSITION:
         return None
+
     C = loop.C.copy()
     delays_s = conditions.age_s[conditions.alpha != 0.0]
     delayed = {float(delay_s): np.zeros_like(loop.C) for delay_s in delays_s}
@@ -107,9 +125,9 @@ def build_proof_output(
 
 
 def compute_proof_weights(conditions: OperatingConditions) -> Array:
-    """Returns beta_i = pi_i / c_i of the corrected proof in docs/errata.md, shape (N,).
+    """Returns the weights of the sites in the energy function of the corrected proof, shape (N,).
 
-    The weights sum to N.
+    They are beta_i = pi_i / c_i of docs/errata.md, and their sum is N.
     """
     Kd = np.full((len(conditions.sites), conditions.sites[0].layout.shared), np.nan)
     for site_Kd, site in zip(Kd, conditions.sites, strict=True):
@@ -119,14 +137,15 @@ def compute_proof_weights(conditions: OperatingConditions) -> Array:
 
 
 class TwoPort(NamedTuple):
-    """Llewellyn's criterion for one joint of two sites.
+    """Llewellyn's criterion of absolute stability for one joint of two sites.
+
+    No operator acts at the other joints.
 
     Attributes:
-        sites: the two sites.
-        joint: number of the joint, or coordinate of the task, from 1 on; no operator is at the
-            others.
-        clamped: the third site if it is clamped; "" if it is free, or there is no third site.
-        minima: Llewellyn's parameter over frequency, and the bands where it is below 1.
+        sites: The two sites.
+        joint: Number of the joint, or of the coordinate in task space, from 1 on.
+        clamped: Name of the third site if it is clamped. Empty if it is free or does not exist.
+        minima: Llewellyn's parameter over frequency, and the bands in which it is below 1.
     """
 
     sites: tuple[str, str]
@@ -136,28 +155,29 @@ class TwoPort(NamedTuple):
 
 
 class PortAnalysis(NamedTuple):
-    """The ports of a teleoperator without operators and environments.
+    """Results of the analysis of a teleoperator's ports, see `analyse_ports`.
 
     Attributes:
-        scenario: the teleoperator.
-        band_hz: the analysed band, Hz.
-        resolved_hz: the frequency up to which the grid resolves the phase of the delays, Hz.
-        verdict: verdict of the loop's roots: "stable", "unstable" or "at the edge".
-        pole: the pole of the admittance at zero frequency.
-        velocity: passivity at all ports with respect to qd.
-        joints: the same for each joint alone, with no operator at the others.
-        proof: passivity with respect to r = qd + Lambda e; None if the law has no r.
-        beta: the weights of the sites in `proof`, shape (N,), sum N.
+        scenario: The teleoperator.
+        band_hz: Lower and upper end of the analysed band, in Hz.
+        resolved_hz: Frequency up to which the grid resolves the phase of the delays, in Hz.
+        verdict: Verdict of the loop's characteristic roots: "stable", "unstable" or "at the
+            edge".
+        pole: Pole of the admittance at zero frequency.
+        velocity: Passivity at all ports with respect to the velocities.
+        joints: The same for each joint alone, without operators at the others, by number.
+        proof: Passivity with respect to r = qd + Lambda e. None if the law has no r.
+        beta: Weights of the sites in `proof`, shape (N,), with the sum N.
         estimates_true: True if all estimates at the equilibrium are true. Otherwise the proof
             counts the energy that they store, which a linear loop cannot show.
-        absolute: the least eigenvalue under the best weights; the loop is stable with any
-            passive operators if it is not negative.
+        absolute: Least eigenvalue over frequency under the best weights. The loop is stable
+            with any passive operators if it is never negative.
         two_ports: Llewellyn's criterion for every pair of sites.
-        transparency: transparency at each site, with one other site free and clamped.
-        clamped_verdict: verdict of the roots with that other site clamped.
-        axes: in task space the name of each port number's axis; {} in joint space.
-        measured: result with measured hands at the masters, see `check_against_hands`; None if
-            no hand was measured.
+        transparency: Transparency at each site, with one other site free and clamped.
+        clamped_verdict: Verdict of the roots with that other site clamped.
+        axes: Name of each port number's axis in task space. Empty in joint space.
+        measured: Result with measured operators at the masters, see `check_against_hands`. None
+            if no operator was measured.
     """
 
     scenario: Scenario
@@ -197,7 +217,11 @@ class PortAnalysis(NamedTuple):
         return f"{self.kind} {self.axes.get(number, number)}"
 
     def impedance_unit(self, number: int = 0) -> str:
-        """Returns the unit of an impedance at the ports with a number; 0: at all ports."""
+        """Returns the unit of an impedance at the ports with a number.
+
+        Args:
+            number: Number of the ports, from 1. 0 stands for all ports.
+        """
         linear = "N s/m"
         angular = "N m s/rad"
         if not self.axes:
@@ -215,34 +239,37 @@ def analyse_ports(
     band_hz: tuple[float, float] = (frequency_search.LOW_HZ, frequency_search.HIGH_HZ),
     hands: Sequence[HandMatrices] = (),
 ) -> PortAnalysis:
-    """Returns the analysis of a scenario's ports at an equilibrium, over a band.
+    """Analyses the ports of a scenario at an equilibrium, over a band of frequencies.
 
     Args:
-        scenario: the teleoperator.
-        rest: the equilibrium.
-        of: the site that is free and clamped for the others' transparency; None: the slave, or
-            the last site.
-        band_hz: lower and upper end of the band, Hz.
-        hands: measured hands, any of which may hold any master.
+        scenario: The teleoperator.
+        rest: The equilibrium.
+        of: Site that is free and clamped for the transparency at the others. None for the
+            slave, or for the last site if there is no slave.
+        band_hz: Lower and upper end of the band, in Hz.
+        hands: Measured impedances of operators, any of which may hold any master.
 
     Raises:
-        ScenarioError: the scenario has no linear loop.
-        UsageError: there is no site of that name, or the band is empty.
+        ScenarioError: The scenario has no linear loop.
+        UsageError: There is no site of that name, or the band is empty.
     """
     low, high = band_hz
     if not 0.0 < low < high:
         raise UsageError(
             f"a band goes from a frequency to a higher one, not from {low:g} to {high:g} Hz"
         )
+
     conditions = derive_operating_conditions(scenario)
     loop = linearise_teleoperator(conditions, rest)
     other_site = of or scenario.slave
+
     sites = port_response.list_port_sites(loop)
     delay_s = port_response.find_longest_delay_s(loop)
     grid = frequency_search.build_frequency_grid(low, high, delay_s)
     Y = port_response.build_admittance(loop)
     w_rad_s = frequency_search.refine_frequencies(Y, grid)
     Y = frequency_search.cache_response(Y, w_rad_s)
+
     joints = {
         joint: check_passivity(port_response.select_ports(Y, ports), w_rad_s)
         for joint, ports in port_response.group_ports_by_joint(loop).items()
@@ -251,6 +278,7 @@ def analyse_ports(
     for site in sites:
         if site != other_site:
             transparency += measure_transparency(loop, site, other_site)
+
     clamped_loop = port_response.clamp_site(loop, other_site)
     held_hands = _locate_hands(scenario, conditions, rest=rest, loop=loop, hands=hands)
     return PortAnalysis(
@@ -276,7 +304,7 @@ def analyse_ports(
 
 
 def _are_estimates_true(conditions: OperatingConditions, rest: Equilibrium) -> bool:
-    """True if every estimate at the equilibrium is the true parameter."""
+    """Returns True if every estimate at the equilibrium is the true parameter."""
     for theta_hat, site in zip(rest.theta_hat, conditions.sites, strict=True):
         if site.gains.law is Law.USER:
             continue
@@ -290,7 +318,13 @@ def _check_absolute_stability(
     Y: port_response.PortResponse,
     w_rad_s: Array,
 ) -> frequency_search.Minima:
-    """Returns the margin of absolute stability over frequency, with the best weights."""
+    """Returns the margin of absolute stability over frequency, with the best weights.
+
+    Args:
+        loop: The loop.
+        Y: Admittance at all ports.
+        w_rad_s: Frequencies, in rad/s.
+    """
     owners = _find_owners(loop)
     return frequency_search.find_minima(
         lambda w: find_best_weights(Y(w), owners).margin,
@@ -300,12 +334,12 @@ def _check_absolute_stability(
 
 
 class _HeldHands(NamedTuple):
-    """The masters' end effectors and the hands that may hold them.
+    """The end effectors of the masters, and the measured operators that may hold them.
 
     Attributes:
-        hands: for each master the hands of which any may hold.
-        places: for each master the matrix from the velocities at all ports to that of its end
-            effector, shape (n, p).
+        hands: For each master, the operators of whom any may hold it.
+        places: For each master, the matrix from the velocities at all ports to the velocity of
+            its end effector, shape (n, p).
     """
 
     hands: list[Sequence[HandMatrices]]
@@ -320,15 +354,16 @@ def _locate_hands(
     loop: LinearLoop,
     hands: Sequence[HandMatrices],
 ) -> _HeldHands:
-    """Returns the masters' end effectors and the hands that may hold them.
+    """Returns the end effectors of the masters, and the measured operators that may hold them.
 
     Raises:
-        UsageError: a hand moves along other axes than an end effector.
+        UsageError: An operator was measured along other axes than an end effector has.
     """
     places: list[Array] = []
     for site, site_q in zip(conditions.sites, rest.q, strict=True):
         if not hands or scenario.sites[site.name].role != "master":
             continue
+
         q = site_q[np.newaxis, : site.layout.joints]
         ports = port_response.find_site_ports(loop, site.name)
         arm = build_arm_rows(scenario, site.name)
@@ -339,6 +374,7 @@ def _locate_hands(
                 f"{site.name}: its end effector moves along {count_nouns(len(J), 'axis')}, "
                 "and a hand along another number"
             )
+
         place = np.zeros((len(J), len(loop.inputs)))
         if site.layout.task:
             # the ports are axes already
@@ -363,7 +399,12 @@ def _check_proof(
     loop: LinearLoop,
     w_rad_s: Array,
 ) -> Passivity | None:
-    """Returns passivity with respect to r under the proof's weights; None: no proof."""
+    """Checks passivity with respect to the output r of the paper's proof.
+
+    Returns:
+        The passivity under the weights of the proof. None if there is no proof for this loop,
+        or if some site has the weight zero.
+    """
     output = build_proof_output(conditions, loop)
     beta = compute_proof_weights(conditions)[_find_owners(loop)]
     if output is None or not (beta > 0.0).all():
@@ -383,7 +424,7 @@ def _check_two_ports(
 ) -> tuple[TwoPort, ...]:
     """Returns Llewellyn's criterion for each joint that both sites of a pair have.
 
-    With three sites, the third is once free and once clamped.
+    With three sites, the third one is once free and once clamped.
     """
     two_ports = []
     sites = port_response.list_port_sites(loop)
@@ -410,7 +451,14 @@ def _check_llewellyn(
     clamped: list[int],
     w_rad_s: Array,
 ) -> frequency_search.Minima:
-    """Returns Llewellyn's parameter of two ports, with other ports clamped."""
+    """Returns Llewellyn's parameter of two ports over frequency.
+
+    Args:
+        Y: Admittance at all ports.
+        keep: Indices of the two ports.
+        clamped: Indices of the ports that are clamped. All others are free.
+        w_rad_s: Frequencies, in rad/s.
+    """
     return frequency_search.find_minima(
         lambda w: llewellyn_parameter(clamp_ports(Y(w), keep, clamped)),
         w_rad_s,
@@ -420,7 +468,7 @@ def _check_llewellyn(
 
 
 def ports_to_json(ports: PortAnalysis) -> dict[str, Any]:
-    """Returns a port analysis as plain values; infinite numbers are None."""
+    """Returns a port analysis as plain values. Infinite numbers are None."""
     measured = ports.measured
     return {
         "sites": list(ports.sites),
@@ -467,7 +515,7 @@ def _passivity_to_json(passivity: Passivity) -> dict[str, Any]:
 
 
 def _minima_to_json(minima: frequency_search.Minima) -> dict[str, Any]:
-    """Returns the least value of a curve and the bands in which it fails, as plain values."""
+    """Returns the least value of a curve, and the bands in which it fails, as plain values."""
     return {
         "holds": not minima.below,
         "least": minima.least,
@@ -495,14 +543,14 @@ def _transparency_to_json(transparency: Transparency) -> dict[str, Any]:
 
 
 def list_followed_axes(site: SiteSetup) -> list[int]:
-    """Returns the coordinates that a site follows, from 1 on; in joint space all joints."""
+    """Returns the coordinates that a site follows, from 1 on. In joint space all joints."""
     if site.chain is None or site.chain.task is None:
         return list(range(1, site.layout.joints + 1))
     return [n for n, is_followed in enumerate(site.chain.task.axes, 1) if is_followed]
 
 
 def name_ports(conditions: OperatingConditions) -> dict[int, str]:
-    """Returns the name of each port number's axis in task space; {} in joint space."""
+    """Returns the name of each port number's axis in task space. Empty in joint space."""
     if not conditions.sites[0].layout.task:
         return {}
     followed = sorted({n for site in conditions.sites for n in list_followed_axes(site)})
@@ -514,13 +562,22 @@ def move_ports_to_end_effectors(
     rest: Equilibrium,
     loop: LinearLoop,
 ) -> LinearLoop:
-    """Returns a loop with ports at the end effectors; in joint space the same loop.
+    """Moves the ports of a loop from the joints to the end effectors.
 
-    The states change to T X with a block T = (J; N') for the positions and the velocities of
-    each site, and the ports to J.
+    The states X change to T X. The block of a site in T is (J; N') for its positions and again
+    for its velocities, with J and N as in the module's docstring.
+
+    Args:
+        conditions: The numbers of the loop.
+        rest: The equilibrium.
+        loop: The loop with ports at the joints.
+
+    Returns:
+        The loop with ports at the end effectors. In joint space the same loop.
     """
     if not conditions.sites[0].layout.task:
         return loop
+
     state_blocks = []
     inverse_blocks = []
     port_blocks = []
@@ -537,12 +594,15 @@ def move_ports_to_end_effectors(
         N = null_space(J)
         T = np.vstack([J, N.T])
         T_inverse = np.hstack([np.linalg.pinv(J), N])
+
+        # the states of estimates, which follow those of the joints, stay as they are
         site_states = [name for name in loop.names if name.startswith(f"{site.name}.")]
         estimates = site_states[2 * layout.joints :]
         unchanged = np.eye(len(estimates))
         state_blocks.append(block_diag(T, T, unchanged))
         inverse_blocks.append(block_diag(T_inverse, T_inverse, unchanged))
         port_blocks.append(J)
+
         free_names = [f"free{n + 1}" for n in range(N.shape[1])]
         names += [f"{site.name}.q{n}" for n in followed]
         names += [f"{site.name}.{name}" for name in free_names]
@@ -551,6 +611,7 @@ def move_ports_to_end_effectors(
         names += estimates
         inputs += [f"{site.name}.tau{n}" for n in followed]
         outputs += [f"{site.name}.qd{n}" for n in followed]
+
     new_by_old = block_diag(*state_blocks)
     old_by_new = block_diag(*inverse_blocks)
     J = block_diag(*port_blocks)

@@ -1,10 +1,13 @@
 """Computes all metrics of a log, converts them to JSON, and compares several logs.
 
+`measures` explains what a metric, a quantity and a subject are. Every file of this folder
+declares some of them.
+
 Invariant:
     - Each quantity is present for each subject (run, site, link or wall) to which it applies:
       as a number, or with the reason why the number is missing.
-    - In JSON a missing number is null, and `unknown` has the reason.
-    - A comparison has a column for each log and a row for each metric of the whole run.
+    - In JSON a missing number is null, and the key `unknown` has the reason.
+    - A comparison has a column for each log and a row for each quantity of the whole run.
 """
 
 import math
@@ -44,26 +47,27 @@ METRICS_JSON_VERSION = 1
 
 @dataclass(frozen=True, repr=False)
 class LogMetrics(Result):
-    """All metrics of a log.
+    """All metrics of a log, computed by `compute_log_metrics`.
 
     Attributes:
-        log: name of the log's file.
-        scenario: name of the scenario.
-        driver: driver of the run, "live" or "virtual".
+        log: Name of the file of the log.
+        scenario: Name of the scenario.
+        driver: How the run was executed: "live" or "virtual".
         complete: True if the log was closed properly.
-        run: metrics of the whole run.
-        sites: metrics by site.
-        links: metrics by link, "j->i".
-        walls: metrics by wall; "s/1" is the first wall of site s.
-        estimates: parameter estimates by site, of sites with records.
-        static_windows: number of static windows.
-        joint_loads: loaded joints in static windows, with the torques of all loaded sites.
-        sharing_ratios: force sharing at joints at which two sites are loaded.
-        stiffness: stiffness between successive static windows.
-        responses: impedances and reflections over frequency.
-        axes: names of the shared coordinates in task space, where the number of a joint stands
-            for a coordinate; () otherwise.
-        joint_names: names of the joints, if all arms' files have the same names; () otherwise.
+        run: Metrics of the whole run.
+        sites: Metrics of each site, by name.
+        links: Metrics of each link, by a name such as "m1->s".
+        walls: Metrics of each wall. "s/1" is the first wall of site s.
+        estimates: Estimates of the arm parameters, for each site with records.
+        static_windows: Number of windows of time in which all arms rest.
+        joint_loads: Torques of all loaded sites at each loaded joint, in each static window.
+        sharing_ratios: Force sharing at each joint at which two sites are loaded.
+        stiffness: Stiffness that an operator met between successive static windows.
+        responses: Impedances and reflections over frequency.
+        axes: Names of the shared coordinates in task space, where the number of a joint stands
+            for a coordinate. Empty in joint space.
+        joint_names: Names of the joints, if the files of all arms have the same names. Empty
+            otherwise.
     """
 
     log: str
@@ -87,7 +91,7 @@ class LogMetrics(Result):
         """Returns the label of a joint, "1" or "3 elbow", or the name of an axis.
 
         Args:
-            number: number of the joint or axis, from 1.
+            number: Number of the joint or axis, from 1.
         """
         if self.axes:
             return self.axes[number - 1]
@@ -96,11 +100,11 @@ class LogMetrics(Result):
         return str(number)
 
     def unit(self, joint_unit: str, number: int) -> str:
-        """Returns the unit of a quantity of a joint or of an axis.
+        """Returns the unit of a quantity at a joint or along an axis.
 
         Args:
-            joint_unit: the unit of the quantity of a joint.
-            number: number of the joint or axis, from 1.
+            joint_unit: Unit of the quantity at a joint.
+            number: Number of the joint or axis, from 1.
         """
         if self.axes and number <= POSITION:
             return _ALONG_AXES.get(joint_unit, joint_unit)
@@ -116,7 +120,7 @@ class LogMetrics(Result):
         return f"{self.log}: {numbers} of {self.scenario}, {sites}"
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns plain values, with the keys of `trilat metrics --json`."""
+        """Returns the metrics as plain values, with the keys of `trilat metrics --json`."""
         content: dict[str, Any] = {
             "version": METRICS_JSON_VERSION,
             "log": self.log,
@@ -142,11 +146,11 @@ class LogMetrics(Result):
 
     @property
     def _subjects(self) -> dict[str, dict[str, MetricValues]]:
-        """The metrics by name, for each kind of subject."""
+        """The metrics by name of the subject, for each kind of subject but the run."""
         return {"sites": self.sites, "links": self.links, "walls": self.walls}
 
     def _list_reasons(self) -> dict[str, str]:
-        """Returns the reason for each missing number, by its path in the JSON."""
+        """Returns the reason for each missing number, by the path of the number in the JSON."""
         metrics_by_path = {"run.": self.run}
         for kind, metrics_by_name in self._subjects.items():
             for name, metrics in metrics_by_name.items():
@@ -169,7 +173,7 @@ class LogMetrics(Result):
         return rows
 
     def _list_values(self) -> Iterator[tuple[dict[str, str], Metric]]:
-        """Yields a description of quantity and subject, and the metric, for all metrics."""
+        """Yields each metric with a description of its quantity and its subject."""
         for quantity in quantities():
             for subject, metric in self.values_of(quantity).items():
                 description = {
@@ -182,14 +186,14 @@ class LogMetrics(Result):
                 yield description, metric
 
     def values_of(self, quantity: Quantity) -> dict[str, Metric]:
-        """Returns a quantity by subject; the run is named ""."""
+        """Returns the metrics of a quantity by subject. The name of the run is empty."""
         if quantity.of == "run":
             return {"": self.run[quantity.key]}
         metrics_by_name: dict[str, MetricValues] = getattr(self, f"{quantity.of}s")
         return {name: metrics[quantity.key] for name, metrics in metrics_by_name.items()}
 
     def run_value(self, quantity: Quantity) -> Metric:
-        """Returns a quantity of the run, see `reduce_to_run`."""
+        """Returns the metric of a quantity for the whole run, see `reduce_to_run`."""
         return reduce_to_run(quantity, self.values_of(quantity))
 
 
@@ -197,7 +201,11 @@ def reduce_to_run(quantity: Quantity, values_by_subject: Mapping[str, Metric]) -
     """Returns a quantity of the run: the largest value of its subjects, or their sum.
 
     Subjects to which the quantity does not apply are left out. If the number of any other
-    subject is missing, so is the number of the run.
+    subject is missing, the number of the run is missing as well.
+
+    Args:
+        quantity: The quantity, which states whether the maximum or the sum is used.
+        values_by_subject: Its metric for each subject.
     """
     numbers = []
     reasons = []
@@ -208,6 +216,7 @@ def reduce_to_run(quantity: Quantity, values_by_subject: Mapping[str, Metric]) -
             reasons.append(f"{subject}: {metric.why}" if subject else metric.why)
         if metric.value is not None:
             numbers.append(metric.value)
+
     if reasons:
         return Metric(None, "; ".join(reasons))
     if not numbers:
@@ -216,6 +225,7 @@ def reduce_to_run(quantity: Quantity, values_by_subject: Mapping[str, Metric]) -
         different_reasons = dict.fromkeys(all_reasons)
         why = "; ".join(different_reasons) or f"there is no {quantity.of}"
         return Metric(None, why, applies=False)
+
     reduced = sum(numbers) if quantity.reduction == "sum" else max(numbers)
     return Metric(reduced)
 
@@ -223,14 +233,15 @@ def reduce_to_run(quantity: Quantity, values_by_subject: Mapping[str, Metric]) -
 # overflow and NaN do not warn: a metric that is not finite becomes a reason
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
 def compute_log_metrics(log: Log) -> LogMetrics:
-    """Returns all metrics of a log, which may be torn, short or empty.
+    """Computes all metrics of a log, which may be torn, short or empty.
 
     Raises:
-        LogError: a record cannot be read, or names a change that is not valid.
+        LogError: A record cannot be read, or names a change that is not valid.
     """
     view = RunView(log)
     scenario = log.scenario
     values = _measure_subjects(view, list_measures())
+
     axes: tuple[str, ...] = ()
     if follows_in_task_space(log):
         axes = TASK_AXES[: scenario.arms[log.sites[0]].counts.shared]
@@ -238,6 +249,7 @@ def compute_log_metrics(log: Log) -> LogMetrics:
     for site, arm in scenario.arms.items():
         has_file = bool(scenario.sites[site].arm.urdf)
         joint_names.add(arm.joint_names if has_file else ())
+
     return LogMetrics(
         log=Path(log.source).name,
         scenario=scenario.name,
@@ -261,7 +273,15 @@ def compute_log_metrics(log: Log) -> LogMetrics:
 def _measure_subjects(
     view: RunView, wanted: Iterable[Measure]
 ) -> dict[str, dict[str, MetricValues]]:
-    """Returns metrics by kind of subject, subject and key."""
+    """Computes metrics for all subjects.
+
+    Args:
+        view: The run.
+        wanted: The measures to apply.
+
+    Returns:
+        The metrics by kind of subject, name of the subject, and key.
+    """
     values: dict[str, dict[str, MetricValues]] = {}
     for kind in ("run", "site", "link", "wall"):
         values[kind] = {name: {} for name in view.list_subjects(kind)}
@@ -272,10 +292,10 @@ def _measure_subjects(
 
 
 def find_quantity(key: str) -> Quantity:
-    """Returns the quantity of a key.
+    """Returns the quantity with a given key.
 
     Raises:
-        KeyError: no quantity has this key; the message names the nearest key.
+        KeyError: No quantity has this key. The message names the most similar key.
     """
     known = {quantity.key: quantity for quantity in quantities()}
     if key not in known:
@@ -286,11 +306,18 @@ def find_quantity(key: str) -> Quantity:
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # as in compute_log_metrics
 def measure_run(log: Log, keys: Iterable[str]) -> dict[str, Metric]:
-    """Returns quantities of the whole run by their keys; computes nothing else.
+    """Computes some quantities of a whole run, and nothing else.
+
+    Args:
+        log: The log of the run.
+        keys: Keys of the quantities.
+
+    Returns:
+        Their metrics, by key.
 
     Raises:
-        KeyError: no quantity has one of the keys.
-        LogError: a record cannot be read, or names a change that is not valid.
+        KeyError: No quantity has one of the keys.
+        LogError: A record cannot be read, or names a change that is not valid.
     """
     requested = {key: find_quantity(key) for key in keys}
     wanted = []
@@ -298,6 +325,7 @@ def measure_run(log: Log, keys: Iterable[str]) -> dict[str, Metric]:
         measured_keys = {quantity.key for quantity in measure.quantities}
         if not measured_keys.isdisjoint(requested):
             wanted.append(measure)
+
     values = _measure_subjects(RunView(log), wanted)
     run_values = {}
     for key, quantity in requested.items():
@@ -309,7 +337,10 @@ def measure_run(log: Log, keys: Iterable[str]) -> dict[str, Metric]:
 
 
 def _details_to_json(metrics: LogMetrics) -> dict[str, Any]:
-    """Returns the results of static windows and the responses, ready for JSON."""
+    """Returns the results of static windows and the responses as plain values.
+
+    In task space the entries have an axis in place of the joint, and the units of this axis.
+    """
     details: dict[str, list[dict[str, Any]]] = {
         "levers": [_load_to_json(load) for load in metrics.joint_loads],
         "force_sharing": [_sharing_to_json(ratio) for ratio in metrics.sharing_ratios],
@@ -330,7 +361,7 @@ def _details_to_json(metrics: LogMetrics) -> dict[str, Any]:
 
 
 def _load_to_json(load: JointLoad) -> dict[str, Any]:
-    """Returns a joint's load as plain values."""
+    """Returns the load of a joint as plain values."""
     content = load._asdict()
     content["weight"] = _values_to_json(load.weight)
     return content | _value_and_reason("imbalance", load.imbalance)
@@ -353,7 +384,7 @@ def _impedance_to_json(metrics: LogMetrics, estimate: ImpedanceEstimate) -> dict
 
 
 def _name_axis(metrics: LogMetrics, entry: dict[str, Any]) -> dict[str, Any]:
-    """Returns an entry with an axis in place of its joint, and the units of this axis."""
+    """Returns an entry of a joint, renamed to that of an axis, with the units of this axis."""
     number = entry.pop("joint")
     renamed = {"axis": metrics.label(number)}
     for key, value in entry.items():
@@ -363,7 +394,7 @@ def _name_axis(metrics: LogMetrics, entry: dict[str, Any]) -> dict[str, Any]:
 
 
 def _name_along_axis(key: str) -> str:
-    """Returns the key of a joint's quantity with the unit of a position's coordinate."""
+    """Replaces the unit at the end of a joint's key by the unit along a position axis."""
     # the longest ending first
     endings = {"_nm_rad": "_n_m", "_nm": "_n", "_rad": "_m"}
     for ending, replacement in endings.items():
@@ -378,12 +409,12 @@ def _response_to_json(response: FrequencyResponse, unit: str) -> dict[str, Any]:
 
 
 def _value_and_reason(key: str, value: Metric) -> dict[str, Any]:
-    """Returns the number of a metric under a key, and the reason if it is missing."""
+    """Returns the number of a metric under a key, and the reason if the number is missing."""
     return {key: value.value, "why": value.why or None}
 
 
 def _replace_not_finite(value: Any) -> Any:
-    """Returns a value in which None replaces all numbers that are not finite."""
+    """Replaces all numbers that are not finite by None, in nested dictionaries and lists."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, dict):
@@ -394,7 +425,7 @@ def _replace_not_finite(value: Any) -> Any:
 
 
 def _values_to_json(metrics: MetricValues) -> dict[str, float | None]:
-    """Returns the numbers of metrics by key; None for missing numbers."""
+    """Returns the numbers of metrics by key. Missing numbers are None."""
     return {key: metric.value for key, metric in metrics.items()}
 
 
@@ -402,8 +433,8 @@ class ComparisonRow(NamedTuple):
     """A quantity of several runs.
 
     Attributes:
-        quantity: the quantity.
-        entries: its metric in every run, by column.
+        quantity: The quantity.
+        entries: Its metric in every run, by column.
     """
 
     quantity: Quantity
@@ -411,7 +442,7 @@ class ComparisonRow(NamedTuple):
 
     @property
     def values(self) -> tuple[float | None, ...]:
-        """The numbers by column; None for missing numbers."""
+        """The numbers by column. Missing numbers are None."""
         return tuple(entry.value for entry in self.entries)
 
 
@@ -419,28 +450,32 @@ class MetricComparison(NamedTuple):
     """Metrics of several runs, side by side.
 
     Attributes:
-        columns: names of the runs.
-        rows: all quantities that apply to one of the runs, in the order in which they are
-            shown.
+        columns: Names of the runs.
+        rows: All quantities that apply to at least one of the runs, in the order in which they
+            are shown.
     """
 
     columns: tuple[str, ...]
     rows: tuple[ComparisonRow, ...]
 
     def row(self, key: str) -> ComparisonRow:
-        """Returns the row of a quantity by its key; raises KeyError if there is none."""
+        """Returns the row of a quantity.
+
+        Raises:
+            KeyError: No row has this key.
+        """
         return {row.quantity.key: row for row in self.rows}[key]
 
 
 def compare_metrics(logs: Sequence[Log], names: Sequence[str] = ()) -> MetricComparison:
-    """Returns the metrics of several logs, which may be torn, short or empty, side by side.
+    """Computes the metrics of several logs, side by side.
 
     Args:
-        logs: the logs.
-        names: names of the columns; by default the names of the logs' files.
+        logs: The logs, which may be torn, short or empty.
+        names: Names of the columns. By default the names of the logs' files.
 
     Raises:
-        LogError: a record cannot be read, or names a change that is not valid.
+        LogError: A record cannot be read, or names a change that is not valid.
     """
     measured = [compute_log_metrics(log) for log in logs]
     rows = []
@@ -453,7 +488,7 @@ def compare_metrics(logs: Sequence[Log], names: Sequence[str] = ()) -> MetricCom
 
 
 def comparison_to_json(comparison: MetricComparison) -> dict[str, Any]:
-    """Returns a comparison, ready for JSON: missing numbers are null, with a reason."""
+    """Returns a comparison as plain values. Missing numbers are None, with a reason."""
     rows = []
     for row in comparison.rows:
         quantity = row.quantity

@@ -1,15 +1,20 @@
-"""Estimates rendered impedances and reflected wall forces over frequency, from a recorded run.
+"""Estimates from a recorded run what an operator feels: impedances and reflected wall forces.
 
-In a closed loop the ratio of two signals depends on the drive. The drive is therefore a third
-signal, which depends on nothing else, and the ratio is H = S_dy / S_dx. docs/metrics.md names
-drives and sources (Welch; Bendat and Piersol; Soderstrom and Stoica).
+An impedance is the ratio of the operator's torque to the velocity of the arm, as a function of
+frequency. A reflection is the ratio of the torque that an operator feels to the torque with
+which the environment pushes another arm.
+
+In a closed loop, each of the two signals x and y depends on the other. Therefore a third signal
+d, the drive, is needed, which depends on nothing else, such as the operator's planned torque.
+The ratio is H = S_dy / S_dx, where S is a cross-spectrum. docs/metrics.md names the drives and
+the sources (Welch; Bendat and Piersol; Soderstrom and Stoica).
 
 Invariant:
-    - A response is given at the spectral line with the strongest drive, and at all lines that
+    - A response is given at the frequency with the strongest drive, and at all frequencies that
       are driven nearly as much.
-    - A response is decided only if at least `MIN_SEGMENTS` independent segments excite the
-      line, and if both signals have a coherence of at least `MIN_COHERENCE` with the drive:
-      its random error is at most 17.2 % then.
+    - A response is decided only if at least `MIN_SEGMENTS` independent segments of the run
+      excite the frequency, and if both signals have a coherence of at least `MIN_COHERENCE`
+      with the drive. Its random error is then at most 17.2 %.
     - A response without sufficient excitation is undecided, with a reason.
 """
 
@@ -27,41 +32,44 @@ from ..run_view import RunView, SiteRun
 Complex = NDArray[np.complex128]
 
 SEGMENT_S = 4.0
-"""Length of a segment, s: lines are a quarter of a hertz apart."""
+"""Length of a segment, in s. Spectral lines are a quarter of a hertz apart."""
 _LOWEST_LINE = 2
-"""The first line into which a Hann window does not leak the mean."""
+"""Index of the first spectral line into which a Hann window does not leak the mean."""
 HIGHEST_HZ = 20.0
-"""Highest line, Hz: operators and arms are slower."""
+"""Highest frequency of a response, in Hz. Operators and arms are slower."""
 MIN_COHERENCE = 0.9
 """Least coherence of both signals with the drive."""
 MIN_SEGMENTS = 4.0
-"""Least number of independent segments that excite a line."""
+"""Least number of independent segments that excite a spectral line."""
 _OVERLAP_FACTOR = 1.06
-"""Segments per independent segment, under a Hann window with half-overlapping segments."""
+"""Number of segments that count as one independent segment.
+
+Segments overlap by half, and are weighted by a Hann window.
+"""
 MIN_DRIVE_TORQUE_NM = 0.05
-"""Least amplitude of a torque that drives, N m."""
+"""Least amplitude of a torque that serves as a drive, in N m."""
 _DRIVEN_SHARE = 0.55
 """Share of the strongest drive above which a line counts as driven.
 
 A Hann window leaks 0.5 of a line into the next line.
 """
 STILL_SCRIPT_NM_S = 1e-6
-"""A script that changes by less than this per second stands still, N m/s."""
+"""Largest rate of change of a planned torque that counts as constant, in N m/s."""
 NO_SCRIPT_TEXT = "the scenario does not contain the hand's intention: the drive is unknown"
 
 
 class FrequencyResponse(NamedTuple):
-    """Ratio of an output to an input at one frequency; undecided values are None.
+    """Ratio of an output to an input at one frequency. Undecided values are None.
 
     Attributes:
-        frequency_hz: frequency of the line.
-        gain: gain of the ratio, in the unit of output over input.
-        phase_rad: phase of the ratio.
-        coherence: the smaller of both signals' coherences with the drive.
-        segments: number of segments of equal power that would drive the line as much as all
+        frequency_hz: Frequency of the spectral line.
+        gain: Magnitude of the ratio, in the unit of output over input.
+        phase_rad: Phase of the ratio.
+        coherence: The smaller of both signals' coherences with the drive.
+        segments: Number of segments of equal power that would drive the line as much as all
             recorded segments do.
-        error: random error of the gain, one standard deviation as a share of the gain.
-        why: the reason why the ratio is undecided; "" if it is decided.
+        error: Random error of the magnitude: one standard deviation as a share of it.
+        why: The reason why the ratio is undecided. Empty if it is decided.
     """
 
     frequency_hz: float | None = None
@@ -81,37 +89,42 @@ def estimate_responses(
     rate_hz: int,
     least: float,
 ) -> list[FrequencyResponse]:
-    """Returns the ratio of an output to an input at every driven line, the strongest first.
+    """Estimates the ratio of an output to an input at every driven frequency.
 
     `scipy.signal.csd` is not used, because it cannot leave out segments with unusable rows.
 
     Args:
-        drive: the signal that drives both, and that depends on no other signal, shape (K,).
-        put_in: the input signal, shape (K,).
-        came_out: the output signal, shape (K,).
+        drive: The signal that drives both, and that depends on no other signal, shape (K,).
+        put_in: The input signal, shape (K,).
+        came_out: The output signal, shape (K,).
         usable: True for rows that are recorded while no other drive is active, shape (K,).
-        rate_hz: rows per second.
-        least: least amplitude of the drive at a driven line.
+        rate_hz: Rows per second.
+        least: Least amplitude of the drive at a driven frequency.
 
     Returns:
-        The responses; without a driven line, a single response with the reason.
+        The responses, the one with the strongest drive first. If no frequency is driven, a
+        single response with the reason.
     """
     length = round(SEGMENT_S * rate_hz)
     starts = _find_segments(usable, length)
     if not starts:
         reason = f"no {SEGMENT_S:g} s are recorded in which nobody else drives"
         return [FrequencyResponse(why=reason)]
+
     D = _compute_spectra(drive, starts, length)
     power = (np.abs(D) ** 2).mean(axis=0)
     if not np.isfinite(power).all():
         return [FrequencyResponse(why="its numbers are too large")]
+
     strongest = int(power.argmax())
     if math.sqrt(2.0 * power[strongest]) < least:
         return [FrequencyResponse(why="nothing drives it")]
     least_power = max(0.5 * least**2, _DRIVEN_SHARE**2 * power[strongest])
     driven = np.flatnonzero(power >= least_power)
+
     X = _compute_spectra(put_in, starts, length)
     Y = _compute_spectra(came_out, starts, length)
+
     responses = []
     for line in (strongest, *driven[driven != strongest].tolist()):
         frequency_hz = (line + _LOWEST_LINE) / SEGMENT_S
@@ -126,7 +139,12 @@ def estimate_responses(
 
 
 def _find_segments(usable: Bools, length: int) -> list[int]:
-    """Returns the first rows of all segments of usable rows, which overlap by half."""
+    """Returns the first rows of all segments without an unusable row. They overlap by half.
+
+    Args:
+        usable: True for usable rows, shape (K,).
+        length: Number of rows of a segment.
+    """
     if length < 4 * _LOWEST_LINE:
         return []
     unusable_before = np.concatenate([[0], np.cumsum(~usable)])
@@ -142,13 +160,13 @@ def _estimate_at_line(
     X: Complex,
     Y: Complex,
 ) -> FrequencyResponse:
-    """Returns the ratio of Y to X at one line, from the segments' spectra there.
+    """Returns the ratio of Y to X at one frequency, from the spectra of the segments.
 
     Args:
-        frequency_hz: frequency of the line.
-        D: the drive in every segment, shape (S,).
-        X: the input in every segment, shape (S,).
-        Y: the output in every segment, shape (S,).
+        frequency_hz: The frequency.
+        D: Spectrum of the drive in every segment, shape (S,).
+        X: Spectrum of the input in every segment, shape (S,).
+        Y: Spectrum of the output in every segment, shape (S,).
     """
     power = np.abs(D) ** 2
     square_of_sum = power.sum() ** 2
@@ -160,6 +178,7 @@ def _estimate_at_line(
             f"{frequency_hz:g} Hz, {MIN_SEGMENTS:g} are needed"
         )
         return FrequencyResponse(frequency_hz, segments=segments, why=reason)
+
     input_coherence = _compute_coherence(D, X)
     output_coherence = _compute_coherence(D, Y)
     coherence = min(input_coherence, output_coherence)
@@ -174,6 +193,7 @@ def _estimate_at_line(
             segments=segments,
             why=reason,
         )
+
     S_dx = np.vdot(D, X)
     S_dy = np.vdot(D, Y)
     H = S_dy / S_dx
@@ -192,7 +212,10 @@ def _estimate_at_line(
 
 
 def _compute_coherence(D: Complex, X: Complex) -> float:
-    """Returns the coherence |S_dx|^2 / (S_dd S_xx) of two signals; 0 if one vanishes."""
+    """Returns the coherence |S_dx|^2 / (S_dd S_xx) of two signals.
+
+    It is 0 if one of the signals vanishes.
+    """
     S_dd = np.vdot(D, D).real
     S_xx = np.vdot(X, X).real
     S_dx = np.vdot(D, X)
@@ -204,15 +227,15 @@ def _compute_coherence(D: Complex, X: Complex) -> float:
 
 
 def _compute_spectra(signal: Array, starts: list[int], length: int) -> Complex:
-    """Returns the spectral lines of every segment under a Hann window, shape (S, L).
+    """Returns the spectrum of every segment under a Hann window, shape (S, L).
 
     The lines are scaled so that the square of a line is the mean square of its sinusoid. No
     trend is removed, because this would distort slow sinusoids too.
 
     Args:
-        signal: the signal, shape (K,).
-        starts: the first row of every segment.
-        length: rows of a segment.
+        signal: The signal, shape (K,).
+        starts: First row of every segment.
+        length: Number of rows of a segment.
     """
     segments = np.stack([signal[start : start + length] for start in starts])
     middles = np.arange(length) + 0.5
@@ -226,17 +249,18 @@ def _compute_spectra(signal: Array, starts: list[int], length: int) -> Complex:
 
 
 class ImpedanceEstimate(NamedTuple):
-    """An impedance or a reflection of a joint over frequency.
+    """An impedance or a reflection at one joint, over frequency.
 
     Attributes:
-        kind: "impedance" for an operator's torque ON its arm over the joint's velocity, which
-            is the impedance of its site and of all sites behind it, N m s/rad; "reflection"
-            for the torque that an operator feels over the environment's torque ON another arm.
-        at: site of the operator.
-        of: site of the environment of a reflection; "" otherwise.
-        joint: number of the joint, from 1.
-        ratio: the response at the line with the strongest drive.
-        spectrum: the responses at all driven lines, by rising frequency.
+        kind: "impedance" for the operator's torque on its arm over the velocity of the joint,
+            in N m s/rad. It is the impedance of the site and of all sites behind it.
+            "reflection" for the torque that an operator feels over the environment's torque on
+            another arm.
+        at: Site of the operator.
+        of: Site of the environment, for a reflection. Empty for an impedance.
+        joint: Number of the joint, from 1.
+        ratio: The response at the frequency with the strongest drive.
+        spectrum: The responses at all driven frequencies, by rising frequency.
     """
 
     kind: str
@@ -248,12 +272,12 @@ class ImpedanceEstimate(NamedTuple):
 
     @property
     def unit(self) -> str:
-        """The unit of the gain."""
+        """The unit of the magnitude."""
         return "" if self.kind == "reflection" else "N m s/rad"
 
 
 def estimate_impedances(view: RunView) -> list[ImpedanceEstimate]:
-    """Returns each operator's impedance, and its reflection of each environment elsewhere."""
+    """Estimates each operator's impedance, and its reflection of each environment elsewhere."""
     runs = view.shared
     operators = [site for site, run in runs.items() if run.torque.operator.any()]
     environments = [site for site, run in runs.items() if run.torque.environment.any()]
@@ -275,9 +299,9 @@ def _estimate_joints(
     """Yields the impedance of every joint of a site, or its reflection of an environment.
 
     Args:
-        runs: all sites with records.
-        site: the site of the operator.
-        environment: the site of the environment; "" for an impedance.
+        runs: All sites with records.
+        site: Site of the operator.
+        environment: Site of the environment. Empty for an impedance.
     """
     records = runs[site].records
     torque = runs[site].torque
@@ -325,15 +349,15 @@ def _find_still_rows(
     *,
     alone: bool,
 ) -> Bools | None:
-    """Returns the ticks of a site at which no operator moves, shape (K,).
+    """Finds the ticks of a site at which no operator moves, so that nothing else drives.
 
     Args:
-        runs: all sites with records.
-        reference_site: the site whose ticks are judged.
-        alone: the operator of that site may move, since it alone drives.
+        runs: All sites with records.
+        reference_site: The site whose ticks are judged.
+        alone: True if the operator of that site may move, because it is the drive itself.
 
     Returns:
-        True for each such tick; None if some operator has no script.
+        True for each such tick, shape (K,). None if the plan of some operator is unknown.
     """
     t_s = runs[reference_site].records.t_s
     still = np.ones(len(t_s), dtype=np.bool_)

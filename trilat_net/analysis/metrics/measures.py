@@ -1,11 +1,16 @@
-"""Declares metrics: the quantities of a kind of subject, and the function that measures them.
+"""Declares the metrics of recorded runs.
 
-A subject is the run, a site, a link or a wall.
+A metric is a number that describes a run or a part of it, for example the RMS error of a site.
+Each file of this folder contains functions that compute such numbers. The decorator `measures`
+registers a function together with the quantities that it returns, so that tables, comparisons
+and the command line find them. A subject is what a number describes: the run, a site, a link or
+a wall.
 
 Invariant:
     - A value is a finite number, or None with a reason.
-    - A key has one definition, beside its function in one file of this folder, and in
-      docs/metrics.md. Everything that shows, compares or requests a metric finds it there.
+    - Every key is defined in exactly one place: beside its function in this folder, and in
+      docs/metrics.md. Everything that shows, compares or requests a metric uses this
+      definition.
 """
 
 import math
@@ -21,13 +26,13 @@ from ..run_view import RunView
 
 
 class Metric(NamedTuple):
-    """A number, or the reason why there is none.
+    """The value of a quantity for one subject: a number, or the reason why there is none.
 
     Attributes:
-        value: the number, finite; None if there is none.
-        why: the reason why there is no number; "" otherwise.
-        applies: False if no log of this experiment could have a number: nothing is unknown
-            then.
+        value: The number, which is finite. None if there is none.
+        why: The reason why there is no number. Empty if there is one.
+        applies: False if the quantity cannot exist for this subject in any run of this
+            scenario, so that no information is missing.
     """
 
     value: float | None
@@ -36,13 +41,18 @@ class Metric(NamedTuple):
 
 
 MetricValues = dict[str, Metric]
-"""Metrics by the keys of their quantities."""
+"""Metrics of one subject, by the keys of their quantities."""
 
 _NOT_FINITE = "it is no finite number"
 
 
 def metric(value: float | None, why: str = _NOT_FINITE) -> Metric:
-    """Returns the metric of a number, or of the reason `why` if it is None or not finite."""
+    """Returns the metric of a number.
+
+    Args:
+        value: The number, or None.
+        why: The reason that is stated if the number is None or not finite.
+    """
     if value is None or not math.isfinite(value):
         return Metric(None, why)
     return Metric(float(value))
@@ -55,13 +65,13 @@ def unavailable(
     of: str = "",
     applies: bool = True,
 ) -> MetricValues:
-    """Returns the quantities of a group, all without a number.
+    """Returns the metrics of a group of quantities, all without a number.
 
     Args:
-        group: the group of the quantities.
-        why: the reason why there are no numbers.
-        of: kind of subject to which the quantities are limited; "" for every kind.
-        applies: see `Metric`.
+        group: Group of the quantities.
+        why: The reason why there are no numbers.
+        of: Kind of subject to which the quantities are limited. Empty for every kind.
+        applies: See `Metric`.
     """
     return {
         quantity.key: Metric(None, why, applies)
@@ -78,17 +88,19 @@ def measure_shared(
     at_end: NDArray[np.bool_],
     why_not_at_end: str = _NOT_FINITE,
 ) -> MetricValues:
-    """Returns the RMS, the peak and the peak at the end of differences in a shared coordinate.
+    """Returns the RMS, the peak and the peak at the end of differences between sites.
 
-    Sites share angles in rad, positions in m, or both in a pose.
+    Sites share joint angles in rad, positions of their end effectors in m, or whole poses,
+    which have both units. The quantities of a unit that does not occur are marked as not
+    applicable.
 
     Args:
-        group: the group of the quantities.
-        space: the space in which sites share: "joints", "position" or "pose".
-        keys: the keys of the three quantities, without the unit.
-        differences: the differences in every row, shape (K, n).
+        group: Group of the quantities.
+        space: What the sites share: "joints", "position" or "pose".
+        keys: Keys of the three quantities, without the unit.
+        differences: Differences in every row, shape (K, n).
         at_end: True for rows of the last second, shape (K,).
-        why_not_at_end: the reason if no row is at the end.
+        why_not_at_end: The reason that is stated if no row is at the end.
     """
     columns_by_unit = {"rad": slice(None)}
     excluded = "sites share angles, not places"
@@ -97,6 +109,7 @@ def measure_shared(
         excluded = "sites share places, not angles"
         if space == "pose":
             columns_by_unit["rad"] = slice(POSITION, None)
+
     values = unavailable(group, excluded, applies=False)
     for unit, columns in columns_by_unit.items():
         part = differences[:, columns]
@@ -111,7 +124,14 @@ def measure_shared(
 
 
 def rms(values: ArrayLike) -> float:
-    """Returns the largest of the columns' root mean squares, shape (K, n); NaN without rows."""
+    """Returns the root mean square of each column, and of these the largest.
+
+    Args:
+        values: The values, shape (K, n).
+
+    Returns:
+        The largest root mean square. NaN without rows.
+    """
     array = np.asarray(values, dtype=np.float64)
     if not array.size:
         return math.nan
@@ -121,21 +141,21 @@ def rms(values: ArrayLike) -> float:
 
 
 def peak(values: ArrayLike) -> float:
-    """Returns the largest absolute value; NaN without values."""
+    """Returns the largest absolute value. NaN without values."""
     array = np.asarray(values, dtype=np.float64)
     return float(np.abs(array).max()) if array.size else math.nan
 
 
 class Quantity(NamedTuple):
-    """A number that a run, or each of its sites, links or walls has.
+    """Definition of a number that a run, or each of its sites, links or walls has.
 
     Attributes:
-        key: key in programs; ends in its unit, if any.
-        name: name for people.
-        unit: unit; "" for a pure number.
-        reduction: reduction to the run: "max" or "sum" over all subjects.
-        of: kind of subject: "run", "site", "link" or "wall".
-        group: heading under which the quantity is shown.
+        key: Key in programs. It ends in the unit, if there is any.
+        name: Name for people.
+        unit: Unit. Empty for a pure number.
+        reduction: How the number of the run follows from those of its subjects: "max" or "sum".
+        of: Kind of subject: "run", "site", "link" or "wall".
+        group: Heading under which the quantity is shown.
     """
 
     key: str
@@ -147,11 +167,14 @@ class Quantity(NamedTuple):
 
 
 def list_shared_quantities(names: Mapping[str, str]) -> list[Quantity]:
-    """Returns quantities of shared angles q, in rad, and then of shared positions x, in m.
+    """Returns the definitions of quantities that exist for shared angles and shared positions.
 
     Args:
-        names: names for people by key; a key lacks its unit, and "{0}" in a name stands for q
-            or x.
+        names: Names for people by key. The keys lack their unit, and "{0}" in a name stands for
+            the symbol q of angles or x of positions.
+
+    Returns:
+        The quantities of angles, in rad, and then those of positions, in m.
     """
     symbols = {"rad": "q", "m": "x"}
     return [
@@ -162,11 +185,18 @@ def list_shared_quantities(names: Mapping[str, str]) -> list[Quantity]:
 
 
 Measuring = Callable[[RunView, str], MetricValues]
-"""Measures a subject of a run: returns its quantities by key, each a number or a reason."""
+"""Function that measures a subject of a run, given by its name, and returns its metrics."""
 
 
 class Measure(NamedTuple):
-    """Quantities of a kind of subject, and the function that measures them."""
+    """Quantities of a kind of subject, and the function that measures them.
+
+    Attributes:
+        of: Kind of subject: "run", "site", "link" or "wall".
+        group: Heading under which the quantities are shown.
+        quantities: The quantities.
+        measure: The function.
+    """
 
     of: str
     group: str
@@ -203,15 +233,17 @@ _GROUP_ORDER = (
 
 
 def measures(of: str, group: str, *quantities: Quantity) -> Callable[[Measuring], Measuring]:
-    """Declares that a function measures some quantities of every subject of a kind.
+    """Registers the decorated function as the one that measures some quantities.
+
+    The function is called for every subject of the kind, and returns all of the quantities.
 
     Args:
-        of: kind of subject: "run", "site", "link" or "wall".
-        group: heading under which the quantities are shown.
-        quantities: the quantities, without kind and group.
+        of: Kind of subject: "run", "site", "link" or "wall".
+        group: Heading under which the quantities are shown.
+        quantities: The quantities, without kind and group.
 
     Raises:
-        ValueError: another function measures one of the quantities.
+        ValueError: Another function measures one of the quantities.
     """
 
     def declare(measure: Measuring) -> Measuring:
@@ -223,6 +255,7 @@ def measures(of: str, group: str, *quantities: Quantity) -> Callable[[Measuring]
             if other is not None:
                 modules = f"{other.measure.__module__} and {measure.__module__}"
                 raise ValueError(f"metric {quantity.key} has two definitions, in {modules}")
+
         complete = tuple(quantity._replace(of=of, group=group) for quantity in quantities)
         _MEASURES.append(Measure(of, group, complete, measure))
         return measure
@@ -231,7 +264,7 @@ def measures(of: str, group: str, *quantities: Quantity) -> Callable[[Measuring]
 
 
 def list_measures() -> list[Measure]:
-    """Returns all measures, in the order in which they are shown."""
+    """Returns all registered measures, in the order in which they are shown."""
     rank = {group: n for n, group in enumerate(_GROUP_ORDER)}
     return sorted(_MEASURES, key=lambda measure: rank.get(measure.group, len(rank)))
 

@@ -1,17 +1,16 @@
-"""Metrics of motion, contact, learning, links and loops.
+"""Metrics of motion, effort, contact, learning, links and control loops.
 
-Metrics of links and of the sites' loops use the definitions of docs/definitions.md.
+Metrics of links and of the control loops use the definitions of docs/definitions.md.
 
 Invariant:
-    - e is that of Eq. (9), and includes the delay.
-    - The spread compares all sites at the same instant.
-    - A slave is compared with its master at the time at which the sample in use was taken.
-    - Effort counts the recorded torque: Eq. (13) within its limit, gravity compensation
-      included.
-    - A wall is that of the scenario, at the logged states. Ticks without a record contribute
-      nothing.
-    - A parameter counts if the control law adapts it (Gamma > 0). If theta is unknown there is
-      no error, but the estimates are still reported.
+    - The error e of a site is that of Eq. (9), and includes the delay of the links.
+    - The spread compares all sites at the same instant, without the delay.
+    - A slave is compared with its master at the time at which the sample in use was sent.
+    - Effort counts the recorded torque: Eq. (13) within its limit, with gravity compensation.
+    - The force of a wall is computed from the scenario's wall and the recorded states. Ticks
+      without a record contribute nothing.
+    - A parameter counts if the control law adapts it (Gamma > 0). If the true parameters theta
+      are unknown there is no error, but the estimates are still reported.
 """
 
 from typing import NamedTuple
@@ -60,7 +59,7 @@ from .measures import (
 )
 
 LONG_END_S = 5.0
-"""Length of the end of a run over which contact and the slopes of estimates are measured, s."""
+"""Length of the end of a run in which contact and slopes of estimates are measured, in s."""
 _ERRORS = {"rms_error": "RMS e", "max_error": "peak |e|", "max_error_end": "peak |e|, last 1 s"}
 _SPREADS = {
     "spread_rms": "RMS spread, undelayed",
@@ -79,7 +78,7 @@ _ERROR_UNITS = {"joints": "rad", "position": "m", "pose": "m or rad"}
     "site", TRACKING, Quantity("settle_s", "settled", "s"), *list_shared_quantities(_ERRORS)
 )
 def measure_tracking(view: RunView, site: str) -> MetricValues:
-    """Returns the settling time, the RMS and the peak of a site's error e."""
+    """Returns the settling time of a site, and the RMS and the peak of its error e."""
     log = view.log
     part = log[site]
     if not len(part):
@@ -101,32 +100,36 @@ def measure_tracking(view: RunView, site: str) -> MetricValues:
 
 @measures("run", SPREAD, *list_shared_quantities(_SPREADS))
 def measure_spread(view: RunView, _run: str) -> MetricValues:
-    """Returns the undelayed spread: the largest difference of a joint angle between two sites.
+    """Returns the spread of a run: the largest difference of a joint angle between two sites.
 
-    In task space the positions of end effectors are compared instead, along the axes that all
-    sites follow. The instants are the ticks of the first site at which every other site has a
-    record of its latest tick.
+    The sites are compared at the same instant. In task space the positions of end effectors are
+    compared instead, along the axes that all sites follow. The instants are the ticks of the
+    first site at which every other site has a record of its latest tick.
     """
     log = view.log
     if view.absent:
         return unavailable(SPREAD, f"no records of {', '.join(view.absent)}")
     sites = [run.records for run in view.sites.values()]
     rows, known = find_common_rows(sites)
+
     poses_by_site = []
     for records, row in zip(sites, rows, strict=True):
         poses_by_site.append(records.shared[row])
     if not known.any():
         return unavailable(SPREAD, "no instant of which every site has a record")
+
     poses = np.stack(poses_by_site)[:, known]
     # two rotation vectors of nearly the same orientation, on both sides of half a turn, differ
     # by a whole turn
     if sites[0].x.shape[1] == POSE:
         for orientations in poses[1:, :, POSITION:]:
             orientations[:] = choose_nearest_vectors(orientations, poses[0, :, POSITION:])
+
     spread = np.ptp(poses, axis=0)
     axes = [records.axes for records in sites]
     if all(axes):
         spread = spread * np.prod(axes, axis=0)
+
     end_s = min(float(records.t_s[-1]) for records in sites)
     return measure_shared(
         group=SPREAD,
@@ -140,10 +143,11 @@ def measure_spread(view: RunView, _run: str) -> MetricValues:
 
 @measures("link", FOLLOWING, *list_shared_quantities(_LAGS))
 def measure_following(view: RunView, link: str) -> MetricValues:
-    """Returns q_m(t - T) - q_s of a link from a master to a slave, T being the age at the tick.
+    """Returns q_m(t - T) - q_s: how far a slave is from the delayed motion of its master.
 
-    At every tick of the slave from its first sample of that master on, the master's angles in
-    the record whose sample the slave uses are compared with the slave's own angles.
+    T is the age of the sample in use. At every tick of the slave from its first sample of that
+    master on, the slave's angles q_s are compared with the angles q_m in the master's record of
+    that sample. In task space the poses of the end effectors are compared.
     """
     peer = view.links[link].peer
     site = view.links[link].site
@@ -153,6 +157,7 @@ def measure_following(view: RunView, link: str) -> MetricValues:
     missing = [name for name in (peer, site) if name not in view.sites]
     if missing:
         return unavailable(FOLLOWING, f"no records of {', '.join(missing)}")
+
     master = view.sites[peer].records
     slave = view.sites[site].records
     used = slave.used[peer]
@@ -162,6 +167,7 @@ def measure_following(view: RunView, link: str) -> MetricValues:
     known = slave.known & is_recorded & master.known[row]
     if not known.any():
         return unavailable(FOLLOWING, f"no record of {site} uses a recorded sample of {peer}")
+
     master_pose = master.shared[row]
     if slave.x.size:
         lag = compute_task_errors(master_pose, slave.x, slave.axes)
@@ -194,11 +200,13 @@ def measure_effort(view: RunView, site: str) -> MetricValues:
     tau = part.tau
     limit_nm = view.log.scenario.sites[site].limits.tau_limit_nm
     at_limit = np.any(np.abs(tau) >= limit_nm, axis=1)
+
     is_successive = np.diff(part.tick) == 1
     changes = np.abs(np.diff(tau, axis=0)[is_successive])
     chatter = None
     if len(changes):
         chatter = float(changes.mean(axis=0).max())
+
     sum_of_squares = float(np.einsum("kj,kj->", tau, tau))
     return {
         "effort_nm2_s": metric(sum_of_squares / part.rate_hz),
@@ -224,24 +232,28 @@ def measure_effort(view: RunView, site: str) -> MetricValues:
     Quantity("end_hits", "hits, last 5 s", "", "sum"),
 )
 def measure_wall_contact(view: RunView, name: str) -> MetricValues:
-    """Returns force, hits and depth of a wall, over the run and over its last 5 s.
+    """Returns force, hits and depth of the contact with a wall.
 
-    A contact in the first record, or in the first record after a gap, is not counted as a hit,
-    because its beginning is unknown.
+    The numbers are given for the whole run and for its last 5 s. A contact in the first record,
+    or in the first record after a gap, is not counted as a hit, because its beginning is
+    unknown.
     """
     site, wall = view.walls[name]
     run = view.sites.get(site)
     if run is None:
         return unavailable(CONTACT, "no records of the site")
+
     t_s = run.records.nominal_s
     known = run.records.known
     end_effector = run.torque.end_effector
     force = wall_force(wall, t_s, end_effector)
     touches = force > 0.0
+
     is_known_free = known & ~touches
     was_free = np.concatenate([[False], is_known_free[:-1]])
     is_hit = touches & was_free
     depth = wall_depth(wall, end_effector)[known]
+
     metrics = {
         "contact_share": metric(float(touches[known].mean())),
         "depth_max_m": metric(max(0.0, float(depth.max()))),
@@ -256,18 +268,20 @@ def measure_wall_contact(view: RunView, name: str) -> MetricValues:
 
 
 class BaseEstimates(NamedTuple):
-    """Estimates of a chain in base parameters, shape (B,) each.
+    """Estimates of the base parameters of a chain, which are those that torques determine.
 
-    Base parameters are the combinations of learnt parameters that torques determine.
+    The parameters of neighbouring links act on the torques only in certain combinations, the
+    base parameters. Each combination is named after one parameter in it. Lists have the shape
+    (B,).
 
     Attributes:
-        parameter: index in theta of the parameter after which each combination is named.
-        theta: true values; None if unknown.
-        first: estimates in the first record.
-        last: estimates in the last record.
-        consistent_first: for each link, whether some body has the parameters of the first
-            record.
-        consistent_last: the same for the last record.
+        parameter: Index in theta of the parameter after which each combination is named.
+        theta: True values. None if unknown.
+        first: Estimates in the first record.
+        last: Estimates in the last record.
+        consistent_first: For each link, whether some rigid body has the estimated parameters of
+            the first record.
+        consistent_last: The same for the last record.
     """
 
     parameter: list[int]
@@ -279,16 +293,16 @@ class BaseEstimates(NamedTuple):
 
 
 class ParameterEstimates(NamedTuple):
-    """Parameter estimates of a site, shape (P,) each.
+    """Estimates of the arm parameters theta that a site made during a run, shape (P,) each.
 
     Attributes:
         learnt: True for each parameter that the law adapts.
-        theta: true parameters; None if unknown.
-        first: estimates in the first record.
-        last: estimates in the last record.
-        slope_per_s: slopes of straight lines through the last 5 s, 1/s; None with fewer than
+        theta: True parameters. None if unknown.
+        first: Estimates in the first record.
+        last: Estimates in the last record.
+        slope_per_s: Slopes of straight lines through the last 5 s, in 1/s. None with fewer than
             two records.
-        base: the estimates of a chain in base parameters; None for the planar arm.
+        base: Estimates of a chain in base parameters. None for the planar arm.
     """
 
     learnt: list[bool]
@@ -299,7 +313,7 @@ class ParameterEstimates(NamedTuple):
     base: BaseEstimates | None = None
 
     def to_json(self) -> JsonObject:
-        """Returns the estimates, ready for JSON."""
+        """Returns the estimates as plain values, with the keys of the JSON output."""
         content = self._asdict()
         del content["base"]
         if self.base is not None:
@@ -308,7 +322,12 @@ class ParameterEstimates(NamedTuple):
 
 
 def read_parameter_estimates(scenario: Scenario, records: AlignedRecords) -> ParameterEstimates:
-    """Returns the estimates of a site, and their least-squares slopes at the end."""
+    """Returns the estimates of a site, with their least-squares slopes at the end of the run.
+
+    Args:
+        scenario: Scenario of the run.
+        records: Records of the site.
+    """
     spec = scenario.sites[records.site]
     arm = build_arm_rows(scenario, records.site)
     gains = spec.control.gains(arm.theta)
@@ -317,11 +336,13 @@ def read_parameter_estimates(scenario: Scenario, records: AlignedRecords) -> Par
         learnt = np.array(gains.Gamma) > 0.0
     else:  # a parameter that changes is learnt
         learnt = (theta_hat != theta_hat[0]).any(axis=0)
+
     at_end = records.known_at_end(LONG_END_S)
     slope = None
     if np.count_nonzero(at_end) >= 2:
         centred_s = records.t_s[at_end] - records.t_s[at_end].mean()
         slope = (centred_s @ theta_hat[at_end] / (centred_s @ centred_s)).tolist()
+
     theta = arm.theta.tolist() if spec.arm.known else None
     base = None
     if not isinstance(arm, PlanarArmRows):
@@ -337,7 +358,7 @@ def read_parameter_estimates(scenario: Scenario, records: AlignedRecords) -> Par
 
 
 def read_all_estimates(view: RunView) -> dict[str, ParameterEstimates]:
-    """Returns the parameter estimates of every site with records."""
+    """Returns the parameter estimates of every site with records, by name."""
     return {
         site: read_parameter_estimates(view.scenario, run.records)
         for site, run in view.sites.items()
@@ -350,13 +371,13 @@ def _estimate_base_parameters(
     theta: list[float] | None,
     theta_hat: Array,
 ) -> BaseEstimates:
-    """Returns the estimates of a chain in base parameters.
+    """Returns the estimates of a chain in base parameters, see `BaseEstimates`.
 
     Args:
-        arm: the chain.
+        arm: The chain.
         learnt: True for each parameter that the law adapts, shape (P,).
-        theta: true parameters; None if unknown.
-        theta_hat: estimates in every record, shape (K, P).
+        theta: True parameters. None if unknown.
+        theta_hat: Estimates in every record, shape (K, P).
     """
     base = find_base_parameters(arm, learnt)
     first_and_last = theta_hat[[0, -1]]
@@ -386,32 +407,36 @@ def _estimate_base_parameters(
     Quantity("unphysical_links", "unphysical links, at last", "", "sum"),
 )
 def measure_parameter_error(view: RunView, site: str) -> MetricValues:
-    """Returns the estimates' distance from theta, and their rate of change at the end.
+    """Returns the distance of the estimates from theta, and their rate of change at the end.
 
-    Distance and energy of a chain are computed from its base parameters. The other errors of
-    the estimates never change, and have no effect on the torque.
+    Distance and energy of a chain are computed from its base parameters. Errors of the
+    estimates that cancel in the base parameters never change, and have no effect on the torque.
     """
     scenario = view.scenario
     estimates = view.compute_once(read_all_estimates).get(site)
     if estimates is None:
         return unavailable(LEARNING, "no records of the site")
+
     arm = build_arm_rows(scenario, site)
     gains = scenario.sites[site].control.gains(arm.theta)
     learnt = np.array(estimates.learnt)
     if not learnt.any():
         return unavailable(LEARNING, "nothing is learnt", applies=False)
+
     base = estimates.base
     metrics = unavailable(LEARNING, "theta of the arm is not known")
     slope = None
     if estimates.slope_per_s is not None:
         learnt_slopes = np.array(estimates.slope_per_s)[learnt]
         slope = float(np.linalg.norm(learnt_slopes))
+
     metrics["theta_slope_per_s"] = metric(slope, "less than two records in the last 5 s")
     metrics["unphysical_links"] = Metric(
         None, "it is no chain, of ten parameters a link", applies=False
     )
     if base is not None:
         metrics["unphysical_links"] = metric(base.consistent_last.count(False))
+
     if estimates.theta is None:
         return metrics
     if base is None:
@@ -419,11 +444,13 @@ def measure_parameter_error(view: RunView, site: str) -> MetricValues:
         errors = first_and_last - np.array(estimates.theta)[learnt]
     else:
         errors = np.array([base.first, base.last]) - np.array(base.theta)
+
     energies: list[float | None] = [None, None]
     why = "the gains of learning are not known"
     if gains.law is Law.ADAPTIVE:
         energies = _compute_parameter_energy(arm, learnt, np.array(gains.Gamma), errors)
         why = "it is no finite number"
+
     distances = np.linalg.norm(errors, axis=1)
     for end, distance, energy in zip(("first", "last"), distances, energies, strict=True):
         metrics[f"theta_error_{end}"] = metric(float(distance))
@@ -437,16 +464,20 @@ def _compute_parameter_energy(
     Gamma: Array,
     errors: Array,
 ) -> list[float | None]:
-    """Returns the part of V of parameter errors, in J, for each row.
+    """Returns the energy of parameter errors, which is a part of the energy function V.
 
-    Base parameters learn with the gain B Gamma B', where B is the matrix of their combinations.
+    The energy of the errors d is d' Gamma^-1 d / 2 with the adaptation gains Gamma. Base
+    parameters learn with the gain B Gamma B', where B is the matrix of their combinations.
 
     Args:
-        arm: the arm.
+        arm: The arm.
         learnt: True for each parameter that the law adapts, shape (P,).
-        Gamma: adaptation gains, shape (P,).
-        errors: errors of the learnt parameters, of a chain those of its base parameters, shape
+        Gamma: Adaptation gains, shape (P,).
+        errors: Errors of the learnt parameters, for a chain those of its base parameters, shape
             (K, B).
+
+    Returns:
+        The energy in J, for each row.
     """
     if isinstance(arm, PlanarArmRows):
         energy = 0.5 * (errors**2 / Gamma[learnt]).sum(axis=1)
@@ -470,7 +501,7 @@ def _compute_parameter_energy(
     Quantity("late_samples", "late samples", "", "sum"),
 )
 def measure_network(view: RunView, name: str) -> MetricValues:
-    """Returns effective delay, loss and bursts of a link."""
+    """Returns the effective delay, the losses and the bursts of losses of a link."""
     link = view.links[name]
     age = link.age_ms
     unused = "no sample ever came into use"
@@ -500,13 +531,18 @@ def measure_network(view: RunView, name: str) -> MetricValues:
     Quantity("missing", "missing records", "", "sum"),
 )
 def measure_loop(view: RunView, site: str) -> MetricValues:
-    """Returns lateness, computing time and overruns of a site's loop, and missing records."""
+    """Returns the timing of a site's control loop, and the number of its missing records.
+
+    In virtual time no clock is read, so that the timing does not apply.
+    """
     log = view.log
     missing = {"missing": metric(log.missing(site))}
+
     if log.driver != "live":
         return unavailable(LOOP, "no clock was read", applies=False) | missing
     if not len(log[site]):
         return unavailable(LOOP, f"no records of {site}") | missing
+
     health = describe_site_health(log, site)
     late_us = health["late_us"]
     busy_us = health["busy_us"]

@@ -1,17 +1,20 @@
 """Metrics of energy: of a site's ports, of its arm, and of the delay of each link.
 
-The work of a torque is int tau' dq. A torque that is held over a period does exactly the work
-tau_k' (q_{k+1} - q_k). For a torque that follows the state, the trapezoid rule over dq is used,
-which is exact for springs. The running energy of a port is that of a passivity observer
-(Hannaford and Ryu 2002).
+A port is where energy enters an arm: the controller, the operator or the environment. The work
+of a torque tau during a motion dq is int tau' dq. A torque that is held during a tick period
+does exactly the work tau_k' (q_{k+1} - q_k). For a torque that follows the motion, the
+trapezoid rule is used, which is exact for springs. The running energy of a port is that of a
+passivity observer (Hannaford and Ryu 2002).
 
-The control torque is affine in a peer's motion: it equals the torque of the same law without
-delay, at the same state and estimate, plus one term per link,
+The delay of a link injects energy as well. The control torque is affine in the motion of a
+peer: it equals the torque that the same law would compute without delay, plus a term for each
+    link
+from peer j to site i. The energy of this term is
 
     E_ij = int qd_i' dtau_ij dt,   dtau_ij = S_i ( p_j(t - T_ij) - p_j(t) ),
 
-where p_j is the signal that the link carries, and S_i the law's gain. docs/metrics.md gives
-both for each law, and the sources.
+where qd_i is the site's velocity, p_j the signal that the link carries, T_ij its delay, and S_i
+the gain of the law. docs/metrics.md gives p_j and S_i for each law, and the sources.
 """
 
 import numpy as np
@@ -36,14 +39,14 @@ _NO_FRICTION = Metric(None, "its joints have no friction", applies=False)
 
 
 def held_work(torque: Array, q: Array) -> Array:
-    """Returns the work per period of a torque that is held over every period.
+    """Returns the work in each tick period of a torque that is held during the period.
 
     Args:
-        torque: the torque in every period, shape (K - 1, n) or longer, N m.
-        q: joint angles at the ticks, shape (K, n), rad.
+        torque: Torque in every period, shape (K - 1, n) or longer, in N m.
+        q: Joint angles at the ticks, shape (K, n), in rad.
 
     Returns:
-        Work per period, shape (K - 1,), J.
+        Work in each period, shape (K - 1,), in J.
     """
     motion = np.diff(q, axis=0)
     period_torque = torque[: len(motion)]
@@ -52,24 +55,33 @@ def held_work(torque: Array, q: Array) -> Array:
 
 
 def trapezoid_work(torque: Array, q: Array) -> Array:
-    """Returns the work per period of a torque that follows the state, by the trapezoid rule.
+    """Returns the work in each tick period of a torque that follows the motion.
+
+    The trapezoid rule is used.
 
     Args:
-        torque: the torque at the ticks, shape (K, n), N m.
-        q: joint angles at the ticks, shape (K, n), rad.
+        torque: Torque at the ticks, shape (K, n), in N m.
+        q: Joint angles at the ticks, shape (K, n), in rad.
 
     Returns:
-        Work per period, shape (K - 1,), J.
+        Work in each period, shape (K - 1,), in J.
     """
     mean_torque = 0.5 * (torque[:-1] + torque[1:])
     return held_work(mean_torque, q)
 
 
 def held_control_torque(records: AlignedRecords, scenario: Scenario) -> Array:
-    """Returns the torque that the controller held over every period, shape (K - 1, n), N m.
+    """Returns the torque that the controller applied during every tick period.
 
-    The drives of an external arm received tau, but their torque between two ticks is unknown:
-    the mean of both ticks is used.
+    For an arm that is not simulated, the torque of the drives between two ticks is unknown. The
+    mean of the commands at both ticks is used.
+
+    Args:
+        records: Records of the site.
+        scenario: Scenario of the run.
+
+    Returns:
+        Torque, shape (K - 1, n), in N m.
     """
     spec = scenario.sites[records.site]
     tau = records.tau
@@ -82,10 +94,11 @@ def held_control_torque(records: AlignedRecords, scenario: Scenario) -> Array:
 
 
 def mechanical_energy(arm: ArmRows, records: AlignedRecords) -> Array:
-    """Returns the arm's kinetic and potential energy, shape (K,), J.
+    """Returns the kinetic and potential energy of an arm at every record, shape (K,), in J.
 
-    For the planar arm the energy is 1/2 qd'M qd + g (theta_4 sin q_1 + theta_5 sin(q_1 + q_2)):
-    the potential energy is zero when the arm is level.
+    For the planar arm the energy is 1/2 qd'M qd + g (theta_4 sin q_1 + theta_5 sin(q_1 + q_2)),
+    with the inertia matrix M, the gravity g and the parameters theta. The potential energy is
+    zero when the arm is level.
     """
     momentum = arm.multiply_inertia(records.q, records.qd)
     qd_M_qd = np.einsum("kj,kj->k", records.qd, momentum)
@@ -108,10 +121,11 @@ def mechanical_energy(arm: ArmRows, records: AlignedRecords) -> Array:
     Quantity("unaccounted_j", "unaccounted for", "J"),
 )
 def measure_port_energy(view: RunView, site: str) -> MetricValues:
-    """Returns the energies of a site's ports, over the periods with both ends recorded.
+    """Returns the energies that an arm exchanged with controller, operator and environment.
 
-    The stops of joints count as environment. Friction absorbs energy that the arm does not
-    gain.
+    Only tick periods with a record at both ends count. The stops of joints count as
+    environment. Friction absorbs energy that the arm does not gain. The difference between the
+    energy gained and the energy supplied is reported as unaccounted.
     """
     if site not in view.sites:
         return unavailable(ENERGY, f"no records of {site}", of="site")
@@ -131,15 +145,19 @@ def measure_port_energy(view: RunView, site: str) -> MetricValues:
 
     controller_torque = held_control_torque(records, scenario)
     controller = accumulate(held_work(controller_torque, q))
+
     operator_now_work = trapezoid_work(torque.operator_now, q)
     operator_held_work = held_work(torque.operator_held, q)
     operator = accumulate(operator_now_work + operator_held_work)
+
     stop_torque = arm.stop_torque(q, records.qd)
     walls_now_work = trapezoid_work(torque.environment_now + stop_torque, q)
     walls_held_work = held_work(torque.environment_held, q)
     walls = accumulate(walls_now_work + walls_held_work)
+
     friction_torque = arm.friction(records.qd)
     friction = accumulate(trapezoid_work(friction_torque, q))
+
     metrics = {
         "controller_j": metric(controller[-1]),
         "hands_j": metric(operator[-1]),
@@ -152,12 +170,14 @@ def measure_port_energy(view: RunView, site: str) -> MetricValues:
         no_walls = Metric(None, "the scenario has no environment here", applies=False)
         metrics["walls_j"] = no_walls
         metrics["walls_most_j"] = no_walls
+
     metrics["friction_j"] = _NO_FRICTION
     if friction_torque.any():
         metrics["friction_j"] = metric(friction[-1])
     if not spec.arm.known:
         unknown = Metric(None, "theta of the arm is not known")
         return {**metrics, "mechanical_j": unknown, "unaccounted_j": unknown}
+
     energy = mechanical_energy(arm, records)
     gained = accumulate(np.diff(energy))
     unaccounted = np.abs(gained - controller - operator - walls + friction)
@@ -173,10 +193,10 @@ def measure_port_energy(view: RunView, site: str) -> MetricValues:
     Quantity("delay_most_j", "given by the delay at most", "J"),
 )
 def measure_delay_energy(view: RunView, link: str) -> MetricValues:
-    """Returns the energy that a link's delay injects: at the end, and its maximum, J.
+    """Returns the energy that the delay of a link injects: at the end of the run, and at most.
 
-    Only periods count that follow from records alone, and in which the site follows its peers.
-    The torque is the law's, before its limit.
+    Only tick periods count that follow from records alone, and in which the site follows its
+    peers. The torque is that of the law, before it is limited.
     """
     runs = view.sites
     peer = view.links[link].peer
@@ -184,6 +204,7 @@ def measure_delay_energy(view: RunView, link: str) -> MetricValues:
     arm = build_arm_rows(view.scenario, site)
     law = view.scenario.sites[site].control
     gains = law.gains(arm.theta)
+
     missing = [name for name in (peer, site) if name not in runs]
     if missing:
         return unavailable(ENERGY, f"no records of {', '.join(missing)}", of="link")
@@ -191,16 +212,19 @@ def measure_delay_energy(view: RunView, link: str) -> MetricValues:
         name = identify_law(law)
         unknown = f"the law {name} does not say which part of its torque is due to a peer"
         return unavailable(ENERGY, unknown, of="link")
+
     records = runs[site].records
     peer_records = runs[peer].records
     dominance = runs[site].dominance
     if min(len(records.known), len(peer_records.known)) < 2:
         return unavailable(ENERGY, "no two records in a row", of="link")
+
     peer_view = view_delayed_peer(records, PeerTrajectory(peer_records))
     known = peer_view.delayed.known & peer_view.now.known & records.follows
     judged = records.known_periods & known[:-1] & known[1:]
     if not judged.any():
         return unavailable(ENERGY, "no period rests on records of both sites", of="link")
+
     j = list(records.used).index(peer)
     torque = _compute_delay_torque(
         gains=gains,
@@ -211,6 +235,7 @@ def measure_delay_energy(view: RunView, link: str) -> MetricValues:
         alpha=dominance.alpha[:, [j]],
         alpha_rate=dominance.rate[:, [j]],
     )
+
     work = trapezoid_work(torque, records.q)
     judged_work = np.where(judged, work, 0.0)
     injected = np.cumsum(judged_work)
@@ -229,24 +254,28 @@ def _compute_delay_torque(
     alpha: Array,
     alpha_rate: Array,
 ) -> Array:
-    """Returns the torque that the delay of a link adds to the law's torque, shape (K, n), N m.
+    """Returns the torque that the delay of a link adds to the law's torque.
 
     The effect of the delay on the Coulomb friction that a law compensates is left out.
 
     Args:
-        gains: gains of the law.
-        arm: the site's arm.
-        records: the site's records.
-        peer_records: the peer's records.
-        view: the peer as the site sees it.
-        alpha: dominance factor of the peer, shape (K, 1).
-        alpha_rate: its derivative, shape (K, 1), 1/s.
+        gains: Gains of the law.
+        arm: Arm of the site.
+        records: Records of the site.
+        peer_records: Records of the peer.
+        view: Motion of the peer as the site sees it, and at the same time.
+        alpha: Dominance factor of the peer, shape (K, 1).
+        alpha_rate: Time derivative of the dominance factor, shape (K, 1), in 1/s.
+
+    Returns:
+        Torque, shape (K, n), in N m.
     """
     all_rows = slice(None)
     lag = view.delayed.q - view.now.q
     rate_lag = view.delayed.qd - view.now.qd
     reference_change = alpha * lag
     reference_rate_change = alpha * rate_lag + alpha_rate * lag
+
     axes = np.array(records.axes or 1.0)
     Lambda = axes * np.array(gains.Lambda)
     Kd = axes * np.array(gains.Kd)
@@ -273,20 +302,25 @@ def _compute_delay_torque(
 
 
 def _compute_reflected_lag(records: AlignedRecords, peer_records: AlignedRecords) -> Array:
-    """Returns the peer's external torque as it arrived, less its present value, shape (K, n).
+    """Returns the torque that the peer reflected with delay, less its present torque.
 
     Args:
-        records: records of a site whose law reflects force.
-        peer_records: the peer's records.
+        records: Records of a site whose law feeds back the external torque of its peer.
+        peer_records: Records of the peer.
+
+    Returns:
+        The difference, shape (K, n), in N m. Forces in N if the peer measures a wrench.
     """
     peer_torque = peer_records.tau_x
     if peer_records.wrench.size:
         peer_torque = peer_records.wrench
+
     used = records.used[peer_records.site]
     has_arrived = (used >= 0)[:, np.newaxis]
     last_row = len(peer_records.known) - 1
     row = np.clip(used - peer_records.first, 0, last_row)
     arrived = np.where(has_arrived, -peer_torque[row], 0.0)
+
     columns = [
         np.interp(records.t_s, peer_records.t_s, -joint_torque)
         for joint_torque in peer_torque.T

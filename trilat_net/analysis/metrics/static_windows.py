@@ -1,17 +1,21 @@
 """Metrics at rest: static windows, rendered stiffness and force sharing.
 
-In a static window all arms rest under constant torques. The torques tau_i ON the arms obey
+In a static window all arms rest under constant torques. The torques tau_i on the arms then obey
 
     sum_i (pi_i / K_i) tau_i = 0   for every joint,
 
-where pi is the left Perron vector of the dominance matrix, and K_i the stiffness that holds
-e_i. docs/metrics.md defines and derives each metric.
+where pi is the left eigenvector of the matrix of dominance factors for the eigenvalue 1 (its
+Perron vector), and K_i the stiffness with which site i holds its error e_i. If one operator
+pushes and another holds, the equation predicts the torque that the holder feels: this is force
+sharing. docs/metrics.md defines and derives each metric.
 
 Invariant:
-    - A stiffness is measured by one operator, and is known only if nothing but this operator
-      changed between two windows.
-    - A stiffness is a secant along the path of the arm: the other joints move as well.
-    - If gravity is adapted, the estimates take up the load, and no torque is expected.
+    - A stiffness is reported only if nothing but a single operator changed between two static
+      windows.
+    - A stiffness is the ratio of changes along the path of the arm, on which the other joints
+      move as well.
+    - If a law learns the gravity of its arm, its estimates take up the load. No torque is
+      predicted then.
 """
 
 from collections.abc import Mapping
@@ -34,34 +38,35 @@ from ..run_view import RunView, SiteRun
 from .measures import SHARING, Metric, MetricValues, Quantity, measures, metric
 
 WINDOW_S = 1.0
-"""Length of a window, s."""
+"""Length of a static window, in s."""
 MAX_TORQUE_VARIATION = 0.01
-"""Largest variation of a torque within a window, as a share of the largest torque there."""
+"""Largest variation of a torque within a window, as a share of the largest torque in it."""
 MIN_LOAD_NM = 0.05
-"""Smaller torques do not count as a load, N m."""
+"""Smallest torque that counts as a load, in N m."""
 MOVING_SCRIPT_NM = 1e-9
-"""A script that changes by more than this from tick to tick moves, N m."""
+"""Largest change of a planned torque from tick to tick that counts as constant, in N m."""
 MIN_TORQUE_CHANGE_NM = 0.1
-"""Least change of a torque from which a stiffness is computed, N m."""
+"""Least change of a torque from which a stiffness is computed, in N m."""
 MIN_ANGLE_CHANGE_RAD = 1e-4
-"""Least change of an angle from which a stiffness is computed, rad."""
+"""Least change of an angle from which a stiffness is computed, in rad."""
 STILL_SCRIPT_NM = 1e-6
-"""An operator whose script changes by at most this between two windows did not move, N m."""
+"""Largest change of a planned torque between two windows that counts as constant, in N m."""
 MIN_LOAD_SHARE = 0.02
-"""A site with less than this share of the largest torque is not loaded."""
+"""Smallest torque of a loaded site, as a share of the largest torque of all sites."""
 
 
 class StaticWindow(NamedTuple):
-    """A window in which all arms rest, with means over the window by site.
+    """A window of time in which all arms rest, with means over the window for each site.
 
     Attributes:
-        from_s: time of the first tick, in s.
-        to_s: time of the last tick, in s.
-        torque: torque of operator and environment ON the arm, shape (n,), N m.
-        environment: torque of the environment alone, shape (n,), N m.
-        script: the operator's script, shape (n,), N m; None if unknown.
-        q: joint angles, shape (n,), rad.
-        alpha: the dominance matrix, shape (N, N).
+        from_s: Time of the first tick, in s.
+        to_s: Time of the last tick, in s.
+        torque: Torque of operator and environment on the arm, shape (n,), in N m.
+        environment: Torque of the environment alone, shape (n,), in N m.
+        script: Torque that the scenario plans for the operator, shape (n,), in N m. None if it
+            is unknown.
+        q: Joint angles, shape (n,), in rad.
+        alpha: Matrix of the dominance factors, shape (N, N).
     """
 
     from_s: float
@@ -74,9 +79,16 @@ class StaticWindow(NamedTuple):
 
 
 def find_static_windows(view: RunView) -> list[StaticWindow]:
-    """Returns the static windows of a run, in order; [] if some site has no records.
+    """Finds the static windows of a run, in order.
 
-    A window is the last `WINDOW_S` of an interval in which all sites rest.
+    A window is the last `WINDOW_S` of an interval in which all sites rest. Each interval has
+    one window at most.
+
+    Args:
+        view: The run.
+
+    Returns:
+        The windows. Empty if some site has no records.
     """
     if view.absent:
         return []
@@ -88,6 +100,7 @@ def find_static_windows(view: RunView) -> list[StaticWindow]:
         row, recorded = find_latest_rows(run.records, first_records.t_s)
         rows_by_site[site] = row
         still &= recorded & _find_resting_rows(run)[row]
+
     window_ticks = int(np.ceil(WINDOW_S * first_records.rate_hz))
     framed = np.concatenate([[False], still, [False]])
     # starts and ends of the intervals in turns
@@ -98,6 +111,7 @@ def find_static_windows(view: RunView) -> list[StaticWindow]:
             continue
         ticks = slice(end - window_ticks - 1, end)
         window_rows = {site: row[ticks] for site, row in rows_by_site.items()}
+
         largest_nm = []
         variation_nm = []
         for site, row in window_rows.items():
@@ -105,6 +119,7 @@ def find_static_windows(view: RunView) -> list[StaticWindow]:
             ranges = np.ptp(torque, axis=0)
             largest_nm.append(float(np.abs(torque).max()))
             variation_nm.append(float(ranges.max()))
+
         reference_nm = max(max(largest_nm), MIN_LOAD_NM)
         # also if the variation is NaN
         if not max(variation_nm) > MAX_TORQUE_VARIATION * reference_nm:
@@ -114,7 +129,14 @@ def find_static_windows(view: RunView) -> list[StaticWindow]:
 
 
 def _find_resting_rows(run: SiteRun) -> Bools:
-    """Returns the rows in which a site rests under constant shares and a constant script."""
+    """Finds the ticks in which a site rests, while its weights and its operator do not change.
+
+    Args:
+        run: Records and torques of the site.
+
+    Returns:
+        True for each such tick, shape (K,).
+    """
     records = run.records
     largest_speed = np.abs(records.qd).max(axis=1)
     is_slow = largest_speed < STATIC_SPEED_RAD_S
@@ -136,12 +158,12 @@ def _average_window(
     rows: Mapping[str, Ints],
     t_s: Array,
 ) -> StaticWindow:
-    """Returns a static window with the means over its rows.
+    """Returns a static window with the means over its ticks.
 
     Args:
-        runs: all sites.
-        rows: rows of the window by site.
-        t_s: times of the window, in s.
+        runs: All sites.
+        rows: Rows of the window in the records of each site.
+        t_s: Times of the window, in s.
     """
     names = list(runs)
     window = StaticWindow(
@@ -153,6 +175,7 @@ def _average_window(
         q={},
         alpha=np.zeros((len(names), len(names))),
     )
+
     for i, (site, run) in enumerate(runs.items()):
         row = rows[site]
         records = run.records
@@ -174,14 +197,14 @@ class StiffnessEstimate(NamedTuple):
     """Stiffness that an operator met at a joint, between two successive static windows.
 
     Attributes:
-        from_s: end of the first window, in s.
-        to_s: end of the second window, in s.
-        site: site of the operator.
-        joint: number of the joint, from 1.
-        torque_nm: change of the operator's torque ON its arm.
-        angle_rad: change of the joint's angle.
-        stiffness_nm_rad: their ratio; None if the joint did not move, and is too stiff to be
-            measured.
+        from_s: End of the first window, in s.
+        to_s: End of the second window, in s.
+        site: Site of the operator.
+        joint: Number of the joint, from 1.
+        torque_nm: Change of the operator's torque on its arm.
+        angle_rad: Change of the joint's angle.
+        stiffness_nm_rad: Ratio of both changes. None if the joint did not move, so that it is
+            too stiff to be measured.
     """
 
     from_s: float
@@ -194,12 +217,17 @@ class StiffnessEstimate(NamedTuple):
 
 
 def estimate_stiffness(view: RunView) -> list[StiffnessEstimate]:
-    """Returns the stiffness between successive static windows, if a single operator moved."""
+    """Estimates stiffnesses between successive static windows, if a single operator moved.
+
+    Args:
+        view: The run.
+    """
     estimates = []
     for before, after in pairwise(view.compute_once(find_static_windows)):
         site = _find_single_mover(before, after)
         if not site or (before.alpha != after.alpha).any():
             continue
+
         torque_before = before.torque[site] - before.environment[site]
         torque_after = after.torque[site] - after.environment[site]
         torque_changes = (torque_after - torque_before).tolist()
@@ -226,9 +254,11 @@ def estimate_stiffness(view: RunView) -> list[StiffnessEstimate]:
 
 
 def _find_single_mover(before: StaticWindow, after: StaticWindow) -> str:
-    """Returns the site of the only operator whose script changed between two windows.
+    """Returns the site of the only operator that acted differently in two static windows.
 
-    Returns "" if no operator or several operators moved, or if some script is unknown.
+    Returns:
+        Name of the site. Empty if no operator or several operators moved, or if the plan of
+        some operator is unknown.
     """
     moved = []
     for site, script_after in after.script.items():
@@ -244,15 +274,16 @@ class SharingRatio(NamedTuple):
     """Force sharing between two loaded sites at a joint, in a static window.
 
     Attributes:
-        from_s: time of the window's first tick, in s.
-        to_s: time of the window's last tick, in s.
-        joint: number of the joint, from 1.
-        pushed: site at which the torque acts.
-        pushed_nm: the torque ON the arm of this site.
+        from_s: Time of the window's first tick, in s.
+        to_s: Time of the window's last tick, in s.
+        joint: Number of the joint, from 1.
+        pushed: Site at which the torque acts.
+        pushed_nm: Torque on the arm of this site.
         by_wall: True if the environment contributes most of this torque.
-        holds: site of the operator that feels the torque.
-        felt_nm: torque that this operator feels: the negative of its torque ON its arm.
-        expected_nm: torque to be felt according to the dominance factors.
+        holds: Site of the operator that feels the torque.
+        felt_nm: Torque that this operator feels: the negative of the operator's torque on the
+            arm.
+        expected_nm: Torque that the operator should feel according to the dominance factors.
     """
 
     from_s: float
@@ -267,7 +298,7 @@ class SharingRatio(NamedTuple):
 
     @property
     def off(self) -> float | None:
-        """Relative deviation of the felt torque from the expected torque; None if unknown."""
+        """Relative deviation of the felt torque from the expected torque. None if unknown."""
         expected = self.expected_nm.value
         if expected is None or expected == 0.0:
             return None
@@ -279,12 +310,14 @@ class JointLoad(NamedTuple):
     """The torques of all loaded sites at a joint, in a static window.
 
     Attributes:
-        from_s: time of the window's first tick, in s.
-        to_s: time of the window's last tick, in s.
-        joint: number of the joint, from 1.
-        torque_nm: torque ON the arm of each loaded site.
-        weight: pi_i / K_i of each loaded site, scaled so that the largest of all sites is 1.
-        imbalance: |sum of weight times torque| / largest |weight times torque|.
+        from_s: Time of the window's first tick, in s.
+        to_s: Time of the window's last tick, in s.
+        joint: Number of the joint, from 1.
+        torque_nm: Torque on the arm of each loaded site.
+        weight: pi_i / K_i of each loaded site, scaled so that the largest value of all sites is
+            1.
+        imbalance: |sum of weight times torque| / largest |weight times torque|. It is 0 if the
+            torques obey the equation of the module's docstring.
     """
 
     from_s: float
@@ -296,7 +329,14 @@ class JointLoad(NamedTuple):
 
 
 def find_joint_loads(view: RunView) -> list[JointLoad]:
-    """Returns the loaded joints of every static window."""
+    """Finds the loaded joints of every static window.
+
+    A site is loaded at a joint if its torque is neither small nor much smaller than that of
+    another site.
+
+    Args:
+        view: The run.
+    """
     loads = []
     for window in view.compute_once(find_static_windows):
         weights = _compute_torque_weights(view.scenario, window.alpha)
@@ -313,7 +353,7 @@ def find_joint_loads(view: RunView) -> list[JointLoad]:
 
 
 def count_static_windows(view: RunView) -> Metric:
-    """Returns the number of static windows."""
+    """Returns the number of static windows of a run. Without any, the metric states a reason."""
     if view.absent:
         return Metric(None, f"no records of {', '.join(view.absent)}")
     windows = view.compute_once(find_static_windows)
@@ -327,11 +367,12 @@ def count_static_windows(view: RunView) -> Metric:
     Quantity("sharing_off", "furthest from tau_s beta_s / beta_i"),
 )
 def measure_force_sharing(view: RunView, _run: str) -> MetricValues:
-    """Returns the largest deviation of force sharing from the dominance factors."""
+    """Returns how far felt torques deviate from those that the dominance factors predict."""
     ratios = view.compute_once(find_sharing_ratios)
     deviations = [ratio.off for ratio in ratios if ratio.off is not None]
     if deviations:
         return {"sharing_off": metric(max(deviations))}
+
     reasons = [ratio.expected_nm.why for ratio in ratios]
     why = count_static_windows(view).why
     if not why:
@@ -348,13 +389,13 @@ def _weigh_load(
     torque: dict[str, float],
     weights: Array | str,
 ) -> JointLoad:
-    """Returns a loaded joint with the weights of its torques.
+    """Returns the load of a joint, with the weights of its torques.
 
     Args:
-        window: the static window.
-        joint: index of the joint, from 0.
-        torque: torques of the loaded sites, N m.
-        weights: weights of all sites and joints, shape (N, n), or the reason why they are
+        window: The static window.
+        joint: Index of the joint, from 0.
+        torque: Torques of the loaded sites, in N m.
+        weights: Weights of all sites and joints, shape (N, n), or the reason why they are
             unknown.
     """
     if isinstance(weights, str):
@@ -383,10 +424,13 @@ def _weigh_load(
 
 
 def find_sharing_ratios(view: RunView) -> list[SharingRatio]:
-    """Returns the force sharing at every joint at which two sites are loaded.
+    """Finds the force sharing at every joint at which exactly two sites are loaded.
 
-    The operator that feels the torque is a spring. If both operators or neither of them is a
-    spring, the torque acts on the slave.
+    The operator who feels the torque is the one who holds the arm like a spring. If both
+    operators or neither of them do so, the torque acts on the slave.
+
+    Args:
+        view: The run.
     """
     static_windows = view.compute_once(find_static_windows)
     windows = {window.from_s: window for window in static_windows}
@@ -394,13 +438,16 @@ def find_sharing_ratios(view: RunView) -> list[SharingRatio]:
     for load in view.compute_once(find_joint_loads):
         if len(load.torque_nm) != 2:
             continue
+
         ranks = {}
         for site in load.torque_nm:
             ranks[site] = _rank_as_holder(view.scenario, site, load.to_s)
         pushed, holds = sorted(load.torque_nm, key=ranks.__getitem__)
+
         torque = load.torque_nm[pushed]
         environment = windows[load.from_s].environment[pushed]
         wall_torque = float(environment[load.joint - 1])
+
         pushed_weight = load.weight[pushed]
         holds_weight = load.weight[holds]
         if pushed_weight.value is None or holds_weight.value is None:
@@ -409,6 +456,7 @@ def find_sharing_ratios(view: RunView) -> list[SharingRatio]:
             expected = Metric(None, f"no site follows {holds} in the end")
         else:
             expected = metric(torque * pushed_weight.value / holds_weight.value)
+
         ratio = SharingRatio(
             from_s=load.from_s,
             to_s=load.to_s,
@@ -425,9 +473,15 @@ def find_sharing_ratios(view: RunView) -> list[SharingRatio]:
 
 
 def _rank_as_holder(scenario: Scenario, site: str, t_s: float) -> tuple[bool, bool]:
-    """Returns a sort key: the site whose operator feels the torque comes last.
+    """Returns a sort key with which the site whose operator feels the torque comes last.
 
-    Such a site has an active spring and no environment. Among equal sites, masters come last.
+    Such an operator is a spring that acts at the time, and the site has no environment. Among
+    equal sites, masters come last.
+
+    Args:
+        scenario: Scenario of the run.
+        site: Name of the site.
+        t_s: The time, in s.
     """
     spec = scenario.sites[site]
     spring_kinds = (TorqueKind.HAND, TorqueKind.TASK_HAND)
@@ -437,7 +491,15 @@ def _rank_as_holder(scenario: Scenario, site: str, t_s: float) -> tuple[bool, bo
 
 
 def _compute_torque_weights(scenario: Scenario, alpha: Array) -> Array | str:
-    """Returns pi_i / K_i per joint, shape (N, n), or the reason why it is unknown."""
+    """Returns the weights pi_i / K_i of the torques of all sites and joints.
+
+    Args:
+        scenario: Scenario of the run.
+        alpha: Matrix of the dominance factors, shape (N, N).
+
+    Returns:
+        The weights, shape (N, n), or the reason why they are unknown.
+    """
     if len(find_closed_groups(alpha)) > 1:
         return "two groups of sites follow nobody else: who feels whom is not unique"
     stiffness = []
@@ -451,11 +513,11 @@ def _compute_torque_weights(scenario: Scenario, alpha: Array) -> Array | str:
 
 
 def _find_holding_stiffness(scenario: Scenario, site: str) -> tuple[Array, str]:
-    """Returns the stiffness that holds e at rest, shape (n,), N m/rad.
+    """Returns the stiffness with which a site holds its error e at rest.
 
     Returns:
-        The stiffness, NaN along axes that the site does not follow.
-        The reason why the stiffness is unknown, or ""; with a reason the stiffness is zero.
+        The stiffness, shape (n,), in N m/rad. NaN along axes that the site does not follow.
+        The reason why the stiffness is unknown. Empty if it is known.
     """
     spec = scenario.sites[site]
     arm = build_arm_rows(scenario, site)
@@ -468,11 +530,13 @@ def _find_holding_stiffness(scenario: Scenario, site: str) -> tuple[Array, str]:
         return unknown, "theta of the arm is not known"
     if np.any(gains.k_f):
         return unknown, "the law reflects force: its torque does not depend on e alone"
+
     is_adaptive = gains.law is Law.ADAPTIVE
     gravity = arm.gravity_parameters
     if is_adaptive and arm.task is not None:
         why = "in task space the stiffness of this law changes with the pose: J+'Kp J+ Lambda"
         return unknown, why
+
     estimate = np.array(gains.theta_hat0 if is_adaptive else gains.known)
     if is_adaptive:
         adapts = np.array(gains.Gamma) > 0.0
@@ -484,6 +548,7 @@ def _find_holding_stiffness(scenario: Scenario, site: str) -> tuple[Array, str]:
     K = np.array(gains.K)
     if is_adaptive:
         K = np.array(gains.Kp) * np.array(gains.Lambda)
+
     axes = np.array(scenario.arms[site].axes or 1.0)
     is_free = axes == 0.0
     is_held = (K > 0.0) | is_free

@@ -1,11 +1,14 @@
-"""Metrics of users who share a slave: authority, disagreement, interventions and takeovers.
+"""Metrics of users who share a slave arm: authority, disagreement, interventions and takeovers.
+
+The users are the operators at the masters of the scenario, and the shared slave is its first
+slave. The slave follows each user's master with a weight, the dominance factor of the user,
+which may change during the run.
 
 Invariant:
-    - The users are the masters of the scenario, and the shared slave is its first slave.
-    - The user with the largest share in the slave's reference leads.
-    - Torques are those of hands ON arms, without the environment's. In task space they are
-      forces at end effectors.
-    - Rows without a record do not count.
+    - The user with the largest dominance factor leads.
+    - Torques are those with which the operators push their arms, without the environment's. In
+      task space they are forces at the end effectors.
+    - Ticks without a record do not count.
 """
 
 import math
@@ -35,9 +38,9 @@ from .measures import (
 )
 
 JACKKNIFE_BLOCKS = 8
-"""Number of blocks of rows that the jackknife leaves out, one at a time."""
+"""Number of blocks of ticks that the jackknife leaves out, one at a time."""
 LARGEST_HALF_WIDTH = 0.25
-"""Largest half-width of the 95 % interval with which a share in the motion is given."""
+"""Largest half-width of the 95 % interval with which a share in the motion is reported."""
 STUDENT_T = 2.3646
 """The 0.975 quantile of Student's t with `JACKKNIFE_BLOCKS` - 1 = 7 degrees of freedom."""
 LEAST_INDEPENDENCE = 1e-9
@@ -48,12 +51,17 @@ With a smaller value the users' motions count as dependent.
 
 
 def _not_applicable(reason: str) -> Metric:
-    """Returns the metric of a quantity that does not apply, with the reason."""
+    """Returns the metric of a quantity that cannot exist in this scenario, with the reason."""
     return Metric(None, reason, applies=False)
 
 
 def read_user_shares(view: RunView) -> UserShares | Metric:
-    """Returns the users' shares at the slave's ticks, or a metric with the reason for none."""
+    """Returns the dominance factors of the users at the slave's ticks.
+
+    Returns:
+        The factors and the leading user. A metric with the reason if no users share a slave, or
+        if their records are missing.
+    """
     slave, users = find_users(view.scenario)
     if not slave or len(users) < 2:
         return _not_applicable("no two users share a slave")
@@ -71,10 +79,10 @@ def read_user_shares(view: RunView) -> UserShares | Metric:
     Quantity("motion_share", "share in the slave's motion"),
 )
 def measure_authority(view: RunView, site: str) -> MetricValues:
-    """Returns a user's authority: its weighted effort, and its share in the slave's motion.
+    """Returns the authority of a user: its weighted effort and its share in the slave's motion.
 
-    The effort is h sum_k a_k |tau_h,k|^2, with a_k the user's dominance factor at tick k, and
-    tau_h,k the torque of its hand.
+    The effort is h sum_k a_k |tau_h,k|^2, with the tick period h, the user's dominance factor
+    a_k at tick k, and the torque tau_h,k with which the user pushes the master.
     """
     shared = view.compute_once(read_user_shares)
     slave, users = find_users(view.scenario)
@@ -82,15 +90,18 @@ def measure_authority(view: RunView, site: str) -> MetricValues:
         return unavailable(USERS, shared.why, of="site", applies=shared.applies)
     if site not in users:
         return unavailable(USERS, "its hand is no user's", of="site", applies=False)
+
     records = view.sites[site].records
     torque = view.sites[site].torque
     user = users.index(site)
     slave_row, slave_recorded = find_latest_rows(view.sites[slave].records, records.t_s)
+
     share = shared.shares[slave_row, user]
     squared_torque = np.square(torque.operator).sum(axis=1)
     weighted = share * squared_torque
     counted = weighted[records.known & slave_recorded]
     effort = counted.sum() * records.h_s
+
     motion_shares = view.compute_once(_identify_shares)
     if isinstance(motion_shares, Metric):
         motion_share = motion_shares
@@ -103,19 +114,21 @@ def measure_authority(view: RunView, site: str) -> MetricValues:
 
 
 def _identify_shares(view: RunView) -> list[float] | Metric:
-    """Returns the least-squares shares of the users in the slave's motion.
+    """Estimates by least squares how much each user contributes to the slave's motion.
 
     The shares a_i minimise sum_k |qd_k - sum_i a_i qd_i(s_k)|^2 subject to sum_i a_i = 1. Here
     qd_k is the slave's velocity at tick k (in task space the velocity of its end effector), and
-    qd_i(s_k) is user i's velocity at the stamp of the sample that the slave uses. The
-    constraint is met by subtracting the last user's velocity from all others: the last user's
-    share is one minus the sum of the other shares.
+    qd_i(s_k) is the velocity of user i's master at the time at which the sample that the slave
+    uses was sent.
 
-    The jackknife over blocks of rows estimates the shares' standard error, since velocities at
-    successive ticks are not independent.
+    The constraint is met by subtracting the last user's velocity from all others. The last
+    user's share is one minus the sum of the other shares. The standard error of the shares is
+    estimated by the jackknife over blocks of ticks, since velocities at successive ticks are
+    not independent.
 
     Returns:
-        The shares in the order of the users, or a metric that states why they are unknown.
+        The shares in the order of the users. A metric with the reason if the motion does not
+        determine them.
     """
     slave, users = find_users(view.scenario)
     slave_records = view.sites[slave].records
@@ -127,11 +140,13 @@ def _identify_shares(view: RunView) -> list[float] | Metric:
         row = used_row.clip(0, len(records.known) - 1)
         valid &= (used_row == row) & records.known[row]
         user_rates.append(records.shared_rate[row])
+
     slave_rate = slave_records.shared_rate[valid].ravel()
     valid_rates = [rate[valid].ravel() for rate in user_rates]
     *other_rates, last_rate = valid_rates
     relative_rates = np.column_stack([rate - last_rate for rate in other_rates])
     relative_slave_rate = slave_rate - last_rate
+
     unknown = Metric(None, "the users' motions are not independent, or no arm moves")
     if not len(slave_rate):
         return unknown
@@ -154,6 +169,7 @@ def _identify_shares(view: RunView) -> list[float] | Metric:
     if not half_width <= LARGEST_HALF_WIDTH:
         why = f"the motion does not determine the shares: only within +- {half_width:.2g}"
         return Metric(None, why)
+
     last_share = 1.0 - float(shares.sum())
     return [*shares.tolist(), last_share]
 
@@ -170,15 +186,21 @@ def _identify_shares(view: RunView) -> list[float] | Metric:
     Quantity("lead_jump", "largest step of q_id while shares change, to that of the rest"),
 )
 def measure_sharing(view: RunView, _run: str) -> MetricValues:
-    """Returns disagreement, interventions and takeovers of the users of a slave."""
+    """Returns how the users of a slave disagree, intervene and take over.
+
+    A user intervenes while another user leads than the scenario plans. A takeover is a change
+    of the leader.
+    """
     shared = view.compute_once(read_user_shares)
     slave, users = find_users(view.scenario)
     if isinstance(shared, Metric):
         return unavailable(USERS, shared.why, of="run", applies=shared.applies)
+
     records = view.sites[slave].records
     intervenes = shared.leader[records.known] != shared.program
     _, ramps = list_ramps(view.log, slave)
     ramp_spans_s = sorted((ramp.start_ns * 1e-9, ramp.end_ns * 1e-9) for ramp in ramps)
+
     leader_changes = np.diff(shared.leader) != 0
     takeover_times_s = records.t_s[1:][leader_changes]
     durations_s = [
@@ -188,6 +210,7 @@ def measure_sharing(view: RunView, _run: str) -> MetricValues:
     longest_s = _not_applicable("the leader never changes")
     if durations_s:
         longest_s = metric(max(durations_s))
+
     user_runs = [view.shared[user] for user in users]
     return {
         **_measure_disagreement(user_runs),
@@ -201,17 +224,23 @@ def measure_sharing(view: RunView, _run: str) -> MetricValues:
 def _measure_disagreement(runs: list[SiteRun]) -> MetricValues:
     """Returns the part of the users' torques that cancels, as an RMS and as a share.
 
-    Torques tau_i in a joint or along an axis cancel by (sum_i |tau_i| - |sum_i tau_i|) / 2.
+    Torques tau_i of the users i in a joint or along an axis cancel by
+    (sum_i |tau_i| - |sum_i tau_i|) / 2.
+
+    Args:
+        runs: The masters of the users.
     """
     rows, known = find_common_rows([run.records for run in runs])
     torques = []
     for run, row in zip(runs, rows, strict=True):
         common_torque = run.torque.operator[row]
         torques.append(common_torque[known])
+
     sum_of_sizes = np.abs(torques).sum(axis=0)
     size_of_sum = np.abs(np.sum(torques, axis=0))
     cancelled = 0.5 * (sum_of_sizes - size_of_sum)
     total = sum_of_sizes.sum()
+
     internal_share = _not_applicable("nobody pushes")
     if total:
         internal_share = metric(2.0 * cancelled.sum() / total)
@@ -233,15 +262,16 @@ def _measure_takeover_s(
     h_s: float,
     ramp_spans_s: list[tuple[float, float]],
 ) -> float:
-    """Returns the time from the start of a ramp to the change of the leader that it caused.
+    """Returns the time from the start of a planned change of weights to a change of the leader.
 
     Args:
-        change_s: time at which the leader changed, in s.
-        h_s: the slave's period, in s.
-        ramp_spans_s: (start, end) of every ramp, in s, sorted.
+        change_s: Time at which the leader changed, in s.
+        h_s: Tick period of the slave, in s.
+        ramp_spans_s: (start, end) of every ramp of the dominance factors, in s, sorted.
 
     Returns:
-        The time in s; 0 if no ramp caused the change.
+        The time since the start of the latest ramp that can have caused the change, in s. 0 if
+        there is no such ramp.
     """
     latest_start_s = None
     for start_s, end_s in ramp_spans_s:
@@ -255,11 +285,17 @@ def _measure_takeover_s(
 
 
 def _compare_steps(records: AlignedRecords, ramp_spans_s: list[tuple[float, float]]) -> Metric:
-    """Returns the largest step of q_id while shares change, divided by the largest other step.
+    """Compares the steps of the slave's reference while weights change with all other steps.
+
+    A change of the dominance factors should not make the reference jump.
 
     Args:
-        records: records of the slave.
-        ramp_spans_s: (start, end) of every ramp of the slave's shares, in s.
+        records: Records of the slave.
+        ramp_spans_s: (start, end) of every ramp of the dominance factors, in s.
+
+    Returns:
+        The largest step from tick to tick while a ramp lasts, divided by the largest other
+        step.
     """
     q_des = records.q_des[:, :POSITION] if records.x.size else records.q_des
     follows = records.known & records.follows
@@ -270,11 +306,13 @@ def _compare_steps(records: AlignedRecords, ramp_spans_s: list[tuple[float, floa
     changing = np.zeros(len(steps), dtype=np.bool_)
     for start_s, end_s in ramp_spans_s:
         changing |= (period_end_s >= start_s) & (period_start_s <= end_s)
+
     judged = follows[:-1] & follows[1:]
     judged_changing = judged & changing
     judged_otherwise = judged & ~changing
     if not judged_changing.any():
         return _not_applicable("no share changes")
+
     largest_while_changing = peak(steps[judged_changing])
     largest_otherwise = peak(steps[judged_otherwise])
     ratio = None
