@@ -1,13 +1,16 @@
-"""Splits the torque on an arm by its sources, and evaluates operator and environment models.
+"""Splits the external torque on an arm by its sources, and evaluates models of the sources.
 
-All functions work over all rows of a log at once. Torques act ON the arm.
+An arm is pushed by operators and by environments such as walls. The scenario contains a model
+of each, and the records contain their total torque. All functions work over all records of a
+log at once. Torques act on the arm.
 
 Invariant:
-    - All torques are computed from the definitions of the scenario, independently of the core;
-      the tests compare the two.
+    - All torques are computed from the definitions in the scenario, independently of the
+      simulation kernel. The tests compare the two.
     - The recorded torque less the environment's torque is the operator's, even if the scenario
       does not explain it.
-    - An operator has a script only if its torque matches the scenario.
+    - The plan of an operator (its script) is known only if the operator's torque agrees with
+      the scenario.
 """
 
 from collections.abc import Iterable
@@ -24,7 +27,7 @@ from .aligned import AlignedRecords, Bools, align_records
 from .arm_rows import EndEffectorRows, build_arm_rows
 
 SCRIPT_TORQUE_TOLERANCE = 1e-8
-"""Relative difference up to which a torque matches that of the scenario."""
+"""Largest relative difference of a torque that agrees with the scenario."""
 
 
 def list_walls(spec: SiteSpec) -> list[TorqueSource]:
@@ -34,7 +37,7 @@ def list_walls(spec: SiteSpec) -> list[TorqueSource]:
 
 
 def wall_depth(wall: TorqueSource, end_effector: EndEffectorRows) -> Array:
-    """Returns the depth of an end effector in a wall, shape (K,), m; negative outside."""
+    """Returns the depth of an end effector in a wall, shape (K,), in m. Negative outside."""
     surface_point = np.array(wall.a)
     normal = np.array(wall.b)
     depth: Array = (surface_point - end_effector.position) @ normal
@@ -42,15 +45,18 @@ def wall_depth(wall: TorqueSource, end_effector: EndEffectorRows) -> Array:
 
 
 def wall_force(wall: TorqueSource, t_s: Array, end_effector: EndEffectorRows) -> Array:
-    """Returns the force of a wall along its normal, shape (K,), N: it pushes, and never pulls.
+    """Returns the force of a wall along its normal, which pushes and never pulls.
 
-    The force is max(K depth - B outward speed, 0) inside the wall, and 0 outside, before the
-    wall's start and after its end.
+    The force is max(K depth - B outward speed, 0) inside the wall, with its stiffness K and
+    damping B. It is 0 outside, before the wall's start and after its end.
 
     Args:
-        wall: the wall.
-        t_s: times, shape (K,), s.
-        end_effector: motion of the end effector.
+        wall: The wall.
+        t_s: Times, shape (K,), in s.
+        end_effector: Motion of the end effector.
+
+    Returns:
+        Force, shape (K,), in N.
     """
     depth = wall_depth(wall, end_effector)
     outward_speed = end_effector.speed @ np.array(wall.b)
@@ -62,7 +68,7 @@ def wall_force(wall: TorqueSource, t_s: Array, end_effector: EndEffectorRows) ->
 
 
 def _is_active(source: TorqueSource, t_s: Array) -> Bools:
-    """Returns the times between start and end of a source, shape (K,)."""
+    """Returns True for the times between start and end of a source, shape (K,)."""
     has_started = t_s >= source.start_s
     has_not_ended = t_s < source.end_s
     active: Bools = has_started & has_not_ended
@@ -75,8 +81,8 @@ def compute_target_motion(source: TorqueSource, t_s: Array) -> tuple[Array, Arra
     The target moves from a to b with minimum jerk.
 
     Args:
-        source: the spring.
-        t_s: times, shape (K,), s.
+        source: The spring.
+        t_s: Times, shape (K,), in s.
     """
     span_s = source.move_end_s - source.move_start_s
     progress = (t_s > source.move_start_s).astype(np.float64)
@@ -102,13 +108,13 @@ def compute_spring_effort(
     position: Array,
     speed: Array,
 ) -> Array:
-    """Returns K (target - position) + B (target velocity - speed), shape (K, n).
+    """Returns the effort K (target - position) + B (target velocity - speed), shape (K, n).
 
     Args:
-        source: a spring with a damper.
-        t_s: times, shape (K,), s.
-        position: joint angles, or position of the end effector, shape (K, n).
-        speed: their velocities, shape (K, n).
+        source: A spring with stiffness K and damping B.
+        t_s: Times, shape (K,), in s.
+        position: Joint angles, or position of the end effector, shape (K, n).
+        speed: Their velocities, shape (K, n).
     """
     target, target_velocity = compute_target_motion(source, t_s)
     spring = np.array(source.K) * (target - position)
@@ -118,7 +124,7 @@ def compute_spring_effort(
 
 
 def _map_to_joints(J: Array, force: Array) -> Array:
-    """Returns the joint torque J'f of a force f at the end effector, shape (K, n), N m."""
+    """Returns the joint torque J'f of a force f at the end effector, shape (K, n), in N m."""
     torque: Array = np.einsum("kij,ki->kj", J, force)
     return torque
 
@@ -130,19 +136,22 @@ def compute_source_torque(
     qd: Array,
     end_effector: EndEffectorRows,
 ) -> Array:
-    """Returns the torque of a source that depends on the state, ON the arm, (K, n), N m.
+    """Returns the torque of a source that depends on the arm's motion.
 
-    Such a source is a spring, a damper, a wall, or a user-written model.
+    The source may be a spring, a damper, a wall, or a model that a user wrote.
 
     Args:
-        source: the source.
-        t_s: times, shape (K,), s.
-        q: joint angles, shape (K, n), rad.
-        qd: joint velocities, shape (K, n), rad/s.
-        end_effector: motion of the end effector.
+        source: The source.
+        t_s: Times, shape (K,), in s.
+        q: Joint angles, shape (K, n), in rad.
+        qd: Joint velocities, shape (K, n), in rad/s.
+        end_effector: Motion of the end effector.
+
+    Returns:
+        Torque on the arm, shape (K, n), in N m.
 
     Raises:
-        ValueError: the source is scripted, and therefore no function of the state.
+        ValueError: The torque of the source is scripted, and does not depend on the motion.
     """
     kind = source.kind
     position = end_effector.position
@@ -177,15 +186,18 @@ def compute_live_torque(
     qd: Array,
     end_effector: EndEffectorRows,
 ) -> Array:
-    """Returns the torque of a live hand ON the arm, shape (K, n), N m.
+    """Returns the torque of an operator who acts live, on a page or with a device.
 
     Args:
-        source: the live hand.
-        hand: recorded action of the hand, see `HandInForce`, shape (K, h): the hand's share,
-            two further values, the hand's target and the target's velocity.
-        q: joint angles, shape (K, n), rad.
-        qd: joint velocities, shape (K, n), rad/s.
-        end_effector: motion of the end effector.
+        source: The operator.
+        hand: Recorded action of the operator, see `HandInForce`, shape (K, h): the strength of
+            the grip from 0 to 1, two further values, the target and the target's velocity.
+        q: Joint angles, shape (K, n), in rad.
+        qd: Joint velocities, shape (K, n), in rad/s.
+        end_effector: Motion of the end effector.
+
+    Returns:
+        Torque on the arm, shape (K, n), in N m.
     """
     size = (hand.shape[1] - 3) // 2
     share = hand[:, 0]
@@ -194,6 +206,7 @@ def compute_live_torque(
     acts_on_joints = source.kind is TorqueKind.LIVE_JOINT
     position = q if acts_on_joints else end_effector.position
     speed = qd if acts_on_joints else end_effector.speed
+
     if source.kind is TorqueKind.LIVE_FORCE:
         pull = target
     else:
@@ -213,16 +226,18 @@ def compute_live_torque(
 
 
 class TorqueSplit(NamedTuple):
-    """The torque ON an arm by its sources, without the arm's stops, shape (K, n) each, N m.
+    """The external torque on an arm by its sources, shape (K, n) each, in N m.
+
+    The torque of the arm's mechanical stops is not included.
 
     Attributes:
-        end_effector: motion of the end effector.
-        operator_now: the operator's torque that follows the state.
-        operator_held: the operator's torque that is computed once a tick and held.
-        environment_now: the environment's torque that follows the state.
-        environment_held: the environment's torque that is computed once a tick and held.
-        script: the operator's intention, see `compute_operator_script`; None if not requested,
-            or if the operator's torque does not match the scenario.
+        end_effector: Motion of the end effector.
+        operator_now: Operator's torque that follows the motion continuously.
+        operator_held: Operator's torque that is computed once per tick and held.
+        environment_now: Environment's torque that follows the motion continuously.
+        environment_held: Environment's torque that is computed once per tick and held.
+        script: Plan of the operator, see `compute_operator_script`. None if not requested, or
+            if the operator's torque does not agree with the scenario.
     """
 
     end_effector: EndEffectorRows
@@ -234,17 +249,22 @@ class TorqueSplit(NamedTuple):
 
     @property
     def operator(self) -> Array:
-        """The operator's whole torque, shape (K, n), N m."""
+        """The operator's whole torque, shape (K, n), in N m."""
         return self.operator_now + self.operator_held
 
     @property
     def environment(self) -> Array:
-        """The environment's whole torque, shape (K, n), N m."""
+        """The environment's whole torque, shape (K, n), in N m."""
         return self.environment_now + self.environment_held
 
 
 def split_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit:
-    """Returns the torque on a site's arm by its sources, without the operator's script."""
+    """Splits the torque on a site's arm by its sources, without the operator's plan.
+
+    Args:
+        records: Records of the site.
+        scenario: Scenario of the run.
+    """
     spec = scenario.sites[records.site]
     t_s = records.nominal_s
     arm = build_arm_rows(scenario, records.site)
@@ -290,20 +310,23 @@ def split_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit:
 
 
 def compute_operator_script(source: TorqueSource, t_s: Array, J: Array) -> Array:
-    """Returns the intention of an operator, shape (K, n), N m.
+    """Returns the plan of an operator as a torque that does not depend on the arm's motion.
 
-    The intention does not depend on the arm's motion, and changes if and only if the operator
-    moves. Its definition depends on the kind of the operator:
+    It changes if and only if the operator moves. Its definition depends on the kind of the
+    operator:
 
     - Scripted torque (pulse, recorded, chirp, multisine): the torque itself.
     - Spring: K times the displacement of its target plus B times the target's speed. If the
       spring acts at the end effector, the Jacobian J of one pose maps this force to the joints.
-    - User-written model: its effort on an arm that rests at zero.
+    - Model that a user wrote: its effort on an arm that rests at zero.
 
     Args:
-        source: the operator.
-        t_s: times, shape (K,), s.
+        source: The operator.
+        t_s: Times, shape (K,), in s.
         J: Jacobian of one pose, shape (2, 2) or (3, n).
+
+    Returns:
+        The plan, shape (K, n), in N m.
     """
     if source.kind in SCRIPTED_KINDS:
         intent = _evaluate_scripted_torque(source, t_s)
@@ -322,11 +345,14 @@ def compute_operator_script(source: TorqueSource, t_s: Array, J: Array) -> Array
 
 
 def _evaluate_scripted_torque(source: TorqueSource, t_s: Array) -> Array:
-    """Returns a scripted torque over time, shape (K, n), N m, as if it never started or ended.
+    """Returns a scripted torque over time, as if it never started or ended.
 
     Args:
-        source: a pulse, a recorded torque, a chirp or a multisine.
-        t_s: times, shape (K,), s.
+        source: A pulse, a recorded torque, a chirp or a multisine.
+        t_s: Times, shape (K,), in s.
+
+    Returns:
+        Torque, shape (K, n), in N m.
     """
     since_start_s = t_s - source.start_s
     if source.kind is TorqueKind.RECORDED:
@@ -337,6 +363,7 @@ def _evaluate_scripted_torque(source: TorqueSource, t_s: Array) -> Array:
             column = np.interp(t_s, table_s, joint_torque, left=0.0, right=0.0)
             columns.append(column)
         return np.stack(columns, axis=1)
+
     if source.kind is TorqueKind.PULSE:
         span_s = source.end_s - source.start_s
         x = np.clip(since_start_s / span_s, 0.0, 1.0)
@@ -353,15 +380,20 @@ def _evaluate_scripted_torque(source: TorqueSource, t_s: Array) -> Array:
         phases = source.table[:, 1]
         turns = np.outer(since_start_s, frequencies_hz) + phases
         wave = np.sin(2.0 * np.pi * turns).sum(axis=1)
+
     torque: Array = wave[:, np.newaxis] * np.array(source.a)
     return torque
 
 
 def attribute_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit:
-    """Returns the torque on a site's arm by its sources, with the operator's script.
+    """Splits the torque on a site's arm by its sources, with the operator's plan.
 
     If the scenario has no operator, the operator's torque is set to zero where only rounding
     errors are left.
+
+    Args:
+        records: Records of the site.
+        scenario: Scenario of the run.
     """
     split = split_torque(records, scenario)
     t_s = records.nominal_s
@@ -384,6 +416,7 @@ def attribute_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit
             )
             script = script + live_torque
             continue
+
         source_script = compute_operator_script(source, t_s, split.end_effector.J[0])
         script = script + source_script
         if source.kind in SCRIPTED_KINDS:
@@ -397,6 +430,7 @@ def attribute_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit
                 end_effector=split.end_effector,
             )
             expected = expected + torque
+
     size = 1.0 + np.abs(records.tau_x)
     difference = np.abs(split.operator_now - expected)
     matches = difference <= SCRIPT_TORQUE_TOLERANCE * size
@@ -411,22 +445,23 @@ def attribute_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit
 class WallEnergy(NamedTuple):
     """Energy that a sampled wall generates in contact, and the damping needed to dissipate it.
 
-    The wall's force F_k is held over a tick h, and does the work F_k (x_{k+1} - x_k). Together
-    with the energy K x^2 / 2 of its spring, it generates K (x_{k+1} - x_k)^2 / 2 in every tick
-    of a contact, less the energy that its damping B dissipates. A damper b of the arm itself
-    dissipates all of this energy if b > K h / 2 + B: Colgate and Schenkel, "Passivity of a
-    class of sampled-data systems", J. Robotic Systems 14 (1997).
+    The force F_k of a sampled wall is computed once per tick and held for the tick period h. It
+    does the work F_k (x_{k+1} - x_k), where x is the depth. Together with the energy K x^2 / 2
+    of its spring, the wall generates K (x_{k+1} - x_k)^2 / 2 in every tick of a contact, less
+    the energy that its damping B dissipates. A damper b of the arm itself dissipates all of
+    this energy if b > K h / 2 + B: Colgate and Schenkel, "Passivity of a class of sampled-data
+    systems", J. Robotic Systems 14 (1997).
 
     The condition is sufficient, if B acts on the speed at the tick, and the motion is straight
-    within a tick (docs/certificate.md). Whether the loop is stable in contact follows from the
-    map from tick to tick, `trilat linear`.
+    within a tick (docs/certificate.md). `trilat linear` shows whether the loop is stable in
+    contact.
 
     Attributes:
-        site: site of the wall.
-        generated_j: largest energy that the wall supplied in qd beyond the energy that its
-            spring had stored.
+        site: Site of the wall.
+        generated_j: Largest energy that the wall supplied to the joint motion beyond the energy
+            that its spring had stored.
         required_damping_n_s_m: K h / 2 + B.
-        arm_damping_n_s_m: the arm's own damping b along the normal, the least during contact.
+        arm_damping_n_s_m: The arm's own damping b along the normal, the least during contact.
     """
 
     site: str
@@ -436,7 +471,7 @@ class WallEnergy(NamedTuple):
 
 
 def list_sampled_walls(spec: SiteSpec) -> list[TorqueSource]:
-    """Returns the walls of a site whose force is held over a tick and depends on the depth."""
+    """Returns the walls of a site that hold their force for a tick, and have a stiffness."""
     walls = list_walls(spec)
     return [wall for wall in walls if wall.sampled and any(wall.K)]
 
@@ -453,6 +488,7 @@ def find_wall_energies(log: Log) -> list[WallEnergy]:
             touched = force > 0.0
             if not touched.any():
                 continue
+
             generated_j = _find_generated_energy(wall, records, end_effector, force)
             spring_share = 0.5 * wall.K[0] * records.h_s
             contact_J = end_effector.J[touched]
@@ -473,13 +509,13 @@ def _find_generated_energy(
     end_effector: EndEffectorRows,
     force: Array,
 ) -> float:
-    """Returns the largest rise of the wall's work plus its spring's energy, in J.
+    """Returns the largest rise of a wall's work plus its spring's energy, in J.
 
     Args:
-        wall: the wall.
-        records: records of its site.
-        end_effector: motion of the end effector.
-        force: force of the wall along its normal, shape (K,), N.
+        wall: The wall.
+        records: Records of its site.
+        end_effector: Motion of the end effector.
+        force: Force of the wall along its normal, shape (K,), in N.
     """
     force_vector = force[:, np.newaxis] * np.array(wall.b)
     torque = _map_to_joints(end_effector.J, force_vector)
@@ -488,6 +524,7 @@ def _find_generated_energy(
     depth = np.where(force > 0.0, wall_depth(wall, end_effector), 0.0)
     stored = 0.5 * wall.K[0] * depth**2
     generated = work + np.diff(stored)
+
     known_part = np.where(records.known_periods, generated, 0.0)
     supplied = np.concatenate([[0.0], np.cumsum(known_part)])
     least_so_far = np.minimum.accumulate(supplied)
@@ -500,15 +537,16 @@ def _find_arm_damping(
     J: Array,
     t_s: Array,
 ) -> float:
-    """Returns the arm's own least damping along a wall's normal n in contact, in N s/m.
+    """Returns the arm's own least damping along a wall's normal in contact, in N s/m.
 
-    The damping is 1 / (n'J D^-1 J'n), with D the damping of joints that acts continuously.
+    The damping is 1 / (n'J D^-1 J'n), with the normal n, the Jacobian J and the damping D of
+    the joints. Only dampers that act continuously count.
 
     Args:
-        spec: site of the wall.
-        wall: the wall.
+        spec: Site of the wall.
+        wall: The wall.
         J: Jacobian of the rows in contact, shape (K, m, n).
-        t_s: times of the rows in contact, shape (K,), s.
+        t_s: Times of the rows in contact, shape (K,), in s.
     """
     viscous = []
     for source in spec.environment:
@@ -520,6 +558,7 @@ def _find_arm_damping(
     D = np.zeros(J.shape[2])
     for B in viscous:
         D = D + np.array(B)
+
     lever_arms = np.einsum("kij,i->kj", J, np.array(wall.b))
     squared_arms = lever_arms**2
     with np.errstate(divide="ignore", invalid="ignore"):

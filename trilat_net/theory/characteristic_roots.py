@@ -167,7 +167,7 @@ class Pencil(NamedTuple):
         return float(abs(s) + undelayed + delayed)
 
     def compute_taylor_coefficient(self, power: int) -> Array:
-        """Returns the coefficient of s^power in the Taylor series of Delta at 0, shape (n, n)."""
+        """Returns the coefficient of s^power in Delta's Taylor series at 0, shape (n, n)."""
         undelayed: Array | float = 0.0
         if power == 0:
             undelayed = -self.A

@@ -289,7 +289,7 @@ class _FrequencySweep:
         self._modes: characteristic_roots.Complex = modes.astype(np.complex128)
 
     def build_grid(self) -> Array:
-        """Returns the frequencies to evaluate, in rad/s. They are denser near the loop's modes."""
+        """Returns the frequencies to evaluate, in rad/s, denser near the loop's modes."""
         lowest = _LOWEST * self._highest
         even = np.geomspace(lowest, self._highest, _POINTS)
         oscillates = np.abs(self._modes.imag) > 0.0
@@ -303,7 +303,7 @@ class _FrequencySweep:
         return grid
 
     def compute_eigenvalues(self, omega: Array) -> characteristic_roots.Complex:
-        """Computes the eigenvalues of the open-loop frequency response G(j w) at many frequencies.
+        """Computes the eigenvalues of the open-loop frequency response G(j w).
 
         Args:
             omega: Frequencies w, shape (K,), in rad/s.

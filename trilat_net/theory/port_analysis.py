@@ -125,9 +125,9 @@ def build_proof_output(
 
 
 def compute_proof_weights(conditions: OperatingConditions) -> Array:
-    """Returns the weights of the sites in the energy function of the corrected proof, shape (N,).
+    """Returns the weights of the sites in the energy function of the corrected proof.
 
-    They are beta_i = pi_i / c_i of docs/errata.md, and their sum is N.
+    They are beta_i = pi_i / c_i of docs/errata.md, shape (N,), and their sum is N.
     """
     Kd = np.full((len(conditions.sites), conditions.sites[0].layout.shared), np.nan)
     for site_Kd, site in zip(Kd, conditions.sites, strict=True):

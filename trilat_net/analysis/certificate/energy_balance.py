@@ -1,17 +1,18 @@
-"""The energy balance of each site, and of all sites together under the weights beta.
+"""Computes the energy balance of each site, and of all sites together.
 
-For each site, without weights:
+V_i is the energy function of site i, see `energy_terms`. For each site, without weights:
 
     V_i - V_i(0) + dissipation + transfer - work = 0
 
-For the weighted sum over all sites, where the transfers cancel:
+The transfer is energy that a site gives to the sites that follow it. In the sum over all sites
+with the weights beta, which depend on the dominance factors, the transfers cancel:
 
     V - V(0) + dissipation - work = 0
 
-Both hold whatever the operators do.
+Both equations hold whatever the operators do, because their work is part of the work.
 
 Invariant:
-    - Records for which these sums do not vanish were not produced by the equations that the log
+    - If these sums do not vanish, the records were not produced by the equations that the log
       claims.
 """
 
@@ -39,25 +40,26 @@ from . import energy_terms
 from .energy_terms import FunctionalParts, Increment, SiteMotion
 
 MIN_PERIODS = 10
-"""With fewer judged periods the error by motion within a period cannot be estimated."""
+"""Least number of judged periods from which the error of the trapezoid rule is estimated."""
 ZERO_ENERGY_J = 1e-12
-"""Rounding error of an energy that is zero, J."""
+"""Rounding error of an energy that is zero, in J."""
 EXTERNAL_SOURCES = ("hands", "walls", "stops")
 """Sources of work outside the loop: operators, environments, and the stops of joints."""
 
 
 @dataclass(frozen=True)
 class SiteEnergy:
-    """Energies of a site over its K rows and K - 1 periods.
+    """Energies of a site over its K records and K - 1 tick periods.
 
     Attributes:
-        motion: motion of the site, from which its energies are computed.
-        parts: the site's functional V_i by its parts.
-        dissipation: dissipated energy per period, by kind.
-        transfer: energy per period that the site gives to its followers, less the energy that
-            it gets from the sites that it follows.
-        work: work per period on the site, by source.
-        sampling: work per period of the scheme that samples the continuous law.
+        motion: Motion of the site, from which its energies are computed.
+        parts: The energy function V_i of the site, by its parts.
+        dissipation: Dissipated energy in each period, by kind.
+        transfer: Energy in each period that the site gives to its followers, less the energy
+            that it gets from the sites that it follows.
+        work: Work on the site in each period, by source.
+        sampling: Work in each period that arises because the continuous law is executed in
+            ticks.
     """
 
     motion: SiteMotion
@@ -69,14 +71,14 @@ class SiteEnergy:
 
     @cached_property
     def judged(self) -> Bools:
-        """True if a period follows from records alone, shape (K - 1,)."""
+        """True if the energies of a period follow from records alone, shape (K - 1,)."""
         known_views = [view.known for view in self.followed.values()]
         known = [self.motion.records.known_periods, *known_views]
         return np.asarray(np.logical_and.reduce(known))
 
     @cached_property
     def residual(self) -> Array:
-        """V_i - V_i(0) + dissipation + transfer - work over judged periods, shape (K,), J."""
+        """V_i - V_i(0) + dissipation + transfer - work over judged periods, shape (K,)."""
         dissipated = [kind.total for kind in self.dissipation.values()]
         worked = [source.total for source in self.work.values()]
         change = np.diff(self.parts.total) + self.transfer.total
@@ -86,13 +88,13 @@ class SiteEnergy:
 
     @cached_property
     def unexplained(self) -> Array:
-        """The residual without the work of the scheme, shape (K,), J."""
+        """The residual without the work of sampling, shape (K,), in J."""
         sampling = _accumulate(self.sampling.total, self.judged)
         return self.residual - sampling
 
     @property
     def followed(self) -> dict[str, DelayedPeer]:
-        """The peers that have a share at any time, as the site sees them."""
+        """The peers that the site follows at any time, with their motion as it sees them."""
         alpha = self.motion.dominance.alpha
         followed = {}
         for j, (peer, view) in enumerate(self.motion.peers.items()):
@@ -102,7 +104,7 @@ class SiteEnergy:
 
     @property
     def largest_age_s(self) -> float:
-        """The largest age of a sample in use, in s; 0 if no sample came into use."""
+        """The largest age of a sample in use, in s. 0 if no sample came into use."""
         t_s = self.motion.records.t_s
         largest_s = []
         for view in self.followed.values():
@@ -113,7 +115,10 @@ class SiteEnergy:
 
     @property
     def begin_s(self) -> float:
-        """The first tick at which V_i follows from records, in s; infinite if there is none."""
+        """Time of the first tick at which V_i follows from records, in s.
+
+        It is infinite if there is no such tick.
+        """
         known = []
         for view in self.followed.values():
             is_known = view.delayed.known & view.now.known
@@ -125,11 +130,11 @@ class SiteEnergy:
 
     @cached_property
     def uncertainty(self) -> float:
-        """Bound of the energies' error by motion within the periods, in J.
+        """Bound of the error of the energies because of motion within the tick periods, in J.
 
         The error of the trapezoid rule is estimated by the sum of the second differences of the
         total power. The error of sampling and operators is estimated by the products of the
-        changes of r and of a torque: if these products add up, the period is long for these
+        changes of r and of a torque: if these products add up, the period is long for the
         gains. With too few periods for second differences, the whole energy is uncertain.
         """
         dissipated = [self.transfer, *self.dissipation.values()]
@@ -141,6 +146,7 @@ class SiteEnergy:
                 right_size = np.abs(increment.right).sum()
                 sizes.append(left_size + right_size)
             return float(sum(sizes))
+
         powers = [increment.left for increment in dissipated]
         powers += [-increment.left for increment in worked]
         power = np.sum(powers, axis=0)
@@ -162,19 +168,27 @@ class SiteEnergy:
 
 
 def _accumulate(amounts: Array, judged: Bools | None = None) -> Array:
-    """Returns the running sum of amounts per period, over the judged periods, shape (K,)."""
+    """Returns the running sum of amounts per period, shape (K,), which starts with 0.
+
+    Args:
+        amounts: Amount in each period, shape (K - 1,).
+        judged: True for each period that counts. None if all periods count.
+    """
     counted = amounts if judged is None else np.where(judged, amounts, 0.0)
     return np.concatenate([[0.0], np.cumsum(counted)])
 
 
 def compute_site_energies(log: Log) -> dict[str, SiteEnergy]:
-    """Returns the energies of the sites of a log, all of which must have a functional.
+    """Computes the energies of the sites of a log, all of which must have an energy function.
+
+    Args:
+        log: The log of the run.
 
     Returns:
-        The energies by site; {} if V is known at no two ticks.
+        The energies, by site. Empty if there are no two ticks at which V is known.
 
     Raises:
-        LogError: a record names a change that is not valid.
+        LogError: A record names a change that is not valid.
     """
     records = align_records(log, common=True)
     pasts = {site: PeerTrajectory(site_records) for site, site_records in records.items()}
@@ -191,13 +205,15 @@ def derive_site_energies(
     pasts: Mapping[str, PeerTrajectory],
     dominance: Callable[[str, Array], DominanceHistory],
 ) -> dict[str, SiteEnergy]:
-    """Returns the energies of sites over some records; every site must have a functional.
+    """Computes the energies of sites over some records.
+
+    Every site must have an energy function.
 
     Args:
-        scenario: scenario of the run.
-        records: records of every site.
-        pasts: motion of every site, back to the oldest sample that was in use.
-        dominance: returns the dominance factors of a site at times in s.
+        scenario: Scenario of the run.
+        records: Records of every site.
+        pasts: Motion of every site, back to the oldest sample that was in use.
+        dominance: Function that returns the dominance factors of a site at times in s.
     """
     energies = {}
     constants = {site: energy_terms.derive_site_constants(scenario, site) for site in records}
@@ -206,6 +222,7 @@ def derive_site_energies(
     if axes:
         # 1 along the axes that all sites follow
         common_axes = tuple(np.prod(axes, axis=0).tolist())
+
     for site, site_records in records.items():
         peers = {}
         for peer in site_records.used:
@@ -231,7 +248,7 @@ def derive_site_energies(
 
 
 def find_common_times(energies: Mapping[str, SiteEnergy]) -> Array:
-    """Returns the ticks of the fastest site at which every V_i is known, shape (T,), s."""
+    """Returns the ticks of the fastest site at which every V_i is known, shape (T,), in s."""
     records = [energy.motion.records for energy in energies.values()]
     fastest = max(records, key=lambda site_records: site_records.rate_hz)
     times = fastest.t_s
@@ -245,21 +262,22 @@ def find_common_times(energies: Mapping[str, SiteEnergy]) -> Array:
 
 @dataclass(frozen=True)
 class EnergyBalance:
-    """The functional V of a group of sites over time, and all energies that change it.
+    """The energy function V of a group of sites over time, and all energies that change it.
 
     Energies are given at the T ticks of the fastest site, in J, shape (T,) unless stated
     otherwise. Dissipation, work and transfer are sums over the judged periods from the first
     tick on.
 
     Attributes:
-        t_s: the ticks, in s.
-        beta: the weights of the N sites over time, shape (T, N).
-        sites: beta_i V_i by site.
-        parts: the parts of V by name, summed over the sites.
-        dissipation: dissipated energy by kind.
-        work: work by source.
-        sampling: work of the sampling scheme; not part of the balance, see `unexplained`.
-        transfer: transferred energy that the weights do not cancel; 0 if the weights are right.
+        t_s: Times of the ticks, in s.
+        beta: Weights of the N sites over time, shape (T, N).
+        sites: beta_i V_i, by site.
+        parts: The parts of V by name, summed over the sites.
+        dissipation: Dissipated energy, by kind.
+        work: Work, by source.
+        sampling: Work that arises because the law is executed in ticks. It is not part of the
+            balance, see `unexplained`.
+        transfer: Transferred energy that the weights do not cancel. 0 if the weights are right.
         judged: True if the period before a tick follows from records alone, shape (T - 1,).
     """
 
@@ -275,27 +293,27 @@ class EnergyBalance:
 
     @cached_property
     def V(self) -> Array:  # noqa: N802 - the paper's symbol
-        """The functional, shape (T,), J."""
+        """The energy function, shape (T,), in J."""
         return _sum(self.parts)
 
     @cached_property
     def residual(self) -> Array:
-        """V - V(0) + dissipation - work over the judged periods, shape (T,), J."""
+        """V - V(0) + dissipation - work over the judged periods, shape (T,), in J."""
         dissipation = _sum(self.dissipation)
         work = _sum(self.work)
         return self._accumulate_judged(self.V + dissipation - work)
 
     @cached_property
     def unexplained(self) -> Array:
-        """The residual less the work of sampling and the transfer, shape (T,), J."""
+        """The residual less the work of sampling and the transfer, shape (T,), in J."""
         explained = self._accumulate_judged(self.sampling - self.transfer)
         return self.residual - explained
 
     @cached_property
     def unsupplied(self) -> Array:
-        """V less the external work, over the judged periods, shape (T,), J.
+        """V less the work of operators and environments, over the judged periods, in J.
 
-        By the theorem this quantity does not rise.
+        According to the theorem this quantity, of shape (T,), does not rise.
         """
         rise = self._accumulate_judged(self.V - self.external_work)
         unsupplied: Array = self.V[0] + rise
@@ -303,7 +321,7 @@ class EnergyBalance:
 
     @property
     def _work_from_outside(self) -> dict[str, Array]:
-        """External work by source (hands, walls, stops)."""
+        """Work of operators, environments and stops, by source."""
         sources = {}
         for name in EXTERNAL_SOURCES:
             if name in self.work:
@@ -312,12 +330,12 @@ class EnergyBalance:
 
     @property
     def external_work(self) -> Array:
-        """Work of operators, environments and stops since the first tick, shape (T,), J."""
+        """Work of operators, environments and stops since the first tick, shape (T,), in J."""
         return _sum(self._work_from_outside)
 
     @property
     def external(self) -> dict[str, Array]:
-        """External work by source (hands, walls, stops), of sources that did any work."""
+        """Work of operators, environments and stops, of sources that did any work."""
         sources = self._work_from_outside
         return {name: work for name, work in sources.items() if work.any()}
 
@@ -335,13 +353,13 @@ class EnergyBalance:
 def compute_energy_balance(
     energies: Mapping[str, SiteEnergy], *, paper_weights: bool = False
 ) -> EnergyBalance:
-    """Returns the energy balance of a group of sites.
+    """Computes the energy balance of a group of sites.
 
     Args:
-        energies: energies of the sites in scenario order; no site follows a site outside the
+        energies: Energies of the sites in scenario order. No site may follow a site outside the
             group.
-        paper_weights: give all sites the same weight, as in the paper; the balance need not
-            close then.
+        paper_weights: True to give all sites the same weight, as in the paper. The balance need
+            not close then.
     """
     times = find_common_times(energies)
     weights_by_grid = {}
@@ -358,6 +376,7 @@ def compute_energy_balance(
             weights_by_grid[grid] = _trace_weights(
                 energies, records, paper_weights=paper_weights
             )
+
         beta_left, beta_right = weights_by_grid[grid]
         left = beta_left[:, n]
         right = beta_right[:, n]
@@ -368,9 +387,11 @@ def compute_energy_balance(
             sums[key] = resampled
         beta_columns.append(_resample(times, t_s, left))
         sites[site] = _resample(times, t_s, left * energy.parts.total)
+
         is_unjudged = (~energy.judged).astype(np.float64)
         unjudged_periods = _accumulate(is_unjudged)
         unjudged += np.abs(_resample(times, t_s, unjudged_periods))
+
     judged: Bools = np.diff(unjudged) == 0.0
     all_judged = bool(judged.all())
 
@@ -402,13 +423,13 @@ def compute_energy_balance(
 def _weigh_site(energy: SiteEnergy, left: Array, right: Array) -> dict[tuple[str, str], Array]:
     """Returns a site's weighted contributions to the balance, at its own ticks.
 
-    A change of the weight itself does work on V_i, along a ramp and at a step. That work is
-    booked under `shares`.
+    A change of the weight itself does work on V, along a ramp and at a step. That work is
+    booked as the work of the dominance factors, "shares".
 
     Args:
-        energy: energies of the site over K ticks.
-        left: the site's weight at every tick, shape (K,).
-        right: its weight at the end of every period, before a step there, shape (K - 1,).
+        energy: Energies of the site over K ticks.
+        left: Weight of the site at every tick, shape (K,).
+        right: Its weight at the end of every period, before a step there, shape (K - 1,).
 
     Returns:
         Contributions by (kind, name), shape (K,) each, in J.
@@ -428,6 +449,7 @@ def _weigh_site(energy: SiteEnergy, left: Array, right: Array) -> dict[tuple[str
         weighted["dissipation", name] = weigh(increment)
     for name, increment in energy.work.items():
         weighted["work", name] = weigh(increment)
+
     V = energy.parts.total
     V_start = V[:-1]
     V_end = V[1:]
@@ -435,13 +457,20 @@ def _weigh_site(energy: SiteEnergy, left: Array, right: Array) -> dict[tuple[str
     step_work = (after_step - right) * V_end
     weight_work = _accumulate(ramp_work + step_work)
     weighted["work", "shares"] = weighted["work", "shares"] + weight_work
+
     weighted["sampling", ""] = weigh(energy.sampling)
     weighted["transfer", ""] = weigh(energy.transfer)
     return weighted
 
 
 def _resample(times: Array, t_s: Array, values: Array) -> Array:
-    """Returns values at `t_s` interpolated at `times`; unchanged if the times are equal."""
+    """Interpolates values at the times `times`. Equal times return the same values.
+
+    Args:
+        times: Times of the result, shape (T,), in s.
+        t_s: Times of the values, shape (K,), in s.
+        values: The values, shape (K,).
+    """
     if len(t_s) == len(times) and t_s[0] == times[0]:
         return values
     return np.interp(times, t_s, values)
@@ -453,7 +482,12 @@ def _trace_weights(
     *,
     paper_weights: bool,
 ) -> tuple[Array, Array]:
-    """Returns the weights beta of all N sites, on the tick grid of one site's records.
+    """Returns the weights beta of all N sites, at the ticks of one site.
+
+    Args:
+        energies: Energies of the N sites.
+        records: Records of the site that has these ticks.
+        paper_weights: True to return the weights of the paper, which are ones.
 
     Returns:
         beta at the ticks, shape (K, N).
@@ -493,12 +527,12 @@ def _interpolate_dominance(
     t_s: Array,
     ahead_s: float = 0.0,
 ) -> Array:
-    """Returns the dominance matrix of a group of sites over time, shape (T, N, N).
+    """Returns the matrix of dominance factors of a group of sites over time, shape (T, N, N).
 
     Args:
-        energies: energies of the N sites; peers outside the group are left out.
-        t_s: times, shape (T,), s.
-        ahead_s: time by which a ramp in progress is extrapolated, in s.
+        energies: Energies of the N sites. Peers outside the group are left out.
+        t_s: Times, shape (T,), in s.
+        ahead_s: Time by which a ramp in progress is extrapolated, in s.
     """
     names = list(energies)
     alpha = np.zeros((len(t_s), len(names), len(names)))
@@ -523,9 +557,9 @@ def _interpolate_dominance(
 
 
 def find_dominance_matrices(energies: Mapping[str, SiteEnergy]) -> Array:
-    """Returns all dominance matrices that were in force, shape (M, N, N).
+    """Returns all matrices of dominance factors that were in force, shape (M, N, N).
 
-    Of a ramp the matrices at its ends are returned.
+    For a ramp, the matrices at its ends are returned.
     """
     motions = [energy.motion for energy in energies.values()]
     first_s = motions[0].records.t_s[:1]
@@ -549,6 +583,6 @@ def rise_above_minimum(values: Array) -> Array:
 
 
 def _sum(columns: Mapping[str, Array]) -> Array:
-    """Returns the sum of columns at each time, shape (T,)."""
+    """Returns the sum of curves at each time, shape (T,)."""
     total: Array = np.sum(list(columns.values()), axis=0)
     return total

@@ -1,26 +1,34 @@
-"""The corrected functional V_i of a site, and all terms that change it, in J.
+"""Evaluates the energy function V_i of a site, and all terms that change it, in J.
+
+The stability proof uses the sum of these functions over all sites. Here r = qd + Lambda e is
+the filtered error of a site, e its error and ed the derivative of e, M the inertia matrix of
+the arm, theta its parameters and theta_hat their estimates, Gamma, Lambda, Kp and Kd gains, and
+alpha_ij the dominance factor with which site i follows peer j:
 
     V_i = 1/2 ( r'M r + (theta_hat - theta)' Gamma^-1 (theta_hat - theta) + e' Lambda Kd e
                 + sum_j alpha_ij int qd_j' Kd qd_j ds )
 
-The integral runs from the stamp of the sample in use to now. This is the paper's Eq. (16) with
-the integral that its Eq. (22) needs (docs/errata.md). With |x|^2 = x'Kd x, its derivative is
+The integral runs from the time at which the sample in use was sent to now. This is the paper's
+Eq. (16) with the integral that its Eq. (22) needs (docs/errata.md). With |x|^2 = x'Kd x, its
+derivative is
 
     V_i' = -r'Kp r - 1/2 sum_j alpha_ij |qd_i - qd_j(t - T)|^2
            - 1/2 |qd_i|^2 + 1/2 sum_j alpha_ij |qd_j|^2
 
 The terms of the first line dissipate energy. The terms of the second line transfer it between
-sites, and cancel under the weights beta. In task space e and qd_j are errors and velocities of
-end effectors, and r belongs to the task (`following`); docs/certificate.md has the rest.
+sites, and cancel in the sum over all sites with the weights beta. In task space e and qd_j are
+errors and velocities of end effectors, and r belongs to the task (see `following`).
+docs/certificate.md has the rest.
 
-Within a sample period each term is integrated by the trapezoid rule, with an error of second
-order in the period. An exact jump at the end of the period follows. A jump of e is divided
-among the links, changes of dominance, and the rule for stale peers.
+Within a tick period each term is integrated by the trapezoid rule, with an error of second
+order in the period. At the end of the period a new sample comes into use, so that e jumps. The
+energy of the jump is computed exactly, and divided among the links, the changes of dominance
+factors, and the rule for silent peers.
 
 Invariant:
-    - Operators and environments do work on r = qd + Lambda e, not on qd: the theorem requires
-      passivity with respect to r.
-    - A site has a functional if its control law is the paper's, and theta of its arm is known.
+    - Operators and environments do work on r and not on qd, because the theorem requires that
+      they are passive with respect to r.
+    - A site has an energy function if its control law is the paper's, and theta is known.
 """
 
 from collections.abc import Mapping
@@ -41,29 +49,34 @@ from ..following import Following, build_following
 from ..torque_sources import TorqueSplit
 
 RATE_TOLERANCE = 1e-12
-"""A torque is at its rate limit if it is nearer than this, as a share of its largest value."""
+"""Largest distance from the rate limit at which a torque counts as limited.
+
+It is a share of the largest torque.
+"""
 JUMP_TOLERANCE = 1e-12
-"""Smaller changes of e, rad, and of its derivative, rad/s, are no jump."""
+"""Largest change of e, in rad, or of its derivative, in rad/s, that is no jump."""
 
 
 class SiteConstants(NamedTuple):
-    """Constants of a site; vectors per joint have shape (n,), per parameter (P,).
+    """Constants of a site. Vectors per joint have the shape (n,), vectors per parameter (P,).
+
+    In task space, vectors per coordinate of the task have the shape (m,).
 
     Attributes:
-        arm: the arm with its true parameters.
-        Lambda: gain of the error, 1/s; in task space of shape (m,).
-        Kp: gain of r, N m s/rad.
-        Kd: gain of ed, N m s/rad; in task space of shape (m,), N s/m.
-        Gamma: adaptation gains.
-        low: lower limits of the estimates.
-        high: upper limits of the estimates.
-        tau_limit: largest torque of a joint, N m, shape () or (n,).
-        axes: for each coordinate of the task, 1 if the site follows along it; else 0, and then
-            Lambda and Kd are 0 too; () in joint space.
-        rho: largest robust torque of each joint, N m.
-        width: value of r at which the robust torque is 0.71 of the largest, rad/s.
-        friction: share of the joints' friction that the law compensates.
-        tau_rate: largest rate of the torque of a joint, N m/s, shape () or (n,).
+        arm: The arm with its true parameters.
+        Lambda: Gain of the error, in 1/s. Per coordinate in task space.
+        Kp: Gain of r, in N m s/rad.
+        Kd: Gain of ed, in N m s/rad. In task space per coordinate, in N s/m.
+        Gamma: Adaptation gains.
+        low: Lower limits of the estimates.
+        high: Upper limits of the estimates.
+        tau_limit: Largest torque of a joint, in N m, shape () or (n,).
+        axes: For each coordinate of the task, 1 if the site follows along it, else 0. Lambda
+            and Kd are then 0 too. Empty in joint space.
+        rho: Largest robust torque of each joint, in N m.
+        width: Value of r at which the robust torque is 0.71 of the largest, in rad/s.
+        friction: Share of the joints' friction that the law compensates.
+        tau_rate: Largest rate of the torque of a joint, in N m/s, shape () or (n,).
     """
 
     arm: ArmRows
@@ -87,14 +100,14 @@ class SiteConstants(NamedTuple):
 
     @property
     def weighing_Kd(self) -> Array:  # noqa: N802 - the paper's symbol
-        """Kd as the weights of V use it, shape (m,): NaN along axes that are not followed."""
+        """Kd as the weights of V use it, shape (m,). NaN along axes that are not followed."""
         if not self.axes:
             return self.Kd
         is_free = np.array(self.axes) == 0.0
         return np.where(is_free, np.nan, self.Kd)
 
     def robust_torque(self, r: Array) -> Array:
-        """Returns the robust torque that opposes r in addition to Kp r, shape (K, n), N m."""
+        """Returns the robust torque that opposes r in addition to Kp r, shape (K, n)."""
         root = np.sqrt(r**2 + self.width**2)
         return self.rho * r / root
 
@@ -114,13 +127,19 @@ class SiteConstants(NamedTuple):
 
 
 def derive_site_constants(scenario: Scenario, site: str) -> SiteConstants:
-    """Returns the constants of a site whose law is the paper's, with or without a box."""
+    """Returns the constants of a site whose control law is the paper's.
+
+    Args:
+        scenario: Scenario of the run.
+        site: Name of the site.
+    """
     spec = scenario.sites[site]
     arm = build_arm_rows(scenario, site)
     gains = scenario.gains(site)
     gain_arrays = {}
     for name in ("Lambda", "Kp", "Kd", "Gamma", "low", "high", "rho", "width", "friction"):
         gain_arrays[name] = np.array(getattr(gains, name))
+
     axes: tuple[float, ...] = ()
     if arm.task is not None:
         axes = arm.task.axes
@@ -136,24 +155,24 @@ def derive_site_constants(scenario: Scenario, site: str) -> SiteConstants:
 
 
 class PeriodEnds(NamedTuple):
-    """The ends of all K - 1 periods, shape (K - 1, n) each.
+    """The motion of a site at both ends of all K - 1 tick periods, shape (K - 1, n) each.
 
-    At the end of a period e jumps. `left` means the start of the period, `right` its end before
-    the jump, and `middle` half-way through the jump. In task space, e and its jumps have m
-    coordinates, in m.
+    At the end of a period a new sample comes into use, and e jumps. `left` means the start of
+    the period, `right` its end before the jump, and `middle` half-way through the jump. In task
+    space, e and its jumps have m coordinates, in m.
 
     Attributes:
         following: True if the site followed its peers at both ends, shape (K - 1,).
-        link: for each peer, the jump of e by the age of its sample, shape (peers, K - 1, n),
-            rad.
-        dominance: jump of e by a step of dominance factors, rad.
-        rule: jump of e by the rule for stale peers, rad.
-        r_left: r = qd + Lambda e at the start, rad/s.
-        r_right: r before the jump, rad/s.
-        r_middle: r half-way through the jump, rad/s.
-        e_middle: e half-way through the jump, rad.
-        qd_des_left: reference velocity at the start, rad/s.
-        qd_des_right: reference velocity before the jump, rad/s.
+        link: For each peer, the jump of e by the change of its sample's age, shape
+            (peers, K - 1, n), in rad.
+        dominance: Jump of e by a step of dominance factors, in rad.
+        rule: Jump of e by the rule for silent peers, in rad.
+        r_left: r = qd + Lambda e at the start, in rad/s.
+        r_right: r before the jump, in rad/s.
+        r_middle: r half-way through the jump, in rad/s.
+        e_middle: e half-way through the jump, in rad.
+        qd_des_left: Velocity of the reference at the start, in rad/s.
+        qd_des_right: Velocity of the reference before the jump, in rad/s.
     """
 
     following: Bools
@@ -170,16 +189,19 @@ class PeriodEnds(NamedTuple):
 
 @dataclass(frozen=True)
 class SiteMotion:
-    """Motion of a site and everything that acts on it, over K rows.
+    """The recorded motion of a site, and everything that acts on it, over K records.
+
+    All energies of the site are computed from this object.
 
     Attributes:
-        records: records of the site.
-        constants: constants of the site.
-        dominance: dominance factors for its peers.
-        peers: the peers as the site sees them, in the order of the dominance factors.
-        torque: torque ON the arm by source.
-        scheme: whether the controller holds tau_k, or extrapolates the torque.
-        common: for each coordinate, 1 if all sites follow along it, else 0; () if all sites
+        records: Records of the site.
+        constants: Constants of the site.
+        dominance: Dominance factors of its peers.
+        peers: The motion of the peers as the site sees them, in the order of the dominance
+            factors.
+        torque: External torque on the arm, by source.
+        scheme: Whether the controller holds the torque for a tick, or extrapolates it.
+        common: For each coordinate, 1 if all sites follow along it, else 0. Empty if all sites
             follow along all coordinates.
     """
 
@@ -200,9 +222,9 @@ class SiteMotion:
 
     @cached_property
     def r(self) -> Array:
-        """The sliding variable, shape (K, n), rad/s.
+        """The filtered error (sliding variable) r, shape (K, n), in rad/s.
 
-        It is qd + Lambda e, Eq. (10), and in task space qd - v.
+        It is qd + Lambda e, Eq. (10). In task space it is qd - v with the reference velocity v.
         """
         records = self.records
         v, _ = self.following.compute_reference(slice(None), records.e, records.ed)
@@ -210,7 +232,7 @@ class SiteMotion:
 
     @cached_property
     def Yr(self) -> Array:  # noqa: N802 - the paper's symbol
-        """Y'r of Eq. (15), shape (K, P)."""
+        """Y'r of Eq. (15), with the regressor Y of the arm's dynamics, shape (K, P)."""
         records = self.records
         v, a = self.following.compute_reference(slice(None), records.e, records.ed)
         return self.constants.arm.gradient(
@@ -223,7 +245,7 @@ class SiteMotion:
 
     @cached_property
     def mean_Yr(self) -> Array:  # noqa: N802 - the paper's symbol
-        """Y'r with which the scheme advances the estimate over a period, shape (K - 1, P)."""
+        """Y'r with which the law advances the estimate over a period, shape (K - 1, P)."""
         if self.scheme is Scheme.DIGITAL:
             return self.Yr[:-1]
         Yr_left = self.Yr[:-1]
@@ -231,7 +253,14 @@ class SiteMotion:
         return 0.5 * (Yr_left + Yr_right)
 
     def law_torque(self, rows: Ints) -> Array:
-        """Returns tau of Eq. (13) without its limit, in some rows, shape (K, n), N m."""
+        """Returns the torque of the control law, Eq. (13), without its limit, in N m.
+
+        Args:
+            rows: Rows of the records, shape (K,).
+
+        Returns:
+            Torque, shape (K, n).
+        """
         return self.control_torque(
             rows,
             e=self.records.e[rows],
@@ -246,13 +275,16 @@ class SiteMotion:
         ed: Array,
         r: Array,
     ) -> Array:
-        """Returns tau of Eq. (13) without its limit, with the given errors, shape (K, n), N m.
+        """Returns the torque of the control law, Eq. (13), for given errors.
 
         Args:
-            rows: rows whose pose and estimate are used.
-            e: errors in place of the recorded ones, shape (K, n).
-            ed: their derivatives, shape (K, n).
-            r: sliding variable in place of the recorded one, shape (K, n).
+            rows: Rows whose pose and estimate are used.
+            e: Errors in place of the recorded ones, shape (K, n).
+            ed: Their derivatives, shape (K, n).
+            r: Filtered errors in place of the recorded ones, shape (K, n).
+
+        Returns:
+            Torque without its limit, shape (K, n), in N m.
         """
         records = self.records
         c = self.constants
@@ -273,40 +305,45 @@ class SiteMotion:
 
     @property
     def rests(self) -> Bools:
-        """True if the torque may not be that of the law alone, shape (K,)."""
+        """True if the arm comes to rest, so that the torque may not be that of the law."""
         records = self.records
         if records.rests.size:
             return records.rests
         return np.zeros(len(records.known), dtype=np.bool_)
 
     @cached_property
-    def nearest_torques(self) -> tuple[Array, Array]:
-        """The smallest and the largest torque that a row may have, shape (K, n) each, N m.
+    def torque_bounds(self) -> tuple[Array, Array]:
+        """Smallest and largest torque that the limits permit in each record, in N m.
 
-        They follow from the torque's limit, and from its rate limit after the tick before.
+        The torque limit applies to every record. The rate limit additionally bounds the
+        difference from the torque of the previous record.
+
+        Returns:
+            Lower and upper bounds, each of shape (K, n).
         """
         records = self.records
-        c = self.constants
+        limits = self.constants
         shape = records.tau.shape
-        low = np.broadcast_to(-c.tau_limit, shape).copy()
-        high = -low
-        if not np.any(np.isfinite(c.tau_rate)):
-            return low, high
-        # the torque before tick 0 is zero; before any other first tick it is unknown
-        zero = np.zeros(shape[1])
-        before = np.vstack([zero, records.tau[:-1]])
-        step_limit = records.h_s * c.tau_rate
-        largest_step = np.broadcast_to(step_limit, shape).copy()
+        lower = np.broadcast_to(-limits.tau_limit, shape).copy()
+        upper = -lower
+        if not np.any(np.isfinite(limits.tau_rate)):
+            return lower, upper
+
+        torque_before_start = np.zeros(shape[1])
+        previous_torque = np.vstack([torque_before_start, records.tau[:-1]])
+        change_limit = records.h_s * limits.tau_rate
+        largest_change = np.broadcast_to(change_limit, shape).copy()
         if records.first != 0:
-            largest_step[0] = np.inf
-        lowest = np.maximum(low, before - largest_step)
-        highest = np.minimum(high, before + largest_step)
+            # The records start in the middle of the run: the torque before them is unknown.
+            largest_change[0] = np.inf
+        lowest = np.maximum(lower, previous_torque - largest_change)
+        highest = np.minimum(upper, previous_torque + largest_change)
         return lowest, highest
 
     @cached_property
     def limited(self) -> Bools:
         """True for each torque at its limit or at its rate limit, shape (K, n)."""
-        low, high = self.nearest_torques
+        low, high = self.torque_bounds
         c = self.constants
         tau = self.records.tau
         tolerance: Array | float = 0.0
@@ -319,11 +356,11 @@ class SiteMotion:
 
     @cached_property
     def ends(self) -> PeriodEnds:
-        """The ends of all periods.
+        """The motion at both ends of all tick periods.
 
-        While the site follows its peers, its reference moves smoothly by Eq. (6) with all
-        stamps moving at rate one. Otherwise the rule for stale peers decides, and the trapezoid
-        rule is applied to the recorded derivative.
+        While the site follows its peers, its reference moves smoothly within a period by Eq.
+        (6), as if the samples in use grew no older. Otherwise the rule for silent peers
+        decides, and the trapezoid rule is applied to the recorded velocity of the reference.
         """
         records = self.records
         dominance = self.dominance
@@ -382,7 +419,14 @@ class SiteMotion:
 
 
 class FunctionalParts(NamedTuple):
-    """The four parts of V_i in the order of the module's docstring, shape (K,) each, J."""
+    """The four parts of V_i in the order of the module's docstring, shape (K,) each, in J.
+
+    Attributes:
+        kinetic: Energy of r.
+        parameter: Energy of the errors of the estimates.
+        position: Energy of the error e.
+        delay: Energy of the peers' motion that is under way on the links.
+    """
 
     kinetic: Array
     parameter: Array
@@ -391,21 +435,23 @@ class FunctionalParts(NamedTuple):
 
     @property
     def total(self) -> Array:
-        """V_i, shape (K,), J."""
+        """V_i, shape (K,), in J."""
         return self.kinetic + self.parameter + self.position + self.delay
 
 
 def evaluate_functional(site: SiteMotion) -> FunctionalParts:
-    """Returns the functional of a site along its records."""
+    """Returns the energy function V_i of a site along its records."""
     records = site.records
     c = site.constants
     r = site.r
     momentum = c.arm.multiply_inertia(records.q, r)
     r_M_r = (r * momentum).sum(axis=1)
+
     parameter_error = (records.theta_hat - c.theta)[:, c.adapts]
     scaled_squares = parameter_error**2 / c.Gamma[c.adapts]
     stiffness = c.Lambda * c.Kd
     e_K_e = (stiffness * records.e**2).sum(axis=1)
+
     delay_terms = []
     for j, view in enumerate(site.peers.values()):
         alpha = site.dominance.alpha[:, j]
@@ -419,18 +465,26 @@ def evaluate_functional(site: SiteMotion) -> FunctionalParts:
 
 
 def _energy_in_transit(c: SiteConstants, view: DelayedPeer) -> Array:
-    """Returns 1/2 int qd_j' Kd qd_j ds from the stamp in use to now, shape (K,), J."""
+    """Returns 1/2 int qd_j' Kd qd_j ds from the time of the sample in use to now, in J.
+
+    Args:
+        c: Constants of the site.
+        view: Motion of peer j as the site sees it.
+
+    Returns:
+        The energy at every record, shape (K,).
+    """
     integral_of_squares = view.now.squares - view.delayed.squares
     return 0.5 * (integral_of_squares @ c.Kd)
 
 
 class Increment(NamedTuple):
-    """An amount of energy per period, shape (K - 1,) each, J.
+    """An amount of energy in each tick period, shape (K - 1,) each, in J.
 
     Attributes:
-        left: contribution of the start of the period to the trapezoid rule.
-        right: contribution of the end of the period, before a jump.
-        jump: amount at the jump after it.
+        left: Contribution of the start of the period to the trapezoid rule.
+        right: Contribution of the end of the period, before the jump of e.
+        jump: Amount at the jump.
     """
 
     left: Array
@@ -439,7 +493,7 @@ class Increment(NamedTuple):
 
     @property
     def total(self) -> Array:
-        """The amount of every period, shape (K - 1,), J."""
+        """The whole amount of every period, shape (K - 1,), in J."""
         return self.left + self.right + self.jump
 
 
@@ -449,7 +503,14 @@ def _trapezoid(
     right: Array,
     jump: Array | None = None,
 ) -> Increment:
-    """Returns the trapezoid rule over powers at both ends of every period, and a jump."""
+    """Integrates a power over every tick period by the trapezoid rule.
+
+    Args:
+        site: Motion of the site.
+        left: Power at the start of every period, shape (K - 1,), in W.
+        right: Power at the end of every period, in W.
+        jump: Energy of the jump after each period, in J. None for no energy.
+    """
     half_s = 0.5 * site.records.h_s
     if jump is None:
         jump = np.zeros(len(left))
@@ -457,13 +518,13 @@ def _trapezoid(
 
 
 def _jump_alone(amount: Array) -> Increment:
-    """Returns amounts that all belong to the jumps at the ends of periods."""
+    """Returns amounts of energy that all belong to the jumps at the ends of periods."""
     zero = np.zeros(len(amount))
     return Increment(zero, zero, amount)
 
 
 def _zero_increment(site: SiteMotion) -> Increment:
-    """Returns an increment of no energy in every period."""
+    """Returns no energy in every period."""
     periods = len(site.records.known) - 1
     return _jump_alone(np.zeros(periods))
 
@@ -512,6 +573,7 @@ def compute_dissipation(site: SiteMotion) -> dict[str, Increment]:
     if not all(site.common):
         open_axes = 1.0 - np.array(site.common)
         dissipation["open axes"] = compute_transfer(site, open_axes)
+
     friction_left = friction_power(ends.r_left, records.qd[:-1])
     friction_right = friction_power(ends.r_right, records.qd[1:])
     if friction_left.any() or friction_right.any():
@@ -520,13 +582,14 @@ def compute_dissipation(site: SiteMotion) -> dict[str, Increment]:
 
 
 def compute_transfer(site: SiteMotion, axes: Array) -> Increment:
-    """Returns the energy that a site gives to its followers, less the energy it gets.
+    """Returns the energy that a site gives to its followers, less the energy that it gets.
 
-    That is int 1/2 |qd_i|^2 - 1/2 sum_j alpha_ij |qd_j|^2.
+    It is int (1/2 |qd_i|^2 - 1/2 sum_j alpha_ij |qd_j|^2) dt, and cancels in the weighted sum
+    over all sites.
 
     Args:
-        site: motion of the site.
-        axes: weight of each axis, 1 or 0, shape (m,) or ().
+        site: Motion of the site.
+        axes: Weight of each axis, 1 or 0, shape (m,) or ().
     """
     dominance = site.dominance
     c = site.constants._replace(Kd=axes * site.constants.Kd)
@@ -550,7 +613,10 @@ def _weighted_square(c: SiteConstants, x: Array) -> Array:
 
 
 def compute_work(site: SiteMotion) -> dict[str, Increment]:
-    """Returns the work on a site by source: all terms besides transfer that may raise V_i."""
+    """Returns the work on a site, by source.
+
+    The sources are all terms besides the transfer that may raise V_i.
+    """
     torque = site.torque
     records = site.records
     c = site.constants
@@ -575,12 +641,12 @@ def compute_work(site: SiteMotion) -> dict[str, Increment]:
 
 
 def torque_work(site: SiteMotion, now: Array, held: Array) -> Increment:
-    """Returns the work int r' tau_h of a torque ON the arm.
+    """Returns the work int r' tau_h dt of an external torque on the arm.
 
     Args:
-        site: motion of the site.
-        now: part of the torque that follows the state, shape (K, n), N m.
-        held: part of the torque that is held over every period, shape (K, n), N m.
+        site: Motion of the site.
+        now: Part of the torque that follows the motion, shape (K, n), in N m.
+        held: Part of the torque that is held during every period, shape (K, n), in N m.
     """
     torque_left = now[:-1] + held[:-1]
     torque_right = now[1:] + held[:-1]
@@ -592,14 +658,18 @@ def torque_work(site: SiteMotion, now: Array, held: Array) -> Increment:
 def link_work(site: SiteMotion, j: int) -> Increment:
     """Returns the work of the link from peer j: the change of V_i when a sample's age jumps.
 
-    At the end of a period the stamp s + h is replaced by the stamp s' of the next sample in
-    use. With r and e half-way through the jump, and de the jump of e by this link, the work is
-    exactly
+    At the end of a period the sample in use, which was sent at s and has moved on to s + h, is
+    replaced by the next one, which was sent at s'. With r and e half-way through the jump, and
+    de the jump of e by this link, the work is exactly
 
         (Lambda M r + Lambda Kd e)' de - 1/2 alpha_ij int qd_j' Kd qd_j ds from s + h to s'.
 
-    For an age that varies smoothly this is the integral of the theorem's missing term with
-    dT/dt.
+    For an age that varies smoothly this is the integral of the term with dT/dt that the theorem
+    leaves out.
+
+    Args:
+        site: Motion of the site.
+        j: Index of the peer.
     """
     view = list(site.peers.values())[j]
     integral_of_squares = view.delayed_end.squares - view.delayed.squares[1:]
@@ -610,7 +680,7 @@ def link_work(site: SiteMotion, j: int) -> Increment:
 
 
 def dominance_change_work(site: SiteMotion) -> Increment:
-    """Returns the work on V_i of a change of dominance factors, along a ramp or at a step.
+    """Returns the work of a change of dominance factors on V_i, along a ramp or at a step.
 
     Along a ramp its power is
 
@@ -630,6 +700,7 @@ def dominance_change_work(site: SiteMotion) -> Increment:
     jump = _energy_of_jump(site, ends.dominance)
     qd_left = records.shared_rate[:-1]
     qd_right = records.shared_rate[1:]
+
     for j, view in enumerate(site.peers.values()):
         stored = _energy_in_transit(c, view)
         integral_at_end = view.now.squares[1:] - view.delayed_end.squares
@@ -650,7 +721,7 @@ def dominance_change_work(site: SiteMotion) -> Increment:
 
 
 def stale_rule_work(site: SiteMotion) -> Increment:
-    """Returns the work of the rule for stale peers, while it replaces Eq. (6)."""
+    """Returns the work of the rule for silent peers, while it replaces Eq. (6)."""
     dominance = site.dominance
     ends = site.ends
     ruled = ~ends.following
@@ -666,6 +737,7 @@ def stale_rule_work(site: SiteMotion) -> Increment:
     # the rule replaces the reference velocity that Eq. (6) would have
     replaced_left = ends.qd_des_left - np.sum(left_terms, axis=0)
     replaced_right = ends.qd_des_right - np.sum(right_terms, axis=0)
+
     rate = site.records.shared_rate
     Kd = site.constants.Kd
     left = (rate[:-1] * Kd * replaced_left).sum(axis=1)
@@ -680,7 +752,10 @@ def stale_rule_work(site: SiteMotion) -> Increment:
 
 
 def torque_limit_work(site: SiteMotion) -> Increment:
-    """Returns the work int r' (tau - tau of Eq. (13)) of limits and rests on the torque."""
+    """Returns the work int r' (tau - tau_law) dt of torques that are not those of the law.
+
+    Torques differ from tau_law of Eq. (13) at their limits, and while the arm comes to rest.
+    """
     records = site.records
     power = np.zeros(len(records.known))
     is_limited = site.limited.any(axis=1)
@@ -693,7 +768,10 @@ def torque_limit_work(site: SiteMotion) -> Increment:
 
 
 def unknown_friction_work(site: SiteMotion) -> Increment:
-    """Returns the work -int r' friction(v) of friction that the law does not compensate."""
+    """Returns the work -int r' friction(v) dt of friction that the law does not compensate.
+
+    v = qd - r is the reference velocity.
+    """
     records = site.records
     c = site.constants
     ends = site.ends
@@ -710,9 +788,10 @@ def unknown_friction_work(site: SiteMotion) -> Increment:
 
 
 def singular_pose_work(site: SiteMotion) -> Increment:
-    """Returns the work of the damping near singular poses.
+    """Returns the work of the damping of the inverse Jacobian near singular poses.
 
-    The work is int r'M(a - v') - (J r - x' - Lambda e)'Kd ed. Both terms are zero if J J+ = I.
+    The work is int (r'M(a - v') - (J r - x' - Lambda e)'Kd ed) dt. Both terms are zero if J J+
+    = I.
     """
     ends = site.ends
     e_right = 2.0 * ends.e_middle - site.records.e[1:]
@@ -740,7 +819,15 @@ def _singular_pose_power(
     qd_des: Array,
     r: Array,
 ) -> Array:
-    """Returns the power of the damping near singular poses at one end of every period, W."""
+    """Returns the power of this damping at one end of every period, shape (K - 1,), in W.
+
+    Args:
+        site: Motion of the site.
+        rows: Rows of this end in the records.
+        e: Errors, shape (K - 1, m).
+        qd_des: Velocity of the reference, shape (K - 1, m).
+        r: Filtered errors, shape (K - 1, n).
+    """
     records = site.records
     c = site.constants
     velocity_error, acceleration_error = site.following.compute_damping_deviation(rows, e)
@@ -754,13 +841,16 @@ def _singular_pose_power(
 
 
 def measure_torque_error(site: SiteMotion) -> Array:
-    """Returns the difference between recorded torques and Eq. (13), shape (K,), N m.
+    """Returns how far the recorded torques are from the control law, Eq. (13), in N m.
 
-    Eq. (13) is taken within its limits. The difference is the largest of all joints, and 0 in
-    rows without a record and while the site rests.
+    The law is evaluated within its limits.
+
+    Returns:
+        The largest difference of all joints, shape (K,). 0 in rows without a record, and while
+        the arm comes to rest.
     """
     records = site.records
-    low, high = site.nearest_torques
+    low, high = site.torque_bounds
     all_rows = np.arange(len(records.known))
     law_torque = site.law_torque(all_rows)
     limited_torque = np.clip(law_torque, low, high)
@@ -771,16 +861,18 @@ def measure_torque_error(site: SiteMotion) -> Array:
 
 
 def estimate_work(site: SiteMotion) -> Increment:
-    """Returns the work of estimates that do not follow Eq. (15): held in their box, or fixed.
+    """Returns the work of estimates that do not follow the adaptive law, Eq. (15).
 
-    The box reduces 1/2 (theta_hat - theta)' Gamma^-1 (theta_hat - theta), since it contains
-    theta. For a parameter that is not adapted, or not while the site rests, no term cancels the
+    Such estimates are held at the limits of their box, or are not adapted at all. The box
+    reduces 1/2 (theta_hat - theta)' Gamma^-1 (theta_hat - theta), since it contains theta. For
+    a parameter that is not adapted, or not while the arm comes to rest, no term cancels the
     power r' Y (theta_hat - theta).
     """
     records = site.records
     c = site.constants
     theta_hat = records.theta_hat
     parameter_error = theta_hat - c.theta
+
     change = np.diff(parameter_error, axis=0)
     is_unchanged = (change == 0.0).all(axis=1)
     is_frozen = np.concatenate([[False], is_unchanged]) & site.rests
@@ -796,23 +888,24 @@ def estimate_work(site: SiteMotion) -> Increment:
     with np.errstate(divide="ignore", invalid="ignore"):
         box_work = mean_error * correction / c.Gamma
     jump = np.where(is_held, box_work, 0.0).sum(axis=1)
+
     fixed_power = site.Yr * parameter_error
     power = np.where(is_fixed, fixed_power, 0.0).sum(axis=1)
     return _trapezoid(site, power[:-1], power[1:], jump)
 
 
 def compute_sampling_work(site: SiteMotion) -> Increment:
-    """Returns the work of the scheme that samples the continuous law.
+    """Returns the work that arises because the continuous law is executed in ticks.
 
     The work has two parts:
 
-    - int r' (u - tau), where u is the torque that is held: tau_k of `digital`, or the
-      extrapolated torque of `second_order`. tau is taken as a straight line up to its value
-      before the jump.
-    - the scheme's step of the estimate, in place of the trapezoid rule on Eq. (15).
+    - int r' (u - tau) dt, where u is the torque that is held: the torque of the tick for the
+      scheme `digital`, or the extrapolated torque for `second_order`. tau is taken as a
+      straight line up to its value before the jump of e.
+    - The step of the estimate, compared with the trapezoid rule on Eq. (15).
 
-    This work is not part of the balance. The residual of the balance less this work is the
-    unexplained energy.
+    This work is not part of the energy balance. The residual of the balance less this work is
+    the unexplained energy.
     """
     records = site.records
     c = site.constants
@@ -840,7 +933,7 @@ def _evaluate_before_jump(site: SiteMotion) -> tuple[Array, Array]:
     """Returns the torque and Y'r at the end of every period, before the jump of e.
 
     Returns:
-        tau of Eq. (13) within its limit, shape (K - 1, n), N m.
+        Torque of the law, Eq. (13), within its limit, shape (K - 1, n), in N m.
         Y'r of Eq. (15), shape (K - 1, P).
     """
     records = site.records
@@ -868,6 +961,7 @@ def _evaluate_before_jump(site: SiteMotion) -> tuple[Array, Array]:
         a=a,
         r=r,
     )
+
     law_torque = site.control_torque(rows, e, ed, r)
     limited_torque = np.clip(law_torque, -c.tau_limit, c.tau_limit)
     # a torque at its rate limit, or of a resting site, does not move with a jump of e
@@ -880,17 +974,17 @@ def _evaluate_before_jump(site: SiteMotion) -> tuple[Array, Array]:
 
 
 def _energy_of_jump(site: SiteMotion, de: Array) -> Array:
-    """Returns the share of `de` in the change of 1/2 (r'M r + e' Lambda Kd e) at every jump.
+    """Returns the change of 1/2 (r'M r + e' Lambda Kd e) at every jump, because of `de`.
 
     Both terms are quadratic in e. Their change is therefore exactly the gradient half-way
     through the whole jump, times the jump, and it is linear in `de`.
 
     Args:
-        site: motion of the site.
-        de: part of the jump of e, shape (K - 1, n).
+        site: Motion of the site.
+        de: Part of the jump of e, shape (K - 1, n).
 
     Returns:
-        The change, shape (K - 1,), J.
+        The change, shape (K - 1,), in J.
     """
     c = site.constants
     ends = site.ends

@@ -1,16 +1,19 @@
-"""Judges the energies that control laws declare, from the records of a run.
+"""Checks the energies that a control law declares against the records of a run.
 
-A law may declare the energies that prove its passivity: those of its lines to peers, of its
-observers and of its tanks. This module recomputes what the arms exchanged with the laws, and
-checks the declared energies against that.
+Some control laws prove passivity by bookkeeping: they store energy in tanks, in lines between
+sites, or in passivity observers. Such a law declares these energies for every record. This
+module computes the same energies independently, from the recorded torques and motion, and
+compares them:
 
-    line from peer j to site i: energy that j's law sent, less energy that i's law received;
-    arm's port: sum over ticks of u_k' (q_{k+1} - q_k), u_k the torque that was held.
+- Energy of the line from site j to site i: the energy that the law of j sent into the line,
+  less the energy that the law of i received from it.
+- Energy through the port of an arm: the sum of u_k' (q_{k+1} - q_k) over all ticks k, where u_k
+  is the torque that was held during tick k, and q_k the joint angles.
 
 Invariant:
-    - The declared energies are believed only as far as they agree with the records.
-    - Lines and stores are never below zero, and the energy that a law dissipated never falls;
-      otherwise the verdict names the line, the store or the site.
+    - A declared energy counts as evidence only if it agrees with the computed energy.
+    - The verdict is negative if the energy of a line or store is ever below zero, or if the
+      energy that a law dissipated ever decreases. It names the line, the store or the site.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -31,15 +34,15 @@ from ..arm_rows import build_arm_rows
 from .premises import Premise
 
 LEAST_ENERGY_J = -1e-9
-"""Rounding error of an energy that is zero, J."""
+"""Rounding error of an energy that is zero, in J. It is negative, as lower bounds use it."""
 ROUNDING_SHARE = 1e-12
 """Further rounding error, as a share of the largest energy."""
 SAMPLING_SHARE = 1e-2
-"""Energy that arms may get beyond what their laws book, as a share of the largest energy."""
+"""Energy that an arm may get beyond what its law books, as a share of the largest energy."""
 
 
 class ObservedFinding(StrEnum):
-    """Class of a verdict; the value is the text for people."""
+    """What the declared energies show about a run. The value is the text for people."""
 
     PASSIVE = "observed energy never below zero"
     NEGATIVE = "observed energy below zero"
@@ -54,11 +57,11 @@ class EnergyCurve(NamedTuple):
         kind: "line" for the energy on the way from a peer to the site, "known" for the part of
             it that the site knows, "store" for energy that the law stores, "taken" for energy
             that the law dissipated, "given" for energy that the arm gave to the law.
-        site: name of the site.
-        peer: the other end of a line; "" otherwise.
-        t_s: times of the site's ticks, shape (K,), s.
-        energy_j: the sum of the energy's parts, shape (K,).
-        least_j: the smallest part, shape (K,).
+        site: Name of the site.
+        peer: Name of the site at the other end of a line. Empty for other kinds.
+        t_s: Times of the site's ticks, shape (K,), in s.
+        energy_j: Sum of the energy's parts, shape (K,).
+        least_j: Smallest part, shape (K,).
     """
 
     kind: str
@@ -83,9 +86,9 @@ class LeastEnergy(NamedTuple):
     """The minimum over time of an energy that must not be below zero.
 
     Attributes:
-        name: name of the energy's curve.
-        amount_j: the minimum.
-        at_s: time of the minimum.
+        name: Name of the energy's curve.
+        amount_j: The minimum.
+        at_s: Time of the minimum.
     """
 
     name: str
@@ -94,17 +97,17 @@ class LeastEnergy(NamedTuple):
 
 
 class ObservedEnergy(NamedTuple):
-    """Verdict on the energies that laws declare.
+    """Verdict on the energies that control laws declare, see `observe_energies`.
 
     Attributes:
-        finding: class of the verdict.
-        text: the verdict as a sentence.
-        premises: the premises of the verdict.
-        least: the minimum of every energy.
-        largest_j: the largest of all energies.
-        residual_j: the largest error in the books of a law.
-        sampling_j: the most energy that an arm got beyond what its law books.
-        curves: every energy over time, and what the arms gave to their laws.
+        finding: What the energies show.
+        text: The verdict as a sentence.
+        premises: The conditions under which the energies count as evidence.
+        least: Minimum of every energy.
+        largest_j: Largest of all energies.
+        residual_j: Largest error in the books of a law.
+        sampling_j: Largest energy that an arm got beyond what its law books.
+        curves: Every energy over time, and the energies that the arms gave to their laws.
     """
 
     finding: ObservedFinding
@@ -117,7 +120,7 @@ class ObservedEnergy(NamedTuple):
     curves: Sequence[EnergyCurve] = ()
 
     def to_json(self) -> JsonObject:
-        """Returns the verdict without its curves, ready for JSON."""
+        """Returns the verdict without its curves as plain values."""
         content = self._asdict()
         del content["curves"]
         content["finding"] = self.finding.name.lower()
@@ -127,15 +130,15 @@ class ObservedEnergy(NamedTuple):
 
 
 class _SiteBooks(NamedTuple):
-    """The energies of a site's law at its ticks, from the first tick on, shape (K,) each, J.
+    """The energies of a site's law at its ticks, from the first tick on, shape (K,) each, in J.
 
     Attributes:
-        t_s: times of the ticks, in s.
-        declared: the energies that the law declares.
-        port: energy that the arm gave to the law, according to the law.
-        taken: energy that the law dissipated.
-        residual: error of the law's books.
-        leak: energy that the arm got beyond what the law books.
+        t_s: Times of the ticks, in s.
+        declared: The energies that the law declares.
+        port: Energy that the arm gave to the law, according to the law.
+        taken: Energy that the law dissipated.
+        residual: Error of the law's books.
+        leak: Energy that the arm got beyond what the law books.
     """
 
     t_s: Array
@@ -147,18 +150,19 @@ class _SiteBooks(NamedTuple):
 
 
 def observe_energies(log: Log, *, own_laws: bool = False) -> ObservedEnergy | None:
-    """Returns the verdict on the energies that the laws of a log declare.
+    """Checks the energies that the control laws of a log declare.
 
     Args:
-        log: the log of a run.
-        own_laws: also evaluate laws from outside the program, which runs their code.
+        log: The log of the run.
+        own_laws: True to also evaluate laws that are not part of this program, which runs their
+            code.
 
     Returns:
-        The verdict, or None if no law declares energies.
+        The verdict. None if no law declares energies.
 
     Raises:
-        LogError: a record cannot be read.
-        ScenarioError: the file of a law from outside is missing.
+        LogError: A record cannot be read.
+        ScenarioError: The file of a law that is not part of this program is missing.
     """
     laws: dict[str, Any] = {}
     for site, spec in log.scenario.sites.items():
@@ -170,11 +174,13 @@ def observe_energies(log: Log, *, own_laws: bool = False) -> ObservedEnergy | No
                 laws[site] = law
     if not laws:
         return None
+
     unjudged = ObservedFinding.NOT_JUDGED
     silent = [site for site in log.sites if site not in laws]
     if silent:
         text = f"{unjudged}: the law of {', '.join(silent)} declares none"
         return ObservedEnergy(unjudged, text)
+
     parts = {site: log[site] for site in log.sites}
     incomplete = []
     for site, part in parts.items():
@@ -184,12 +190,19 @@ def observe_energies(log: Log, *, own_laws: bool = False) -> ObservedEnergy | No
     if incomplete:
         text = f"{unjudged}: records of {', '.join(incomplete)} are missing"
         return ObservedEnergy(unjudged, text)
+
     books = {site: _read_books(log, site, law) for site, law in laws.items()}
     return _judge_books(log, books)
 
 
 def _read_books(log: Log, site: str, law: Any) -> _SiteBooks:
-    """Returns the energies of a site's law, declared and recomputed from the records."""
+    """Returns the energies of a site's law, declared by the law and computed from the records.
+
+    Args:
+        log: The log of the run.
+        site: Name of the site.
+        law: The law, which has a method `energies`.
+    """
     part = log[site]
     setup = log.scenario.setup(site)
     # no law computed a record with the mode "diverged"
@@ -199,6 +212,7 @@ def _read_books(log: Log, site: str, law: Any) -> _SiteBooks:
     limit_nm = np.array(setup.tau_limit_nm)
     digital = setup.scheme is Scheme.DIGITAL
     held_torque = hold_torque(records.tau, limit_nm, digital=digital)
+
     arm_gave = -sum_work(held_torque, records.q)
     if setup.theta_known:
         # holding the arm against gravity is no work of the law
@@ -213,6 +227,7 @@ def _read_books(log: Log, site: str, law: Any) -> _SiteBooks:
     sent = sum(map(_add_parts, declared.gave))
     dissipated = port + (received - sent) - stored
     dissipated -= dissipated[0]
+
     taken = dissipated
     if declared.taken is not None:
         taken = declared.taken - declared.taken[0]
@@ -227,7 +242,7 @@ def _read_books(log: Log, site: str, law: Any) -> _SiteBooks:
 
 
 def _add_parts(energy: Array) -> Array:
-    """Returns the sum of an energy's parts, shape (K,)."""
+    """Returns the sum of an energy's parts at every tick, shape (K,)."""
     parts = energy.reshape(len(energy), -1)
     total: Array = parts.sum(axis=1)
     return total
@@ -239,7 +254,14 @@ def _read_law_records(
     law: Any,
     count: int,
 ) -> LawRecords:
-    """Returns the first `count` records of a site in the form that a law expects."""
+    """Returns the records of a site in the form that a law expects.
+
+    Args:
+        log: The log of the run.
+        site: Name of the site.
+        law: The law.
+        count: Number of records, from the first one on.
+    """
     part = log[site]
     sent = {key: values[:count] for key, values in part.sent.items()}
     return LawRecords(
@@ -260,7 +282,14 @@ def _read_law_memory(
     law: Any,
     count: int,
 ) -> dict[str, Array]:
-    """Returns the attributes that a law remembers, over the first `count` records."""
+    """Returns the values that a law stores from tick to tick, by the attribute of the law.
+
+    Args:
+        log: The log of the run.
+        site: Name of the site.
+        law: The law, which lists these attributes in `remembers`.
+        count: Number of records, from the first one on.
+    """
     part = log[site]
     rule = log.scenario.sites[site].on_stale.rule
     life_length = part.layout.count_life_memory(len(part.peers), degrades=rule.degrades)
@@ -268,6 +297,7 @@ def _read_law_memory(
     first = part.layout.shared + 1
     if rule.action is StaleAction.GLIDE:
         first = life_length
+
     attributes = getattr(law, "remembers", ())
     lengths = [np.size(getattr(law, attribute)) for attribute in attributes]
     memory = part.memory(first, sum(lengths))[:count]
@@ -284,13 +314,21 @@ def _read_peer_records(
     sent: Mapping[str, Array],
     count: int,
 ) -> PeerRecords:
-    """Returns the values that a site's law received from a peer, and sent to this peer alone.
+    """Returns the values that a law received from a peer, and those sent to this peer alone.
 
     A key such as `wave[s]` is a value for site s alone.
+
+    Args:
+        log: The log of the run.
+        site: Name of the site of the law.
+        peer: Name of the peer.
+        sent: Values that the law sent.
+        count: Number of records, from the first one on.
     """
     tick = log[site].used[peer][:count]
     has_sample = tick[:, np.newaxis] >= 0
     row = np.maximum(tick, 0)
+
     received = {}
     for key, values in log[peer].sent.items():
         name = key.removesuffix(f"[{site}]")
@@ -298,6 +336,7 @@ def _read_peer_records(
         if "[" in name:
             continue
         received[name] = np.where(has_sample, values[row], 0.0)
+
     sent_to_peer = {}
     for key, values in sent.items():
         if key.endswith(f"[{peer}]"):
@@ -307,7 +346,12 @@ def _read_peer_records(
 
 
 def _find_curves(log: Log, books: Mapping[str, _SiteBooks]) -> Iterator[EnergyCurve]:
-    """Yields the energies that must not be below zero."""
+    """Yields the energies that must not be below zero, over time.
+
+    Args:
+        log: The log of the run.
+        books: Energies of every site's law.
+    """
     for site, site_books in books.items():
         declared = site_books.declared
         energies = []
@@ -344,7 +388,12 @@ def _find_curves(log: Log, books: Mapping[str, _SiteBooks]) -> Iterator[EnergyCu
 
 
 def _judge_books(log: Log, books: Mapping[str, _SiteBooks]) -> ObservedEnergy:
-    """Returns the verdict on the energies of all sites."""
+    """Returns the verdict on the energies of all sites.
+
+    Args:
+        log: The log of the run.
+        books: Energies of every site's law.
+    """
     curves = list(_find_curves(log, books))
     least = []
     for curve in curves:
@@ -355,6 +404,7 @@ def _judge_books(log: Log, books: Mapping[str, _SiteBooks]) -> ObservedEnergy:
             at_s=float(curve.t_s[row]),
         )
         least.append(minimum)
+
     largest_j = max(float(curve.energy_j.max()) for curve in curves)
     for site, site_books in books.items():
         port = site_books.port
@@ -367,9 +417,11 @@ def _judge_books(log: Log, books: Mapping[str, _SiteBooks]) -> ObservedEnergy:
             least_j=port,
         )
         curves.append(curve)
+
     ports_j = [float(np.abs(site_books.port).max()) for site_books in books.values()]
     scale_j = max(largest_j, *ports_j)
     premises = _check_books(log, books, scale_j)
+
     lowest = min(least, key=lambda energy: energy.amount_j)
     failed = [premise.name for premise in premises if not premise.holds]
     if not premises[0].holds:
@@ -383,6 +435,7 @@ def _judge_books(log: Log, books: Mapping[str, _SiteBooks]) -> ObservedEnergy:
         text = f"{count_nouns(len(least), 'energy')}, the largest {largest_j:.4g} J"
         if failed:
             text += f"; but a premise fails: {', '.join(failed)}"
+
     return ObservedEnergy(
         finding=finding,
         text=f"{finding}: {text}",
@@ -401,12 +454,16 @@ def _largest_residual_j(site_books: _SiteBooks) -> float:
 
 
 def _check_books(log: Log, books: Mapping[str, _SiteBooks], scale_j: float) -> list[Premise]:
-    """Returns the premises on the books of all laws: `books`, `torque` and `sampling`.
+    """Checks the conditions under which the declared energies count as evidence.
+
+    - books: the energies that each law declares add up;
+    - torque: each law books the torque that the arm received, even if it was cut off;
+    - sampling: arms get little energy between the ticks beyond what their laws book.
 
     Args:
-        log: the log of the run.
-        books: the energies of every site's law.
-        scale_j: the largest energy that occurs.
+        log: The log of the run.
+        books: Energies of every site's law.
+        scale_j: Largest energy that occurs.
     """
     residual_j = {site: _largest_residual_j(site_books) for site, site_books in books.items()}
     worst = max(residual_j, key=residual_j.__getitem__)

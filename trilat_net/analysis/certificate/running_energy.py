@@ -1,13 +1,14 @@
-"""Computes V, and the work of operators and environments, while a session runs.
+"""Computes the energy function V, and the work of operators, while a session runs.
 
-The newest records of every site are kept in a window. V is computed by the functions of
-`certify`, over the records of these windows.
+V is the function of the stability proof, see `energy_terms`. `certify` computes it from a whole
+log. This module receives the records as they arrive, keeps the newest ones of every site in a
+window, and computes V with the same functions over these windows.
 
 Invariant:
-    - V equals the V of `certify` at the same instants, up to rounding: the windows reach back
-      to the oldest sample in use.
-    - Nothing is extrapolated: an instant waits until its records are complete, and is skipped
-      if records are lost.
+    - V equals the V of `certify` at the same times, up to rounding, because the windows reach
+      back to the oldest sample in use.
+    - Nothing is extrapolated. V at a time is computed when all records up to it have arrived,
+      and is left out if records are lost.
     - The size of a window is bounded.
     - A record may arrive late, out of order or twice. Ticks without a record are marked
       unknown, as in `AlignedRecords`.
@@ -46,34 +47,37 @@ from .energy_balance import (
 from .premises import describe_closed_groups, explain_no_functional
 
 STEP_S = 0.25
-"""Shortest span over which V is computed in one call, s."""
+"""Shortest span of time over which V is computed in one call, in s."""
 LONGEST_STEP_S = 2.0
-"""Longest span over which V is computed in one call, s.
+"""Longest span of time over which V is computed in one call, in s.
 
-A longer backlog takes several calls.
+If more records are waiting, several calls are needed.
 """
 KEPT_S = 12.0
-"""Least time that a window reaches back, s.
+"""Least time that a window reaches back, in s.
 
 It covers the largest age of a sample, and the time within which a gap is filled.
 """
 _NEVER_TICK = -(2**40)
-"""The last resting tick of a site that has never rested."""
+"""Stands for the last resting tick of a site that has never rested."""
 _RAMP_MARGIN_S = 1.0
-"""Time for which a ramp is kept after a later ramp has replaced it, s."""
+"""Time for which a ramp is kept after a later ramp has replaced it, in s."""
 
 
 class RecordWindow:
-    """The newest records of one site.
+    """The newest records of one site, in arrays of fixed size.
 
     Args:
-        scenario: the session's scenario.
-        site: name of the site.
-        kept_s: least time that the window reaches back, in s.
+        scenario: Scenario of the session.
+        site: Name of the site.
+        kept_s: Least time that the window reaches back, in s.
 
     Attributes:
-        first: the oldest tick of the window.
-        newest: the newest recorded tick; -1 before the first record.
+        site: Name of the site.
+        rate_hz: Tick rate of the site.
+        peers: Names of the site's peers.
+        first: Oldest tick of the window.
+        newest: Newest recorded tick. -1 before the first record.
     """
 
     def __init__(self, scenario: Scenario, site: str, kept_s: float = KEPT_S) -> None:
@@ -114,21 +118,25 @@ class RecordWindow:
         """Stores a record.
 
         Returns:
-            False if the record is older than the window, or if its mode is "diverged".
+            False if the record was not stored, because it is older than the window or belongs
+            to an arm that exceeded its limits (mode "diverged").
         """
         tick = record.tick
         if tick < self.first or record.mode == "diverged":
             return False
+
         if self.newest < 0:
             self.first = max(0, tick - self._kept)
         if tick - self.first >= len(self._floats):
             self._shift_to(tick - self._kept + 1)
+
         row = tick - self.first
         for name, columns in self._columns.items():
             self._floats[row, columns] = getattr(record, name)
         self._used[row] = [record.used.get(peer, -1) for peer in self.peers]
         if self._glides and record.mode in RESTING_MODES:
             self._last_resting_tick = max(self._last_resting_tick, tick)
+
         ticks_since_rest = tick - self._last_resting_tick
         self._known[row] = True
         self._rests[row] = 0 <= ticks_since_rest <= RESUMING_S * self.rate_hz
@@ -137,7 +145,7 @@ class RecordWindow:
         return True
 
     def _is_unlimited(self, record: State) -> bool:
-        """True if the reference of a record moves slower than its limit."""
+        """Returns True if the reference of a record moves slower than its limit."""
         if self._limits.qd_des_limit_rad_s is None:
             return True
         qd_des = np.array(record.qd_des)
@@ -154,19 +162,28 @@ class RecordWindow:
         self.first = first
 
     def has_record(self, tick: int) -> bool:
-        """True if the window has a record of tick `tick`."""
+        """Returns True if the window contains the record of a tick."""
         if not self.first <= tick <= self.newest:
             return False
         return bool(self._known[tick - self.first])
 
     def rows(self, first: int, last: int) -> AlignedRecords:
-        """Returns the records of ticks `first` to `last`; missing records are interpolated."""
+        """Returns the records of a span of ticks. Missing records are interpolated.
+
+        Args:
+            first: First tick.
+            last: Last tick.
+
+        Returns:
+            The records. `known` is False for the missing ones.
+        """
         part = slice(first - self.first, last + 1 - self.first)
         known = self._known[part].copy()
         floats = self._floats[part]
         used = self._used[part]
         follows = self._follows[part].copy()
         rests = self._rests[part].copy()
+
         if not known.all() and known.any():
             floats = floats.copy()
             ticks = np.arange(len(known))
@@ -180,6 +197,7 @@ class RecordWindow:
             used = used[last_known]
             follows = follows[last_known]
             rests = rests[last_known]
+
         columns: dict[str, Any] = {}
         for name, span in self._columns.items():
             columns[name] = floats[:, span]
@@ -197,13 +215,13 @@ class RecordWindow:
 
 
 class EnergyCourse(NamedTuple):
-    """The functional V over some instants.
+    """The energy function V over a span of time.
 
     Attributes:
-        t_s: instants, at ticks of the fastest site, shape (T,), s.
-        V: the functional, shape (T,), J.
-        supplied: work of operators and environments since the first computed instant, shape
-            (T,), J.
+        t_s: Times of the ticks of the fastest site, shape (T,), in s.
+        V: The energy function, shape (T,), in J.
+        supplied: Work of operators and environments since the first computed time, shape (T,),
+            in J.
     """
 
     t_s: Array
@@ -212,14 +230,14 @@ class EnergyCourse(NamedTuple):
 
 
 class RunningEnergy:
-    """Computes V of a running session, span by span.
+    """Computes V of a running session, one span of time after the other.
 
     Args:
-        scenario: the session's scenario.
-        windows: the newest records of every site, which are updated while the session runs.
+        scenario: Scenario of the session.
+        windows: The newest records of every site, which their owner updates during the session.
 
     Attributes:
-        reason: the reason why V cannot be computed; "" if it can.
+        reason: The reason why V cannot be computed. Empty if it can.
     """
 
     def __init__(self, scenario: Scenario, windows: Mapping[str, RecordWindow]) -> None:
@@ -234,21 +252,30 @@ class RunningEnergy:
         self._supplied = 0.0
 
     def add_changes(self, site: str, changes: Iterable[CoreChange]) -> None:
-        """Adds the changes of a site's dominance factors; other changes have no effect on V."""
+        """Applies changes of a site's dominance factors. Other changes have no effect on V.
+
+        Args:
+            site: Name of the site.
+            changes: The changes.
+        """
         _, ramps = self._dominance[site]
         for change in changes:
             if change.ramp is not None:
                 ramps.append(change.ramp)
 
     def compute_next(self, complete: Mapping[str, int]) -> EnergyCourse | None:
-        """Returns V since the last call; None if no further span is complete yet.
+        """Returns V since the last call.
 
         Args:
-            complete: for every site, the last tick up to which each record has arrived or is
+            complete: For every site, the last tick up to which each record has arrived or is
                 lost.
+
+        Returns:
+            V over the next span. None if no further span is complete, or if V is unknown in it.
         """
         if self.reason or min(complete.values()) < 1:
             return None
+
         complete_times_s = []
         oldest_times_s = []
         for site, window in self._windows.items():
@@ -256,17 +283,27 @@ class RunningEnergy:
             oldest_times_s.append(window.first / window.rate_hz)
         complete_s = min(complete_times_s)
         oldest_s = max(oldest_times_s)
+
         if self._computed_until_s is None:
             self._computed_until_s = oldest_s
         if complete_s - self._computed_until_s < STEP_S:
             return None
+
         begin_s = max(self._computed_until_s, oldest_s)
         end_s = min(complete_s, begin_s + LONGEST_STEP_S)
         self._computed_until_s = end_s
         return self._compute_span(begin_s, end_s)
 
     def _compute_span(self, begin_s: float, end_s: float) -> EnergyCourse | None:
-        """Returns V from the end of the span before until `end_s`; None if V is not known."""
+        """Returns V over a span of time.
+
+        Args:
+            begin_s: Start of the span, in s.
+            end_s: End of the span, in s.
+
+        Returns:
+            V and the supplied work. None if V is not known.
+        """
         tick_spans = {}
         for site, window in self._windows.items():
             first = int(np.ceil(begin_s * window.rate_hz - 1e-6))
@@ -274,6 +311,7 @@ class RunningEnergy:
             if last - first < 1:
                 return None
             tick_spans[site] = (first, last)
+
         energies = self._derive_energies(tick_spans)
         for alpha in find_dominance_matrices(energies):
             groups = find_closed_groups(alpha)
@@ -282,14 +320,17 @@ class RunningEnergy:
                 names = [[sites[n] for n in group] for group in groups[:2]]
                 self.reason = describe_closed_groups(names)
                 return None
+
         is_known = len(find_common_times(energies)) > 1
         balance = compute_energy_balance(energies) if is_known else None
+
         ramps_from_s = begin_s - _RAMP_MARGIN_S
         for site, (start, ramps) in self._dominance.items():
             self._dominance[site] = drop_finished_ramps(start, ramps, ramps_from_s)
         # in a session that was joined late, the oldest samples in use are unknown at first
         if balance is None:
             return None
+
         supplied = self._supplied + balance.external_work
         self._supplied = float(supplied[-1])
         return EnergyCourse(balance.t_s, balance.V, supplied)
@@ -297,7 +338,11 @@ class RunningEnergy:
     def _derive_energies(
         self, tick_spans: Mapping[str, tuple[int, int]]
     ) -> dict[str, SiteEnergy]:
-        """Returns the energies of all sites over their spans of ticks, (first, last) each."""
+        """Returns the energies of all sites over a span of ticks.
+
+        Args:
+            tick_spans: First and last tick of the span, by site.
+        """
         records = {}
         # for each site, the first tick whose sample a peer may still use
         oldest_used = {}
@@ -308,6 +353,7 @@ class RunningEnergy:
             for peer, used in site_records.used.items():
                 oldest = max(int(used.min()) - 2, 0)
                 oldest_used[peer] = min(oldest_used[peer], oldest)
+
         pasts = {}
         for site, window in self._windows.items():
             first = max(oldest_used[site], window.first)

@@ -353,7 +353,7 @@ def find_joint_loads(view: RunView) -> list[JointLoad]:
 
 
 def count_static_windows(view: RunView) -> Metric:
-    """Returns the number of static windows of a run. Without any, the metric states a reason."""
+    """Returns the number of static windows of a run, or the reason why there are none."""
     if view.absent:
         return Metric(None, f"no records of {', '.join(view.absent)}")
     windows = view.compute_once(find_static_windows)
