@@ -1,8 +1,8 @@
 """Finds the largest gains with which equal arms can follow each other over a delay.
 
 Two or three equal arms follow one another over links with the given delay. Each joint has a
-stiffness K and a damping, the sum of d against its own motion and Kd against the motion of the
-other arm. All gains lie on a ray with one parameter k:
+stiffness K, a damping d of its own velocity, and for some laws a damping Kd of the velocity of
+its error. All gains lie on a ray with one parameter k:
 
     K = k m,    d + Kd = 2 zeta sqrt(k) m,
 

@@ -1,14 +1,16 @@
-"""The worker pool of all studies, which runs a function on many items.
+"""Runs a function on many items in parallel; the worker pool of all studies.
 
-Items run in this process, in worker processes (loky) or on a Dask cluster
-(`on="tcp://SCHEDULER:8786"`); any `concurrent.futures.Executor` can do the work.
+An item is a piece of work such as one simulated run. The items run in this process, in worker
+processes of this machine (by the library loky), or on a Dask cluster with the address
+"tcp://SCHEDULER:8786". Any other `concurrent.futures.Executor` can also run them. Several items
+are sent to a worker at once, as a batch, so that the overhead of the communication is small.
 
 Invariant:
-    - Results do not depend on which worker runs an item.
+    - The result of an item does not depend on the worker that runs it.
     - The number of items in flight is bounded.
-    - An item whose worker died runs again, at most `MAX_LOSSES` times in all. Its last attempt
-      is a batch of its own while nothing else runs, so that the item in the error message is
-      the one that kills its workers.
+    - An item whose worker died runs again, at most `MAX_LOSSES` times in all. In its last
+      attempt it is the only item that runs. Therefore the item that is named in the error
+      message is the one that kills its workers.
 """
 
 import textwrap
@@ -37,38 +39,39 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 Progress = Callable[[int, int], None]
-"""Called with the number of finished items and the number of all items."""
+"""Function that is called with the number of finished items and the number of all items."""
 Workers = str | Executor | None
-"""The address of a Dask scheduler, an executor, or None for processes of this machine."""
+"""Address of a Dask scheduler, an executor, or None for processes of this machine."""
 
 BATCH_S = 0.4
-"""Duration of a batch of items: with 20 ms per item its overhead is below 1 %."""
+"""Intended duration of a batch, in s, so that the overhead of a batch is below 1 % of it."""
 CLUSTER_BATCH_S = 2.0
-"""Duration of a batch on a cluster, where each batch has an overhead of about 20 ms."""
+"""Intended duration of a batch on a cluster, in s. There a batch costs about 20 ms."""
 MAX_BATCH = 400
 """Largest number of items in a batch."""
-_SMALLEST = 16
-"""The last batches have at least a full batch's number of items divided by this."""
+_SMALLEST_FRACTION = 16
+"""The last batches have at least the number of items of a full batch divided by this number."""
 MAX_LOSSES = 3
-"""Number of losses of its worker after which an item is given up."""
+"""Number of lost workers after which an item is given up."""
 _BATCHES_PER_WORKER = 2
-"""A batch in work and a waiting batch, so that no worker is idle."""
+"""Number of batches per worker in flight: one runs and one waits, so that no worker is idle."""
 _POLL_S = 1.0
+"""Period in which a cluster is checked while no batch ends, in s."""
 _MAX_NAME = 200
-"""Longest name of an item in an error message."""
+"""Largest number of characters of an item's name in an error message."""
 
 
 def ignore_progress(_done: int, _total: int) -> None:
-    """Shows no progress."""
+    """Does nothing, as the progress function of a caller that shows no progress."""
 
 
 class _BatchResult(NamedTuple):
-    """Results of a batch.
+    """Result of a batch, which a worker sends back.
 
     Attributes:
-        results: results of the items up to the first error.
-        wall_s: duration of these items, s.
-        error: the first error; None if all items have a result.
+        results: Results of the items, up to the first error.
+        wall_s: Duration of these items, in s.
+        error: First error. None if all items have a result.
     """
 
     results: list[Any]
@@ -82,16 +85,17 @@ def run_batch(
     required: WorkerRequirements | None,
     allowed: CodeConsents,
 ) -> _BatchResult:
-    """Runs a function on the items of a batch, in a worker.
+    """Runs a function on the items of a batch. A worker executes this.
 
     Args:
-        function: the function.
-        items: the items.
-        required: requirements on the worker; None: no requirements.
-        allowed: imported laws that may run.
+        function: The function.
+        items: The items.
+        required: Requirements on the worker, such as the version of the program. None if there
+            are no requirements.
+        allowed: Imported control laws that the user allowed to run.
 
     Raises:
-        UsageError: this worker does not meet the requirements.
+        UsageError: This worker does not meet the requirements.
     """
     if required is not None:
         check_this_worker(required)
@@ -110,12 +114,12 @@ def run_batch(
 
 
 class _Batch(NamedTuple):
-    """A batch in flight.
+    """A batch that was sent to a worker and has not ended yet.
 
     Attributes:
-        numbers: numbers of the items.
-        items: the items.
-        executor: the executor that runs them.
+        numbers: Numbers of the items.
+        items: The items.
+        executor: Executor that runs the items.
     """
 
     numbers: list[int]
@@ -124,13 +128,16 @@ class _Batch(NamedTuple):
 
 
 class _Feed(Generic[T]):
-    """The queue of items, which forms the batches.
+    """Queue of the items, which combines them to batches.
+
+    The size of the batches follows from the measured duration of the items. Items whose worker
+    died come back to this queue.
 
     Args:
-        items: the items.
-        count: number of items; None: unknown.
-        workers: number of workers.
-        batch_s: intended duration of a batch, s.
+        items: The items.
+        count: Number of items. None if it is not known.
+        workers: Number of workers.
+        batch_s: Intended duration of a batch, in s.
     """
 
     def __init__(
@@ -141,77 +148,88 @@ class _Feed(Generic[T]):
         self._workers = workers
         self._batch_s = batch_s
         self._retries: deque[tuple[int, T]] = deque()
-        self._suspects: deque[tuple[int, T]] = deque()
+        self._suspects: deque[tuple[int, T]] = deque()  # items in their last attempt
         self._losses: Counter[int] = Counter()
         self._runs = 0
         self._wall_s = 0.0
 
     def add_timing(self, runs: int, wall_s: float) -> None:
-        """Adds measured items to the mean duration per item, which sets the batch size.
+        """Adds finished items to the mean duration per item, which determines the batch size.
 
         Args:
-            runs: number of items.
-            wall_s: their duration together, s.
+            runs: Number of finished items.
+            wall_s: Duration of all of them together, in s.
         """
         self._runs = self._runs + runs
         self._wall_s = self._wall_s + wall_s
 
     def pop_batch(self, *, idle: bool) -> list[tuple[int, T]]:
-        """Returns the next batch as pairs of number and item; [] if no item can run now.
+        """Removes the next batch from the queue.
+
+        Items whose worker died come first, and form a batch of their own.
 
         Args:
-            idle: no batch is in flight. Only then does an item that may kill its worker leave
-                the queue.
+            idle: True if no batch is in flight. An item that probably kills its worker leaves
+                the queue only then.
+
+        Returns:
+            Pairs of the number of an item and the item. Empty if no item can run now.
         """
         if self._suspects:
             return [self._suspects.popleft()] if idle else []
         if self._retries:
             return [self._retries.popleft()]
-        size = 1
+
+        size = 1  # until the duration of an item is known
         if self._wall_s > 0.0:
             size = min(MAX_BATCH, int(self._batch_s * self._runs / self._wall_s))
         if self._remaining is not None:
-            # small batches at the end leave no worker idle
-            share = self._remaining // (2 * self._workers * _BATCHES_PER_WORKER)
-            size = min(size, max(share, size // _SMALLEST))
+            # Towards the end the batches become smaller, so that no worker is idle for long.
+            fair_size = self._remaining // (2 * self._workers * _BATCHES_PER_WORKER)
+            size = min(size, max(fair_size, size // _SMALLEST_FRACTION))
         batch = list(islice(self._new, max(1, size)))
         if self._remaining is not None:
             self._remaining -= len(batch)
         return batch
 
     def return_lost(self, batch: _Batch, losses: int = 1) -> list[tuple[int, T]]:
-        """Puts the items of a lost batch back into the queue.
+        """Puts the items of a batch whose worker died back into the queue.
 
         Args:
-            batch: the batch.
-            losses: number of losses that count for each item.
+            batch: The batch.
+            losses: Number of losses that count for each item.
 
         Returns:
-            The items that were lost `MAX_LOSSES` times and stay out of the queue.
+            The items that were lost `MAX_LOSSES` times. They are given up and do not return to
+            the queue.
         """
-        lost = []
+        given_up = []
         for number, item in zip(batch.numbers, batch.items, strict=True):
             self._losses[number] += losses
-            if self._losses[number] >= MAX_LOSSES:
-                lost.append((number, item))
-            elif self._losses[number] == MAX_LOSSES - 1:
+            attempts_left = MAX_LOSSES - self._losses[number]
+            if attempts_left <= 0:
+                given_up.append((number, item))
+            elif attempts_left == 1:
                 self._suspects.append((number, item))
             else:
                 self._retries.append((number, item))
-        return lost
+        return given_up
 
 
 class WorkerPool:
-    """The workers of a study.
+    """The workers of a study. `open_worker_pool` creates this object.
 
     Args:
-        executor: the executor of the batches; None: items run in this process.
-        workers: number of items that run at the same time.
-        restart: returns a new executor after the loss of a worker broke the old one; None: the
-            executor cannot be replaced.
-        cluster: the cluster to which the executor belongs.
-        required: requirements on each worker of the cluster.
-        hint: advice in the message about a lost worker.
+        executor: Executor that runs the batches. None if the items run in this process.
+        workers: Number of items that run at the same time.
+        restart: Function that returns a new executor after a dying worker broke the old one.
+            None if the executor cannot be replaced.
+        cluster: Cluster to which the executor belongs, if any.
+        required: Requirements on each worker of the cluster.
+        hint: Advice for the user that follows the message about a dead worker.
+
+    Attributes:
+        is_local: True if the items run in this process.
     """
 
     def __init__(
@@ -238,18 +256,21 @@ class WorkerPool:
         lost: Callable[[T], R] | None = None,
         count: int | None = None,
     ) -> Iterator[tuple[int, R]]:
-        """Yields the number and the result of each item, in the order in which they end.
+        """Runs a function on each item, and yields the results as the items end.
 
         Args:
-            function: a function at module level, so that another process can import it.
-            items: the items; messages name them by their `str`.
-            lost: returns the result of an item that killed its workers; None: such an item is
-                an error.
-            count: number of items, if known.
+            function: Function at module level, so that another process can import it.
+            items: The items. Error messages name an item by its `str`.
+            lost: Function that returns the result of an item that killed its workers. None if
+                such an item is an error.
+            count: Number of items, if it is known.
+
+        Yields:
+            The number of an item and its result.
 
         Raises:
-            RunFailed: an item killed its workers, or no workers are left.
-            UsageError: a worker does not meet the requirements.
+            RunFailed: An item killed its workers, or no workers are left.
+            UsageError: A worker does not meet the requirements.
         """
         if self._executor is None:
             for number, item in enumerate(items):
@@ -257,6 +278,7 @@ class WorkerPool:
                     result = function(item)
                 yield number, result
             return
+
         batch_s = BATCH_S if self._cluster is None else CLUSTER_BATCH_S
         feed = _Feed(items, count, self.workers, batch_s)
         pending: dict[Future[_BatchResult], _Batch] = {}
@@ -271,7 +293,8 @@ class WorkerPool:
                 for future in sorted(ended, key=lambda future: pending[future].numbers):
                     yield from self._collect(future, pending.pop(future), feed, lost)
         finally:
-            # own processes end with the pool, and loky fails on futures that are cancelled
+            # Processes of this machine end together with the pool. Their futures are not
+            # cancelled, because loky fails on cancelled futures.
             if self._restart is None:
                 for future in pending:
                     future.cancel()
@@ -282,7 +305,17 @@ class WorkerPool:
         items: Sequence[T],
         progress: Progress = ignore_progress,
     ) -> list[R]:
-        """Returns the function's results in the order of the items, and reports progress."""
+        """Returns the results of a function in the order of the items.
+
+        Args:
+            function: Function at module level, so that another process can import it.
+            items: The items.
+            progress: Function that is called whenever an item has ended.
+
+        Raises:
+            RunFailed: An item killed its workers, or no workers are left.
+            UsageError: A worker does not meet the requirements.
+        """
         results: dict[int, R] = {}
         for number, result in self.iterate_results(function, items, count=len(items)):
             results[number] = result
@@ -295,7 +328,13 @@ class WorkerPool:
         feed: _Feed[T],
         pending: dict[Future[_BatchResult], _Batch],
     ) -> None:
-        """Submits batches until every worker has one in work and one waiting."""
+        """Submits batches until every worker has one batch that runs and one that waits.
+
+        Args:
+            function: The function to run on each item.
+            feed: Queue of the items.
+            pending: Batches in flight, by their futures. New batches are added.
+        """
         assert self._executor is not None
         while len(pending) < self.workers * _BATCHES_PER_WORKER:
             batch = feed.pop_batch(idle=not pending)
@@ -321,10 +360,14 @@ class WorkerPool:
         """Yields the results of a batch that ended, or returns its items to the queue.
 
         Args:
-            future: the future of the batch.
-            batch: the batch.
-            feed: the queue.
-            lost: returns the result of an item that killed its workers, see `iterate_results`.
+            future: Future of the batch.
+            batch: The batch.
+            feed: Queue of the items.
+            lost: Function that returns the result of an item that killed its workers, see
+                `iterate_results`.
+
+        Raises:
+            RunFailed: An item killed its workers, and `lost` is None.
         """
         try:
             result = future.result()
@@ -332,17 +375,20 @@ class WorkerPool:
             self._replace_executor(batch.executor)
             given_up = feed.return_lost(batch)
         except (Exception, CancelledError) as error:
-            if self._cluster is None or not self._cluster.is_worker_loss(error):
+            is_worker_loss = self._cluster is not None and self._cluster.is_worker_loss(error)
+            if not is_worker_loss:
                 raise
-            # Dask has repeated a single item already
+            # Dask itself has already repeated a batch, so a single item is given up at once.
             losses = 1 if len(batch.items) > 1 else MAX_LOSSES
             given_up = feed.return_lost(batch, losses)
         else:
             feed.add_timing(len(result.results), result.wall_s)
+            # If an item failed, there are fewer results than items.
             yield from zip(batch.numbers, result.results, strict=False)
             if result.error is not None:
                 raise result.error
             return
+
         for number, item in given_up:
             if lost is None:
                 name = textwrap.shorten(str(item), _MAX_NAME, placeholder="...")
@@ -350,10 +396,16 @@ class WorkerPool:
             yield number, lost(item)
 
     def _replace_executor(self, broken: Executor) -> None:
-        """Starts a new executor in place of a broken one, unless that has been done already.
+        """Starts a new executor in place of a broken one.
+
+        Several batches of the broken executor fail one after another. Only the first failure
+        starts a new executor.
+
+        Args:
+            broken: The broken executor.
 
         Raises:
-            RunFailed: the executor cannot be replaced.
+            RunFailed: The executor cannot be replaced.
         """
         if self._restart is None:
             raise RunFailed(f"a worker process was ended{self._hint}") from None
@@ -370,17 +422,18 @@ def open_worker_pool(
     laws: Sequence[Any] = (),
     hint: str = "",
 ) -> Iterator[WorkerPool]:
-    """Yields the workers of a study, and ends the processes that it started.
+    """Opens the workers of a study. On exit, the processes that were started end.
 
     Args:
-        jobs: number of processes of this machine; None: one per core; 1: this process.
-        on: runs the items instead of processes of this machine.
-        most: number of items; no more processes are started.
-        laws: imported control laws that the items need; each worker must have their files.
-        hint: advice in the message about a lost worker.
+        jobs: Number of processes of this machine. None uses all cores, and 1 runs the items in
+            this process.
+        on: Workers to use instead of processes of this machine.
+        most: Number of items, so that no more processes are started.
+        laws: Imported control laws that the items need. Each worker must have their files.
+        hint: Advice for the user that follows the message about a dead worker.
 
     Raises:
-        UsageError: the cluster cannot be reached, a worker does not meet the requirements, or a
+        UsageError: The cluster cannot be reached, a worker does not meet the requirements, or a
             library is missing.
     """
     require_libraries()
@@ -414,10 +467,10 @@ def open_worker_pool(
 
 
 def check_workers(jobs: int | None, on: Workers) -> None:
-    """Refuses --jobs together with --on.
+    """Refuses the option --jobs together with --on, which it does not affect.
 
     Raises:
-        UsageError: both options are present.
+        UsageError: Both options are given.
     """
     if on is not None and jobs is not None:
         raise UsageError(
@@ -428,10 +481,10 @@ def check_workers(jobs: int | None, on: Workers) -> None:
 def count_workers(jobs: int | None, on: Workers = None) -> int:
     """Returns the number of items that will run at the same time.
 
-    The workers of a cluster are checked.
+    For a cluster, this connects to its scheduler and checks its workers.
 
     Raises:
-        UsageError: the cluster cannot be reached, or a worker does not meet the requirements.
+        UsageError: The cluster cannot be reached, or a worker does not meet the requirements.
     """
     check_workers(jobs, on)
     if on is None:
