@@ -1,13 +1,20 @@
-"""A Gymnasium environment in which one user of an experiment acts over the network.
+"""A Gymnasium environment for training a policy that operates one arm over the network.
+
+A policy takes the place of one user of an experiment. In each step it observes what that user
+can observe of the local arm and of the peers, the other arms, whose states arrive with the
+delay of the network. Its action is a target for the arm, or a force on it. All sites, each of
+which runs one arm, are simulated in virtual time.
 
 Invariant:
-    - An episode is a run in virtual time and a function of the scenario, the seed and the
-      actions; saved as a log it verifies.
-    - A step is a fixed number of ticks. A refused action makes no step and changes nothing.
-    - Steps follow a reset and end with the episode.
-    - Observations, and the time at which an action takes effect, are those of a user-written
-      hand (`OwnHand`), so that a trained policy can hold an arm live without changes. Only
-      orientations are observed as six numbers, which never jump (`expand_poses`).
+    - An episode is a run in virtual time, and a function of the scenario, the seed and the
+      actions. If the episode is saved as a log, this log can be verified bit for bit.
+    - A step is a fixed number of ticks of the control loop. An action that is refused makes no
+      step and changes nothing.
+    - Steps are possible only after a reset and until the end of the episode.
+    - The observations, and the time at which an action takes effect, are the same as for a
+      user-written operator (`OwnHand`). Therefore a trained policy can operate an arm in a live
+      session without changes. Only orientations differ: they are observed as six numbers,
+      which never jump (`expand_poses`).
 """
 
 import math
@@ -45,31 +52,36 @@ except ImportError:
     raise
 
 ENV_ID = "trilat_net/Teleoperation-v0"
+"""Name of the environment in the registry of Gymnasium."""
 FAR = 1e6
-"""Bound of observed numbers without a tighter bound: rad, rad/s, m, N m, s."""
+"""Bound of observed numbers that have no tighter bound, in rad, rad/s, m, N m or s."""
 MOST_DRAWS = {False: 1000, True: 100}
-"""Largest number of positions that a task draws until one is within reach.
+"""Largest number of random positions that a task tries until one is within reach.
 
-It is smaller for chains (True), for which a pose is searched numerically.
+It is smaller for arms with a chain of joints (True), because the pose for a position must be
+searched numerically.
 """
 
 
 class EpisodeError(UsageError, gymnasium.error.ResetNeeded):
-    """There is no episode in progress: it has not begun, or it has ended."""
+    """No episode is in progress: it has not begun, or it has ended."""
 
 
 class Scene(NamedTuple):
-    """The true state of an episode at a step, which the user need not know.
+    """True state of an episode at a step, from which the task computes the reward.
+
+    It contains the current states of all arms, which the user sees only with a delay.
 
     Attributes:
-        t_s: time since the epoch, s.
-        q: joint angles by site, rad, shape (n,).
-        end_effector_m: position of the end effector by site, m.
-        view: the user's view.
-        bodies: poses of the bodies of plants, by site and then name, as in a record, shape
-            (7,).
-        can_reach: returns whether a site's end effector can reach a position, m.
-        draws: largest number of positions that a task may draw until one is within reach.
+        t_s: Time since the start of the run, in s.
+        q: Joint angles of each site, shape (n,), in rad.
+        end_effector_m: Position of the end effector of each site, in m.
+        view: State as the user observes it.
+        bodies: Poses of simulated bodies, by the site that simulates them and by name. A pose
+            has the shape (7,), as in a record.
+        can_reach: Function that returns whether the end effector of a site can reach a
+            position, in m.
+        draws: Largest number of random positions that a task may try until one is within reach.
     """
 
     t_s: float
@@ -82,12 +94,12 @@ class Scene(NamedTuple):
 
 
 class Judgement(NamedTuple):
-    """The judgement of a step by its task.
+    """Judgement of a step by the task of the episode.
 
     Attributes:
-        reward: the reward.
-        succeeded: the task is done, and the episode ends.
-        failed: the task cannot be done any more, and the episode ends.
+        reward: Reward of the step.
+        succeeded: True if the task is done, which ends the episode.
+        failed: True if the task can no longer be done, which ends the episode.
     """
 
     reward: float
@@ -96,31 +108,41 @@ class Judgement(NamedTuple):
 
 
 class EpisodeTask(Protocol):
-    """The task of an episode."""
+    """Interface of the task of an episode, which a user can implement."""
 
     goal: Array
-    """The goal that the user observes; its shape never changes."""
+    """Goal that the user observes. Its shape must never change."""
     bound: float
-    """Bound of the goal's numbers, which never changes."""
+    """Bound of the numbers of the goal. It must never change."""
 
     def begin(self, random: np.random.Generator, scene: Scene) -> None:
-        """Draws the goal of an episode."""
+        """Draws the goal of a new episode.
+
+        Args:
+            random: Source of random numbers.
+            scene: State at the start of the episode.
+        """
 
     def judge(self, scene: Scene) -> float | tuple[Any, ...]:
-        """Returns the reward of a step, or a `Judgement`, also as a tuple."""
+        """Returns the reward of a step, or a `Judgement`, which may also be a plain tuple.
+
+        Args:
+            scene: State after the step.
+        """
 
 
 class ReachTask:
-    """Task to bring an end effector to a random position within its reach, and to stay there.
+    """Task to bring an end effector to a random position and to keep it there.
 
-    The reward of a step is minus the distance, m, times the duration of the step, s. It is
-    larger by 1 once the end effector has stayed at the goal for `stay_s`.
+    The reward of a step is minus the distance from the goal, in m, times the duration of the
+    step, in s. The reward is larger by 1 once the end effector has stayed at the goal for
+    `stay_s`, which ends the episode.
 
     Args:
-        site: site of the end effector.
-        radius_m: largest distance of the goal from the start, m.
-        within_m: largest distance from the goal that counts as reached, m.
-        stay_s: time to stay at the goal, s.
+        site: Site of the end effector.
+        radius_m: Largest distance of the goal from the start, in m.
+        within_m: Largest distance from the goal that counts as reached, in m.
+        stay_s: Time for which the end effector must stay at the goal, in s.
     """
 
     def __init__(
@@ -140,17 +162,20 @@ class ReachTask:
         self._last_s = 0.0
 
     def begin(self, random: np.random.Generator, scene: Scene) -> None:
-        """Draws a goal, uniformly over the part of the sphere that the end effector reaches.
+        """Draws a goal, uniformly over the part of a sphere that the end effector can reach.
+
+        The centre of the sphere is the position of the end effector at the start.
 
         Raises:
-            UsageError: no drawn position is within reach.
+            UsageError: None of the drawn positions is within reach.
         """
         start_m = scene.end_effector_m[self._site]
+        dimensions = len(start_m)
         for _ in range(scene.draws):
-            direction = random.normal(size=len(start_m))
-            # the root makes the density uniform over the area or the volume
-            share = random.uniform() ** (1.0 / len(start_m))
-            offset_m = self._radius_m * share * direction / np.linalg.norm(direction)
+            direction = random.normal(size=dimensions)
+            # The root makes the density uniform over the area or the volume.
+            relative_radius = random.uniform() ** (1.0 / dimensions)
+            offset_m = self._radius_m * relative_radius * direction / np.linalg.norm(direction)
             position_m = start_m + offset_m
             if scene.can_reach(self._site, position_m):
                 break
@@ -166,7 +191,11 @@ class ReachTask:
         self._last_s = scene.t_s
 
     def judge(self, scene: Scene) -> Judgement:
-        """Returns the reward of a step, and whether the goal was kept for long enough."""
+        """Returns the reward of a step, and whether the end effector stayed long enough.
+
+        Args:
+            scene: State after the step.
+        """
         from_goal_m = scene.end_effector_m[self._site] - self.goal
         distance_m = float(np.linalg.norm(from_goal_m))
         step_s = scene.t_s - self._last_s
@@ -180,11 +209,11 @@ class ReachTask:
 
 
 class ActedHand(HandPlayer):
-    """The user's hand, which applies the actions of an episode.
+    """Operator that applies the actions of an episode to the user's arm.
 
     Args:
-        hand_site: site and settings of the hand.
-        actions: the action of each step; the environment appends to this list.
+        hand_site: Site and settings of the operator.
+        actions: Action of each step. The environment appends to this list.
     """
 
     def __init__(self, hand_site: HandSite, actions: list[Array]) -> None:
@@ -192,13 +221,17 @@ class ActedHand(HandPlayer):
         self._actions = actions
 
     def request_action(self, k: int, arrays: SiteArrays) -> None:  # noqa: ARG002 - already observed
-        """Passes the action of the current step to the hand as its decision."""
+        """Passes the action of the current step on, as the decision of the operator.
+
+        The policy has already observed the state, so that the observation of tick `k` in the
+        second argument is not needed.
+        """
         action = self._actions[k // self.hand.period_ticks]
         self.hand.accept_decision(k, action.tolist())
 
 
 class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
-    """An experiment in which one user is trained; also called `tn.make_env`.
+    """An environment in which a policy operates one arm; also called `tn.make_env`.
 
     See docs/policies.md.
 
@@ -209,29 +242,31 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
     (1, 2)
 
     Args:
-        scenario: the name of a shipped scenario, a path, a TOML text, its tables, or a
-            scenario.
-        set: overrides, as in `{"link.delay_ms": 100}`.
-        user: the site whose arm the actions move.
-        mode: "tip", "joint" or "force", as for a live hand; by default the scenario's.
-        rate_hz: number of steps per second.
-        delay_ms: time from an observation to the effect of its action, ms.
-        duration_s: duration of an episode, s; by default the scenario's.
-        task: the task; by default the site `leads` brings its end effector to a position.
-        vary: keys that each episode draws: from a list of values, or from a pair of bounds.
-        leads: the site that does the task.
-        render_mode: "rgb_array": `render` returns a picture of the arms and the goal; None:
-            `render` returns None.
-        flat: an observation is one array of float32 instead of a dictionary, and an action is
-            float32.
+        scenario: Name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
+        set: Overrides, as in `{"link.delay_ms": 100}`.
+        user: Site whose arm the actions move.
+        mode: Meaning of an action, "tip", "joint" or "force", as for a live operator. Empty
+            keeps the mode of the scenario.
+        rate_hz: Number of steps per second.
+        delay_ms: Time from an observation until its action takes effect, in ms.
+        duration_s: Duration of an episode, in s. None keeps the duration of the scenario.
+        task: Task of the episodes. By default the site `leads` brings its end effector to a
+            random position.
+        vary: Keys of the scenario that each episode draws at random, from a list of values or
+            between a pair of bounds.
+        leads: Site that does the task.
+        render_mode: With "rgb_array", `render` returns a picture of the arms and the goal. With
+            None, `render` returns None.
+        flat: True if observations are one array of float32 instead of a dictionary, and actions
+            are float32.
 
     Attributes:
-        observation_names: with `flat`, the name of each number of an observation, as in
+        observation_names: With `flat`, the name of each number of an observation, as in
             "q[0]". A number of a matrix has two indices, its row and its column.
 
     Raises:
-        ScenarioError: the scenario or an override is not valid.
-        UsageError: there is no such site, the rate is not valid, or Gymnasium is missing.
+        ScenarioError: The scenario or an override is not valid.
+        UsageError: There is no such site, the rate is not valid, or Gymnasium is missing.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012 - Gymnasium's
@@ -290,10 +325,10 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         self._flat = flat
 
     def _build_dict_space(self, scene: Scene) -> spaces.Dict:
-        """Returns the space of observations as a dictionary.
+        """Returns the space of observations in the form of a dictionary.
 
         Args:
-            scene: a state of an episode, whose observation has the shapes of all observations.
+            scene: Any state of an episode. All observations have the shapes of its observation.
         """
         bounds = {"alpha": 1.0, "grip": 1.0, "goal": self.task.bound}
         boxes: dict[str, Any] = {}
@@ -303,7 +338,14 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return spaces.Dict(boxes)
 
     def _prepare(self, scenario: Scenario) -> Scenario:
-        """Returns an experiment in which the user's arm has a live hand only."""
+        """Returns a scenario in which only the policy operates the user's arm.
+
+        The operators that the scenario defines for this arm are removed, except for the
+        settings of a live operator.
+
+        Raises:
+            ScenarioError: The scenario does not contain the site of the user or of the task.
+        """
         find_site(scenario, self._user)
         find_site(scenario, self._leads)
         spec = scenario.sites[self._user]
@@ -311,7 +353,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         if self._mode:
             hand = replace(hand, mode=self._mode)
         sites = {**scenario.sites, self._user: replace(spec, hands=(hand,))}
-        # the scenario's hands of the user are gone, and with them the values that they draw
+        # The values that the removed operators would draw at random are removed too.
         drawn = {
             key: distribution
             for key, distribution in scenario.drawn.items()
@@ -320,7 +362,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return replace(scenario, sites=sites, drawn=drawn)
 
     def _build_hand_site(self, scenario: Scenario) -> HandSite:
-        """Returns the site and the settings of the user's hand."""
+        """Returns the site and the settings of the operator that applies the actions."""
         hand = scenario.sites[self._user].find_live_hand()
         assert hand is not None
         return HandSite(
@@ -332,9 +374,10 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         )
 
     def _find_reach(self) -> float:
-        """Returns the largest distance of the user's end effector from its base, m.
+        """Returns the bound of an action in the modes "tip" and "joint".
 
-        In the mode "joint" it is the largest angle of a joint, rad.
+        In the mode "tip" an action is a position of the end effector, and the bound is its
+        largest distance from the base, in m. In the mode "joint" it is an angle, in rad.
         """
         arm = self._base.arms[self._user]
         spec = self._base.sites[self._user]
@@ -342,12 +385,16 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
             return 2.0 * math.pi
         if arm.chain is None:
             return float(sum(arm.lengths_m))
-        # a chain's reach is not known in closed form: a generous bound
+        # The reach of a chain is not known in closed form. This bound is generous.
         start_distance_m = float(np.linalg.norm(arm.end_effector(spec.q0_rad)))
         return 1.5 * start_distance_m + 1.0
 
     def _begin(self, scenario: Scenario) -> None:
-        """Prepares the run of an episode."""
+        """Prepares the simulated run of a new episode, up to its first step.
+
+        Args:
+            scenario: Scenario of the episode.
+        """
         self.scenario = scenario
         self._k = 0
         self._actions = list[Array]()
@@ -386,11 +433,17 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         )
 
     def _can_reach(self, q: Mapping[str, Array], site: str, position_m: Array) -> bool:
-        """True if a site's end effector can reach a position, m, from joint angles q."""
+        """Returns whether the end effector of a site can reach a position.
+
+        Args:
+            q: Joint angles of each site, from which the search for a pose starts, in rad.
+            site: Name of the site.
+            position_m: The position, in m.
+        """
         return can_reach(self.scenario.arms[site], q[site], position_m)
 
     def _format_observation(self, scene: Scene) -> Any:
-        """Returns an observation in the form of the observation space."""
+        """Returns the user's observation of a state, in the form of the observation space."""
         parts = self._observe(scene)
         if not self._flat:
             return parts
@@ -398,7 +451,10 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return np.concatenate(arrays).astype(np.float32)
 
     def _observe(self, scene: Scene) -> dict[str, Array]:
-        """Returns the parts of an observation by name."""
+        """Returns the parts of the user's observation of a state, by name.
+
+        Parts that begin with "peer_", and `alpha` and `age_s`, have one row per peer.
+        """
         view = scene.view
         peers = view.peers
         parts = {
@@ -423,21 +479,28 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return parts
 
     def _describe_step(self, scene: Scene, *, succeeded: bool) -> dict[str, Any]:
-        """Returns the facts of a step; the first two have the names of gym-hil.
+        """Returns the information dictionary of a step.
 
-        The teacher is the other user with the largest share in the site that does the task.
+        The first two keys are those of gym-hil, a library in which a human teacher can take
+        over from the policy. Here the teacher is the other user whom the site that does the
+        task follows most. The teacher intervenes while that site follows the teacher more than
+        the policy.
+
+        Args:
+            scene: State after the step.
+            succeeded: True if the task is done.
         """
         leading_site = self.scenario.names.index(self._leads)
         links = np.asarray(self._run.arrays(leading_site).links)
         peers = self.scenario.peers(self._leads)
-        shares = dict(zip(peers, links["alpha"].tolist(), strict=True))
-        user_share = shares.get(self._user, 0.0)
-        teachers = {name: share for name, share in shares.items() if name != self._user}
+        dominance = dict(zip(peers, links["alpha"].tolist(), strict=True))
+        user_dominance = dominance.get(self._user, 0.0)
+        teachers = {name: factor for name, factor in dominance.items() if name != self._user}
         teacher = max(teachers, key=lambda name: teachers[name], default=self._user)
         return {
-            "is_intervention": teachers.get(teacher, 0.0) > user_share,
+            "is_intervention": teachers.get(teacher, 0.0) > user_dominance,
             "teleop_action": scene.end_effector_m[teacher],
-            "dominance": shares,
+            "dominance": dominance,
             "t_s": scene.t_s,
             "success": succeeded,
         }
@@ -445,13 +508,18 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begins an episode: draws the varied keys, the randomness of links and the task.
+        """Begins an episode, and draws everything that is random in it.
 
-        `options` are overrides of this episode only, as in {"link.delay_ms": 200}.
+        Args:
+            seed: Seed of the random numbers. None continues the sequence of earlier episodes.
+            options: Overrides for this episode only, as in {"link.delay_ms": 200}.
+
+        Returns:
+            The first observation, and the information dictionary.
 
         Raises:
-            ScenarioError: the options or the drawn values are not valid.
-            UsageError: the task has no goal within reach.
+            ScenarioError: The options or the drawn values are not valid.
+            UsageError: The task has no goal within reach.
         """
         self._runs = False
         super().reset(seed=seed)
@@ -469,9 +537,17 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
     def step(self, action: Array) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Applies an action and advances the episode by one step.
 
+        Args:
+            action: Target of the arm or force on it, depending on the mode.
+
+        Returns:
+            The observation; the reward; True if the task was done or failed, or if an arm left
+            its limits; True if the episode ended by its duration; and the information
+            dictionary.
+
         Raises:
-            UsageError: the action is not valid; the episode does not advance.
-            EpisodeError: there is no episode, or it has ended.
+            UsageError: The action is not valid. The episode does not advance.
+            EpisodeError: There is no episode, or it has ended.
         """
         checked = self._check_action(action)
         if not self._runs:
@@ -480,9 +556,11 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         self._k += self._ticks_per_step
         next_ns = tick_ns(self._k, self._tick_rate_hz)
         try:
+            # The tick at `next_ns` belongs to the next step, whose action is not known yet.
             self._run.step_to(next_ns - 1)
         except ValueError as error:
             raise UsageError(f"an action: {error}") from None
+
         scene = self._build_scene()
         result = self.task.judge(scene)
         judgement = Judgement(*result) if isinstance(result, tuple) else Judgement(result)
@@ -496,10 +574,10 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return observation, judgement.reward, terminated, truncated, info
 
     def _check_action(self, action: Array) -> Array:
-        """Returns an action within its bounds.
+        """Returns an action as an array, with each value clipped to its bounds.
 
         Raises:
-            UsageError: the action has another number of values, or one that is not finite.
+            UsageError: The action has another number of values, or a value is not finite.
         """
         try:
             values = np.array(action, dtype=np.float64)
@@ -516,12 +594,13 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return np.clip(values, -self._action_limit, self._action_limit)
 
     def render(self) -> Any:
-        """Returns a picture of the arms and the goal, shape (height, width, 3).
+        """Draws the arms and the goal.
 
-        None: the environment has no render mode.
+        Returns:
+            A picture of shape (height, width, 3). None if the environment has no render mode.
 
         Raises:
-            EpisodeError: no episode has begun.
+            EpisodeError: No episode has begun.
         """
         if self.render_mode is None:
             return None
@@ -539,10 +618,20 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return self._picture.draw(scene.q, scene.bodies, goal, f"t = {scene.t_s:.2f} s")
 
     def save(self, path: str | Path, *, force: bool = False) -> Path:
-        """Writes the steps of the episode to a log and returns its path; the log verifies.
+        """Writes the steps of the episode so far to a log, which can be verified.
+
+        The run is simulated again with the same actions, because the environment keeps no
+        records.
+
+        Args:
+            path: Name of the log.
+            force: True to replace an existing file.
+
+        Returns:
+            The path of the log.
 
         Raises:
-            UsageError: the episode has no step yet, or the file exists.
+            UsageError: The episode has no step yet, or the file exists.
         """
         if not self._actions:
             raise UsageError("an episode has a log once it has a step")
@@ -555,7 +644,11 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
 
 
 def _flatten_space(parts: spaces.Dict) -> spaces.Box:
-    """Returns the space of all numbers of an observation in one array of float32."""
+    """Returns the space of flat observations, with all numbers in one array of float32.
+
+    Args:
+        parts: Space of observations in the form of a dictionary.
+    """
     boxes = [box for box in parts.values() if isinstance(box, spaces.Box)]
     low = np.concatenate([np.ravel(box.low) for box in boxes])
     high = np.concatenate([np.ravel(box.high) for box in boxes])
@@ -567,7 +660,11 @@ def _flatten_space(parts: spaces.Dict) -> spaces.Box:
 
 
 def _name_numbers(parts: spaces.Dict) -> list[str]:
-    """Returns the name of each number of a flat observation, as "peer_q[1][0]"."""
+    """Returns the name of each number of a flat observation, such as "peer_q[1][0]".
+
+    Args:
+        parts: Space of observations in the form of a dictionary.
+    """
     names = []
     for part, box in parts.items():
         for indices in np.ndindex(box.shape or ()):
@@ -577,7 +674,12 @@ def _name_numbers(parts: spaces.Dict) -> list[str]:
 
 
 def _draw(random: np.random.Generator, values: Sequence[Any]) -> Any:
-    """Returns a random element of a list, or a random number between a pair of bounds."""
+    """Draws a value for a key that varies from episode to episode.
+
+    Args:
+        random: Source of random numbers.
+        values: A tuple of two numbers, which are bounds, or a sequence of possible values.
+    """
     are_numbers = all(isinstance(value, int | float) for value in values)
     if isinstance(values, tuple) and len(values) == 2 and are_numbers:
         return float(random.uniform(*values))

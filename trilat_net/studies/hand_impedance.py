@@ -1,23 +1,26 @@
-"""Identify mass, damping and stiffness of a person's hand from the log of a run.
+"""Identifies mass, damping and stiffness of a person's hand from the log of a run.
 
-A person holds the arm of a site while an operator of kind `multisine`, at any site, moves it
-with sines. The force F of the hand on the arm and the position X of the end effector contain
-responses to the sines. At the angular frequency w of a sine these responses satisfy
+A person holds the arm of a site, a process that runs one arm and its control loop. At any site,
+a simulated operator of the kind `multisine` moves the arms with a sum of sines. The force F of
+the hand on the arm and the position X of the end effector contain responses to the sines. At
+the angular frequency w of each sine, these responses satisfy
 
     F(j w) = -(M (j w)^2 + B j w + K) X(j w)
 
-with the mass M, the damping B and the stiffness K of the hand. The person's own movements do
-not follow the sines, and their part vanishes in the mean over segments of the run: the sines
-serve as an instrument, in the sense of system identification. M, B and K are fitted by weighted
-least squares. Their confidence intervals come from the jackknife over segments.
+with the mass M, the damping B and the stiffness K of the hand, which are matrices over the axes
+of space. The person's voluntary movements do not follow the sines, so that their contribution
+vanishes in the mean over segments of the run. In the terms of system identification, the sines
+are an instrument. M, B and K are fitted by weighted least squares. Their confidence intervals
+come from the jackknife, which repeats the fit without one segment at a time.
 
 Sources:
-    - Stiffness along both axes at once: E. J. Perreault, R. F. Kirsch, A. M. Acosta,
+    - Stiffness along several axes at once: E. J. Perreault, R. F. Kirsch, A. M. Acosta,
       "Multiple-input, multiple-output system identification for characterization of limb
       stiffness dynamics", Biological Cybernetics 80 (1999).
     - Sines in a closed loop: R. Pintelon, J. Schoukens, "System identification: a frequency
       domain approach" (2012), ch. 2 and 7.
-    - B. Efron, "The jackknife, the bootstrap and other resampling plans" (1982).
+    - Confidence intervals: B. Efron, "The jackknife, the bootstrap and other resampling plans"
+      (1982).
 
 Invariant:
     - The force is that of the hand ON the arm, in N. Sines that act at the same site are not
@@ -52,28 +55,29 @@ from ..theory.port_passivity import HandMatrices
 MIN_SEGMENTS = 5
 """Smallest number of segments for confidence intervals."""
 MIN_KNOWN_SHARE = 0.98
-"""Smallest share of a segment's records that must be in the log."""
+"""Smallest fraction of a segment's records that must be in the log."""
 NEIGHBOUR_CORRELATION = 1.0 / 6.0
-"""Correlation of white noise in two segments with Hann's window that overlap by half."""
+"""Correlation of white noise in two segments with a Hann window that overlap by half."""
 MAX_CONDITION = 1e3
 """Largest condition number of the motions with which the axes can be distinguished."""
 _TINY = 1e-300
 """Smallest divisor, so that 0 / 0 gives 0."""
 KEYS = {"mass_kg": "M", "damping_n_s_m": "B", "stiffness_n_m": "K"}
-"""The matrix of each key in JSON."""
+"""Name of the matrix under each key of the JSON file."""
 UNITS = {"M": "kg", "B": "N s/m", "K": "N/m"}
+"""Unit of each matrix."""
 
 
 class SineResponse(NamedTuple):
-    """The response at one frequency.
+    """Response of the hand and the arm at the frequency of one sine.
 
     Attributes:
-        hz: the frequency, in Hz.
-        motion_mm: amplitude of the motion over all axes, in mm.
-        force_n: amplitude of the force over all axes, in N.
-        coherence: coherence with the sines, of the motion or the force, whichever is smaller; 1
-            if all segments are equal.
-        unexplained: share of the force that M, B and K do not explain.
+        hz: The frequency, in Hz.
+        motion_mm: Amplitude of the motion over all axes, in mm.
+        force_n: Amplitude of the force over all axes, in N.
+        coherence: Fraction of the motion or of the force, whichever is smaller, that repeats
+            from segment to segment. It is 1 if all segments are equal.
+        unexplained: Fraction of the force that M, B and K do not explain.
     """
 
     hz: float
@@ -85,18 +89,20 @@ class SineResponse(NamedTuple):
 
 @dataclass(frozen=True, repr=False)
 class HandImpedance(Result):
-    """The identified hand.
+    """Identified mass, damping and stiffness of a hand.
+
+    The entry in a row and a column of a matrix is the force along the axis of the row per
+    motion along the axis of the column.
 
     Attributes:
-        site: site of the held arm.
-        M: mass in kg, shape (n, n): force along the row's axis for an acceleration along the
-            column's axis.
-        B: damping in N s/m, likewise for a velocity.
-        K: stiffness in N/m, likewise for a displacement.
-        halves: half the width of the 95 % intervals of "M", "B" and "K", shape (n, n).
-        segments: number of segments.
-        segment_s: duration of a segment, in s.
-        responses: the responses by rising frequency.
+        site: Site of the arm that the hand holds.
+        M: Mass, force per acceleration, in kg, shape (n, n).
+        B: Damping, force per velocity, in N s/m, shape (n, n).
+        K: Stiffness, force per displacement, in N/m, shape (n, n).
+        halves: Half the width of the 95 % intervals of "M", "B" and "K", shape (n, n) each.
+        segments: Number of segments of the run.
+        segment_s: Duration of a segment, in s.
+        responses: Responses at the frequencies of the sines, in rising order.
     """
 
     site: str
@@ -109,7 +115,7 @@ class HandImpedance(Result):
     responses: tuple[SineResponse, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns plain values, which `trilat linear --operators` reads."""
+        """Returns the hand as plain values, which `trilat linear --operators` reads."""
         return {
             "site": self.site,
             "segments": self.segments,
@@ -125,11 +131,14 @@ class HandImpedance(Result):
         }
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a row for each frequency."""
+        """Returns one row for each frequency, as plain values."""
         return [response._asdict() for response in self.responses]
 
     def to_hand(self) -> dict[str, Any]:
-        """Returns the most similar operator of a scenario, which has no mass."""
+        """Returns the settings of the operator of a scenario that resembles the hand most.
+
+        This operator is a spring and a damper along each axis. It has no mass.
+        """
         return {
             "kind": "tip_spring",
             "stiffness_n_m": _round_diagonal(self.K),
@@ -137,7 +146,7 @@ class HandImpedance(Result):
         }
 
     def blocks(self) -> Iterator[Block]:
-        """Yields the matrices with their intervals, the responses, and the nearest operator."""
+        """Yields the matrices and intervals, the responses, and the most similar operator."""
         segments = count_nouns(self.segments, "segment")
         yield f"hand at {self.site}: {segments} of {self.segment_s:g} s, intervals of 95 %"
         yield self._tabulate_matrices()
@@ -149,7 +158,11 @@ class HandImpedance(Result):
         yield f"in a scenario, without its mass: hands = [{{ {hand} }}]"
 
     def _tabulate_matrices(self) -> TextTable:
-        """Returns the table of M, B and K with their intervals, a column for each entry."""
+        """Returns a table with a row for each of M, B and K, and a column for each entry.
+
+        The columns are named by their axes, as in "xy". Each cell has the value and half the
+        width of its interval.
+        """
         axes = "xyz"[: len(self.K)]
         entries = list(product(range(len(axes)), repeat=2))
         heads = [axes[row] + axes[column] for row, column in entries]
@@ -163,17 +176,17 @@ class HandImpedance(Result):
 
 
 def _format_response(response: SineResponse) -> tuple[str, ...]:
-    """Returns the numbers of a response with three digits."""
+    """Returns the numbers of a response as texts with three digits."""
     return tuple(f"{value:.3g}" for value in response)
 
 
 def _round_diagonal(matrix: Array) -> list[float]:
-    """Returns the diagonal of a matrix with four digits, and 0 for negative entries."""
+    """Returns the diagonal of a matrix with four digits, where negative entries become 0."""
     return [max(0.0, float(f"{value:.4g}")) for value in np.diag(matrix)]
 
 
 def identify_hand(log: Log | str | Path, site: str = "m1") -> HandImpedance:
-    """Returns mass, damping and stiffness of the hand at an arm.
+    """Identifies mass, damping and stiffness of the hand that holds an arm.
 
     The command is `trilat identify hand`.
 
@@ -181,12 +194,12 @@ def identify_hand(log: Log | str | Path, site: str = "m1") -> HandImpedance:
     >>> hand.K.diagonal(), hand.halves["K"].diagonal()  # doctest: +SKIP
 
     Args:
-        log: the log or its path.
-        site: site of the held arm.
+        log: Log of the run, or its path.
+        site: Site of the arm that the hand holds.
 
     Raises:
-        UsageError: there is no such site or no sine, the run is too short, or the motion has
-            fewer axes than the arm.
+        UsageError: There is no such site, no sine acts, the run is too short, or the motion
+            does not distinguish the axes.
     """
     log = log if isinstance(log, Log) else open_log(log)
     scenario = log.scenario
@@ -194,8 +207,10 @@ def identify_hand(log: Log | str | Path, site: str = "m1") -> HandImpedance:
     sines = _find_sines(scenario)
     records = align_records(log)[site]
     force, position = _compute_hand_force(records, scenario)
+
+    # A segment lasts two periods of the smallest spacing between frequencies (or of the lowest
+    # frequency), so that the window separates the sines.
     spacing_hz = np.diff(np.concatenate([[0.0], sines.hz]))
-    # Two periods of the smallest spacing, so that the window separates the sines.
     segment_s = float(np.round(2.0 / spacing_hz.min(), 9))
     signals = np.hstack((force, position))[records.t_s < sines.end_s]
     phasors = _compute_phasors(
@@ -212,6 +227,7 @@ def identify_hand(log: Log | str | Path, site: str = "m1") -> HandImpedance:
             f"{site}: {segments} of {segment_s:g} s while the sines act, and intervals need "
             f"{MIN_SEGMENTS}: a run of at least {needed_s:g} s"
         )
+
     axis_count = force.shape[1]
     F, X = np.split(np.array(phasors), [axis_count], axis=2)
     fit = _fit_with_intervals(site, F, X, 2.0 * np.pi * sines.hz)
@@ -231,13 +247,13 @@ def identify_hand(log: Log | str | Path, site: str = "m1") -> HandImpedance:
 def _list_responses(
     F: Complex, X: Complex, hz: Array, unexplained: Array
 ) -> tuple[SineResponse, ...]:
-    """Returns the response at each frequency.
+    """Returns the response at each frequency, averaged over the segments.
 
     Args:
-        F: phasors of the force, shape (segments, F, n), in N.
-        X: phasors of the position, shape (segments, F, n), in m.
-        hz: the frequencies, shape (F,), in Hz.
-        unexplained: share of the force that the fit does not explain, shape (F,).
+        F: Phasors of the force, shape (segments, F, n), in N.
+        X: Phasors of the position, shape (segments, F, n), in m.
+        hz: The F frequencies, in Hz.
+        unexplained: Fraction of the force that the fit does not explain, shape (F,).
     """
     coherence = np.minimum(_compute_coherence(F), _compute_coherence(X))
     motion_mm = 1e3 * np.linalg.norm(X.mean(axis=0), axis=1)
@@ -256,12 +272,12 @@ def _list_responses(
 
 
 class _Sines(NamedTuple):
-    """The sines of a scenario.
+    """The sines that act in a scenario.
 
     Attributes:
-        hz: all frequencies, rising, in Hz.
-        start_s: time from which all sines act, in s.
-        end_s: time until which all sines act, in s.
+        hz: Frequencies of all sines in rising order, in Hz.
+        start_s: Time from which all sines act, in s.
+        end_s: Time until which all sines act, in s.
     """
 
     hz: Array
@@ -270,7 +286,11 @@ class _Sines(NamedTuple):
 
 
 def _find_sines(scenario: Scenario) -> _Sines:
-    """Returns the sines of a scenario, or raises UsageError if there are none."""
+    """Finds the sines that simulated operators of a scenario apply, at any site.
+
+    Raises:
+        UsageError: The scenario has no sines.
+    """
     hands = [hand for spec in scenario.sites.values() for hand in spec.hands]
     multisines = [hand for hand in hands if isinstance(hand, Multisine)]
     if not multisines:
@@ -287,9 +307,17 @@ def _find_sines(scenario: Scenario) -> _Sines:
 
 
 def _compute_hand_force(records: AlignedRecords, scenario: Scenario) -> tuple[Array, Array]:
-    """Returns the force of the hand ON the end effector, and the end effector's position.
+    """Computes the force of the hand ON the end effector, and the position of the end effector.
 
-    Both have the shape (K, n) and the units N and m.
+    The recorded torque of the operators contains the hand and the simulated operators of the
+    same site. Operators that follow a script, such as sines, are subtracted from it.
+
+    Args:
+        records: Records of the site.
+        scenario: Scenario of the run.
+
+    Returns:
+        The force in N and the position in m, shape (K, n) each for K records.
     """
     split = split_torque(records, scenario)
     scripted_torque = np.zeros_like(records.q)
@@ -308,19 +336,23 @@ def _compute_hand_force(records: AlignedRecords, scenario: Scenario) -> tuple[Ar
 def _compute_phasors(
     records: AlignedRecords, signals: Array, hz: Array, start_s: float, segment_s: float
 ) -> list[Complex]:
-    """Returns the phasors of signals in each segment, shape (F, signals).
+    """Computes the phasors of signals at the frequencies of the sines, segment by segment.
 
-    Segments have Hann's window and overlap by half. The spectrum of the window is zero at the
-    other sines, which are two or more multiples of 1 / segment_s away. It falls with the third
-    power of frequency, so that transients and drift, which are slower than the sines, hardly
-    contribute. The first half segment is left out.
+    A phasor is the complex amplitude of a signal at one frequency. Segments have a Hann window
+    and overlap by half. The spectrum of the window is zero at the other sines, which are two or
+    more multiples of 1 / segment_s away. The spectrum falls with the third power of the
+    frequency, so that transients and drift, which are slower than the sines, hardly contribute.
+    The first half segment is left out. Segments with too many missing records are skipped.
 
     Args:
-        records: the records.
-        signals: the signals, shape (K, signals).
-        hz: the frequencies, shape (F,), in Hz.
-        start_s: time from which all sines act, in s.
-        segment_s: duration of a segment, in s.
+        records: Records of the site.
+        signals: The signals, shape (K, signals).
+        hz: The F frequencies, in Hz.
+        start_s: Time from which all sines act, in s.
+        segment_s: Duration of a segment, in s.
+
+    Returns:
+        For each segment, phasors of shape (F, signals).
     """
     size = round(segment_s * records.rate_hz)
     half_s = 0.5 * segment_s
@@ -342,10 +374,12 @@ def _compute_phasors(
 def _compute_coherence(phasors: Complex) -> Array:
     """Returns the coherence of phasors over segments and all axes, shape (F,).
 
-    For the phasor z of a segment the coherence is |mean of z|^2 / mean of |z|^2.
+    If z is the phasor of a segment, the coherence is |mean of z|^2 / mean of |z|^2, where the
+    means are taken over the segments. It is 1 if all segments are equal, and near 0 if the
+    phasors are random.
 
     Args:
-        phasors: the phasors, shape (segments, F, n).
+        phasors: The phasors, shape (segments, F, n).
     """
     power = (np.abs(phasors) ** 2).mean(axis=0).sum(axis=1)
     power_of_mean = (np.abs(phasors.mean(axis=0)) ** 2).sum(axis=1)
@@ -354,12 +388,12 @@ def _compute_coherence(phasors: Complex) -> Array:
 
 
 class _HandFit(NamedTuple):
-    """A fit of mass, damping and stiffness.
+    """Result of the fit of mass, damping and stiffness.
 
     Attributes:
         matrices: M, B and K, shape (3, n, n).
-        halves: half the width of their 95 % intervals, shape (3, n, n).
-        unexplained: share of the force that the fit does not explain, shape (F,).
+        halves: Half the width of their 95 % intervals, shape (3, n, n).
+        unexplained: Fraction of the force that the fit does not explain, shape (F,).
     """
 
     matrices: Array
@@ -368,16 +402,16 @@ class _HandFit(NamedTuple):
 
 
 def _fit_with_intervals(site: str, F: Complex, X: Complex, w: Array) -> _HandFit:
-    """Returns the fit of M, B and K to phasors, with jackknife intervals.
+    """Fits M, B and K to phasors, and estimates their confidence intervals by the jackknife.
 
     Args:
-        site: name of the site, for the error message.
-        F: phasors of the force, shape (segments, F, n), in N.
-        X: phasors of the position, shape (segments, F, n), in m.
-        w: the angular frequencies, shape (F,), in rad/s.
+        site: Name of the site, for the error message.
+        F: Phasors of the force, shape (segments, F, n), in N.
+        X: Phasors of the position, shape (segments, F, n), in m.
+        w: Angular frequencies, shape (F,), in rad/s.
 
     Raises:
-        UsageError: the motions do not distinguish the axes, or mass, damping and stiffness.
+        UsageError: The motions do not distinguish the axes, or mass, damping and stiffness.
     """
     count, _, axes = X.shape
     s = 1j * w[:, np.newaxis]
@@ -388,15 +422,16 @@ def _fit_with_intervals(site: str, F: Complex, X: Complex, w: Array) -> _HandFit
             "or at too few frequencies to distinguish mass, damping and stiffness: "
             "let sines of other frequencies act on another joint"
         )
+
     all_segments = np.arange(count)
     forces = F.transpose(2, 0, 1)
-    estimate = np.array([_fit(force, motions, all_segments) for force in forces])
+    estimate = np.array([_fit_impedance(force, motions, all_segments) for force in forces])
 
     # The jackknife leaves out one segment at a time.
     partial_estimates = []
     for segment in range(count):
         others = all_segments[all_segments != segment]
-        partial_estimates.append([_fit(force, motions, others) for force in forces])
+        partial_estimates.append([_fit_impedance(force, motions, others) for force in forces])
     pseudo_values = count * estimate - (count - 1) * np.array(partial_estimates)
     # Neighbouring segments overlap and are correlated, which widens the interval.
     inflation = 1.0 + 2.0 * NEIGHBOUR_CORRELATION * (count - 1) / count
@@ -418,10 +453,13 @@ def _fit_with_intervals(site: str, F: Complex, X: Complex, w: Array) -> _HandFit
 def _can_distinguish(motions: Complex) -> bool:
     """Returns whether the motions determine mass, damping and stiffness along all axes.
 
+    They do so if there are enough frequencies, and if the motions along the axes, and their
+    derivatives, are linearly independent up to the condition number `MAX_CONDITION`.
+
     Args:
-        motions: phasors of -(acceleration, velocity, position), shape (segments, F, 3 n).
+        motions: Phasors of -(acceleration, velocity, position), shape (segments, F, 3 n).
     """
-    design = _stack_real(motions.mean(axis=0))
+    design = _stack_real_and_imaginary(motions.mean(axis=0))
     column_sizes = np.linalg.norm(design, axis=0)
     normalised = design / np.maximum(column_sizes, _TINY)
     singular_values = np.linalg.svd(normalised, compute_uv=False)
@@ -429,52 +467,64 @@ def _can_distinguish(motions: Complex) -> bool:
     return len(design) >= design.shape[1] and not is_singular
 
 
-def _stack_real(phasors: Complex) -> Array:
-    """Returns real parts and then imaginary parts along the first axis."""
+def _stack_real_and_imaginary(phasors: Complex) -> Array:
+    """Returns the real parts followed by the imaginary parts, along the first axis.
+
+    This turns complex equations into twice as many real ones.
+    """
     return np.concatenate((phasors.real, phasors.imag))
 
 
-def _fit(force: Complex, motions: Complex, chosen: NDArray[np.int64]) -> Array:
-    """Returns the rows of M, B and K for the force along one axis, shape (3 n,).
+def _fit_impedance(force: Complex, motions: Complex, segments: NDArray[np.int64]) -> Array:
+    """Estimates mass, damping and stiffness of a hand for the force along one axis.
 
-    The fit is by weighted least squares. The mean error at each frequency is divided by the
-    spread of the errors over the segments, under the same M, B and K. The spread depends on M,
-    B and K because the motion is noisy as well: the person's own movements move the arm.
+    The model is force = motions @ impedance. It is solved by weighted least squares: at each
+    frequency, the residual averaged over the segments is divided by the standard deviation of
+    the residuals over the segments, so that noisy frequencies count less. The standard
+    deviation itself depends on the impedance, because the person's own movements make the
+    measured motion noisy too. Therefore the problem is nonlinear and needs a first guess, which
+    comes from ordinary least squares.
 
     Args:
-        force: phasors of the force, shape (segments, F).
-        motions: phasors of -(acceleration, velocity, position), shape (segments, F, 3 n).
-        chosen: indices of the segments that are averaged.
+        force: Phasors of the force along the axis, shape (segments, F).
+        motions: Phasors of -(acceleration, velocity, position), shape (segments, F, 3 n).
+        segments: Indices of the segments to average.
+
+    Returns:
+        The rows of M, B and K for this axis, shape (3 n,).
     """
-    mean_motion = motions[chosen].mean(axis=0)
-    mean_force = force[chosen].mean(axis=0)
-    smallest_spread = 1e-6 * np.abs(mean_force).max()
+    mean_motion = motions[segments].mean(axis=0)
+    mean_force = force[segments].mean(axis=0)
+    smallest_deviation = 1e-6 * np.abs(mean_force).max()  # avoids a division by zero
 
-    def compute_residuals(parameters: Array) -> Array:
-        """Returns the weighted errors for rows of M, B and K."""
-        errors = force - motions @ parameters
-        spread = np.maximum(errors.std(axis=0), smallest_spread)
-        mean_error = mean_force - mean_motion @ parameters
-        return _stack_real(mean_error / spread)
+    def compute_weighted_residuals(impedance: Array) -> Array:
+        """Returns the residual of each frequency, divided by its standard deviation."""
+        residuals = force - motions @ impedance
+        deviation = np.maximum(residuals.std(axis=0), smallest_deviation)
+        mean_residual = mean_force - mean_motion @ impedance
+        return _stack_real_and_imaginary(mean_residual / deviation)
 
-    # Ordinary least squares give the first guess.
-    design = _stack_real(mean_motion)
-    start = np.linalg.lstsq(design, _stack_real(mean_force), rcond=None)[0]
-    parameters: Array = least_squares(compute_residuals, start, x_scale="jac").x
-    return parameters
+    design = _stack_real_and_imaginary(mean_motion)
+    start = np.linalg.lstsq(design, _stack_real_and_imaginary(mean_force), rcond=None)[0]
+    impedance: Array = least_squares(compute_weighted_residuals, start, x_scale="jac").x
+    return impedance
 
 
 def read_hands(files: Sequence[str | Path]) -> list[HandMatrices]:
-    """Returns the hands in files from `trilat identify hand --json`.
+    """Reads identified hands from JSON files, which `trilat identify hand --json` wrote.
 
     Raises:
-        UsageError: a file does not contain a hand.
+        UsageError: A file does not contain a hand.
     """
     return [_read_hand(Path(file)) for file in files]
 
 
 def _read_hand(file: Path) -> HandMatrices:
-    """Returns the hand in a file, or raises UsageError."""
+    """Reads an identified hand from a JSON file.
+
+    Raises:
+        UsageError: The file does not contain a hand.
+    """
     try:
         values = json.loads(file.read_text(encoding="utf-8"))
         M, B, K = (np.array(values[key], dtype=np.float64) for key in KEYS)
