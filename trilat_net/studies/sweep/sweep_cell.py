@@ -1,12 +1,15 @@
-"""Runs one cell of a sweep in virtual time and classifies its end.
+"""Runs one cell of a sweep in virtual time and classifies the end of the run.
 
-A run that is undecided at the end of its duration is extended and classified again.
+A sweep runs one scenario, the description of an experiment, on a grid of parameters. A cell is
+one combination of these parameters. Its run is classified as converged, oscillating, diverged
+or undecided. A run that is undecided at the end of its duration is extended and classified
+again.
 
 Invariant:
     - A result is a function of the cell's scenario and of the longest allowed duration.
-    - The class follows from the same numbers as the certificate: a log of the same run has the
-      same class.
-    - A run stores its scenario as a line diff against the experiment's text:
+    - The class follows from the same numbers as the stability certificate, so that the log of a
+      run has the same class.
+    - A run stores only the differences of its scenario from the scenario of the sweep.
       `apply_diff(diff_lines(text, base), base) == text` holds for all texts.
 """
 
@@ -29,7 +32,7 @@ from ...scenario.validate import refuse_live_only
 
 
 class CellClass(StrEnum):
-    """Class of a cell; the values are the texts in results and on pages."""
+    """Class of a cell. The values are the texts in results and on pages."""
 
     CONVERGED = "converged"
     BOUNDED = "bounded oscillation"
@@ -39,13 +42,16 @@ class CellClass(StrEnum):
     @property
     def stable(self) -> bool | None:
         """True if the run is stable, False if it is not stable, None if it is undecided."""
-        return None if self is CellClass.UNDECIDED else self is CellClass.CONVERGED
+        if self is CellClass.UNDECIDED:
+            return None
+        return self is CellClass.CONVERGED
 
 
 def classify_end(end: RunEnd) -> CellClass:
-    """Returns the class of a cell from the end of its run.
+    """Returns the class of a cell, given the judgement of the end of its run.
 
-    A run that is not stable and not bounded counts as diverged: drift and growth included.
+    A run that is not stable counts as diverged unless it stays bounded, that is, also if it
+    drifts or grows.
     """
     if end.stability is Stability.STABLE:
         return CellClass.CONVERGED
@@ -59,28 +65,30 @@ class CellResult(msgspec.Struct, frozen=True):
     """Result of one run of a cell.
 
     Attributes:
-        verdict: the class of the cell.
-        motion: the behaviour at the end, as in the certificate: it distinguishes growth from
-            divergence, and decay from convergence.
-        ran_s: duration of the run, in s, with extensions and an early stop.
-        extended: number of times that the duration was doubled.
-        end_error_rad: largest abs(e) of the last second, in rad.
-        end_speed_rad_s: largest abs(qd) of the last second, in rad/s.
-        error_rate_per_s: rate of the trend exp(rate t) of abs(e) over the second half of the
-            run, in 1/s; None without a trend.
-        speed_rate_per_s: the rate of abs(qd), likewise.
-        peak_error_rad: largest abs(e) of the run, in rad.
-        settled_s: time from which abs(e) stays below 0.01 rad, in s; None if abs(e) is not
-            below 0.01 rad at the end.
-        diverged_s: time at which the first site left its limits, in s, or None.
-        rms_error_rad: see `RunTotals`; this field and those down to `walls_j` cover the
+        verdict: Class of the cell.
+        motion: Behaviour at the end, as in the stability certificate. It distinguishes growth
+            from divergence, and decay from convergence.
+        ran_s: Duration of the run, in s, including extensions. It is shorter than planned if an
+            arm left its limits.
+        extended: Number of times that the duration was doubled.
+        end_error_rad: Largest |e| of the last second, in rad, where e is the error of a site
+            against its reference.
+        end_speed_rad_s: Largest |qd| of the last second, in rad/s.
+        error_rate_per_s: Rate of the trend exp(rate t) of |e| over the second half of the run,
+            in 1/s. None without a trend.
+        speed_rate_per_s: Rate of the trend of |qd|, likewise.
+        peak_error_rad: Largest |e| of the run, in rad.
+        settled_s: Time from which |e| stays below 0.01 rad, in s. None if |e| is not below
+            0.01 rad at the end.
+        diverged_s: Time at which the first site left its limits, in s. None if no site did.
+        rms_error_rad: See `RunTotals`. This field and those down to `walls_j` cover the
             scenario's duration without extensions.
-        effort_nm: see `RunTotals`.
-        force_peak_n: see `RunTotals`.
-        walls_j: see `RunTotals`.
-        reasons: the reasons for which the run is undecided, as a text.
-        exponent_per_s: growth exponent of the run's twins over the scenario's duration, in 1/s
-            (see `measure_exponent`); None without twins, or if no twin moved.
+        effort_nm: See `RunTotals`.
+        force_peak_n: See `RunTotals`.
+        walls_j: See `RunTotals`.
+        reasons: Reasons why the run is undecided, as a text.
+        exponent_per_s: Growth exponent of the run's twins over the scenario's duration, in 1/s,
+            see `measure_exponent`. None without twins, or if no twin moved.
     """
 
     verdict: CellClass
@@ -103,62 +111,65 @@ class CellResult(msgspec.Struct, frozen=True):
 
 
 TWINS_OF_A_CELL = 4
-"""Number of twins: pushes of all joints at once and of single joints, and, under the adaptive
-law, of the estimates.
+"""Number of twins of a run, repeated runs with a small push each. The pushes act on all joints
+at once, on single joints, and under the adaptive law on its estimates.
 """
 FLAT_LOG_CHANGE = 0.02
-"""Largest change of the logarithm of a limit cycle's envelope over half a run."""
+"""Largest change of the logarithm of an amplitude over half a run that counts as constant."""
 
 
 def check_sweepable(scenario: Scenario) -> None:
-    """Refuses a scenario that needs a live network or that the fused loop cannot run.
+    """Refuses a scenario that needs a live network, or that the compiled loop cannot run.
 
     Raises:
-        ScenarioError: see `refuse_live_only` and `check_fusable`.
+        ScenarioError: See `refuse_live_only` and `check_fusable`.
     """
     refuse_live_only(scenario)
     check_fusable(scenario)
 
 
 def classify_cell(text: str, longest_s: float) -> CellResult:
-    """Runs a cell in virtual time and returns its result.
+    """Runs a cell in virtual time and classifies the end of the run.
 
-    While the run is not conclusive at its end (see `is_conclusive`), its duration is doubled
-    and the same run continues. If the run is still not conclusive at `longest_s`, the class of
-    the certificate applies, with two exceptions:
+    While a longer run might have another class (see `is_conclusive`), the duration is doubled
+    and the same run continues. If this is still so at `longest_s`, the class of the stability
+    certificate applies, with two exceptions:
 
-    - A slow trend in a run that draws random numbers is undecided: the error of such a run
-      wanders, and a slow trend is chance.
-    - A run that looks stable although a joint still moves is undecided unless the pushes of its
-      twins decay.
+    - A slow trend in a run with random links is undecided. The error of such a run wanders, so
+      that a slow trend may be chance.
+    - A run that looks stable although a joint still moves is undecided, unless the small pushes
+      of its twins decay.
 
     A run whose small motions grow in contact with a sampled wall is not extended and is not
-    stable: such chatter may end after minutes, once the estimates have drifted, but this does
-    not make the cell stable.
+    stable. Such chatter may end after minutes, once the estimates of the law have drifted, but
+    this does not make the cell stable.
 
     Args:
-        text: the canonical text of the cell's scenario; its `duration_s` is the initial
-            duration.
-        longest_s: longest duration of the run, in s; a run is not extended if this does not
-            exceed its `duration_s`.
+        text: Canonical text of the cell's scenario. Its `duration_s` is the first duration.
+        longest_s: Longest duration of the run, in s. The run is not extended if this is not
+            longer than its first duration.
     """
     scenario = parse_scenario(text)
     run = FusedRun(scenario, SETTLED_ERROR_RAD)
-    ends_s = scenario.duration_s
     growth_per_s = _advance_in_contact(scenario, run)
     totals = run.totals
     extended = 0
     outcome = _build_result(run, scenario, totals, extended)
-    if growth_per_s > 0.0:
+
+    has_chatter = growth_per_s > 0.0
+    if has_chatter:
         diverged = outcome.verdict is CellClass.DIVERGED
         verdict = CellClass.DIVERGED if diverged else CellClass.BOUNDED
         reason = f"in contact with a sampled wall small motions grow by {growth_per_s:+.3g} /s"
         return msgspec.structs.replace(outcome, verdict=verdict, reasons=reason)
-    while not is_conclusive(outcome) and ends_s < longest_s:
-        ends_s = min(2.0 * ends_s, longest_s)
+
+    end_s = scenario.duration_s
+    while not is_conclusive(outcome) and end_s < longest_s:
+        end_s = min(2.0 * end_s, longest_s)
         extended += 1
-        run.advance_to(ends_s)
+        run.advance_to(end_s)
         outcome = _build_result(run, scenario, totals, extended)
+
     undecided = CellClass.UNDECIDED
     has_trend = outcome.motion in (EndBehaviour.GROWS, EndBehaviour.DECAYS)
     if scenario.links_random and has_trend and not _has_pronounced_trend(outcome):
@@ -171,10 +182,14 @@ def classify_cell(text: str, longest_s: float) -> CellResult:
 
 
 def measure_exponent(scenario: Scenario) -> float | None:
-    """Returns the growth exponent of a run, in 1/s; None if no push moved anything.
+    """Measures the growth exponent of a run, the rate at which small disturbances grow.
 
-    The exponent is the largest rate of the run's twins over the judged part, where a small push
-    changes as exp(exponent t); see `analysis.twin_growth`.
+    A twin is a second execution of the run with a small push. The difference between the twin
+    and the run changes as exp(exponent t), see `analysis.twin_growth`. The exponent is the
+    largest rate of all twins over the judged part of the run.
+
+    Returns:
+        The exponent in 1/s, negative if disturbances decay. None if no push moved anything.
     """
     run = FusedRun(scenario, SETTLED_ERROR_RAD)
     run.advance_to(scenario.duration_s)
@@ -184,19 +199,21 @@ def measure_exponent(scenario: Scenario) -> float | None:
 
 
 def _measure_twins(scenario: Scenario, run: FusedRun) -> TwinGrowth:
-    """Returns the growth of small pushes to a run, up to the time that the run has reached."""
+    """Measures how small pushes to a run grow, up to the time that the run has reached."""
     end = classify_run_end(scenario, RunTrace(run.buckets, run.tau_x, run.diverged_s))
     return measure_virtual_twins(scenario, end, run.ran_s, TWINS_OF_A_CELL)
 
 
 def _is_still_moving(run: FusedRun) -> bool:
-    """Returns True if the largest speed of a joint did not halve over the second half of a run.
+    """Returns True if the speed of a joint did not halve over the second half of a run.
 
-    The first and the last quarter of this half are compared.
+    The largest speeds of the first and of the last quarter of this half are compared. Speeds
+    below the rounding floor count as standing still.
     """
     for maxima in run.buckets:
-        joints = maxima.shape[1] // 3  # the second third of the columns has the speeds
-        speeds = maxima[len(maxima) // 2 :, joints : 2 * joints]
+        joints = maxima.shape[1] // 3  # the columns are errors, speeds and angles
+        second_half = len(maxima) // 2
+        speeds = maxima[second_half:, joints : 2 * joints]
         quarter = len(speeds) // 4
         first = speeds[:quarter].max(axis=0)
         last = speeds[-quarter:].max(axis=0)
@@ -206,19 +223,26 @@ def _is_still_moving(run: FusedRun) -> bool:
 
 
 def _advance_in_contact(scenario: Scenario, run: FusedRun) -> float:
-    """Runs a scenario to its duration; returns the growth rate of contact chatter, in 1/s.
+    """Runs a scenario to its duration, and checks the contact with sampled walls.
 
-    The rate is that of small motions at a sampled wall. It is 0 if they do not grow, and if no
-    sampled wall is touched in the last quarter; see `find_contact_growth`.
+    A sampled wall is one whose force is computed once per tick and held. Such a wall can
+    generate energy, so that small motions in contact grow (chatter), see
+    `find_contact_growth`.
+
+    Returns:
+        Growth rate of small motions in contact, in 1/s. It is 0 if they do not grow, and if no
+        sampled wall is touched in the last quarter of the run.
     """
     environments = chain.from_iterable(spec.environment for spec in scenario.sites.values())
-    if not any(environment.actor.sampled for environment in environments):
+    has_sampled_wall = any(environment.actor.sampled for environment in environments)
+    if not has_sampled_wall:
         run.advance_to(scenario.duration_s)
         return 0.0
     states = run.run_and_sample(scenario.duration_s)
     if run.diverged_s is not None:
         return 0.0
-    # imported late: SciPy costs a worker half a second, and only sampled walls need it
+
+    # Imported here, because SciPy costs a worker half a second and only sampled walls need it.
     from ...theory.characteristic_roots import STABILITY_EDGE_PER_S
     from ...theory.linear_edge import find_contact_growth
 
@@ -227,7 +251,7 @@ def _advance_in_contact(scenario: Scenario, run: FusedRun) -> float:
 
 
 def is_conclusive(outcome: CellResult) -> bool:
-    """Returns True if a longer run would hardly have another class.
+    """Returns True if a longer run would very probably have the same class.
 
     A run is conclusive if
     - a site left its limits,
@@ -254,7 +278,10 @@ def is_conclusive(outcome: CellResult) -> bool:
 
 
 def _has_pronounced_trend(outcome: CellResult) -> bool:
-    """Returns True if the speed doubled, or error and speed halved, over the second half."""
+    """Returns True if the largest speed doubled over the second half of a run.
+
+    Also returns True if the largest error and the largest speed both halved.
+    """
     error_change, speed_change = _log_changes(outcome)
     doubled = speed_change >= math.log(2.0)
     halved = max(error_change, speed_change) <= -math.log(2.0)
@@ -262,7 +289,7 @@ def _has_pronounced_trend(outcome: CellResult) -> bool:
 
 
 def _log_changes(outcome: CellResult) -> tuple[float, float]:
-    """Returns the changes of log(abs(e)) and of log(abs(qd)) over the second half of a run."""
+    """Returns the changes of log |e| and of log |qd| over the second half of a run."""
     half_s = 0.5 * outcome.ran_s
     error_change = half_s * (outcome.error_rate_per_s or 0.0)
     speed_change = half_s * (outcome.speed_rate_per_s or 0.0)
@@ -272,7 +299,14 @@ def _log_changes(outcome: CellResult) -> tuple[float, float]:
 def _build_result(
     run: FusedRun, scenario: Scenario, totals: RunTotals, extended: int
 ) -> CellResult:
-    """Returns the result of a run up to the time that the run has reached."""
+    """Returns the result of a run up to the time that the run has reached.
+
+    Args:
+        run: The run.
+        scenario: Scenario of the run.
+        totals: Totals over the scenario's duration, without extensions.
+        extended: Number of times that the duration was doubled.
+    """
     end = classify_run_end(scenario, RunTrace(run.buckets, run.tau_x, run.diverged_s))
     return CellResult(
         verdict=classify_end(end),
@@ -292,17 +326,22 @@ def _build_result(
 
 
 LineDiff = tuple[str | tuple[int, int], ...]
-"""Parts of a text, in order: ranges (first, last) of lines of the base, and lines that the base
-lacks.
+"""A text as differences from a base text. The parts are, in order, ranges (first, last) of line
+numbers of the base, and lines that the base does not contain.
 """
 
 
 def diff_lines(text: str, base: str) -> LineDiff:
-    """Returns the diff of a text against a base: `apply_diff` restores the text."""
+    """Returns the differences of a text from a base, from which `apply_diff` restores the text.
+
+    The differences need not be minimal. Each line is looked up in the base: first at the
+    position after the previous line, and then at its first occurrence.
+    """
     base_lines = base.split("\n")
+    # In reversed order the first occurrence of a line is entered last, and so it is kept.
     first_index = {line: index for index, line in reversed(list(enumerate(base_lines)))}
     parts: list[str | tuple[int, int]] = []
-    expected = 0  # index of the line in the base if the text continues line by line
+    expected = 0  # index in the base if the text continues line by line
     for line in text.split("\n"):
         continues = expected < len(base_lines) and base_lines[expected] == line
         index = expected if continues else first_index.get(line)
@@ -310,9 +349,10 @@ def diff_lines(text: str, base: str) -> LineDiff:
             parts.append(line)
             expected += 1
             continue
+
         previous = parts[-1] if parts else None
         if isinstance(previous, tuple) and previous[1] + 1 == index:
-            parts[-1] = (previous[0], index)
+            parts[-1] = (previous[0], index)  # the line extends the previous range
         else:
             parts.append((index, index))
         expected = index + 1
@@ -320,7 +360,12 @@ def diff_lines(text: str, base: str) -> LineDiff:
 
 
 def apply_diff(parts: Iterable[str | Sequence[int]], base: str) -> str:
-    """Returns the text whose diff against a base is `parts`."""
+    """Returns the text that has these differences from a base.
+
+    Args:
+        parts: Differences, as `diff_lines` returns them.
+        base: The base text.
+    """
     base_lines = base.split("\n")
     lines = list[str]()
     for part in parts:
@@ -333,18 +378,19 @@ def apply_diff(parts: Iterable[str | Sequence[int]], base: str) -> str:
 
 
 class CellRun(msgspec.Struct, frozen=True):
-    """One finished run of a cell.
+    """A finished run of a cell, as the journal of a sweep stores it.
 
     Attributes:
-        cell: the number of the cell.
-        seed: the seed of the run.
-        random: True if the run draws random numbers, so that another seed is another run.
-        law: the laws of the sites, without duplicates.
-        sha256: the digest of the run's scenario.
-        scenario: the canonical text of the scenario, as a diff against the experiment's text.
-        outcome: the result of the run.
-        metrics: the further metrics of the plan over the scenario's duration, by key; None for
-            a metric that the run does not have.
+        cell: Number of the cell.
+        seed: Seed of the run.
+        random: True if the run draws random numbers, so that another seed gives another run.
+        law: Control laws of the sites, without duplicates.
+        sha256: Digest of the run's scenario.
+        scenario: Canonical text of the run's scenario, as differences from the scenario of the
+            sweep.
+        outcome: Result of the run.
+        metrics: Further metrics of the sweep over the scenario's duration, by key. None for a
+            metric that the run does not have.
     """
 
     cell: int

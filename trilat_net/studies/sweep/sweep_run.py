@@ -1,11 +1,14 @@
-"""Runs a sweep in its folder.
+"""Runs a sweep and stores its results in a folder.
 
-The folder holds the plan, the journal of finished runs, and, once the sweep has finished, its
-results.
+A sweep runs one scenario on a grid of parameters. A cell is one combination of these
+parameters; it is run once per seed of the random numbers. The folder of a sweep contains the
+plan, a journal to which every finished run is appended, and in the end the results. A sweep
+that was interrupted continues after the last finished run.
 
 Invariant:
-    - A folder belongs to one sweep on one arithmetic; any other sweep is refused.
-    - The results are a function of the plan: they do not depend on the number of processes, on
+    - A folder belongs to one sweep on one kind of arithmetic. Any other sweep is refused,
+      because its results might differ.
+    - The results are a function of the plan. They do not depend on the number of processes, on
       the order of the runs, or on interruptions.
     - A run in the journal is not repeated.
 """
@@ -44,6 +47,7 @@ from .sweep_results import (
 )
 
 JOURNAL_FILE = "cells.journal"
+"""Name of the journal in the folder of a sweep."""
 _DIFFERENCES = {
     "text": "another text of the scenario",
     "scenario_sha256": "another scenario",
@@ -57,14 +61,25 @@ _DIFFERENCES = {
     "arithmetic": "another kind of arithmetic",
     "versions": "another version of the program",
 }
-"""Keys of the plan in which two sweeps may differ, in words, in the order of messages."""
+"""Keys of a plan in which two sweeps may differ, with the words for a message. The first key
+that differs is reported.
+"""
 
 
 SweepFolder = StudyFolder[SweepPlan, CellRun]
+"""Folder of a sweep, with its plan and its journal."""
 
 
 def _build_folder(path: Path, plan: SweepPlan, facts: Mapping[str, Any]) -> SweepFolder:
-    """Returns the sweep folder at a path, whose journal is tied to the digest of the plan."""
+    """Returns the object for the folder of a sweep.
+
+    The journal is tied to the digest of the plan, so that runs of another plan are ignored.
+
+    Args:
+        path: Path of the folder.
+        plan: The sweep.
+        facts: The plan as plain values, with the arithmetic and the versions of the program.
+    """
     study = hashlib.sha256(_encode_plan(facts).encode()).hexdigest()
     remedy = build_resume_hint("sweep", "--resume", str(path))
 
@@ -75,14 +90,14 @@ def _build_folder(path: Path, plan: SweepPlan, facts: Mapping[str, Any]) -> Swee
 
 
 def prepare_sweep_folder(plan: SweepPlan, path: Path | None) -> SweepFolder:
-    """Returns the folder of a sweep: a new one, or the existing folder with its finished runs.
+    """Prepares the folder of a sweep: a new one, or an existing one with finished runs.
 
     Args:
-        plan: the sweep.
-        path: the path of the folder; None: a new folder with a default name.
+        plan: The sweep.
+        path: Path of the folder. None creates a new folder with a default name.
 
     Raises:
-        UsageError: the folder holds other files or another sweep, or cannot be made.
+        UsageError: The folder contains other files or another sweep, or cannot be created.
     """
     if path is not None and (path / PLAN_FILE).exists():
         return open_sweep_folder(path, plan)
@@ -94,16 +109,16 @@ def prepare_sweep_folder(plan: SweepPlan, path: Path | None) -> SweepFolder:
 
 
 def open_sweep_folder(path: Path, expected: SweepPlan | None = None) -> SweepFolder:
-    """Returns the folder of a sweep that was started before.
+    """Opens the folder of a sweep that was started before.
 
     Args:
-        path: the path of the folder.
-        expected: the sweep that the folder must hold; None: any sweep that was started with
-            the arithmetic and program versions of this process.
+        path: Path of the folder.
+        expected: Sweep that the folder must contain. None accepts any sweep that was started
+            with the arithmetic and program versions of this process.
 
     Raises:
-        UsageError: the folder holds no sweep, or another sweep.
-        ScenarioError: the scenario of the sweep cannot run here.
+        UsageError: The folder contains no sweep, or another sweep.
+        ScenarioError: The scenario of the sweep cannot run on this machine.
     """
     stored = _read_facts(path)
     current = _list_facts(expected or plan_from_json(stored))
@@ -119,22 +134,30 @@ def open_sweep_folder(path: Path, expected: SweepPlan | None = None) -> SweepFol
 
 
 def _format_fact(key: str, facts: Mapping[str, Any]) -> str:
-    """Returns the value of a key of the plan, as messages show it."""
+    """Returns the value of a key of a plan as a text for error messages.
+
+    Args:
+        key: The key. Its value has a default if the plan does not store it.
+        facts: The plan as plain values.
+    """
     value = facts.get(key, JUDGES[0] if key == "judge" else [])
     if key in ("text", "scenario_sha256"):
         digest = str(value)
         if key == "text":
             digest = hashlib.sha256(digest.encode()).hexdigest()
         return f"{facts.get('name')} (sha256 {digest[:12]})"
+
     if isinstance(value, dict):
         versions = [
             f"{name.removeprefix('version_')} {version}" for name, version in value.items()
         ]
         return ", ".join(versions)
+
     if key == "seeds" and isinstance(value, list):
         first = value[0]
         last = value[-1]
-        if value == list(range(first, last + 1)):
+        is_range = value == list(range(first, last + 1))
+        if is_range:
             return f"{first}..{last}"
     if isinstance(value, list):
         return ", ".join(map(str, value)) or "none"
@@ -142,10 +165,10 @@ def _format_fact(key: str, facts: Mapping[str, Any]) -> str:
 
 
 def _read_facts(path: Path) -> dict[str, Any]:
-    """Returns the stored facts of the plan in a folder.
+    """Reads the plan in the folder of a sweep as plain values.
 
     Raises:
-        UsageError: the folder has no plan, or the plan cannot be read.
+        UsageError: The folder has no plan, or the plan cannot be read.
     """
     file = path / PLAN_FILE
     try:
@@ -155,7 +178,7 @@ def _read_facts(path: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "is not JSON"
         raise UsageError(f"{file}: cannot be read: {reason}") from None
-    # a plan at the default judge without metrics does not store these keys
+    # A plan with the default judge and without metrics does not store these keys.
     optional = {"judge", "metrics"}
     required = {"source", "folder", "name", *_DIFFERENCES} - optional
     if not isinstance(facts, dict) or not required <= facts.keys():
@@ -164,34 +187,35 @@ def _read_facts(path: Path) -> dict[str, Any]:
 
 
 def _list_facts(plan: SweepPlan) -> dict[str, Any]:
-    """Returns the facts of the plan, with the arithmetic and versions of this program."""
+    """Returns a plan as plain values, with the arithmetic and versions of this program."""
     arithmetic, versions = describe_program()
     return {**plan.facts(), "arithmetic": arithmetic, "versions": versions}
 
 
 def _encode_plan(facts: Mapping[str, Any]) -> str:
-    """Returns the text of the plan file."""
+    """Returns the text of the plan file. Equal plans have equal bytes."""
     return json.dumps(facts, indent=2, ensure_ascii=False, sort_keys=True) + "\n"
 
 
 MAX_RUNS = 1_000_000
-"""Number of runs above which a sweep needs a confirmation."""
+"""Number of runs above which the user must confirm a sweep."""
 MAX_SWEEP_S = 86_400.0
-"""Wall time above which a sweep needs a confirmation, in s."""
+"""Estimated duration above which the user must confirm a sweep, in s of real time."""
 _PROBES = 7
 """Largest number of runs from which the duration of a sweep is estimated."""
 _PROBING_S = 3.0
-"""Wall time after which an estimate starts no further run, in s."""
+"""Time after which the estimate starts no further run, in s of real time."""
 _RESUME_HINT = "; what is done is kept: go on with --resume"
+"""Advice for the user after a worker died."""
 
 
 class DurationEstimate(NamedTuple):
-    """Estimated duration of the remaining runs of a sweep.
+    """Estimated duration of the runs of a sweep that remain.
 
     Attributes:
-        runs: the largest number of runs that remain.
-        seconds: their estimated wall time, in s.
-        entries: the runs that were made for the estimate; the sweep does not repeat them.
+        runs: Largest possible number of runs that remain.
+        seconds: Estimated duration of these runs, in s of real time.
+        entries: Runs that were made for the estimate. The sweep does not repeat them.
     """
 
     runs: int
@@ -203,12 +227,12 @@ class FinishedSweep(NamedTuple):
     """A finished sweep, with the effort since it was last started or resumed.
 
     Attributes:
-        results: the results of all runs of the sweep.
-        folder: the folder of the sweep.
-        runs: number of runs since the start.
-        simulated_s: simulated time of these runs, in s.
-        wall_s: wall time of these runs, in s.
-        jobs: number of worker processes.
+        results: Results of all runs of the sweep.
+        folder: Folder of the sweep.
+        runs: Number of runs since the last start.
+        simulated_s: Simulated time of these runs together, in s.
+        wall_s: Real time that these runs took, in s.
+        jobs: Number of worker processes.
     """
 
     results: SweepResults
@@ -220,7 +244,13 @@ class FinishedSweep(NamedTuple):
 
 
 class CellItem(NamedTuple):
-    """Task of a worker: one run of a cell. Picklable and self-contained."""
+    """Work for a worker process: one run of a cell. It can be sent to another process.
+
+    Attributes:
+        plan: The sweep.
+        cell: The cell.
+        seed: Seed of the run.
+    """
 
     plan: SweepPlan
     cell: SweepCell
@@ -231,10 +261,10 @@ class CellItem(NamedTuple):
 
 
 def run_cell(task: CellItem) -> CellRun:
-    """Runs one cell with one seed; any process can do it.
+    """Runs one cell with one seed, in any process.
 
     Raises:
-        ScenarioError: the scenario is not valid or cannot run; the message names the cell.
+        ScenarioError: The scenario is not valid or cannot run. The message names the cell.
     """
     plan = task.plan
     cell = task.cell
@@ -244,17 +274,20 @@ def run_cell(task: CellItem) -> CellRun:
     except ScenarioError as error:
         overrides = ", ".join(cell.overrides)
         raise ScenarioError(f"cell {cell.number} ({overrides}): {error}") from None
+
     longest_s = max(plan.longest_s, scenario.duration_s)
     outcome = sweep_cell.classify_cell(scenario.text, longest_s)
     if plan.judge == "twins":
         exponent_per_s = sweep_cell.measure_exponent(scenario)
         outcome = msgspec.structs.replace(outcome, exponent_per_s=exponent_per_s)
+
+    # Metrics that are not fields of the result require a second run, which records a log.
     metrics: dict[str, float | None] = {}
-    # the outcome has the other metrics already: only further metrics need a run with a log
     log_metrics = [key for key in plan.metrics if key not in CellResult.__struct_fields__]
     if log_metrics:
         measured = measure_run(simulate_scenario(scenario), log_metrics)
         metrics = {key: measured[key].value for key in log_metrics}
+
     laws = dict.fromkeys(identify_law(site.control) for site in scenario.sites.values())
     return CellRun(
         cell=cell.number,
@@ -271,15 +304,16 @@ def run_cell(task: CellItem) -> CellRun:
 def estimate_sweep(
     plan: SweepPlan, done: Iterable[tuple[int, int]] = (), jobs: int | None = None
 ) -> DurationEstimate:
-    """Estimates the duration of a sweep from its first and last cells and some between them.
+    """Estimates the duration of a sweep by running a few cells that are spread over the grid.
 
     Args:
-        plan: the sweep.
-        done: the finished runs, as pairs of cell number and seed; they are left out.
-        jobs: number of worker processes; None: as many as there are cores.
+        plan: The sweep.
+        done: Finished runs, as pairs of cell number and seed. They need not be run any more.
+        jobs: Number of worker processes of the sweep. None stands for all cores.
     """
     finished = set(done)
-    numbers = dict.fromkeys(n * (plan.cells - 1) // (_PROBES - 1) for n in range(_PROBES))
+    last_cell = plan.cells - 1
+    numbers = dict.fromkeys(n * last_cell // (_PROBES - 1) for n in range(_PROBES))
     seed = plan.seeds[0]
     probes = [
         CellItem(plan, plan.cell(number), seed)
@@ -288,9 +322,12 @@ def estimate_sweep(
     ]
     if not probes:
         return DurationEstimate(plan.cells * len(plan.seeds) - len(finished), 0.0, [])
+
+    # A short run first: it compiles the simulation kernel, once for all processes.
     brief_s = min(1.0, plan.base.duration_s)
     brief = plan.scenario(*probes[0].cell.overrides, f"duration_s={brief_s!r}")
-    sweep_cell.classify_cell(brief.text, brief_s)  # compiles, once for all processes
+    sweep_cell.classify_cell(brief.text, brief_s)
+
     clock = SystemClock()
     started_ns = clock.monotonic_ns()
     entries: list[CellRun] = []
@@ -300,6 +337,8 @@ def estimate_sweep(
         elapsed_s = (clock.monotonic_ns() - started_ns) * 1e-9
         if elapsed_s >= _PROBING_S:
             break
+
+    # If nothing is random, a cell is run with one seed only.
     seeds = len(plan.seeds) if any(entry.random for entry in entries) else 1
     runs = max(len(entries), plan.cells * seeds - len(finished))
     workers = min(jobs or count_cores(), runs)
@@ -312,8 +351,13 @@ def refuse_oversized_sweep(
 ) -> None:
     """Refuses a sweep of more than `MAX_RUNS` runs or `MAX_SWEEP_S` seconds.
 
+    Args:
+        plan: The sweep.
+        expected: Estimated duration of the sweep.
+        jobs: Number of worker processes. None stands for all cores.
+
     Raises:
-        UsageError: the sweep is too large; the message has its size and estimated duration.
+        UsageError: The sweep is too large. The message states its size and duration.
     """
     if expected.runs <= MAX_RUNS and expected.seconds <= MAX_SWEEP_S:
         return
@@ -328,7 +372,10 @@ def refuse_oversized_sweep(
 
 
 def format_wall_time(seconds: float) -> str:
-    """Returns a duration as a text with a readable unit, as in "2.5 h"."""
+    """Returns a duration as a text with a readable unit, as in "2.5 h".
+
+    A larger unit is used from one and a half units on, and days from two days on.
+    """
     units = (("days", 86_400.0, 172_800.0), ("h", 3600.0, 5400.0), ("min", 60.0, 90.0))
     for unit, unit_s, smallest_s in units:
         if seconds >= smallest_s:
@@ -343,18 +390,20 @@ def run_sweep(
     known: Iterable[CellRun] = (),
     on: executor.Workers = None,
 ) -> FinishedSweep:
-    """Runs the remaining runs of a sweep, writes its results, and returns them.
+    """Runs the remaining runs of a sweep, and writes the results into its folder.
 
     Args:
-        folder: the folder of the sweep; the runs in its journal are not repeated.
-        jobs: number of worker processes; None: as many as there are cores.
-        progress: called with the number of finished runs and the number of runs known so far.
-        known: finished runs, as from an estimate; they enter the journal and are not repeated.
-        on: the workers to use; None: processes of this computer.
+        folder: Folder of the sweep. The runs in its journal are not repeated.
+        jobs: Number of worker processes. None uses all cores.
+        progress: Function that is called with the number of finished runs and the number of
+            runs that are known to be necessary.
+        known: Finished runs, for example from an estimate. They enter the journal and are not
+            repeated.
+        on: Workers to use instead of processes of this computer.
 
     Raises:
-        ScenarioError: a cell cannot run; the message names it. Finished runs are kept.
-        RunFailed: a cell ended its workers, or the cluster is gone. Finished runs are kept.
+        ScenarioError: A cell cannot run. The message names the cell. Finished runs are kept.
+        RunFailed: A cell killed its workers, or the cluster is gone. Finished runs are kept.
     """
     plan = folder.plan
     clock = SystemClock()
@@ -365,7 +414,7 @@ def run_sweep(
         started_ns = clock.monotonic_ns()
         left = plan.cells * len(plan.seeds) - len(finished_before)
         laws = list_imported_code([plan.base])
-        workers = on if left else None
+        workers = on if left else None  # no cluster is needed if nothing is left to run
         with executor.open_worker_pool(
             jobs, workers, most=left, laws=laws, hint=_RESUME_HINT
         ) as pool:
@@ -374,18 +423,18 @@ def run_sweep(
         wall_s = (clock.monotonic_ns() - started_ns) * 1e-9
         new_runs = [run for key, run in journal.done.items() if key not in finished_before]
         rows = build_result_rows(plan, list(journal.done.values()))
+
     results = SweepResults(plan, rows)
     if len(plan.seeds) > 1:
         points = encode_grid_points(plan, collect_grid_points(results))
         write_whole(folder.path / GRID_POINTS_FILE, points, remedy=folder.remedy)
     table = encode_results(plan, rows)
     write_whole(folder.path / RESULTS_FILE, table, remedy=folder.remedy)
-    simulated_s = sum(run.outcome.ran_s for run in new_runs)
     return FinishedSweep(
         results=results,
         folder=folder,
         runs=len(new_runs),
-        simulated_s=simulated_s,
+        simulated_s=sum(run.outcome.ran_s for run in new_runs),
         wall_s=wall_s,
         jobs=count,
     )
@@ -397,13 +446,20 @@ def _run_cells(
     pool: executor.WorkerPool,
     progress: executor.Progress,
 ) -> None:
-    """Runs all cells with the first seed, then those that draw random numbers with the others.
+    """Runs all cells with the first seed, and then the random cells with the other seeds.
 
-    Only the first run of a cell tells whether the cell is random.
+    Only the first run of a cell shows whether anything in the cell is random.
+
+    Args:
+        plan: The sweep.
+        journal: Journal, to which the runs are added.
+        pool: Workers that execute the runs.
+        progress: Function that is called as for `run_sweep`.
     """
     first_seed, *other_seeds = plan.seeds
 
     def run_pending(runs: Iterable[tuple[int, int]], count: int) -> None:
+        """Executes those of some runs that the journal does not contain yet."""
         tasks = (
             CellItem(plan, plan.cell(number), seed)
             for number, seed in runs
@@ -411,7 +467,9 @@ def _run_cells(
         )
         journal.run_pending(pool, run_cell, tasks, len(journal.done), count, progress)
 
-    run_pending(((number, first_seed) for number in range(plan.cells)), plan.cells)
+    first_runs = ((number, first_seed) for number in range(plan.cells))
+    run_pending(first_runs, plan.cells)
+
     random_cells = list[int]()
     if other_seeds:
         random_cells = [
@@ -422,7 +480,7 @@ def _run_cells(
 
 
 def describe_sweep_speed(speed: FinishedSweep) -> str:
-    """Returns the speed of a sweep as a sentence."""
+    """Returns a sentence on the speed of a sweep in relation to real time."""
     processes = count_nouns(speed.jobs, "process")
     wall_time = format_wall_time(speed.wall_s)
     ratio = speed.simulated_s / (speed.wall_s * speed.jobs) if speed.wall_s else math.nan
