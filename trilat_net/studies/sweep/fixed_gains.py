@@ -1,4 +1,7 @@
-"""Describes the gains of a sweep's control laws that were not swept: a map depends on them too.
+"""Describes the gains of control laws that a sweep did not vary.
+
+A stability map also depends on the gains that are the same in all of its cells. Therefore the
+page of the map names them.
 
 Invariant:
     - A gain is named unless an axis of the sweep changes it at every site.
@@ -16,14 +19,17 @@ from ...scenario.laws import identify_law
 from .sweep_plan import SweepPlan
 
 FAIR_COMPARISON = "laws at their best gains compare fairly by: trilat compare --tune"
-"""Advice under a comparison of laws by a sweep."""
+"""Advice that is printed below a comparison of control laws by a sweep."""
 
 
 def describe_fixed_gains(plan: SweepPlan) -> list[str]:
-    """Returns the gains that were not swept, a text per law, as in "p_d of s: K 10, gravity 1".
+    """Returns the gains that a sweep did not vary, such as "p_d of s: K 10, gravity 1".
 
-    Sites with the same law and gains share a text. A text that applies to all sites names no
-    site.
+    Sites with the same law and the same gains share a text. A text that applies to all sites
+    names no site.
+
+    Args:
+        plan: The sweep.
     """
     texts = list[str]()
     first_values = [axis.override(0) for axis in plan.axes]
@@ -34,13 +40,18 @@ def describe_fixed_gains(plan: SweepPlan) -> list[str]:
 
 
 def _describe_laws(plan: SweepPlan, scenario: Scenario) -> Iterator[str]:
-    """Yields a text per law and choice of gains in a scenario of the sweep."""
-    sites_of: dict[tuple[str, str], list[str]] = {}
+    """Yields one text for each combination of a law and its gains in a scenario.
+
+    Args:
+        plan: The sweep.
+        scenario: Scenario of the sweep with one of its laws.
+    """
+    sites_of_law: dict[tuple[str, str], list[str]] = {}
     for site, spec in scenario.sites.items():
         law = identify_law(spec.control)
         gains = ", ".join(_format_gains(plan, site, spec.control)) or "none"
-        sites_of.setdefault((law, gains), []).append(site)
-    for (law, gains), sites in sites_of.items():
+        sites_of_law.setdefault((law, gains), []).append(site)
+    for (law, gains), sites in sites_of_law.items():
         owner = law
         if len(sites) < len(scenario.sites):
             owner = f"{law} of {', '.join(sites)}"
@@ -48,7 +59,13 @@ def _describe_laws(plan: SweepPlan, scenario: Scenario) -> Iterator[str]:
 
 
 def _format_gains(plan: SweepPlan, site: str, law: Any) -> Iterator[str]:
-    """Yields the gains of a site's law that no axis changes, each with its value."""
+    """Yields the gains of a site's law that no axis of the sweep changes, with their values.
+
+    Args:
+        plan: The sweep.
+        site: Name of the site.
+        law: Control law of the site.
+    """
     settings = law.settings if isinstance(law, ImportedLaw) else msgspec.to_builtins(law)
     swept_keys = {axis.key for axis in plan.axes}
     for key, value in settings.items():

@@ -1,9 +1,15 @@
-"""Confirms a map over a real network: runs cells near its edges live and compares classes.
+"""Confirms a stability map over a real network, by running cells near its edges live.
+
+A stability map shows for which parameters a scenario is stable. It is computed in virtual time:
+the simulation advances without waiting for a clock or a network. This module selects cells,
+combinations of parameters, on both sides of the edges of the map. It runs each of them as a
+live session over a network, and compares the class of the recorded log with the class in
+virtual time.
 
 Invariant:
     - A cell is confirmed if the log of the live session, classified over the same duration, has
-      the class of virtual time.
-    - A failed session confirms nothing, unless it failed because an arm diverged.
+      the same class as the run in virtual time.
+    - A failed session confirms nothing, unless it failed because an arm left its limits.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -23,15 +29,19 @@ from .sweep_plan import label_axis
 from .sweep_results import ResultRow
 
 MAX_SESSION_S = 60.0
-"""Longest cell that is confirmed, in s: a live session lasts as long as the cell ran."""
+"""Duration of the longest cell that is confirmed, in s. A live session lasts as long as the
+cell ran.
+"""
 _EXTRA_S = 0.5
-"""Extra duration of a cell that diverged, in s, so that it does not end on the same tick."""
+"""Extra duration of a cell that diverged, in s, so that the divergence is not at the very end.
+"""
 
 
 SessionRunner = Callable[[Scenario, str], tuple[Path, Sequence[str]]]
-"""Runs a scenario over a network under a name.
+"""Function that runs a scenario over a network, under a name for its log.
 
-Returns the path of its log, which may not exist, and the problems of the session, in order.
+It returns the path of the log, which may not exist, and the problems of the session in the
+order of time.
 """
 
 
@@ -40,14 +50,14 @@ GridIndex = tuple[Any, ...]
 
 
 class ConfirmedCell(NamedTuple):
-    """One cell that was run live.
+    """A cell that was run live, with the comparison of its classes.
 
     Attributes:
-        row: the cell's run in the results of the sweep.
-        virtual: the class in virtual time.
-        live: the class of the log of the live session; None if the session failed.
-        text: the figures of the log, or the problems of the session.
-        log: the path of the log; None if the session left no log.
+        row: Run of the cell in the results of the sweep.
+        virtual: Class in virtual time.
+        live: Class of the log of the live session. None if the session failed.
+        text: Numbers from the log, or the problems of the session.
+        log: Path of the log. None if the session left no log.
     """
 
     row: ResultRow
@@ -65,55 +75,56 @@ class ConfirmedCell(NamedTuple):
 def choose_cells_near_edges(
     rows: Sequence[ResultRow], axes: Sequence[str], count: int
 ) -> list[ResultRow]:
-    """Returns the cells nearest to edges, with the same target number on either side.
+    """Selects the cells nearest to the edges of stability, up to `count` on either side.
 
     The distance of a cell from an edge is the number of steps along one axis to the nearest
-    cell with the opposite verdict. Cells that ran longer than `MAX_SESSION_S` are left out. If
-    more than `count` cells are equally near, those spread most evenly along the edge are
-    chosen.
+    cell with the opposite result. Cells that ran longer than `MAX_SESSION_S` are left out. If
+    more cells than `count` are equally near, those are selected that are spread most evenly
+    along the edge.
 
     Args:
-        rows: one mapping per run, with its axes, "law", "seed", "cell", "verdict", "ran_s".
-        axes: the keys of the axes.
-        count: largest number of cells on each side.
+        rows: One mapping per run, with the values of the axes and the keys "law", "seed",
+            "cell", "verdict" and "ran_s".
+        axes: Keys of the axes.
+        count: Largest number of cells on each side.
 
     Raises:
-        UsageError: the results have no edge, or all cells on one side of it ran too long.
+        UsageError: The results have no edge, or all cells on one side of it ran too long.
     """
     if count < 1:
         raise UsageError(f"--confirm takes a number of cells from 1 on, not {count}")
-    row_at = _index_rows(rows, axes)
-    distances = _compute_edge_distances(row_at, len(axes))
+    row_of_index = _index_rows(rows, axes)
+    distances = _compute_edge_distances(row_of_index, len(axes))
     if not distances:
         raise UsageError(
             "no two cells along an axis were decided differently: there is no edge to confirm"
         )
-    chosen = []
+
+    selected = []
     for stable in (True, False):
         candidates = {}
         for index, distance in distances.items():
-            row = row_at[index]
-            short = row["ran_s"] <= MAX_SESSION_S
-            if short and CellClass(row["verdict"]).stable is stable:
+            row = row_of_index[index]
+            is_short = row["ran_s"] <= MAX_SESSION_S
+            if is_short and CellClass(row["verdict"]).stable is stable:
                 candidates[index] = distance
         if not candidates:
             side = "stable" if stable else "other"
             raise UsageError(
                 f"every cell on the {side} side of an edge ran longer than {MAX_SESSION_S:g} s"
             )
-        chosen += [row_at[index] for index in _choose_nearest(candidates, count)]
-    return chosen
+        selected += [row_of_index[index] for index in _select_nearest(candidates, count)]
+    return selected
 
 
-def _choose_nearest(distances: Mapping[GridIndex, int], count: int) -> list[GridIndex]:
+def _select_nearest(distances: Mapping[GridIndex, int], count: int) -> list[GridIndex]:
     """Returns at most `count` of the runs nearest to an edge, spread evenly along the edge.
 
-    The distance of the `count`-th nearest run is the limit: all runs within this limit are
-    candidates.
+    All runs that are not farther than the `count`-th nearest run are candidates.
 
     Args:
-        distances: distance of each run from the edge, by position in the grid.
-        count: largest number of runs.
+        distances: Distance of each run from the edge, by its position in the grid.
+        count: Largest number of runs.
     """
     nearest = sorted(distances.values())[:count]
     limit = nearest[-1]
@@ -124,29 +135,34 @@ def _choose_nearest(distances: Mapping[GridIndex, int], count: int) -> list[Grid
 
 
 def _rank_along_edge(index: GridIndex) -> tuple[Any, ...]:
-    """Returns the sorting key of a run: panel, law and seed first, then the two drawn axes."""
+    """Returns a sorting key that puts runs of the same panel, law and seed side by side.
+
+    Within these, the runs are sorted by the two axes that a map draws.
+    """
     return (*map(str, index[2:]), *index[:2])
 
 
 def confirm_cell(row: ResultRow, run: SessionRunner) -> ConfirmedCell:
-    """Runs a cell over a network and compares the classes.
+    """Runs a cell over a network, and compares the class of the log with that of the sweep.
 
     Args:
-        row: the cell's run in the results of the sweep.
-        run: runs a scenario over a network.
+        row: Run of the cell in the results of the sweep.
+        run: Function that runs a scenario over a network.
     """
     virtual = CellClass(row["verdict"])
     extra_s = _EXTRA_S if row["diverged_s"] is not None else 0.0
     duration_s = min(row["ran_s"] + extra_s, MAX_SESSION_S + _EXTRA_S)
     scenario = msgspec.structs.replace(parse_scenario(row["scenario"]), duration_s=duration_s)
     path, problems = run(scenario, f"cell-{row['cell']}")
+
     live = None
     try:
         end = classify_log_end(open_log(path))
     except LogError as error:
         text = "; ".join([*problems, str(error)])
     else:
-        # a divergence ends the session by design and reports a problem
+        # A session in which an arm leaves its limits ends early and reports a problem. This is
+        # how it should be, and the log counts.
         if problems and end.behaviour is not EndBehaviour.DIVERGED:
             text = "; ".join(problems)
         else:
@@ -159,7 +175,12 @@ def confirm_cell(row: ResultRow, run: SessionRunner) -> ConfirmedCell:
 def tabulate_confirmations(
     confirmations: Sequence[ConfirmedCell], axes: Sequence[str]
 ) -> TextTable:
-    """Returns a table with a row per cell: its values, both classes, figures and log."""
+    """Returns a table with one row per cell: its values, both classes, numbers and the log.
+
+    Args:
+        confirmations: The cells.
+        axes: Keys of the axes of the sweep.
+    """
     heads = ["cell", *map(label_axis, axes)]
     heads += ["seed", "virtual", "live", "", "the log shows", "log"]
     rows = []
@@ -180,36 +201,53 @@ def tabulate_confirmations(
 
 
 def _index_rows(rows: Sequence[ResultRow], axes: Sequence[str]) -> dict[GridIndex, ResultRow]:
-    """Returns the rows by their position in the grid; numbers precede texts on an axis."""
+    """Returns the runs by their position in the grid.
+
+    The values of an axis are numbered in rising order. Numbers come before texts.
+
+    Args:
+        rows: The runs.
+        axes: Keys of the axes.
+    """
     ranks: dict[str, dict[Any, int]] = {}
     for key in axes:
         values = {row[key] for row in rows}
         numbers = sorted(value for value in values if not isinstance(value, str))
         texts = sorted(value for value in values if isinstance(value, str))
         ranks[key] = {value: rank for rank, value in enumerate([*numbers, *texts])}
-    row_at: dict[GridIndex, ResultRow] = {}
+    row_of_index: dict[GridIndex, ResultRow] = {}
     for row in rows:
         position = [ranks[key][row[key]] for key in axes]
-        row_at[*position, row.get("law"), row.get("seed")] = row
-    return row_at
+        row_of_index[*position, row.get("law"), row.get("seed")] = row
+    return row_of_index
 
 
 def _compute_edge_distances(
-    row_at: Mapping[GridIndex, ResultRow], axis_count: int
+    row_of_index: Mapping[GridIndex, ResultRow], axis_count: int
 ) -> dict[GridIndex, int]:
-    """Returns the distance of decided runs from the nearest run with the opposite verdict.
+    """Returns the distance of each decided run from the nearest run with the opposite result.
 
-    Distances are counted in steps along one axis, the other axes, the law and the seed being
-    equal. Runs without an opposite verdict on any of their lines are left out.
+    Distances are counted in steps along one axis, where the values on all other axes, the law
+    and the seed are the same.
+
+    Args:
+        row_of_index: The runs by their position in the grid.
+        axis_count: Number of axes.
+
+    Returns:
+        Distances by position. Runs without an opposite result along any axis are left out.
     """
-    stable = {index: CellClass(row["verdict"]).stable for index, row in row_at.items()}
+    stable = {index: CellClass(row["verdict"]).stable for index, row in row_of_index.items()}
+
+    # A line contains the decided runs that differ in their position on one axis only.
     lines: dict[GridIndex, list[GridIndex]] = {}
-    for index, verdict in stable.items():
-        if verdict is None:
+    for index, is_stable in stable.items():
+        if is_stable is None:
             continue
         for axis in range(axis_count):
             line = (axis, *index[:axis], *index[axis + 1 :])
             lines.setdefault(line, []).append(index)
+
     distances: dict[GridIndex, int] = {}
     for (axis, *_), indices in lines.items():
         for index in indices:

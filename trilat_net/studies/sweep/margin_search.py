@@ -1,11 +1,14 @@
-"""Searches stability margins: the edges of stability along one key.
+"""Searches stability margins: the values of a scenario key at which stability begins or ends.
 
-Each grid point is scanned along the key, and each edge narrowed by bisection. The edges are
-reported beside those of theory, as a table, a Markdown page and plain values.
+A sweep runs one scenario on a grid of parameters. At each grid point, this module searches the
+edges of stability along one further key, such as "control.d". It runs the scenario at evenly
+spaced values of the key (the scan), and narrows each interval in which stability changes by
+bisection. The edges are reported beside those that theory predicts, as a table, a Markdown page
+and plain values.
 
 Invariant:
-    - An edge lies between two values that were run, one stable and one not.
-    - Undecided values widen an edge and count for neither side.
+    - An edge lies between two values that were run, one of them stable and the other not.
+    - Undecided values widen an edge, and count for neither side.
     - All edges that the scan detects are kept.
     - The margin of a grid point is a function of its scenario, its seed and the range.
 """
@@ -40,24 +43,29 @@ from .sweep_plan import (
 )
 
 SCAN_POINTS = 9
-"""Number of values of the scan: it detects islands wider than an eighth of the range."""
+"""Number of values of the scan. It detects islands of stability that are wider than an eighth
+of the range.
+"""
 MARGIN_TOLERANCE = 0.005
-"""Default largest width of an edge, as a share of its value."""
+"""Default largest width of an edge, as a fraction of its value."""
 _MAX_HALVINGS = 60
+"""Largest number of steps of a bisection."""
 
 StabilityTest = Callable[[float], bool | None]
-"""Returns True if the run at a value is stable, False if it is not, None if it is undecided."""
+"""Function that runs the scenario at a value of the key. It returns True if the run is stable,
+False if it is not stable, and None if it is undecided.
+"""
 
 
 class KeyMargin(NamedTuple):
     """The edges of stability along one key.
 
     Attributes:
-        spans: the edges, in rising order: several if the scan detected islands.
-        stable: without edges, True if the decided values are stable, False if they are not;
-            None with edges, or if no value was decided.
-        undecided: number of undecided values.
-        runs: number of values that were run.
+        spans: The edges in rising order. There are several if the scan detected islands.
+        stable: If there are no edges, True if the decided values are stable and False if they
+            are not. None with edges, and if no value was decided.
+        undecided: Number of undecided values.
+        runs: Number of values that were run.
     """
 
     spans: tuple[StabilityEdge, ...]
@@ -74,18 +82,19 @@ def search_key_margin(
     *,
     whole: bool = False,
 ) -> KeyMargin:
-    """Returns the edges between two values.
+    """Searches the edges of stability between two values.
 
     Args:
-        stable: runs and classifies one value.
-        low: the first value of the range.
-        high: the last value of the range.
-        tolerance: largest width of an edge, as a share of its value.
+        stable: Function that runs and classifies one value. Each value is run once.
+        low: Lower end of the range.
+        high: Upper end of the range.
+        tolerance: Largest width of an edge, as a fraction of its value.
         whole: True if only whole numbers can be run.
     """
     results: dict[float, bool | None] = {}
 
     def classify(value: float) -> bool | None:
+        """Returns the result at a value, which is run only the first time."""
         if value not in results:
             results[value] = stable(value)
         return results[value]
@@ -95,10 +104,12 @@ def search_key_margin(
         scan = np.round(scan)
     values = list(dict.fromkeys(scan.tolist()))
     decided = [value for value in values if classify(value) is not None]
+
     spans = list[StabilityEdge]()
     for below, above in pairwise(decided):
         if results[below] != results[above]:
             spans.append(_narrow_edge(classify, below, above, tolerance=tolerance, whole=whole))
+
     stable_everywhere = results[decided[0]] if decided and not spans else None
     undecided = sum(result is None for result in results.values())
     return KeyMargin(tuple(spans), stable_everywhere, undecided, len(results))
@@ -107,7 +118,17 @@ def search_key_margin(
 def _narrow_edge(
     classify: StabilityTest, low: float, high: float, *, tolerance: float, whole: bool
 ) -> StabilityEdge:
-    """Returns the edge between two values that were decided differently."""
+    """Narrows the interval between a stable value and one that is not stable by bisection.
+
+    If undecided values lie between the two sides, both ends of this zone are searched.
+
+    Args:
+        classify: Function that returns whether a value is stable.
+        low: Decided value below the edge.
+        high: Decided value above the edge, with the opposite result.
+        tolerance: Largest width of the edge, as a fraction of its value.
+        whole: True if only whole numbers can be run.
+    """
     low_stable = classify(low)
     high_stable = classify(high)
 
@@ -118,28 +139,33 @@ def _narrow_edge(
         return classify(value) is not high_stable
 
     low, above = _bisect(is_low_side, low, high, tolerance=tolerance, whole=whole)
-    sharp = classify(above) is not None
-    if sharp:
+    is_sharp = classify(above) is not None
+    if is_sharp:
         high = above
-    else:  # an undecided zone: its upper end is searched by itself
+    else:
+        # `above` lies in an undecided zone, whose upper end is searched separately.
         _, high = _bisect(is_not_high_side, above, high, tolerance=tolerance, whole=whole)
-    return StabilityEdge(low, high, low_stable is True, sharp)
+    return StabilityEdge(low, high, low_stable is True, is_sharp)
 
 
 def _bisect(
     holds: Callable[[float], bool], low: float, high: float, *, tolerance: float, whole: bool
 ) -> tuple[float, float]:
-    """Returns a narrow interval from a value where a condition holds to one where it does not.
+    """Narrows the interval between a value where a condition holds and one where it does not.
 
     Args:
-        holds: the condition; it holds at `low` and not at `high`.
-        low: the first value.
-        high: the last value.
-        tolerance: largest width of the interval, as a share of its larger end.
-        whole: True to bisect whole numbers, down to a width of 1.
+        holds: The condition. It holds at `low` and does not hold at `high`.
+        low: Lower end of the interval.
+        high: Upper end of the interval.
+        tolerance: Largest width of the result, as a fraction of its larger end.
+        whole: True to use whole numbers only, down to a width of 1.
+
+    Returns:
+        A value where the condition holds, and a larger value where it does not.
     """
     for _ in range(_MAX_HALVINGS):
-        if high - low <= (1.0 if whole else tolerance * max(abs(low), abs(high))):
+        largest_width = 1.0 if whole else tolerance * max(abs(low), abs(high))
+        if high - low <= largest_width:
             break
         middle = 0.5 * (low + high)
         middle = float(np.floor(middle)) if whole else middle
@@ -151,13 +177,13 @@ def _bisect(
 
 
 class SearchRange(NamedTuple):
-    """The range of a search for edges.
+    """Key and range of a search for edges.
 
     Attributes:
-        key: the scenario key along which edges are searched.
-        low: the first value.
-        high: the last value.
-        tolerance: largest width of an edge, as a share of its value.
+        key: Scenario key along which edges are searched.
+        low: Lower end of the range.
+        high: Upper end of the range.
+        tolerance: Largest width of an edge, as a fraction of its value.
     """
 
     key: str
@@ -167,7 +193,14 @@ class SearchRange(NamedTuple):
 
 
 class MarginItem(NamedTuple):
-    """Task of a worker: the search at one grid point. Picklable and self-contained."""
+    """Work for a worker process: the search at one grid point. The object can be pickled.
+
+    Attributes:
+        plan: The sweep.
+        cell: The grid point.
+        seed: Seed of the runs.
+        range: Key and range of the search.
+    """
 
     plan: SweepPlan
     cell: SweepCell
@@ -180,15 +213,15 @@ class MarginItem(NamedTuple):
 
 
 class GridPointMargin(NamedTuple):
-    """The edges of stability at one grid point.
+    """The edges of stability at one grid point, from runs and from theory.
 
     Attributes:
-        cell: the grid point, with its values along the axes.
-        seed: the seed of its runs.
-        margin: the edges from the runs.
-        linear: the edges of the linear analysis in the range, in rising order.
-        remark: a remark on the linear analysis, or "".
-        closed: the edge of the closed-form criterion in the range, or None.
+        cell: The grid point, with its values along the axes of the sweep.
+        seed: Seed of its runs.
+        margin: The edges from runs.
+        linear: The edges of the linear analysis within the range, in rising order.
+        remark: Remark on the linear analysis. Empty if there is none.
+        closed: The edge of the closed-form criterion within the range, or None.
     """
 
     cell: SweepCell
@@ -200,10 +233,14 @@ class GridPointMargin(NamedTuple):
 
 
 def parse_search_range(text: str, tolerance: float = MARGIN_TOLERANCE) -> SearchRange:
-    """Returns the range that a text such as "control.d=0.2:3" describes.
+    """Parses the range of a search, such as "control.d=0.2:3".
+
+    Args:
+        text: Text of the form KEY=FROM:TO.
+        tolerance: Largest width of an edge, as a fraction of its value.
 
     Raises:
-        UsageError: the text describes no range, or the tolerance is not within (0, 1).
+        UsageError: The text does not have this form, or the tolerance is not within (0, 1).
     """
     key, _, ends = text.partition("=")
     low, colon, high = ends.partition(":")
@@ -217,17 +254,17 @@ def parse_search_range(text: str, tolerance: float = MARGIN_TOLERANCE) -> Search
         raise UsageError(
             f"--tolerance is a share of the edge's value, as in 0.005, not {tolerance:g}"
         )
-    rising = -float("inf") < search_range.low < search_range.high < float("inf")
-    if not colon or not search_range.key or not rising:
+    is_rising = -float("inf") < search_range.low < search_range.high < float("inf")
+    if not colon or not search_range.key or not is_rising:
         form = "KEY=FROM:TO with FROM below TO, as in control.d=0.2:3"
         raise UsageError(f"--margin reads {form}, not {text!r}")
     return search_range
 
 
 def format_range_axis(search_range: SearchRange) -> str:
-    """Returns the description of an axis with the two ends of a range.
+    """Returns the text of a sweep axis that consists of the two ends of a range.
 
-    Planning a sweep with this axis checks the scenario at both ends.
+    If a sweep is planned with this axis, the scenario is checked at both ends.
     """
     low = format_override_value(search_range.low)
     high = format_override_value(search_range.high)
@@ -241,23 +278,25 @@ def search_margins(
     progress: Progress = ignore_progress,
     on: Workers = None,
 ) -> list[GridPointMargin]:
-    """Returns the edges at each grid point of a plan and each seed.
+    """Searches the edges at each grid point of a sweep, for each seed.
 
     Args:
-        plan: the plan; its last axis has the two ends of the range.
-        within: the range.
-        jobs: number of worker processes; None: as many as there are cores.
-        progress: called with the number of finished and of all searches.
-        on: the workers to use; None: processes of this computer.
+        plan: The sweep. Its last axis consists of the two ends of the range.
+        within: Key and range of the search.
+        jobs: Number of worker processes. None uses all cores.
+        progress: Function that is called with the number of finished and of all searches.
+        on: Workers to use instead of processes of this computer.
 
     Raises:
-        ScenarioError: the scenario is not valid at a value of the range.
-        RunFailed: a worker process ended.
+        ScenarioError: The scenario is not valid at a value of the range.
+        RunFailed: A worker process died.
     """
     searches = []
-    for number in range(0, plan.cells, 2):  # each grid point has two cells, one per end
+    # Each grid point has two neighbouring cells, one for each end of the range.
+    for number in range(0, plan.cells, 2):
         end = plan.cell(number)
         cell = end._replace(values=end.values[:-1], overrides=end.overrides[:-1])
+        # If nothing is random, all seeds give the same result.
         seeds = plan.seeds if plan.scenario(*end.overrides).random else plan.seeds[:1]
         searches += [MarginItem(plan, cell, seed, within) for seed in seeds]
     laws = list_imported_code([plan.base])
@@ -266,28 +305,30 @@ def search_margins(
 
 
 def search_margin_task(task: MarginItem) -> GridPointMargin:
-    """Returns the edges at one grid point, from runs and from theory.
+    """Searches the edges at one grid point, by runs and by theory.
 
     Raises:
-        ScenarioError: the scenario is not valid at a value of the range.
+        ScenarioError: The scenario is not valid at a value of the range.
     """
     key, low, high, tolerance = task.range
 
     def load(value: float) -> Scenario:
+        """Returns the scenario at a value of the key."""
         override = format_override(key, value)
         return task.plan.scenario(*task.cell.overrides, override, f"seed={task.seed}")
 
-    def stable(value: float) -> bool | None:
+    def is_stable(value: float) -> bool | None:
+        """Runs the scenario at a value of the key, and returns whether the run is stable."""
         scenario = load(value)
         longest_s = max(task.plan.longest_s, scenario.duration_s)
         return sweep_cell.classify_cell(scenario.text, longest_s).verdict.stable
 
     whole = False
     try:
-        load(low + (high - low) / 3.0**0.5)  # not a whole number
-    except ScenarioError:  # the key takes whole numbers only
-        whole = True
-    margin = search_key_margin(stable, low, high, tolerance, whole=whole)
+        load(low + (high - low) / 3.0**0.5)  # an irrational number, never a whole one
+    except ScenarioError:
+        whole = True  # the key takes whole numbers only
+    margin = search_key_margin(is_stable, low, high, tolerance, whole=whole)
     closed = find_criterion_edge(lambda value: evaluate_criterion(load(value)), low, high)
     linear, remark = find_root_crossings(load(high), key, low, high)
     return GridPointMargin(
@@ -307,12 +348,12 @@ def _find_nearest(value: float, edges: Sequence[float]) -> float | None:
 
 @dataclass(frozen=True, repr=False)
 class SweepMargins(Result):
-    """The edges along one key, at each grid point of a plan and for each seed.
+    """The edges of stability along one key, at each grid point of a sweep and for each seed.
 
     Attributes:
-        plan: the plan; its last axis has the two ends of the range.
-        within: the range of the search.
-        found: the edges of each grid point and seed.
+        plan: The sweep. Its last axis consists of the two ends of the range.
+        within: Key and range of the search.
+        found: The edges of each grid point and seed.
     """
 
     plan: SweepPlan
@@ -330,7 +371,7 @@ class SweepMargins(Result):
         return build_sweep_command(plan, "--margin", search_range, "--tolerance", tolerance)
 
     def table(self) -> TextTable:
-        """Returns a table with a row per edge, and a row per grid point without edges."""
+        """Returns a table with one row per edge. A grid point without edges has one row too."""
         plan = self.plan
         several_seeds = len({point.seed for point in self.found}) > 1
         has_closed_form = any(point.closed is not None for point in self.found)
@@ -369,7 +410,7 @@ class SweepMargins(Result):
         yield self.table()
 
     def headline(self) -> str:
-        """Returns the number of edges and the range of the search, as a sentence."""
+        """Returns a sentence with the number of edges and the range of the search."""
         edges = sum(len(point.margin.spans) for point in self.found)
         low = self.within.low
         high = self.within.high
@@ -388,14 +429,14 @@ class SweepMargins(Result):
         }
 
     def _describe_point(self, point: GridPointMargin) -> dict[str, Any]:
-        """Returns the entry of a grid point in `to_dict`."""
+        """Returns the plain values of a grid point, for `to_dict`."""
         margin = point.margin
-        facts: dict[str, Any] = {}
+        position: dict[str, Any] = {}
         for axis, value in zip(self.plan.axes[:-1], point.cell.values, strict=True):
-            facts[axis.key] = value
+            position[axis.key] = value
         if self.plan.laws:
-            facts["law"] = point.cell.law
-        return facts | {
+            position["law"] = point.cell.law
+        return position | {
             "seed": point.seed,
             "edges": [span._asdict() for span in margin.spans],
             "stable_everywhere": margin.stable,
@@ -407,7 +448,7 @@ class SweepMargins(Result):
         }
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a row per edge, and a row per grid point without edges."""
+        """Returns one row per edge, and one per grid point without edges, as plain values."""
         rows = list[dict[str, Any]]()
         for point in self.to_dict()["places"]:
             columns = {
@@ -418,7 +459,11 @@ class SweepMargins(Result):
         return rows
 
     def page(self) -> str:
-        """Returns the margins as a page in Markdown."""
+        """Returns the margins as a page in Markdown.
+
+        The page has the command, the table, the remarks of the linear analysis, and the gains
+        that were not swept, on which the margins depend too.
+        """
         base = self.plan.base
         parts = [f"# {base.title or base.name}: margin", f"```sh\n{self.command}\n```"]
         parts.append(self.table().markdown())
@@ -436,7 +481,7 @@ class SweepMargins(Result):
         return "\n\n".join(parts) + "\n"
 
     def write(self, folder: Path) -> list[Path]:
-        """Writes margin.json and margin.md, and returns their paths."""
+        """Writes margin.json and margin.md into a folder, and returns their paths."""
         json_path = folder / "margin.json"
         page_path = folder / "margin.md"
         write_whole(json_path, json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n")
@@ -445,7 +490,12 @@ class SweepMargins(Result):
 
 
 def _format_edge(margin: KeyMargin, span: StabilityEdge | None) -> list[str]:
-    """Returns the table cells of an edge and of its stable side."""
+    """Returns the table cells of an edge and of its stable side.
+
+    Args:
+        margin: The edges of the grid point.
+        span: The edge. None if the grid point has no edges.
+    """
     if span is None:
         texts = {
             True: "none: all stable",
@@ -461,7 +511,12 @@ def _format_edge(margin: KeyMargin, span: StabilityEdge | None) -> list[str]:
 
 
 def _format_theory(span: StabilityEdge | None, value: float | None) -> list[str]:
-    """Returns the table cells of an edge of theory and of its relative difference."""
+    """Returns the table cells of an edge from theory, and of its relative difference.
+
+    Args:
+        span: The measured edge, or None.
+        value: The edge from theory, or None.
+    """
     if value is None:
         return ["-", "-"]
     difference = "-" if span is None else f"{100.0 * (value / span.middle - 1.0):+.2f} %"
