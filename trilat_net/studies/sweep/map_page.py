@@ -1,13 +1,16 @@
 """Draws a stability map and writes its page: map.png, map.svg, map.pdf and map.md.
 
-The figure shows a coloured cell per grid point, and the lines of theory on top. With one seed
-the colour is the class of the run. With several seeds it is the share of stable runs among the
-decided ones. If twins judge the map, it is the growth exponent, white at zero.
+A stability map shows for which parameters a scenario is stable. The figure has a coloured cell
+per grid point of two parameters, and lines from theory on top. With one seed the colour is the
+class of the run. With several seeds it is the fraction of the decided runs that are stable. If
+the sweep measured growth exponents, the rates at which small disturbances grow, the colour is
+the exponent, and white stands for zero.
 
 Invariant:
-    - The page holds only results, lines and commands. Equal results give equal bytes.
-    - The colour of a cell depends on its results alone.
-    - A cell is hatched if half or more of its runs are undecided, or if it has no exponent.
+    - The page contains only results, lines and commands. Equal results give equal bytes.
+    - The colour of a cell depends on its own results alone.
+    - A cell is hatched if half or more of its runs are undecided, or if it should have an
+      exponent and has none.
     - Cells stay pixels in vector output, because viewers show seams between touching shapes.
     - The colours of the classes differ in lightness, for grey print and colour-blind readers.
 """
@@ -57,18 +60,21 @@ CLASS_COLOURS = {
 """Colours of the classes: light, medium and dark; undecided cells are white and hatched."""
 _EMPTY_COLOUR = "#f4f4f4"
 """Colour of cells without runs."""
+# Look of the hatching of undecided cells.
 _HATCHED: Any = {
     "facecolor": "none",
     "edgecolor": "#8a8a8a",
     "linewidth": 0.0,
     "hatch": "/////",
 }
+# Styles of the lines, by `MapLine.rank`.
 _LINE_STYLES: tuple[dict[str, Any], ...] = (
     {"color": "#000000", "linestyle": "-", "linewidth": 1.2},
     {"color": "#000000", "linestyle": (0, (4, 1.6)), "linewidth": 1.2},
-    # the last style is that of measured lines, which lie below the others
+    # The last style is that of measured lines, which lie below the others.
     {"color": "#ddaa33", "linestyle": "-", "linewidth": 2.6},
 )
+# Look of the measured edges of the classes on a map of growth exponents.
 _VERDICT_EDGE: dict[str, Any] = {"color": "#6b6b6b", "linewidth": 1.6, "alpha": 0.6}
 _EXPONENTS = LinearSegmentedColormap.from_list(
     "exponents", ["#004488", "#ffffff", "#a23b53"], 257
@@ -98,8 +104,11 @@ _SHARED_HEIGHT_IN = 1.75
 _STRIP_HEIGHT_IN = 0.7
 """Height of a panel of a map with a single axis."""
 _CAPTION_PT = 5.5
+"""Font size of the caption."""
 _CAPTION_LINE_IN = 0.1
+"""Height of a line of the caption."""
 _CAPTION_LETTERS_PER_IN = 25
+"""Letters of the caption per inch."""
 _SHARED_LABEL_IN = 0.14
 """Height of the label that all panels share."""
 _COLOUR_BAR_IN = 0.6
@@ -112,13 +121,13 @@ def draw_stability_map(
     form: FigureSize,
     fixed: Sequence[str] = (),
 ) -> Figure:
-    """Returns the figure of a stability map.
+    """Draws the figure of a stability map.
 
     Args:
-        plane: the results.
-        lines: the lines of each panel.
-        form: the size of the figure.
-        fixed: the gains that were not swept, a text per law, for the caption.
+        plane: Measured part of the map.
+        lines: Lines of each panel, in the order of the panels.
+        form: Size of the figure.
+        fixed: Gains that were not swept, one text per control law, for the caption.
     """
     count = len(plane.panels)
     columns = _count_columns(count, form)
@@ -128,6 +137,7 @@ def draw_stability_map(
     height_in = 0.95 + rows * panel_height_in + _CAPTION_LINE_IN * len(caption)
     shares_labels = columns * rows > 1
     has_colour_bar = plane.judged_by_twins or plane.seeds > 1
+
     with style.styled_figure(form, height_in) as figure:
         x_label_options: dict[str, Any] = {}
         if caption:
@@ -136,7 +146,7 @@ def draw_stability_map(
         panel_grid = style.add_panels(figure, rows, columns, sharex=True, sharey=True)
         grid: list[Any] = list(panel_grid.flat)
         for axes in grid[count:]:
-            axes.set_axis_off()
+            axes.set_axis_off()  # positions of the grid without a panel
 
         titles_in = form.width_in - _COLOUR_BAR_IN * has_colour_bar
         title_letters = round(titles_in * _TITLE_LETTERS_PER_IN / columns)
@@ -163,7 +173,8 @@ def draw_stability_map(
             _draw_colour_bar(figure, grid, plane)
         _draw_legend(figure, plane, lines)
 
-        # the layout is computed here: the size of a cell decides whether counts fit into it
+        # Drawing computes the layout. The resulting size of a cell decides whether the counts
+        # fit into it.
         figure.draw(FigureCanvasAgg(figure).get_renderer())  # type: ignore[no-untyped-call]
         if plane.seeds > 1 and not plane.judged_by_twins:
             for axes, panel in zip(grid, plane.panels, strict=False):
@@ -172,7 +183,12 @@ def draw_stability_map(
 
 
 def _count_columns(panels: int, form: FigureSize) -> int:
-    """Returns the number of columns of panels in a figure."""
+    """Returns the number of columns in which the panels of a figure are arranged.
+
+    Args:
+        panels: Number of panels.
+        form: Size of the figure.
+    """
     if panels == 1:
         return 1
     if form.narrow:
@@ -183,14 +199,24 @@ def _count_columns(panels: int, form: FigureSize) -> int:
 
 
 def _choose_panel_height_in(plane: MapPlane, columns: int) -> float:
-    """Returns the height of a panel, in inches."""
+    """Returns the height of a panel, in inches.
+
+    Args:
+        plane: The map. If only one axis is drawn, its panels are low strips.
+        columns: Number of columns. A panel that has a row to itself is higher.
+    """
     if not plane.y.key:
         return _STRIP_HEIGHT_IN
     return _FULL_HEIGHT_IN if columns == 1 else _SHARED_HEIGHT_IN
 
 
 def _wrap_caption(fixed: Sequence[str], form: FigureSize) -> list[str]:
-    """Returns the lines of the caption, which names the gains that were not swept."""
+    """Returns the lines of the caption, which names the gains that were not swept.
+
+    Args:
+        fixed: Gains that were not swept, one text per control law.
+        form: Size of the figure, from which the length of a line follows.
+    """
     if not fixed:
         return []
     width = round(_CAPTION_LETTERS_PER_IN * form.width_in)
@@ -201,17 +227,17 @@ def _wrap_caption(fixed: Sequence[str], form: FigureSize) -> list[str]:
 def _write_caption(
     figure: Figure, caption: Sequence[str], height_in: float, shares_labels: bool
 ) -> float:
-    """Writes the caption at the bottom of a figure and reserves the space for it.
+    """Writes the caption at the bottom of a figure, and reserves the space for it.
 
     Args:
-        figure: the figure.
-        caption: the lines of the caption.
-        height_in: the height of the figure, in inches.
+        figure: The figure.
+        caption: Lines of the caption.
+        height_in: Height of the figure, in inches.
         shares_labels: True if the panels share a label. The layout engine moves panels but not
-            that label, so that the space for the label is reserved here.
+            this label, so that the space for the label is reserved here.
 
     Returns:
-        The top of the caption, as a share of the height.
+        The position of the top of the caption, as a fraction of the height.
     """
     top = (_CAPTION_LINE_IN * len(caption) + 0.04) / height_in
     reserved = top + _SHARED_LABEL_IN / height_in * shares_labels
@@ -229,7 +255,14 @@ def _write_caption(
 
 
 def _draw_panel(axes: Axes, plane: MapPlane, panel: MapPanel, lines: Sequence[MapLine]) -> None:
-    """Draws the cells of a panel, hatches undecided cells, and draws the lines on top."""
+    """Draws the cells of a panel, hatches the undecided ones, and draws the lines on top.
+
+    Args:
+        axes: Where to draw.
+        plane: The map.
+        panel: The panel.
+        lines: Lines of the panel.
+    """
     axes.grid(visible=False)
     axes.set_facecolor(_EMPTY_COLOUR)
     _draw_cells(axes, plane, panel)
@@ -241,7 +274,11 @@ def _draw_panel(axes: Axes, plane: MapPlane, panel: MapPanel, lines: Sequence[Ma
 
 
 def _draw_cells(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
-    """Draws the coloured cells of a panel."""
+    """Draws the coloured cells of a panel.
+
+    The colour shows the growth exponent, the stable share over several seeds, or the class of
+    the single run.
+    """
     colours: dict[str, Any]
     values: Any
     if plane.judged_by_twins:
@@ -263,7 +300,7 @@ def _draw_cells(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
 
 
 def _hatch_undecided(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
-    """Hatches the cells of `_find_undecided`, neighbours of a row as one rectangle."""
+    """Hatches the undecided cells. Neighbouring cells of a row form one rectangle."""
     x = _compute_borders(plane.x)
     y = _compute_borders(plane.y)
     for row, undecided in enumerate(_find_undecided(plane, panel)):
@@ -275,7 +312,7 @@ def _hatch_undecided(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
 
 
 def _draw_verdict_edges(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
-    """Draws the measured edge of the verdicts in each column as a vertical line."""
+    """Draws the measured edges of the classes in each column as vertical lines."""
     for x_value, edge in find_map_edges(plane, panel):
         x = _find_position(plane.x, x_value)
         low = _find_position(plane.y, edge.low)
@@ -284,12 +321,12 @@ def _draw_verdict_edges(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
 
 
 def _find_position(axis: PlaneAxis, value: float) -> float:
-    """Returns the drawing position of a value, which may lie between the values of the axis."""
+    """Returns the position at which a value is drawn, interpolated between the axis values."""
     return float(np.interp(value, axis.values, axis.positions))
 
 
 def _list_stretches(flags: Array) -> list[tuple[int, int]]:
-    """Returns the stretches of True in a row of flags, as pairs (first, last + 1)."""
+    """Returns the ranges of consecutive True values in a row, as pairs (first, last + 1)."""
     padded = np.concatenate([[False], flags, [False]])
     changes = np.flatnonzero(padded[1:] != padded[:-1]).tolist()
     firsts = changes[::2]
@@ -298,12 +335,21 @@ def _list_stretches(flags: Array) -> list[tuple[int, int]]:
 
 
 def _draw_line(axes: Axes, plane: MapPlane, line: MapLine) -> None:
-    """Draws a line as the zero contour of its quantity, extrapolated to the panel's borders."""
+    """Draws a line of a map as the zero contour of its quantity.
+
+    The quantity is known at the grid points, the centres of the cells. It is extrapolated
+    linearly, so that the line reaches the borders of the panel.
+
+    Args:
+        axes: Where to draw.
+        plane: The map.
+        line: The line.
+    """
     x = _extend_positions(plane.x)
     y = _extend_positions(plane.y)
     excess = _extrapolate_rows(line.excess, y)
     excess = _extrapolate_rows(excess.T, x).T
-    # a border at zero may coincide with the first position: only one of the two is kept
+    # A border at zero may coincide with the first position. Only one of the two is kept.
     keep_x = np.diff(x, append=np.inf) > 0.0
     keep_y = np.diff(y, append=np.inf) > 0.0
     kept_excess = np.ma.masked_invalid(excess[np.ix_(keep_y, keep_x)])
@@ -321,17 +367,17 @@ def _draw_line(axes: Axes, plane: MapPlane, line: MapLine) -> None:
 
 
 def _extend_positions(axis: PlaneAxis) -> Array:
-    """Returns the positions of an axis with the borders of the panel at both ends."""
+    """Returns the positions of the values of an axis, between the two borders of the panel."""
     borders = _compute_borders(axis)
     return np.concatenate([borders[:1], axis.positions, borders[-1:]])
 
 
 def _extrapolate_rows(rows: Array, positions: Array) -> Array:
-    """Returns a field with an extrapolated row before the first and after the last.
+    """Returns a field with an extrapolated row before the first and after the last row.
 
     Args:
-        rows: the field, shape (n, m).
-        positions: positions of the rows of the result, shape (n + 2,).
+        rows: The field, shape (n, m).
+        positions: Positions of the rows of the result, shape (n + 2,).
     """
     before = _extrapolate_row(rows[:2], positions[:3])
     after = _extrapolate_row(rows[:-3:-1], positions[:-4:-1])
@@ -339,11 +385,11 @@ def _extrapolate_rows(rows: Array, positions: Array) -> Array:
 
 
 def _extrapolate_row(rows: Array, positions: Array) -> Array:
-    """Returns a row outside of a field, on the straight line through the next two rows.
+    """Returns a row outside of a field, on the straight line through the two nearest rows.
 
     Args:
-        rows: the next row and the one behind it, shape (2, m).
-        positions: positions of the row outside and of these two rows, shape (3,).
+        rows: The nearest row and the one behind it, shape (2, m).
+        positions: Positions of the new row and of these two rows, shape (3,).
     """
     outside, near, far = positions
     near_row, far_row = rows
@@ -352,10 +398,13 @@ def _extrapolate_row(rows: Array, positions: Array) -> Array:
 
 
 def _find_undecided(plane: MapPlane, panel: MapPanel) -> Any:
-    """Returns True for the cells to be hatched, shape (y, x).
+    """Returns which cells have runs but no clear result and must be hatched.
 
-    These are cells with runs of which half or more are undecided or, if twins judge the map,
-    that have no exponent.
+    These are the cells of which half or more of the runs are undecided. On a map of growth
+    exponents, they are the cells without an exponent.
+
+    Returns:
+        Flags, shape (y, x).
     """
     has_runs = panel.runs > 0
     if plane.judged_by_twins:
@@ -365,9 +414,12 @@ def _find_undecided(plane: MapPlane, panel: MapPanel) -> Any:
 
 
 def _compute_borders(axis: PlaneAxis) -> Array:
-    """Returns the borders of the cells of an axis, halfway between positions, shape (n + 1,).
+    """Returns the borders of the cells along an axis, halfway between the values.
 
-    No border is below zero unless a value is: a delay of -100 ms does not exist.
+    If all values are at least zero, so are the borders: a delay of -100 ms does not exist.
+
+    Returns:
+        Positions, shape (n + 1,) for n values.
     """
     positions = axis.positions
     if len(positions) == 1:
@@ -383,7 +435,9 @@ def _compute_borders(axis: PlaneAxis) -> Array:
 def _set_scale(axes: Axes, plane: MapPlane) -> None:
     """Sets the limits and ticks of a panel.
 
-    The ticks are round numbers on an evenly spaced axis, else the values of the axis.
+    Args:
+        axes: The panel in the figure.
+        plane: The map.
     """
     x = _compute_borders(plane.x)
     y = _compute_borders(plane.y)
@@ -398,7 +452,11 @@ def _set_scale(axes: Axes, plane: MapPlane) -> None:
 
 
 def _set_ticks(axis: Axis, plane_axis: PlaneAxis) -> None:
-    """Sets the ticks of one axis of a panel."""
+    """Sets the ticks of one axis of a panel.
+
+    If the values are equally spaced, the ticks are round numbers. Otherwise they are the values
+    themselves.
+    """
     if plane_axis.is_evenly_spaced:
         axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 2.5, 4, 5, 10]))
         return
@@ -408,9 +466,10 @@ def _set_ticks(axis: Axis, plane_axis: PlaneAxis) -> None:
 
 
 def _find_exponent_limit(plane: MapPlane) -> float:
-    """Returns the exponent with the darkest colours, in 1/s.
+    """Returns the exponent at which the colours end, in 1/s.
 
-    The limit is a round number that four fifths of the exponents do not exceed.
+    The limit is 1, 2 or 5 times a power of ten. Four fifths of the exponents do not exceed it,
+    so that a few large exponents do not make all others pale.
     """
     exponents = [panel.exponents_per_s.ravel() for panel in plane.panels]
     magnitudes = np.abs(np.concatenate(exponents))
@@ -418,15 +477,20 @@ def _find_exponent_limit(plane: MapPlane) -> float:
     least = max(quantile, 1e-6)
     decade = 10.0 ** math.floor(math.log10(least))
     for step in (1.0, 2.0, 5.0):
-        if step * decade >= least * (1.0 - 1e-9):  # a limit that `least` equals is enough
+        if step * decade >= least * (1.0 - 1e-9):  # also if both are equal up to rounding
             return step * decade
     return 10.0 * decade
 
 
 def _draw_colour_bar(figure: Figure, grid: Sequence[Axes], plane: MapPlane) -> None:
-    """Draws the colour bar of exponents or of stable shares.
+    """Draws the colour bar of growth exponents or of stable shares.
 
     The pointed ends of the bar of exponents stand for all exponents beyond its limits.
+
+    Args:
+        figure: The figure.
+        grid: All panels, beside which the bar stands.
+        plane: The map.
     """
     if plane.judged_by_twins:
         limit = _find_exponent_limit(plane)
@@ -449,9 +513,9 @@ def _draw_colour_bar(figure: Figure, grid: Sequence[Axes], plane: MapPlane) -> N
 
 
 def _draw_counts(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
-    """Writes the number of stable and of decided runs into the cells whose runs disagree.
+    """Writes the numbers of stable and of decided runs into the cells whose runs disagree.
 
-    Nothing is written if the counts do not fit into a cell.
+    Nothing is written if the numbers do not fit into a cell.
     """
     extent = axes.get_window_extent()
     dpi = axes.figure.dpi
@@ -478,7 +542,13 @@ def _draw_counts(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
 
 
 def _draw_legend(figure: Figure, plane: MapPlane, lines: Sequence[Sequence[MapLine]]) -> None:
-    """Draws the legend: classes or the edge of the verdicts, hatching, and lines."""
+    """Draws the legend: the classes or the edge of the classes, the hatching, and the lines.
+
+    Args:
+        figure: The figure.
+        plane: The map.
+        lines: Lines of each panel.
+    """
     handles: list[Any] = []
     if plane.judged_by_twins:
         if any(find_map_edges(plane, panel) for panel in plane.panels):
@@ -502,7 +572,7 @@ def _draw_legend(figure: Figure, plane: MapPlane, lines: Sequence[Sequence[MapLi
 
 
 def _list_class_handles(plane: MapPlane) -> list[Patch]:
-    """Returns the legend entries of the decided classes that occur in a map."""
+    """Returns the legend entries of the classes that occur in a map, except "undecided"."""
     counts = sum(panel.counts.sum(axis=(0, 1)) for panel in plane.panels)
     handles = []
     for verdict, count in zip(CELL_CLASSES, counts, strict=True):
@@ -518,21 +588,22 @@ def _list_class_handles(plane: MapPlane) -> list[Patch]:
 
 
 _DPI = 300
+"""Resolution of map.png, and of the cells in the other files, in pixels per inch."""
 
 
 def write_map(chart: StabilityMap, folder: Path, width_in: float = COLUMN_IN) -> list[Path]:
     """Writes the figure and the page of a map into an existing folder.
 
     Args:
-        chart: the map.
-        folder: the folder.
-        width_in: width of the figure, in inches.
+        chart: The map.
+        folder: The folder.
+        width_in: Width of the figure, in inches.
 
     Returns:
         The paths of the files.
 
     Raises:
-        UsageError: the width is not that of one or two columns.
+        UsageError: The width is not that of one or two columns of a printed page.
     """
     form = make_print_size(width_in)
     figure = draw_stability_map(chart.plane, chart.lines, form, chart.fixed)
@@ -547,9 +618,12 @@ def write_map(chart: StabilityMap, folder: Path, width_in: float = COLUMN_IN) ->
 def build_map_page(chart: StabilityMap, picture: str) -> str:
     """Returns the page of a map in Markdown.
 
+    The page has the commands, the picture, the number of runs of each class, notes, and a table
+    of the edges for each panel.
+
     Args:
-        chart: the map.
-        picture: the name of the picture's file.
+        chart: The map.
+        picture: File name of the picture.
     """
     commands = "\n".join(chart.commands)
     parts = [f"# {chart.title}", f"```sh\n{commands}\n```", f"![map]({picture})"]
@@ -567,7 +641,7 @@ def build_map_page(chart: StabilityMap, picture: str) -> str:
 
 
 def _list_notes(chart: StabilityMap) -> list[str]:
-    """Returns the notes of a map's page: on its lines, and on gains that were not swept."""
+    """Returns the notes of a map's page, on the lines and on the gains that were not swept."""
     origins = [f"{line.text}: {line.about}" for lines in chart.lines for line in lines]
     notes = [*dict.fromkeys(origins), *chart.remarks]
     notes += [f"gains that were not swept: {text}" for text in chart.fixed]
@@ -579,7 +653,7 @@ def _list_notes(chart: StabilityMap) -> list[str]:
 
 
 def tabulate_classes(plane: MapPlane) -> TextTable:
-    """Returns a table with the number of runs of each class, a row per panel."""
+    """Returns a table with the number of runs of each class, one row per panel."""
     rows = []
     for panel in plane.panels:
         counts = panel.counts.sum(axis=(0, 1)).tolist()
@@ -588,13 +662,19 @@ def tabulate_classes(plane: MapPlane) -> TextTable:
 
 
 def tabulate_edges(plane: MapPlane, panel: MapPanel, lines: Sequence[MapLine]) -> TextTable:
-    """Returns a table of the measured edges beside the lines, a row per edge.
+    """Returns a table that compares the measured edges of a panel with the lines from theory.
 
-    The table is empty if only one axis was swept. If twins judge the map, an edge is a zero of
-    the exponent, and the nearest edge of the verdicts stands beside it.
+    The table has one row per edge. For each line it has the crossing that is nearest to the
+    edge, and the difference of this crossing from the middle of the edge, or "within" if the
+    crossing lies within the edge.
 
-    The difference is that of a line from the middle of the measured edge, or "within" if the
-    line lies in the measured edge.
+    On a map of growth exponents, the measured edges are the zeros of the exponent, and another
+    column has the nearest edge of the classes. If only one axis is drawn, the table is empty.
+
+    Args:
+        plane: The map.
+        panel: The panel.
+        lines: Lines of the panel.
     """
     theory = [line for line in lines if line.rank >= 0]
     heads = [plane.x.label, f"edge of {plane.y.label}", "stable is"]
@@ -608,6 +688,7 @@ def tabulate_edges(plane: MapPlane, panel: MapPanel, lines: Sequence[MapLine]) -
     if plane.judged_by_twins:
         measured = [line for line in lines if line.rank < 0]
         edges = [crossing for line in measured for crossing in _list_crossings(line, plane)]
+
     rows = []
     for x, edge in edges:
         row = [f"{x:g}", _format_edge(edge), "below" if edge.stable_below else "above"]
@@ -622,7 +703,10 @@ def tabulate_edges(plane: MapPlane, panel: MapPanel, lines: Sequence[MapLine]) -
 
 
 def _list_crossings(line: MapLine, plane: MapPlane) -> Iterator[tuple[float, StabilityEdge]]:
-    """Yields the crossings of a line with the columns, as edges of zero width."""
+    """Yields the crossings of a line with the columns of a map, as edges of zero width.
+
+    Each crossing comes with the value of x of its column.
+    """
     for column, x in enumerate(plane.x.values):
         for value in line.crossings(column, plane.y):
             above = int(np.searchsorted(plane.y.values, value))
@@ -632,13 +716,14 @@ def _list_crossings(line: MapLine, plane: MapPlane) -> Iterator[tuple[float, Sta
 
 
 def _format_edge(edge: StabilityEdge) -> str:
+    """Returns the text of an edge: its interval, or its value if the interval is empty."""
     if edge.low == edge.high:
         return f"{edge.low:.4g}"
     return f"{edge.low:g} to {edge.high:g}"
 
 
 def _format_nearest_edge(value: float, edges: Sequence[StabilityEdge]) -> str:
-    """Returns the text of the edge nearest to a value, or "-" without edges."""
+    """Returns the text of the edge that is nearest to a value, or "-" if there are no edges."""
     if not edges:
         return "-"
     nearest = min(edges, key=lambda edge: abs(edge.middle - value))
@@ -646,7 +731,16 @@ def _format_nearest_edge(value: float, edges: Sequence[StabilityEdge]) -> str:
 
 
 def _compare_with_line(edge: StabilityEdge, values: Sequence[float]) -> list[str]:
-    """Returns the table cells of a line's nearest crossing and of its relative difference."""
+    """Returns the table cells of a line: its crossing nearest to an edge, and the difference.
+
+    Args:
+        edge: The measured edge.
+        values: Values at which the line crosses the column of the edge.
+
+    Returns:
+        The value of the crossing, and its relative difference from the middle of the edge, or
+        "within" if the crossing lies within the edge. Both are "-" if there is no crossing.
+    """
     if not values:
         return ["-", "-"]
     nearest = min(values, key=lambda value: abs(value - edge.middle))
