@@ -1,10 +1,16 @@
-"""Figures of links and loops: ages and delays of samples, lateness and computing time of ticks.
+"""Draws figures of communication and timing: ages and delays of samples, and timing of loops.
+
+A sample is the state that a site publishes in one tick of its control loop. A link is the
+directed connection between two sites. The delay of a sample is the time that it needs on its
+link. The age is the time since the sample that a receiver uses in a tick was sent: it grows
+until a newer sample arrives. The lateness is the time by which a tick started after it was due.
 
 Invariant:
     - A link that follows a measured trace has no line of a stated delay.
-    - A run whose links are all stated as one constant delay has no figure of distributions.
-    - A run in virtual time reads no clock. Its figure of the loops states that reason instead
-      of drawing zeros.
+    - A run whose links all have one constant delay has no figure of distributions, because
+      these would be vertical lines.
+    - A run in virtual time reads no clock. The figure of its loops gives this reason instead of
+      showing zeros.
 """
 
 from typing import Any, NamedTuple
@@ -34,22 +40,25 @@ _POINTS = 400
 _RARE_RATIO = 6.0
 """An axis is logarithmic if the largest value exceeds the 95th percentile by this factor."""
 _STEP_MS = 1.5
-"""An age that falls by more than this from one tick to the next counts as a fluctuation. An
-additional sample at a tick makes the age fall by less.
+"""An age that falls by more than this from one tick to the next counts as a fluctuation.
+
+If two samples arrive in the same tick of 1 ms, the age falls by about 1 ms, which is normal.
 """
 NO_LOOP_CLOCK = "virtual time: no clock was read, so no loop was late and no tick was timed"
 NO_LOOP_TIMES = "no lateness and no computing time in this log"
 _BINS_PER_DECADE = 20
+"""Number of bins of a histogram between 1 us and 10 us, and so on."""
 
 
 class DelayDistribution(NamedTuple):
-    """Delays and ages on one link.
+    """Delays and ages of the samples on one link.
 
     Attributes:
-        peer: the sender.
-        site: the receiver.
-        delay_ms: delays of the samples, shape (S,), by the link's model, or else as measured.
-        age_ms: age of the sample in use at the receiver's ticks, shape (K,).
+        peer: Name of the sender.
+        site: Name of the receiver.
+        delay_ms: Delays of the samples, shape (S,). They follow from the link's model if the
+            scenario has one, and were measured otherwise.
+        age_ms: Age of the sample in use at each tick of the receiver, shape (K,).
     """
 
     peer: str
@@ -60,9 +69,10 @@ class DelayDistribution(NamedTuple):
 
 @draws("sample_age", "age of the samples in use, per link", in_report=True)
 def draw_sample_age(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns the figure of the age of the sample in use on every link over time, in ms.
+    """Draws the age of the sample in use on every link over time, in ms.
 
-    The figure has a row per receiver. An age that fluctuates is drawn as a band.
+    The figure has a row per receiver. An age that fluctuates is drawn as a band with its
+    median, because a line would fill the area between its extremes.
     """
     ages_ms = _read_ages_ms(log)
     stated = {
@@ -98,7 +108,7 @@ def draw_sample_age(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
 
 def _read_ages_ms(log: Log) -> dict[tuple[str, str], Array]:
-    """Returns the age of the sample in use, shape (K,), ms, by sender and receiver."""
+    """Returns the age of the sample in use, shape (K,), in ms, by sender and receiver."""
     ages_ms = {}
     for site in log.sites:
         columns = sample_ages_ms(log, site).T
@@ -110,7 +120,11 @@ def _read_ages_ms(log: Log) -> dict[tuple[str, str], Array]:
 def _add_link_panels(
     figure: Figure, log: Log
 ) -> tuple[style.AxesGrid, dict[tuple[str, str], Axes]]:
-    """Returns a panel per link, as a grid with a row per receiver, and by link."""
+    """Adds a panel per link to a figure, with a row per receiver.
+
+    Returns:
+        The grid of panels, and the panels by sender and receiver.
+    """
     count = len(log.sites)
     grid = style.add_panels(figure, count, count - 1, sharex=True, sharey=True)
     panels = {}
@@ -122,7 +136,7 @@ def _add_link_panels(
 
 
 def has_varying_delay(log: Log) -> bool:
-    """True if some link is not stated as a single constant delay."""
+    """Returns True if at least one link has more than one constant delay."""
     return not all(map(has_one_constant_delay, _list_link_models(log).values()))
 
 
@@ -133,10 +147,10 @@ def has_varying_delay(log: Log) -> bool:
     in_report=True,
 )
 def draw_delay_distributions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns the figure of the distributions of delay and age on every link.
+    """Draws the distributions of delay and age on every link.
 
-    A curve is the percentage of samples, or of ticks, with at most that delay or age. The
-    figure has a row per receiver.
+    A curve at x shows the percentage of samples with a delay of at most x ms, or of ticks with
+    an age of at most x ms. The figure has a row per receiver.
     """
     links = measure_delay_distributions(log)
     x_ms = choose_delay_axis_ms(links)
@@ -165,19 +179,20 @@ def draw_delay_distributions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure
 
 
 def _list_link_models(log: Log) -> dict[str, list[StatedModel]]:
-    """Returns the models of every link, the first one and one after every change."""
+    """Returns the models of every link: the first one, and one after every change."""
     changes = list_changes(log)
     return {link: list_stated_models(log, link, changes) for link in log.scenario.links}
 
 
 def measure_delay_distributions(log: Log) -> list[DelayDistribution]:
-    """Returns the delays and ages of every link, by receiver and then by peer."""
+    """Returns the delays and ages of every link, ordered by receiver and then by sender."""
     distributions = []
     for site in log.sites:
         for peer, arrivals in read_arrivals(log, site).items():
             newest = int(arrivals.sample.max(initial=-1))
             sent_count = count_sent(log, peer, newest)
             delay_ms = predict_delivery(log, peer, site, sent_count).drawn_ms
+            # A link without a model has only measured delays, and only in a live session.
             if not len(delay_ms) and log.driver == "live":
                 delay_ms = arrivals.delay_us / 1e3
             age_ms = sample_ages_ns(log, peer, site) / 1e6
@@ -186,10 +201,16 @@ def measure_delay_distributions(log: Log) -> list[DelayDistribution]:
 
 
 def choose_delay_axis_ms(links: list[DelayDistribution]) -> Array:
-    """Returns the delays at which distributions are drawn, in ms.
+    """Chooses the delays at which distributions are drawn.
 
-    They reach up to the longest delay or age. Their steps are equal, or equal on a logarithmic
-    axis if few values are long.
+    The delays reach up to the longest delay or age. Their steps are equal, or equal on a
+    logarithmic axis if only few values are long.
+
+    Args:
+        links: Delays and ages of all links that share the axis.
+
+    Returns:
+        The delays, in ms, shape (P,). The first one is 0 unless the axis is logarithmic.
     """
     parts: list[Array] = [np.zeros(0)]
     for link in links:
@@ -204,11 +225,14 @@ def choose_delay_axis_ms(links: list[DelayDistribution]) -> Array:
 
 
 def compute_cumulative_percent(values: Array, limits: Array) -> Array:
-    """Returns the percentage of values that do not exceed each limit; NaN without values.
+    """Returns the percentage of values that do not exceed each limit.
 
     Args:
-        values: the values, shape (K,).
-        limits: the limits, shape (P,).
+        values: The values, shape (K,).
+        limits: The limits, shape (P,).
+
+    Returns:
+        Percentages, shape (P,). All are NaN if there are no values.
     """
     if not len(values):
         return np.full(len(limits), np.nan)
@@ -217,15 +241,15 @@ def compute_cumulative_percent(values: Array, limits: Array) -> Array:
 
 
 def trace_stated_delay(log: Log, models: list[StatedModel]) -> tuple[Array, Array]:
-    """Returns the stated mean delay of a link over time, as the points of a line.
+    """Returns the mean delay that the scenario states for a link, as the points of a line.
 
     Args:
-        log: the log.
-        models: the models of the link, at least one.
+        log: Log of the run.
+        models: Models of the link in order of time, at least one.
 
     Returns:
-        Times, s, and mean delays, ms, shape (3 M,) each for M models: start and end of each
-        model, and a NaN that interrupts the line.
+        Times in s, and mean delays in ms, each of shape (3 M,) for M models. Each model has a
+        point at its start, a point at its end, and a NaN that interrupts the line.
     """
     starts_s = [model.from_s for model in models]
     last_s = max(recorded_end_s(log), starts_s[-1])
@@ -240,7 +264,13 @@ def trace_stated_delay(log: Log, models: list[StatedModel]) -> tuple[Array, Arra
 
 
 def needs_log_axis(ages_ms: Array) -> bool:
-    """True if few ages, as after an outage, are so long that a linear axis hides the others."""
+    """Returns True if a few ages are so long that a linear axis would hide the others.
+
+    This happens after an outage of a link, for example.
+
+    Args:
+        ages_ms: Ages, shape (K,). NaN values are ignored.
+    """
     known = ages_ms[np.isfinite(ages_ms)]
     if not len(known):
         return False
@@ -248,13 +278,13 @@ def needs_log_axis(ages_ms: Array) -> bool:
 
 
 def is_unsteady(ages_ms: Array) -> bool:
-    """True if ages fall so often that a line would fill the area between its extremes."""
+    """Returns True if ages fall so often that a line would look like a filled area."""
     falls = np.flatnonzero(np.diff(ages_ms) < -_STEP_MS)
     return len(falls) > style.SPREAD_BUCKETS
 
 
 def _scale_age_axis(axes: Axes, values_ms: Array) -> None:
-    """Scales the axis of ages to all values, shape (K,), NaN for unknown values."""
+    """Scales the value axis of ages to all values, shape (K,). NaN values are ignored."""
     known = values_ms[np.isfinite(values_ms)]
     if needs_log_axis(known):
         least_ms = float(known[known > 0.0].min())
@@ -265,7 +295,7 @@ def _scale_age_axis(axes: Axes, values_ms: Array) -> None:
 
 
 def _list_sender_entries(log: Log) -> list[tuple[str, dict[str, Any]]]:
-    """Returns the entries of a legend of senders."""
+    """Returns the legend entries of the senders of samples."""
     return [
         (f"from {style.site_title(log, site)}", style.site_line(log, site, 1.8))
         for site in log.sites
@@ -273,17 +303,24 @@ def _list_sender_entries(log: Log) -> list[tuple[str, dict[str, Any]]]:
 
 
 def explain_missing_loop_times(log: Log) -> str:
-    """Returns the reason why a log has no lateness and no computing time; "" if it has some."""
+    """Returns the reason why a log has no lateness and no computing times.
+
+    Returns:
+        The reason. Empty if at least one site has such times.
+    """
     if any(np.any(log[site].late_us) or np.any(log[site].busy_us) for site in log.sites):
         return ""
     return NO_LOOP_CLOCK if log.driver == "virtual" else NO_LOOP_TIMES
 
 
 def choose_bin_edges_us(log: Log) -> Array:
-    """Returns the edges of the histograms of a log, in us, shape (B + 1,).
+    """Chooses the bins of the histograms of a log's lateness and computing times.
 
-    The edges have equal steps on a logarithmic axis, from 1 us to above all times of the log.
-    Times below 1 us count in the first bin.
+    The bins have equal widths on a logarithmic axis, from 1 us to above the longest time of the
+    log.
+
+    Returns:
+        Edges of the bins in us, shape (B + 1,).
     """
     largest_us = 0
     for site in log.sites:
@@ -295,7 +332,15 @@ def choose_bin_edges_us(log: Log) -> Array:
 
 
 def bin_loop_times(times_us: Ints, edges_us: Array) -> Ints:
-    """Returns the number of times, shape (K,), in each bin between edges, shape (B + 1,)."""
+    """Counts times per bin. Times below 1 us count in the first bin.
+
+    Args:
+        times_us: Times, shape (K,).
+        edges_us: Edges of the bins, shape (B + 1,).
+
+    Returns:
+        Number of times in each bin, shape (B,).
+    """
     counts, _ = np.histogram(np.maximum(times_us, 1), edges_us)
     return counts.astype(np.int64)
 
@@ -307,7 +352,7 @@ def bin_loop_times(times_us: Ints, edges_us: Array) -> Ints:
     in_report=True,
 )
 def draw_loop_timing(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns the figure of histograms of each site's lateness and computing time, in us."""
+    """Draws the histograms of each site's lateness and computing time, in us."""
     edges_us = choose_bin_edges_us(log)
     labels = ("wake-up after the deadline", "computing time of a tick")
     if form.narrow:
@@ -338,7 +383,7 @@ def _draw_histogram(axes: Axes, times_us: Ints, edges_us: Array, colour: str) ->
 
 
 def _title_histogram(axes: Axes, site: str, times_us: Ints, form: FigureSize) -> None:
-    """Titles a histogram with the site and the percentiles of its times, shape (K,)."""
+    """Writes the site and the percentiles of its times, shape (K,), above a histogram."""
     if not len(times_us):
         style.annotate_empty_panel(axes, f"no times of {site}")
         return

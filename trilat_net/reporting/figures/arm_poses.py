@@ -1,11 +1,14 @@
-"""Poses of the arms at a few times of a run, as a Matplotlib figure and as SVG for the page.
+"""Draws the poses of the arms at a few times of a run, for a figure and for a page.
 
-A planar arm is drawn in its plane. A chain is drawn as seen from one fixed direction, in
-parallel projection, with up opposite to gravity.
+A planar arm is drawn in its plane. An arm in space, called a chain, is drawn as seen from one
+fixed direction, in parallel projection. Up in the picture is opposite to gravity.
+
+`draw_arms` returns a Matplotlib figure, and `render_arms_svg` returns SVG for the page. Both
+draw the same poses, which `find_pose` computes.
 
 Invariant:
-    - The positions of the joints are those of the core's forward kinematics.
-    - The reference pose of each arm is dashed.
+    - The positions of the joints are those of the simulation kernel's forward kinematics.
+    - The reference pose of each arm, which its controller aims at, is dashed.
 """
 
 from collections.abc import Iterable, Sequence
@@ -28,12 +31,16 @@ from ..appearance import REPORT_SIZE, FigureSize
 from .figure_entry import draws
 
 INSTANTS = 6
+"""Number of times at which the arms are drawn."""
 _NARROW_INSTANTS = 3
+"""The same in a figure that is as wide as one column of a paper."""
 _PATH_POINTS = 400
+"""Largest number of points of the path of an end effector."""
 _AZIMUTH = np.deg2rad(-50.0)
-"""Direction from which chains are seen, about the vertical from the base's x axis on, rad."""
+"""Direction of view of chains: angle about the vertical, from the x axis of the base, in rad.
+"""
 _ELEVATION = np.deg2rad(22.0)
-"""Direction from which chains are seen, above the floor, rad."""
+"""Direction of view of chains: angle above the floor, in rad."""
 _SHADOW: dict[str, Any] = {
     "color": "#c9c9c9",
     "linewidth": 1.6,
@@ -48,11 +55,12 @@ _DESIRED: dict[str, Any] = {
 PictureBox = tuple[float, float, float, float]
 """Left, right, bottom and top of a picture."""
 _CORNERS_ON_PATH = np.array([0, 1, 3, 2, 0, 4, 5, 1, 5, 7, 3, 7, 6, 2, 6, 4])
-"""Corners of a box along a path over all of its edges. The bits of a corner's number are its
-sides along x, y and z.
+"""Numbers of a box's corners along a path that visits all of its edges.
+
+The bits of a number tell on which side of the box the corner lies, along x, y and z.
 """
 _BOX_PATH = 0.5 - (_CORNERS_ON_PATH[:, np.newaxis] >> np.arange(3) & 1)
-"""The same path as points of a box with sides of length 1, shape (16, 3)."""
+"""The path as points of a box with sides of length 1 around the origin, shape (16, 3)."""
 _BASE: dict[str, Any] = {
     "linestyle": "none",
     "marker": "s",
@@ -62,15 +70,15 @@ _BASE: dict[str, Any] = {
 
 
 class ArmPose(NamedTuple):
-    """The pose of a site at some time, as points in the plane of a picture.
+    """The pose of a site's arm at some time, as points in the plane of a picture.
 
     Attributes:
-        actual: base, joints and end effector, shape (L, 2), m.
-        desired: the same for the reference pose, shape (L, 2), m.
-        path: path of the end effector until then, shape (P, 2), m.
-        shadow: shadow of a chain on a floor at its base, with light from straight above, shape
-            (L, 2), m; shape (0, 2) for a planar arm.
-        bodies: edges of the bodies of the site's plant as paths, shape (16, 2) each, m.
+        actual: Base, joints and end effector, shape (L, 2), in m.
+        desired: The same points for the reference pose, shape (L, 2), in m.
+        path: Path of the end effector from the start of the run, shape (P, 2), in m.
+        shadow: Shadow of a chain on a floor at its base, with light from straight above, shape
+            (L, 2), in m. Planar arms have no shadow: shape (0, 2).
+        bodies: For each body that the arm can touch, its edges as a path, shape (16, 2), in m.
     """
 
     actual: Array
@@ -90,7 +98,7 @@ class ArmPose(NamedTuple):
         )
 
     def list_points(self) -> Array:
-        """Returns all points of the pose, shape (K, 2), m."""
+        """Returns all points of the pose, shape (K, 2), in m."""
         parts = [self.actual, self.desired, self.path, self.shadow, *self.bodies]
         return np.concatenate(parts)
 
@@ -98,16 +106,18 @@ class ArmPose(NamedTuple):
 def trace_bodies_m(
     arm: ArmModel, sizes_m: Iterable[Sequence[float]], poses: Array
 ) -> list[Array]:
-    """Returns the edges of the bodies of a plant as paths in the plane of a picture.
+    """Returns the edges of box-shaped bodies as paths in the plane of a picture.
+
+    A path visits all edges of a box, so that one line draws the box.
 
     Args:
-        arm: the arm of the site.
-        sizes_m: size of each of the b bodies along its own axes, m.
-        poses: poses of the bodies in K records, shape (K, 7 b): position, m, and unit
-            quaternion, w first.
+        arm: Arm of the site, which determines the projection.
+        sizes_m: Size of each of the b bodies along its own axes, in m.
+        poses: Poses of the bodies in K records, shape (K, 7 b): for each body the position in
+            m, and the unit quaternion of its orientation with w first.
 
     Returns:
-        A path per body, shape (K, 16, 2), m.
+        A path per body, shape (K, 16, 2), in m.
     """
     paths = []
     body_count = poses.shape[1] // 7
@@ -117,7 +127,7 @@ def trace_bodies_m(
         v = pose[:, np.newaxis, 4:]
         box = _BOX_PATH * np.asarray(size)
         corners = np.broadcast_to(box, (len(pose), *box.shape))
-        # rotation of p by the quaternion (w, v): p + 2 v x (v x p + w p)
+        # Rotation of a point p by the quaternion (w, v): p + 2 v x (v x p + w p).
         rotated = corners + 2.0 * np.cross(v, np.cross(v, corners) + w * corners)
         edges = rotated + position
         paths.append(edges[..., :2] if arm.chain is None else project_arm_m(arm, edges))
@@ -125,13 +135,16 @@ def trace_bodies_m(
 
 
 def project_arm_m(arm: ArmModel, points: Array, *, onto_floor: bool = False) -> Array:
-    """Returns points of an arm in the plane of a picture, shape (..., 2), m.
+    """Projects points of an arm to the plane of a picture.
 
     Args:
-        arm: the arm.
-        points: points in the base's frame, m, shape (..., 3); of a planar arm (..., 2), which
-            are returned as they are.
+        arm: The arm.
+        points: Points in the frame of the base, in m, shape (..., 3). Those of a planar arm
+            have the shape (..., 2), and are returned unchanged.
         onto_floor: True to return the shadows of the points on a floor at the base.
+
+    Returns:
+        Points in the picture, shape (..., 2), in m.
     """
     if arm.chain is None:
         return points
@@ -144,14 +157,17 @@ def project_arm_m(arm: ArmModel, points: Array, *, onto_floor: bool = False) -> 
 
 
 def choose_instants_s(log: Log, count: int = INSTANTS) -> list[float]:
-    """Returns times at which to draw the arms, in s, with the first and the last time.
+    """Chooses the times at which to draw the arms, including the first and the last time.
 
-    The times are equally spaced in a progress to which time and motion contribute one half
-    each. Equal steps of time alone would mostly show arms at rest.
+    Equal steps of time would mostly show arms at rest. Therefore the times are equally spaced
+    in a measure of progress to which time and motion contribute one half each.
 
     Args:
-        log: the log.
-        count: largest number of times.
+        log: Log of the run.
+        count: Largest number of times. There may be fewer, because the times are rounded.
+
+    Returns:
+        The times in increasing order, in s.
     """
     end_s = recorded_end_s(log)
     grid_s = np.linspace(0.0, end_s, 1001)
@@ -168,7 +184,7 @@ def choose_instants_s(log: Log, count: int = INSTANTS) -> list[float]:
         progress += moved_rad / moved_rad[-1]
     chosen_s = np.interp(np.linspace(0.0, progress[-1], count), progress, grid_s)
 
-    # rounded to two or three digits, for short titles
+    # The times are rounded to two or three digits, for short titles.
     step_s = 10.0 ** np.floor(np.log10(end_s / 50.0))
     times_s = {0.0, end_s}
     for time_s in chosen_s[1:-1]:
@@ -179,12 +195,15 @@ def choose_instants_s(log: Log, count: int = INSTANTS) -> list[float]:
 
 
 def find_pose(log: Log, site: str, t_s: float) -> ArmPose | None:
-    """Returns the pose of a site in its last record until a time; None without a record.
+    """Returns the pose of a site in its last record until a time.
 
     Args:
-        log: the log.
-        site: name of the site.
-        t_s: the time, in s.
+        log: Log of the run.
+        site: Name of the site.
+        t_s: The time, in s.
+
+    Returns:
+        The pose. None if the site has no record until then.
     """
     part = log[site]
     arm = log.scenario.arms[site]
@@ -192,6 +211,7 @@ def find_pose(log: Log, site: str, t_s: float) -> ArmPose | None:
     if last < 0:
         return None
 
+    # The path of the end effector until then. Its last point belongs to the last record.
     rows = np.unique(np.linspace(0, last, _PATH_POINTS).astype(np.int64))
     positions = joint_positions_m(arm, part.q[rows])
     actual = project_arm_m(arm, positions)
@@ -201,6 +221,7 @@ def find_pose(log: Log, site: str, t_s: float) -> ArmPose | None:
     shadow: Array = np.zeros((0, 2))
     if arm.chain is not None:
         shadow = project_arm_m(arm, positions[-1:], onto_floor=True)[0]
+
     bodies: list[Array] = []
     sizes_m = log.scenario.bodies_m(site).values()
     if sizes_m:
@@ -212,10 +233,16 @@ def find_pose(log: Log, site: str, t_s: float) -> ArmPose | None:
 
 
 def compute_pose_box_m(poses: Sequence[ArmPose | None]) -> PictureBox:
-    """Returns a box around poses and the base, with a margin, m.
+    """Returns a box around poses and the base, with a margin.
 
-    The box is at least 70 % as wide as it is high, and at least 70 % as high as it is wide,
-    before the margin is added.
+    Before the margin is added, the box is made at least 70 % as wide as it is high, and at
+    least 70 % as high as it is wide, so that pictures are never narrow strips.
+
+    Args:
+        poses: The poses. None entries are ignored.
+
+    Returns:
+        Left, right, bottom and top of the box, in m.
     """
     parts = [pose.list_points() for pose in poses if pose is not None]
     base = np.zeros((1, 2))
@@ -225,6 +252,7 @@ def compute_pose_box_m(poses: Sequence[ArmPose | None]) -> PictureBox:
     centre = (low + high) / 2.0
     extent = max(float((high - low).max()), 0.1)
     half = np.maximum((high - low) / 2.0, 0.35 * extent) + 0.08 * extent
+
     left, bottom = (centre - half).tolist()
     right, top = (centre + half).tolist()
     return left, right, bottom, top
@@ -232,10 +260,7 @@ def compute_pose_box_m(poses: Sequence[ArmPose | None]) -> PictureBox:
 
 @draws("arms", "the arms at a few instants", in_report=True)
 def draw_arms(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns the figure of all arms at a few times, with axes in m.
-
-    The figure has a row per site and a column per time.
-    """
+    """Draws the poses of all arms at a few times, with a row per site and a column per time."""
     times_s = choose_instants_s(log, _NARROW_INSTANTS if form.narrow else INSTANTS)
     poses = {site: [find_pose(log, site, t_s) for t_s in times_s] for site in log.sites}
     all_poses = [pose for row in poses.values() for pose in row]
@@ -268,7 +293,7 @@ def draw_arms(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
 
 def _draw_pose(axes: Axes, pose: ArmPose | None, colour: str) -> None:
-    """Draws a pose, or a note if the site has no record yet and `pose` is None."""
+    """Draws a pose into a panel, or a note if `pose` is None because there is no record yet."""
     axes.set_aspect("equal")
     if pose is None:
         style.annotate_empty_panel(axes, "no record")
@@ -297,9 +322,9 @@ def render_arms_svg(log: Log, bounds_m: PictureBox, factor: float) -> str:
     Sites without records are left out.
 
     Args:
-        log: the log.
-        bounds_m: left, right, bottom and top of every picture, m.
-        factor: units of a picture per m.
+        log: Log of the run.
+        bounds_m: Left, right, bottom and top of every picture, in m.
+        factor: Scale of the pictures, in units of the picture per m.
     """
     left_m, right_m, bottom_m, top_m = bounds_m
     bounds = (factor * left_m, factor * right_m, factor * bottom_m, factor * top_m)
@@ -329,10 +354,10 @@ def _render_picture(pose: ArmPose | None, index: int, bounds: PictureBox, label:
     """Returns a picture of a pose as SVG.
 
     Args:
-        pose: the pose in units of the picture; None for a picture without an arm.
-        index: index of the site, on which its colour depends.
-        bounds: left, right, bottom and top of the picture.
-        label: description of the picture for screen readers.
+        pose: The pose in units of the picture. None for a picture without an arm.
+        index: Index of the site, on which its colour depends.
+        bounds: Left, right, bottom and top of the picture.
+        label: Description of the picture for screen readers.
     """
     left, right, bottom, top = bounds
     ground = f'<line class="ground" x1="{left:.3f}" x2="{right:.3f}" y1="0" y2="0"/>'
@@ -360,5 +385,5 @@ def _render_picture(pose: ArmPose | None, index: int, bounds: PictureBox, label:
 
 
 def _format_points(points: Array) -> str:
-    """Returns points, shape (K, 2), as SVG, whose y axis points downwards."""
+    """Returns points, shape (K, 2), as text for SVG, whose y axis points downwards."""
     return " ".join(f"{x:.3f},{-y:.3f}" for x, y in points)

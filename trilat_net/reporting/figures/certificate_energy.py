@@ -1,13 +1,18 @@
-"""Figures of the energies that the certificate judges, in J over the time of the run.
+"""Draws the energies with which the stability of a run is judged, in J over time.
 
-- The functional V: its sites, its parts, dissipation and work, and the residual of the balance.
-- The energies that control laws declare.
+There are two figures:
+
+- `draw_functional` draws V, the energy function of the stability proof, with its contributions
+  from the sites, its parts, the dissipated energy, the work done on the loop, and the residual,
+  which is the part of V that these do not explain.
+- `draw_observed_energy` draws the energies that control laws declare to prove their passivity.
 
 Invariant:
-    - Spans of V without complete records are shaded.
-    - The largest rise of V is marked.
+    - Times for which V is unknown, because records are missing, are shaded.
+    - The largest rise of V is marked, because V must not rise in a stable run.
 """
 
+import math
 from typing import Any
 
 import numpy as np
@@ -57,21 +62,25 @@ _OBSERVED_PANELS = {
     "store": "stored (J)",
     "given": "given, taken (J)",
 }
-"""Label of the panel of each kind of declared energy. The panel "given" also has "taken"."""
+"""Label of the panel of each kind of declared energy.
+
+The panel "given" also shows the kind "taken", the energy that a law dissipated.
+"""
 
 
 def draw_functional(
     log: Log, certificate: Certificate, form: FigureSize = REPORT_SIZE
 ) -> Figure:
-    """Returns the figure of V and its energy balance over time, in J.
+    """Draws V and its energy balance over time, in J.
 
-    The panels are, from the top: V and the share of each site; the parts of V; dissipation and
-    work; and the residual of the balance. Without a balance the figure shows the reason.
+    The panels are, from the top: V and the contribution of each site; the parts of V;
+    dissipation and work; and the residual of the balance. Without a balance the figure shows
+    the reason.
 
     Args:
-        log: the log.
-        certificate: the certificate of the log.
-        form: size of the figure.
+        log: Log of the run.
+        certificate: Judgement whether the run was stable, which contains the balance.
+        form: Size of the figure.
     """
     balance = certificate.balance
     if balance is None:
@@ -86,7 +95,7 @@ def draw_functional(
         _draw_work(work, balance, form)
         _draw_residual(residual, balance, form)
         for axes in (total, parts, work, residual):
-            # the lower panels have a legend where the numbers would be
+            # The lower panels have a legend where the numbers of the changes would be.
             plot.mark(axes, log.sites, numbered=axes is total)
             for from_s, to_s in find_unjudged_spans(balance):
                 axes.axvspan(from_s, to_s, **_UNJUDGED)
@@ -109,23 +118,23 @@ def draw_functional(
     in_report=True,
 )
 def _draw_certificate(log: Log, form: FigureSize) -> Figure:
-    """Returns the figure of V of a log."""
+    """Draws V of a log, for the registry of figures."""
     return draw_functional(log, certify(log), form)
 
 
 def draw_observed_energy(
     log: Log, observed: ObservedEnergy, form: FigureSize = REPORT_SIZE
 ) -> Figure:
-    """Returns the figure of the energies that the control laws declare, in J over time.
+    """Draws the energies that the control laws declare, in J over time.
 
-    The panels are: energy in the lines between sites; the part of it that the receivers know;
-    stored energy; and energy that the arms gave to the laws or that the laws dissipated. A
-    line between sites has the colour of its receiver.
+    There is a panel for each kind that the laws declare: the energy in the lines between sites;
+    the part of it that the receivers know; stored energy; and energy that the arms gave to the
+    laws or that the laws dissipated. A line between sites has the colour of its receiver.
 
     Args:
-        log: the log.
-        observed: the declared energies, at least one.
-        form: size of the figure.
+        log: Log of the run.
+        observed: The declared energies, at least one.
+        form: Size of the figure.
     """
     kinds = {curve.kind for curve in observed.curves}
     panel_kinds = [kind for kind in _OBSERVED_PANELS if kind in kinds]
@@ -135,10 +144,12 @@ def draw_observed_energy(
         rows = style.add_panels(plot.figure, len(panel_kinds), 1, sharex=True)[:, 0]
         panels = dict(zip(panel_kinds, rows, strict=True))
         for curve in observed.curves:
-            axes = panels["given" if curve.kind == "taken" else curve.kind]
+            panel_kind = curve.kind
             line = style.site_line(log, curve.site)
             if curve.kind == "taken":
+                panel_kind = "given"
                 line["linestyle"] = _DISSIPATED["linestyle"]
+            axes = panels[panel_kind]
             ticks = np.arange(len(curve.t_s))
             style.plot_decimated(axes, ticks, curve.t_s, curve.energy_j, **line)
         for kind, axes in panels.items():
@@ -150,7 +161,7 @@ def draw_observed_energy(
 
 
 def _has_declared_energies(log: Log) -> bool:
-    """True if a law of the run declares energies."""
+    """Returns True if at least one control law of the run declares energies."""
     observed = observe_energies(log)
     return observed is not None and bool(observed.curves)
 
@@ -162,7 +173,7 @@ def _has_declared_energies(log: Log) -> bool:
     in_report=True,
 )
 def _draw_observed(log: Log, form: FigureSize) -> Figure:
-    """Returns the figure of the energies that the control laws of a log declare."""
+    """Draws the declared energies of a log's control laws, for the registry of figures."""
     observed = observe_energies(log)
     assert observed is not None
     return draw_observed_energy(log, observed, form)
@@ -175,10 +186,10 @@ def _draw_line(balance: EnergyBalance, axes: Axes, values: Array, **options: Any
 
 
 def _add_panel_legend(axes: Axes, form: FigureSize) -> None:
-    """Adds a legend inside a panel, and room for it above the lines."""
+    """Adds a legend inside a panel, and extends the value axis to make room for it."""
     handles, _ = axes.get_legend_handles_labels()
     columns = 2 if form.narrow else 4
-    rows = -(-len(handles) // columns)
+    rows = math.ceil(len(handles) / columns)
     room = 0.25 * rows if form.narrow else 0.35
     low, high = axes.get_ylim()
     axes.set_ylim(low, high + room * (high - low))
@@ -186,13 +197,17 @@ def _add_panel_legend(axes: Axes, form: FigureSize) -> None:
 
 
 def _choose_legend_pt(form: FigureSize) -> float:
-    """Returns the size of the type of a legend inside a panel, in pt."""
+    """Returns the type size of a legend inside a panel, in pt."""
     is_uniform = form.small_pt == form.tick_pt
     return form.small_pt if is_uniform else form.small_pt + 0.5
 
 
 def _draw_total(axes: Axes, log: Log, certificate: Certificate, balance: EnergyBalance) -> None:
-    """Draws V, V with the paper's weights if these are wrong, and the share of each site."""
+    """Draws V and the contribution of each site to V.
+
+    If the weights of the sites that the paper states do not apply, V with these weights is
+    drawn as a dashed line for comparison.
+    """
     _draw_line(balance, axes, balance.V, **_TOTAL)
     paper_balance = certificate.paper_balance
     if paper_balance is not None:
@@ -204,7 +219,7 @@ def _draw_total(axes: Axes, log: Log, certificate: Certificate, balance: EnergyB
 
 
 def _draw_parts(axes: Axes, balance: EnergyBalance, form: FigureSize) -> None:
-    """Draws the parts of V."""
+    """Draws the parts of V: kinetic, parameter error, position error, and under way."""
     for (name, values), dashes in zip(balance.parts.items(), style.DASHES, strict=True):
         _draw_line(
             balance,
@@ -219,9 +234,9 @@ def _draw_parts(axes: Axes, balance: EnergyBalance, form: FigureSize) -> None:
 
 
 def _draw_work(axes: Axes, balance: EnergyBalance, form: FigureSize) -> None:
-    """Draws the dissipated energy by kind, and the work of every source that matters.
+    """Draws the dissipated energy by kind, and the work of every source.
 
-    The work of all links is drawn as one line.
+    The work of all links is drawn as one line. Sources whose work is negligible are left out.
     """
     for (name, values), dashes in zip(balance.dissipation.items(), style.DASHES, strict=False):
         label = _DISSIPATION_LABELS.get(name, f"taken: {name}")
@@ -245,7 +260,10 @@ def _draw_work(axes: Axes, balance: EnergyBalance, form: FigureSize) -> None:
 
 
 def _draw_residual(axes: Axes, balance: EnergyBalance, form: FigureSize) -> None:
-    """Draws the residual of the balance, with and without the work of sampling."""
+    """Draws the residual of the balance, with and without the work that sampling does.
+
+    The value axis is logarithmic, so that the residual can be compared with the largest energy.
+    """
     scale = balance.scale or 1.0
     floor = 1e-9 * scale
     residuals = (
@@ -258,7 +276,7 @@ def _draw_residual(axes: Axes, balance: EnergyBalance, form: FigureSize) -> None
             balance, axes, magnitude, label=label, color=style.REFERENCE, linestyle=dashes
         )
     axes.axhline(scale, color=style.FAINT, linewidth=0.9, label="largest energy")
-    # a narrow legend is higher and needs more room above the lines
+    # The legend of a narrow figure is higher and needs more room above the lines.
     room = 1e12 if form.narrow else 1e4
     axes.set(yscale="log", ylabel="residual (J)", ylim=(floor, room * scale))
     columns = 1 if form.narrow else 3

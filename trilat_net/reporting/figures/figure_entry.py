@@ -1,11 +1,16 @@
 """Registers the functions that draw figures of a log, each under a name.
 
+A module of this folder adds a figure by decorating a function:
+
     @draws("positions", "actual and desired angles (Fig. 4)", in_report=True)
     def draw_positions(log, form): ...
 
+The command `trilat figure` and the report then offer the figure under this name.
+
 Invariant:
     - Every name has one figure.
-    - Registered figures are listed in the order in which a paper has them.
+    - Figures are listed in the order in which a paper would have them, whatever the order in
+      which the modules are imported.
 """
 
 from collections.abc import Callable
@@ -17,19 +22,22 @@ from ...log.log_reader import Log
 from ..appearance import FigureSize
 
 Draw = Callable[[Log, FigureSize], Figure]
+"""Function that draws a figure of a log in a size."""
 Absent = Callable[[Log], str]
+"""Function that returns the reason why the figure of a log would be empty, or an empty text."""
 Drawing = TypeVar("Drawing", bound=Callable[..., Figure])
+"""Type of a decorated function, which the decorator `draws` keeps."""
 
 
 class FigureEntry(NamedTuple):
     """A registered figure.
 
     Attributes:
-        about: description of the contents.
-        draw: function that draws the figure.
-        absent: function that returns the reason why the figure of a log would be empty; "" if
-            there is something to draw.
-        in_report: True if the report has the figure.
+        about: Description of the contents, for lists of figures.
+        draw: Function that draws the figure.
+        absent: Function that returns the reason why the figure of a log would be empty. It
+            returns an empty text if there is something to draw.
+        in_report: True if the report of a run contains the figure.
     """
 
     about: str
@@ -45,25 +53,29 @@ _PAPER_ORDER = (
     "certificate", "observed_energy", "twins", "arms", "paths", "sample_age",
     "delay_distributions", "loop_timing",
 )  # fmt: skip
-"""Names of figures in the order of a paper; other figures follow."""
+"""Names of figures in the order of a paper. Figures that are not listed follow at the end."""
 
 
 def draws(
     name: str, about: str, absent: Absent = lambda _: "", *, in_report: bool = False
 ) -> Callable[[Drawing], Drawing]:
-    """Returns a decorator that registers a function of a log and a size as a figure.
+    """Returns a decorator that registers a function as a figure.
+
+    The function receives a log and the size of the figure, and returns a Matplotlib figure.
 
     Args:
-        name: name of the figure.
-        about: description of the contents.
-        absent: function that returns the reason why the figure of a log would be empty.
-        in_report: True if the report has the figure.
+        name: Name of the figure.
+        about: Description of the contents.
+        absent: Function that returns the reason why the figure of a log would be empty. By
+            default every log has something to draw.
+        in_report: True if the report of a run contains the figure.
 
     Raises:
-        ValueError: the figure is already registered.
+        ValueError: Another figure has the same name.
     """
 
     def register(draw: Drawing) -> Drawing:
+        """Registers a function, and returns it unchanged."""
         other = _ENTRIES.get(name)
         if other is not None:
             modules = f"{other.draw.__module__} and {draw.__module__}"
@@ -78,14 +90,14 @@ def unless(shows: Callable[[Log], object], reason: str) -> Absent:
     """Returns a function that explains why the figure of a log would be empty.
 
     Args:
-        shows: function that returns a true value for a log with something to draw.
-        reason: the explanation for other logs.
+        shows: Function that returns a true value if a log has something to draw.
+        reason: Explanation for other logs.
     """
     return lambda log: "" if shows(log) else reason
 
 
 def list_figures() -> dict[str, FigureEntry]:
-    """Returns all figures by name, in the order in which a paper has them."""
+    """Returns all figures by name, in the order in which a paper would have them."""
     ranks = {name: rank for rank, name in enumerate(_PAPER_ORDER)}
     names = sorted(_ENTRIES, key=lambda name: ranks.get(name, len(ranks)))
     return {name: _ENTRIES[name] for name in names}

@@ -1,11 +1,16 @@
-"""Figures of the signals of the arms: torques, angles, errors, estimates, paths and contact.
+"""Draws the signals of the arms: torques, angles, errors, estimates, paths and contact forces.
 
-Settling times are those of `analysis.site_signals`. Dominance factors follow from the scenario
-and the recorded changes, Eq. (6) and (7). Wall forces follow from the scenario's walls at the
-recorded states; `analysis.torque_sources` has the equations.
+The sites of a run are processes that each control one arm. An operator is the person or program
+that moves an arm. A dominance factor is the weight with which an arm follows a peer, another
+site: it follows from the scenario and from the recorded changes, Eq. (6) and (7) of the paper.
+Wall forces are computed from the walls of the scenario and the recorded states, with the
+equations of `analysis.torque_sources`. Settling times are those of `analysis.site_signals`.
+
+Each function with the decorator `draws` is one figure.
 
 Invariant:
-    - Torques of operators are those ON the arm, the negative of the records' tau_x.
+    - Torques of operators are those that act on the arm. The records have the opposite sign,
+      because tau_x is the torque that the arm exerts.
 """
 
 from collections.abc import Sequence
@@ -32,30 +37,30 @@ from ..appearance import REPORT_SIZE, FigureSize
 from .figure_entry import draws, unless
 
 _ROW_IN = 1.2
-"""Height of every further row of panels, in."""
+"""Height of every further row of panels, in inches."""
 _TRANSPOSED = {"col": "row", "none": "none"}
-"""Which panels share their axis of values after rows and columns have been exchanged."""
+"""Which panels share their value axis after rows and columns have been exchanged."""
 _LEAST_RAD = 1e-3 * SETTLED_ERROR_RAD
-"""Smallest lower end of the axis of errors, rad."""
+"""Smallest lower end of the axis of errors, in rad."""
 _PLANES = ((0, 1), (0, 2), (1, 2))
 """Horizontal and vertical axis of each plane in which paths are drawn."""
 _LOOP_PT = 0.8
-"""Width of a line that crosses itself, pt."""
+"""Width of a line that crosses itself, in pt."""
 _PATH_STEP = 0.01
 """Distance between two points of a thinned path, as a share of the extent of the path."""
 _LINK_PANEL_PT = 5.5
-"""Size of the type of titles and time labels in the figure of link parameters, pt."""
+"""Type size of titles and time labels in the figure of link parameters, in pt."""
 NO_OPERATOR = "no site has an operator in this run"
 
 explain_absent_operator = unless(site_signals.sites_with_operator, NO_OPERATOR)
-"""Returns the reason why a log has no torque of an operator; "" if it has one."""
+"""Returns the reason why a log has no torque of an operator. Empty if it has one."""
 
 
 @draws(
     "operator_torques", "torque on the arms (Fig. 3)", explain_absent_operator, in_report=True
 )
 def draw_operator_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns the figure of the operators' torques ON the arms, N m; Fig. 3 of the paper."""
+    """Draws the torques of the operators on the arms, in N m, as Fig. 3 of the paper."""
     return _draw_joints(
         log=log,
         form=form,
@@ -66,7 +71,12 @@ def draw_operator_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
 
 def _explain_absent_displacement(log: Log) -> str:
-    """Returns the reason why a run cannot be repeated without its operators, or ""."""
+    """Returns the reason why a run cannot be repeated without its operators.
+
+    Returns:
+        The reason: there are no operators, or the code of a user's control law may not run
+        here. Empty if the run can be repeated.
+    """
     if not any(site.hands for site in log.scenario.sites.values()):
         return NO_OPERATOR
     for law in find_user_laws(log.scenario):
@@ -84,14 +94,14 @@ def _explain_absent_displacement(log: Log) -> str:
 def draw_operator_displacement(
     log: Log, form: FigureSize = REPORT_SIZE, *, twin: Log | None = None
 ) -> Figure:
-    """Returns the figure of the displacement of every site by the operators, rad.
+    """Draws how far the operators moved every arm, in rad.
 
-    The displacement is the log minus the same run without operators.
+    The displacement is the difference between the log and the same run without operators.
 
     Args:
-        log: the log.
-        form: size of the figure.
-        twin: the run without operators; None to simulate it.
+        log: Log of the run.
+        form: Size of the figure.
+        twin: The run without operators. None to simulate it.
     """
     other = simulate_without_operators(log) if twin is None else twin
     return _draw_joints(
@@ -105,9 +115,9 @@ def draw_operator_displacement(
 
 @draws("control_torques", "torque of the controllers")
 def draw_control_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns the figure of tau of Eq. (13) of every site, N m.
+    """Draws the torque of every site's controller, tau of Eq. (13), in N m.
 
-    The limit of a site is drawn if the site reached it.
+    The torque limit of a site is drawn if the site reached it.
     """
     limits = list[Array]()
     for site in log.sites:
@@ -135,15 +145,15 @@ def _draw_joints(
     label: str,
     limits: Sequence[Array] = (),
 ) -> Figure:
-    """Returns the figure of a signal over time: a panel per joint, a line per site.
+    """Draws a signal over time, with a panel per joint and a line per site.
 
     Args:
-        log: the log.
-        form: size of the figure.
-        sites: the sites that have the signal.
-        signal: the signal of a site.
-        label: label of the axis of values.
-        limits: limits of the signal, shape (n,) each, which are drawn with both signs.
+        log: Log of the run.
+        form: Size of the figure.
+        sites: Names of the sites that have the signal.
+        signal: Function that returns the signal of a site.
+        label: Label of the value axis.
+        limits: Limits of the signal, shape (n,) each. They are drawn with both signs.
     """
     count = len(style.name_joints(log))
     rows = len(style.arrange_joints(count, form.narrow))
@@ -175,17 +185,20 @@ def _add_joint_rows(
     labels: Sequence[str],
     sharey: str,
 ) -> tuple[list[list[Axes]], list[Axes]]:
-    """Returns a panel per quantity and joint, and the lowest panel of each column.
+    """Adds a panel per quantity and joint to a figure.
 
     Arms with two joints have a column per joint and a row per quantity. Arms with more joints
-    have a row per joint and a column per quantity.
+    have a row per joint and a column per quantity, because a row of many joints would not fit.
 
     Args:
-        plot: the figure.
-        form: size of the figure.
-        heads: title of each quantity, used above a column.
-        labels: label of each quantity, used beside a row.
-        sharey: "col" if the quantities of a joint share their axis of values, or "none".
+        plot: The figure.
+        form: Size of the figure.
+        heads: Title of each quantity, used above a column.
+        labels: Label of each quantity, used beside a row.
+        sharey: "col" if the quantities of a joint share their value axis, otherwise "none".
+
+    Returns:
+        The panels, by quantity and then by joint, and the lowest panel of each column.
     """
     titles = style.name_joints(plot.log)
     if len(titles) == 2:
@@ -207,7 +220,7 @@ def _add_joint_rows(
 
 @draws("operation", "torque on the arms above their angles", explain_absent_operator)
 def draw_operation(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns the figure of the torques ON the arms, N m, and the angles of all arms, rad.
+    """Draws the torques of the operators on the arms, in N m, and the joint angles, in rad.
 
     The torques are above the angles, or beside them if the arms have more than two joints.
     """
@@ -232,11 +245,14 @@ def draw_operation(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
 
 def _choose_height_in(log: Log, two_joints_in: float) -> float:
-    """Returns the height of a figure in which more than two joints have a row each, in.
+    """Returns the height of a figure that has a row per joint if there are more than two.
 
     Args:
-        log: the log.
-        two_joints_in: height of the figure of arms with two joints, in.
+        log: Log of the run.
+        two_joints_in: Height of the figure of arms with two joints, in inches.
+
+    Returns:
+        The height, in inches.
     """
     count = len(style.name_joints(log))
     return two_joints_in if count == 2 else 0.8 + 0.9 * count
@@ -244,7 +260,7 @@ def _choose_height_in(log: Log, two_joints_in: float) -> float:
 
 @draws("positions", "actual and desired angles (Fig. 4)", in_report=True)
 def draw_positions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns the figure of desired and actual joint angles, rad; Fig. 4 of the paper."""
+    """Draws the desired and the actual joint angles, in rad, as Fig. 4 of the paper."""
     heads = [f"{site}: q (rad)" for site in log.sites]
     labels = heads if form.narrow else [f"angle of {site} (rad)" for site in log.sites]
     row_in = 0.95 if form.narrow else 1.25
@@ -274,10 +290,10 @@ def draw_positions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
 @draws("tracking_errors", "errors, and the largest one still to come (Fig. 5)", in_report=True)
 def draw_tracking_errors(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns the figure of the tracking errors e = q - q_des of every site over time, rad.
+    """Draws the tracking errors e = q - q_des of every site over time, as Fig. 5 of the paper.
 
-    The errors are those of Fig. 5 of the paper. The panel below has the largest error of any
-    joint that is still to come. A site has settled when that line crosses the dashed limit.
+    The panel below shows, at each time, the largest error of any joint from then on. A site has
+    settled when this line falls below the dashed limit.
     """
     titles = style.name_shared(log)
     unit = site_signals.shared_unit(log)
@@ -289,7 +305,8 @@ def draw_tracking_errors(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
         style.title_joints(log, panels.joints, titles)
         error_signal = style.site_records(log, site_signals.joint_errors)
         plot.joint_row(panels.joints, log.sites, error_signal)
-        for axes in panels.joints[:: panels.columns]:
+        first_in_rows = panels.joints[:: panels.columns]
+        for axes in first_in_rows:
             axes.set_ylabel(f"tracking error ({unit})")
 
         low = SETTLED_ERROR_RAD
@@ -314,10 +331,9 @@ def draw_tracking_errors(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
 @draws("settling", "size of the errors on a log axis, settling times")
 def draw_settling(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns the figure of the largest error of any joint of every site over time, rad.
+    """Draws the largest error of any joint of every site over time, on a logarithmic axis.
 
-    The axis of errors is logarithmic. A triangle marks the time at which a site settles, which
-    the legend states.
+    A triangle marks the time at which a site settles, and the legend states this time.
     """
     unit = site_signals.shared_unit(log)
     entries = []
@@ -330,7 +346,8 @@ def draw_settling(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
             drawn = style.positive(errors)
             plot.trace(axes, site, drawn)
             if errors.any():
-                # dips at zero crossings would stretch the logarithmic axis
+                # The 2nd percentile excludes the dips at zero crossings, which would stretch
+                # the logarithmic axis.
                 site_low, site_high = np.nanpercentile(drawn, (2.0, 100.0)).tolist()
                 low = min(low, site_low)
                 high = max(high, site_high)
@@ -362,7 +379,7 @@ def draw_settling(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
 
 def _has_changing_estimates(log: Log) -> bool:
-    """True if an estimate of some site changes during the run."""
+    """Returns True if an estimate of at least one site changes during the run."""
     for site in log.sites:
         records = log[site]
         if len(records) and np.ptp(records.theta_hat, axis=0).any():
@@ -377,10 +394,11 @@ def _has_changing_estimates(log: Log) -> bool:
     in_report=True,
 )
 def draw_parameter_estimates(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns the figure of the parameter estimates over time, with the true values.
+    """Draws the estimates of the arms' inertial parameters over time, with the true values.
 
-    The figure has the estimates of all sites; Fig. 6 of the paper has those of master 1. A
-    chain has a row per link, or two rows per link in a narrow figure.
+    Adaptive control laws estimate these parameters while the arm moves. The figure has the
+    estimates of all sites, whereas Fig. 6 of the paper has those of master 1. An arm in space
+    (a chain) has a row of panels per link, or two rows per link in a narrow figure.
     """
     arm = log.scenario.arms[log.sites[0]]
     if arm.chain is not None:
@@ -400,7 +418,7 @@ def draw_parameter_estimates(log: Log, form: FigureSize = REPORT_SIZE) -> Figure
 
 
 def _draw_link_estimates(log: Log, form: FigureSize) -> Figure:
-    """Returns the figure of the estimates of chains: a panel per parameter of each link."""
+    """Draws the parameter estimates of arms in space, with a panel per link's parameter."""
     arms = log.scenario.arms
     longest = max((arms[site] for site in log.sites), key=lambda arm: arm.counts.joints)
     columns = LINK_PARAMETERS // 2 if form.narrow else LINK_PARAMETERS
@@ -429,7 +447,7 @@ def _draw_link_estimates(log: Log, form: FigureSize) -> Figure:
 
 
 def _list_estimate_entries(log: Log) -> list[tuple[str, dict[str, Any]]]:
-    """Returns the entries of the legend of estimates."""
+    """Returns the legend entries of the figures of estimates."""
     entries = style.site_legend_entries(log, log.sites)
     return [*entries, ("true value", style.LIMIT_LINE)]
 
@@ -441,21 +459,26 @@ def _draw_estimate(
     axes: Axes,
     width: float | None = None,
 ) -> None:
-    """Draws the estimates of one parameter, and its true value once if all sites share it.
+    """Draws the estimates of one parameter and its true value.
+
+    The true value is drawn once if it is equal for all sites, otherwise in the colour of each
+    site.
 
     Args:
-        plot: the figure.
-        sites: the sites that have the parameter.
-        index: index of the parameter.
-        axes: the panel.
-        width: see `style.site_line`.
+        plot: The figure.
+        sites: Names of the sites that have the parameter.
+        index: Index of the parameter.
+        axes: The panel.
+        width: Width of the lines, see `style.site_line`.
     """
     true_values = {}
     for site in sites:
         true_values[site] = float(plot.log.scenario.arms[site].theta[index])
         estimates = site_signals.parameter_estimates(plot.log[site])
         plot.trace(axes, site, estimates[:, index], width)
-    if len(set(true_values.values())) == 1:
+
+    all_are_equal = len(set(true_values.values())) == 1
+    if all_are_equal:
         axes.axhline(true_values[sites[0]], **style.LIMIT_LINE)
         return
     for site, true_value in true_values.items():
@@ -465,7 +488,7 @@ def _draw_estimate(
 
 @draws("phase", "errors against their rates")
 def draw_phase_portrait(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns the phase portrait of the errors: qd - qd_des over e, a panel per joint.
+    """Draws the phase portrait of the errors: e-dot = qd - qd_des over e, a panel per joint.
 
     A ring marks the start of a site, and a disc its end.
     """
@@ -500,7 +523,7 @@ def draw_phase_portrait(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
 
 def _has_only_chains(log: Log) -> bool:
-    """True if no arm of a log is planar."""
+    """Returns True if no arm of a run is planar."""
     return all(arm.chain for arm in log.scenario.arms.values())
 
 
@@ -511,7 +534,7 @@ def _has_only_chains(log: Log) -> bool:
     in_report=True,
 )
 def draw_end_effector_paths(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns the figure of the paths of the end effectors of chains in three planes, in m.
+    """Draws the paths of the end effectors of arms in space in three planes, in m.
 
     The planes are those of the frame that all sites share. In task space, the paths are scaled
     to the task. A ring marks the start of a site, and a disc its end.
@@ -538,7 +561,13 @@ def draw_end_effector_paths(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
 
 def _draw_path(axes: Axes, path: Array, line: dict[str, Any]) -> None:
-    """Draws a path, shape (K, 2), K > 0, with a ring at its start and a disc at its end."""
+    """Draws a path with a ring at its start and a disc at its end.
+
+    Args:
+        axes: The panel.
+        path: Points of the path, shape (K, 2), K > 0.
+        line: Options of the line.
+    """
     path = thin_path(path)
     axes.plot(*path.T, **line)
     disc = {"linestyle": "none", "marker": "o", "markersize": 4.0, "color": line["color"]}
@@ -548,13 +577,16 @@ def _draw_path(axes: Axes, path: Array, line: dict[str, Any]) -> None:
 
 
 def thin_path(path: Array) -> Array:
-    """Returns points of a path at about equal distances along it, with both ends.
+    """Returns points of a path at about equal distances along it, including both ends.
 
-    A path in a plane is thinned by its length and not by time, so that fast parts keep as many
-    points.
+    The path is thinned by its length and not by time, so that its fast parts keep as many
+    points as its slow ones.
 
     Args:
-        path: points of the path, shape (K, 2), K > 0.
+        path: Points of the path, shape (K, 2), K > 0. Each axis is scaled to its own extent.
+
+    Returns:
+        Some of the points, shape (P, 2).
     """
     extent = np.ptp(path, axis=0)
     scaled = path / np.where(extent > 0.0, extent, 1.0)
@@ -567,7 +599,7 @@ def thin_path(path: Array) -> Array:
 
 
 def list_sites_with_changing_dominance(log: Log) -> list[str]:
-    """Returns the sites whose shares change during the run, in scenario order."""
+    """Lists the sites whose dominance factors change during the run, in scenario order."""
     changed_sites = {changed.change.dominance for changed in list_changes(log)}
     return [site for site in log.sites if site in changed_sites]
 
@@ -578,9 +610,10 @@ def list_sites_with_changing_dominance(log: Log) -> list[str]:
     unless(list_sites_with_changing_dominance, "the shares of all sites are constant"),
 )
 def draw_authority(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns the figure of the shares that change, and of the motion of all arms, rad.
+    """Draws the dominance factors that change, and the motion of all arms in rad.
 
-    The motion of an arm is its displacement from the start of the run.
+    The dominance factor of a peer is the weight with which a site follows this peer. The motion
+    of an arm is its displacement from the start of the run.
     """
     owners = list_sites_with_changing_dominance(log)
     titles = style.name_joints(log)
@@ -613,7 +646,7 @@ def draw_authority(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
 
 def list_sites_with_walls(log: Log) -> list[str]:
-    """Returns the sites whose environment has a wall, in scenario order."""
+    """Lists the sites whose environment has a wall, in scenario order."""
     return [site for site in log.sites if list_walls(log.scenario.sites[site])]
 
 
@@ -623,10 +656,7 @@ def list_sites_with_walls(log: Log) -> list[str]:
     unless(list_sites_with_walls, "no site has a wall in this run"),
 )
 def draw_contact(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns the figure of the normal force of every wall, N, and the depth in it, mm.
-
-    The depth is that of the end effector.
-    """
+    """Draws the normal force of every wall, in N, and the end effector's depth in it, in mm."""
     sites = list_sites_with_walls(log)
     with style.time_figure(log, form, 2.9) as plot:
         force_panel, depth_panel = style.add_panels(plot.figure, 2, 1, sharex=True)[:, 0]

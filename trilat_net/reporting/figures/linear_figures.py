@@ -1,9 +1,12 @@
-"""Figures of computed loops: ports, roots, network delays and gains of arms.
+"""Draws figures of computed results, which need no recorded run.
 
-- Ports of a linear loop: the transmitted impedance and the passivity over frequency.
-- Roots of a linear loop, continuous and sampled.
-- One-way delays of a network benchmark.
-- The largest stable gain of an arm over the delay of the links.
+- `draw_port_impedance`, `draw_port_passivity`: a linear model of the coupled arms as seen by
+  the operators who hold them. A port is the place at which an operator and an arm exchange
+  force and velocity.
+- `draw_root_map`: characteristic roots of the linear model, continuous and sampled. A root with
+  a positive real part makes the loop unstable.
+- `draw_network_delays`: one-way delays of a network benchmark.
+- `draw_arm_gains`: largest stable gain of an arm over the delay of the links.
 
 Invariant:
     - A line of a port has the colour of the operator's site. The line is solid while the other
@@ -40,20 +43,20 @@ _PROOF: dict[str, Any] = {
     "linestyle": (0, (5, 1.5, 1, 1.5)),
 }
 _MAX_SHOWN_PARAMETER = 2.5
-"""Upper end of the axis of Llewellyn's parameter; values far above 1 mean the same."""
+"""Upper end of the axis of Llewellyn's parameter. All values far above 1 mean the same."""
 _CROWDED_TICKS_HZ = (0.1, 1.0, 10.0)
-"""Ticks of a narrow panel. Ticks at its ends would meet those of the next panel."""
+"""Ticks of a narrow panel. Labels at its ends would overlap those of the next panel."""
 
 
 def draw_port_impedance(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns the figure of the transmitted impedance of every joint over frequency.
+    """Draws the impedance that operators feel along every joint over frequency.
 
-    A joint has a panel of the magnitude above a panel of the phase. The panels of many joints
-    are arranged in several rows.
+    The impedance is the ratio of force to velocity. A joint has a panel of the magnitude above
+    a panel of the phase. The panels of many joints are arranged in several rows.
 
     Args:
-        ports: the analysed ports.
-        size: size of the figure.
+        ports: Analysed ports.
+        size: Size of the figure.
     """
     if "unstable" in (ports.verdict, ports.clamped_verdict):
         return style.empty_figure("The loop is unstable: it has no impedance.", size)
@@ -86,7 +89,7 @@ def draw_port_impedance(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> 
                 phase.set_ylabel("phase (degrees)")
                 phase.yaxis.set_major_locator(MultipleLocator(45.0))
 
-        # the last row can have fewer joints than columns
+        # The last row can have fewer joints than columns.
         joints_in_last_row = len(joints) - columns * (len(rows) - 1)
         unused: list[Axes] = [*grid[-2:, joints_in_last_row:].flat]
         for axes in unused:
@@ -96,7 +99,7 @@ def draw_port_impedance(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> 
 
 
 def _list_impedance_entries(ports: PortAnalysis) -> list[tuple[str, dict[str, Any]]]:
-    """Returns the entries of the legend of impedances."""
+    """Returns the legend entries of the figure of impedances."""
     operator_sites = dict.fromkeys(response.operator_site for response in ports.transparency)
     entries: list[tuple[str, dict[str, Any]]] = [
         (f"felt at {site}", {"color": _site_colour(ports, site)}) for site in operator_sites
@@ -112,19 +115,22 @@ def _list_impedance_entries(ports: PortAnalysis) -> list[tuple[str, dict[str, An
 def _plot_impedance(
     ports: PortAnalysis, responses: Sequence[Transparency], magnitude: Axes, phase: Axes
 ) -> None:
-    """Plots the impedances along one joint, free and clamped, at the sites of the operators.
+    """Draws the impedances along one joint at the sites of the operators.
+
+    Each site has two lines: the impedance while the other site is free, and while it is
+    clamped.
 
     Args:
-        ports: the analysed ports.
-        responses: the impedances of the joint, at least one.
-        magnitude: the panel of the magnitude.
-        phase: the panel of the phase.
+        ports: Analysed ports.
+        responses: Impedances of the joint, at least one.
+        magnitude: Panel of the magnitude.
+        phase: Panel of the phase.
     """
     for index, response in enumerate(responses):
         hz = _convert_to_hz(response.w_rad_s)
         width = 1.1
         if len(responses) > 1:
-            # later lines are thinner, so that equal lines all stay visible
+            # Later lines are thinner, so that lines that coincide all stay visible.
             width = 2.0 - 1.2 * index / (len(responses) - 1)
         for impedance, dashes in ((response.free, "-"), (response.clamped, _CLAMPED)):
             line: dict[str, Any] = {
@@ -133,7 +139,7 @@ def _plot_impedance(
                 "linewidth": width,
             }
             magnitude.loglog(hz, np.abs(impedance), **line)
-            # continuous from a first value between -180 and 180 degrees on
+            # The phase is continuous, and starts between -180 and 180 degrees.
             angle_rad = np.unwrap(np.angle(impedance))
             phase.semilogx(hz, np.rad2deg(angle_rad), **line)
     for axes in (magnitude, phase):
@@ -142,7 +148,7 @@ def _plot_impedance(
 
 
 def _describe_ratios(responses: Sequence[Transparency]) -> str:
-    """Returns a line of a title with the ratio of clamped to free impedance at each site."""
+    """Returns a line of a title with the clamped over the free impedance of each site, in dB."""
     ratios = [f"{response.operator_site} {response.ratio_db:+.1f} dB" for response in responses]
     text = f"\nclamped / free {', '.join(ratios)}"
     return text.replace("-", "\N{MINUS SIGN}")
@@ -155,22 +161,25 @@ def _site_colour(ports: PortAnalysis, site: str) -> str:
 
 
 def _convert_to_hz(w_rad_s: Array) -> Array:
-    """Returns angular frequencies, rad/s, in Hz."""
+    """Converts angular frequencies from rad/s to Hz."""
     return w_rad_s / (2.0 * np.pi)
 
 
 def draw_port_passivity(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns the figure of passivity, and of stability with any operators, over frequency.
+    """Draws over frequency whether the loop is passive, and stable with any passive operators.
 
-    The upper panel has the least eigenvalue of Y + Y^H, divided by its bound 2 norm(Y). A loop
-    with the value -1 returns all energy that an operator puts in.
+    The upper panel has the smallest eigenvalue of Y + Y^H, divided by its bound 2 norm(Y),
+    where Y is the admittance matrix of the ports: velocities over forces. A negative value
+    means that the loop can generate energy. With the value -1 it returns all energy that an
+    operator puts in.
 
     The lower panel has the criterion for stability with any passive operators: for two sites
-    Llewellyn's parameter of each joint, and for more sites the margin under the best weights.
+    Llewellyn's parameter of each joint, which must be at least 1; for more sites the margin
+    under the best weights, which must be positive.
 
     Args:
-        ports: the analysed ports.
-        size: size of the figure.
+        ports: Analysed ports.
+        size: Size of the figure.
     """
     if ports.verdict == "unstable":
         return style.empty_figure(
@@ -190,7 +199,7 @@ def draw_port_passivity(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> 
 
 
 def _list_passivity_entries(ports: PortAnalysis) -> list[tuple[str, dict[str, Any]]]:
-    """Returns the entries of the legend of passivity."""
+    """Returns the legend entries of the figure of passivity."""
     noun = "axes" if ports.axes else "joints"
     entries = [(f"all {noun}", _ALL)]
     entries += [
@@ -212,18 +221,18 @@ def _style_joint(joint: int) -> dict[str, Any]:
 
 
 def _plot_over_hz(axes: Axes, minima: Minima, values: Array, **options: Any) -> None:
-    """Plots values, shape (F,), over the frequencies of `minima`."""
+    """Draws values, shape (F,), over the frequencies of `minima`."""
     axes.semilogx(_convert_to_hz(minima.w_rad_s), values, **options)
 
 
 def _shade_failures(axes: Axes, minima: Minima) -> None:
-    """Shades the bands of frequency in which a curve lies below its level."""
+    """Shades the bands of frequency in which a curve lies below its limit."""
     for band in minima.below:
         axes.axvspan(*band, **_FAILS)
 
 
 def _plot_eigenvalues(ports: PortAnalysis, axes: Axes) -> None:
-    """Plots the least eigenvalues of Y + Y^H over their bound, for joints and for all ports."""
+    """Draws the smallest eigenvalues of Y + Y^H over their bound, per joint and in all."""
     curves = [(passivity, _style_joint(joint)) for joint, passivity in ports.joints.items()]
     if ports.proof is not None:
         curves.append((ports.proof, _PROOF))
@@ -237,7 +246,7 @@ def _plot_eigenvalues(ports: PortAnalysis, axes: Axes) -> None:
 
 
 def _plot_parameters(ports: PortAnalysis, axes: Axes) -> None:
-    """Plots Llewellyn's parameter of every two-port, with the limit 1."""
+    """Draws Llewellyn's parameter of every joint, with the limit 1."""
     for two_port in ports.two_ports:
         line = _style_joint(two_port.joint)
         _plot_over_hz(axes, two_port.minima, two_port.minima.values, **line)
@@ -247,7 +256,7 @@ def _plot_parameters(ports: PortAnalysis, axes: Axes) -> None:
 
 
 def _plot_margin(ports: PortAnalysis, axes: Axes) -> None:
-    """Plots the least eigenvalue under the best weights, with the limit 0."""
+    """Draws the smallest eigenvalue under the best weights, with the limit 0."""
     _plot_over_hz(axes, ports.absolute, ports.absolute.values, **_ALL)
     _shade_failures(axes, ports.absolute)
     axes.axhline(0.0, **style.LIMIT_LINE)
@@ -260,7 +269,7 @@ _UNSTABLE: Any = {"color": "#cc3311", "alpha": 0.08, "linewidth": 0.0, "zorder":
 
 
 def draw_root_map(analysis: LinearAnalysis) -> Figure:
-    """Returns the map of the continuous and sampled roots, with the unstable half shaded."""
+    """Draws the continuous and the sampled roots, with the unstable half-plane shaded."""
     with style.styled_figure(_SIZE, _HEIGHT_IN) as figure:
         axes = figure.add_subplot()
         _plot_roots(
@@ -289,6 +298,8 @@ def draw_root_map(analysis: LinearAnalysis) -> Figure:
                 color=style.FAINT,
                 label=f"zero by structure ({zeros})",
             )
+
+        # The unstable half is visible even if all roots are stable.
         low, high = axes.get_xlim()
         high = max(high, 0.06 * (high - low), 0.0)
         axes.axvline(0.0, **style.LIMIT_LINE)
@@ -299,7 +310,15 @@ def draw_root_map(analysis: LinearAnalysis) -> Figure:
 
 
 def _plot_roots(axes: Axes, spectrum: Spectrum, mark: str, colour: str, label: str) -> None:
-    """Plots the roots of a spectrum and their complex conjugates."""
+    """Draws the roots of a spectrum and their complex conjugates.
+
+    Args:
+        axes: The panel.
+        spectrum: The roots, of which each complex pair is listed once.
+        mark: Marker of Matplotlib.
+        colour: Colour of the markers.
+        label: Text in the legend.
+    """
     roots = [root.s for root in spectrum.roots]
     conjugates = [root.conjugate() for root in roots if root.imag]
     points = np.array([*roots, *conjugates])
@@ -321,12 +340,12 @@ _TRANSPORT_STEP = 0.22
 
 
 def draw_network_delays(facts: Mapping[str, Any]) -> Figure:
-    """Returns the figure of the one-way delays of a network benchmark, ms.
+    """Draws the one-way delays of a network benchmark, in ms.
 
-    A case is a size and a rate of samples. The case of the benchmark's scenario is shaded.
+    A case is a size and a rate of messages. The case of the benchmark's scenario is shaded.
 
     Args:
-        facts: the values of `NetworkBenchmark.to_dict`.
+        facts: Values of `NetworkBenchmark.to_dict`.
     """
     rows = facts["rows"]
     needs = facts["needs"]
@@ -364,7 +383,7 @@ def draw_network_delays(facts: Mapping[str, Any]) -> Figure:
 def _list_network_handles(
     rows: Sequence[Mapping[str, Any]], transports: Sequence[str]
 ) -> list[Line2D]:
-    """Returns the handles of the legend of network delays."""
+    """Returns the Matplotlib objects for the legend of network delays."""
     handles = []
     for number, name in enumerate(transports):
         handles.append(
@@ -383,13 +402,16 @@ def _list_network_handles(
 
 
 def _plot_case(axes: Axes, x: float, row: Mapping[str, Any], transport: int) -> None:
-    """Plots the delays of one transport in one case, and a cross if samples were lost.
+    """Draws the delays of one transport in one case, and a cross if messages were lost.
+
+    A mark is the median. A thick line leads from there to the 99th percentile, and a thin line
+    to the largest delay.
 
     Args:
-        axes: the panel.
-        x: position of the delays along the axis of cases.
-        row: the row of the benchmark.
-        transport: number of the transport, which decides on its colour and mark.
+        axes: The panel.
+        x: Position along the axis of cases.
+        row: Row of the benchmark.
+        transport: Number of the transport, on which its colour and its mark depend.
     """
     times_us = row["one_way_us"]
     if times_us is not None:
@@ -407,10 +429,11 @@ def _plot_case(axes: Axes, x: float, row: Mapping[str, Any], transport: int) -> 
 
 
 def _plot_bounds(axes: Axes, facts: Mapping[str, Any]) -> None:
-    """Plots the times that a delay is compared with as horizontal lines, ms.
+    """Draws horizontal lines at the times with which the delays are to be compared, in ms.
 
-    They are the period of the scenario, the time for which its links hold samples, and the ends
-    of the first interval of stable delays and of the intervals that contain a measured age.
+    These are the tick period of the scenario, the time for which its links hold samples, and
+    the ends of intervals of stable delays: of the first interval, and of those that contain a
+    measured age.
     """
     needs = facts["needs"]
     stable_ms = needs["stable_ms"] or []
@@ -429,12 +452,12 @@ def _plot_bounds(axes: Axes, facts: Mapping[str, Any]) -> None:
         if not has_age and interval != stable_ms[0]:
             continue
         bounds.append((f"stable from {low_ms:.4g} ms", low_ms, "top"))
-        # an interval that ends where the search ended has no upper edge
+        # An interval that ends where the search ended has no upper edge.
         if high_ms < 1e3 * MAX_COMMON_DELAY_S:
             bounds.append((f"stable up to {high_ms:.4g} ms", high_ms, "bottom"))
+
     for label, time_ms, alignment in bounds:
-        # the logarithmic axis has no zero
-        if time_ms:
+        if time_ms:  # a logarithmic axis has no zero
             axes.axhline(time_ms, **style.LIMIT_LINE)
             axes.annotate(
                 label,
@@ -454,13 +477,13 @@ _RUN_MARKS = {
 
 
 def draw_arm_gains(facts: Mapping[str, Any]) -> Figure:
-    """Returns the figure of the largest stable gain of an arm over the delay of each link.
+    """Draws the largest stable gain of an arm over the delay of each link.
 
-    The gain is k = K / inertia, 1/s^2. The chosen gains and the runs that checked them are
-    marked at the delay of the study.
+    The gain is k = K / inertia, in 1/s^2, with the stiffness K. Marks show the chosen gains,
+    and the simulated runs that checked them, at the delay of the study.
 
     Args:
-        facts: the values of `ArmGains.to_dict`.
+        facts: Values of `ArmGains.to_dict`.
     """
     edge = facts["edge"]
     margin = facts["margin"]

@@ -1,10 +1,13 @@
-"""Draws the figures of a log by name, and writes them for a paper or with the report.
+"""Draws the figures of a log by name, and writes them to files for a paper or for a report.
 
     trilat_net.figure(log, "settling").savefig("settling.pdf")
 
+The modules of this folder register their figures with the decorator `figure_entry.draws`. This
+module imports all of them, so that `FIGURES` is complete.
+
 Invariant:
-    - A figure is a function of a log and a figure size.
-    - Equal logs give equal bytes.
+    - A figure depends only on a log and a figure size.
+    - Equal logs give files with equal bytes.
     - Every figure drawn by a module of this folder is in the registry.
 """
 
@@ -29,7 +32,7 @@ from .joint_motion import draw_operator_displacement
 from .run_overview import draw_overlay
 from .twin_differences import draw_twins
 
-# the modules register their figures when they are imported
+# The modules of this folder register their figures when they are imported.
 for _module in pkgutil.iter_modules(import_module(__package__).__path__):
     import_module(f"{__package__}.{_module.name}")
 
@@ -42,18 +45,18 @@ def figure(
 ) -> Figure:
     """Returns a figure of a log for a paper, with type of 8 pt.
 
-    A notebook shows the figure as a picture. The command is `trilat figure`.
+    A notebook displays the figure as a picture. The command line has `trilat figure` for this.
 
     >>> drawn = tn.figure(tn.simulate("two_sites", duration_s=0.1), "positions")
     >>> drawn.savefig("positions.pdf")
 
     Args:
-        log: the log, or its path.
-        name: name of the figure, one of `FIGURES`.
-        width_in: width of the figure, 3.5 or 7 in: one column or two.
+        log: The log, or its path.
+        name: Name of the figure, one of `FIGURES`.
+        width_in: Width of the figure: 3.5 in for one column of a paper, or 7 in for two.
 
     Raises:
-        UsageError: the figure or the width does not exist, or the log has nothing to show in
+        UsageError: The figure or the width does not exist, or the log has nothing to show in
             the figure.
     """
     form = make_print_size(width_in)
@@ -62,7 +65,7 @@ def figure(
 
 
 def list_drawable_figures(log: Log) -> list[str]:
-    """Returns the names of the figures for which a log has something to show."""
+    """Lists the names of the figures for which a log has something to show."""
     return [name for name, entry in FIGURES.items() if not entry.absent(log)]
 
 
@@ -76,19 +79,22 @@ def write_figures(
     force: bool = False,
     progress: Progress | None = None,
 ) -> list[Path]:
-    """Writes figures of a log into a folder and returns the paths of the files.
+    """Writes figures of a log to files, as for a paper.
 
     Args:
-        log: the log.
-        folder: the folder, created if it does not exist.
-        names: names of figures; empty for all figures for which the log has something to show.
-        width_in: width of the figures, 3.5 or 7 in.
-        formats: formats of the files, of `FIGURE_FORMATS`.
+        log: The log.
+        folder: Folder of the files. It is created if it does not exist.
+        names: Names of figures. Empty for all figures for which the log has something to show.
+        width_in: Width of the figures, 3.5 or 7 in.
+        formats: Formats of the files, of `FIGURE_FORMATS`.
         force: True to overwrite existing files.
-        progress: called with the number of drawn figures and the number of all figures.
+        progress: Function that is called with the number of drawn figures and of all figures.
+
+    Returns:
+        The paths of the files.
 
     Raises:
-        UsageError: a figure, the width or a format does not exist, the log has nothing to show
+        UsageError: A figure, the width or a format does not exist, the log has nothing to show
             in a figure, or a file exists.
     """
     form = make_print_size(width_in)
@@ -114,18 +120,21 @@ def write_overlay(
     formats: Sequence[str] = FIGURE_FORMATS[:2],
     force: bool = False,
 ) -> list[Path]:
-    """Writes a figure of several logs in the same panels, as overlay.pdf and other formats.
+    """Writes a figure that compares several logs, as overlay.pdf and in other formats.
 
     Args:
-        logs: the logs by their names in the legend.
-        folder: the folder, created if it does not exist.
-        width_in: width of the figure, 3.5 or 7 in.
-        formats: formats of the files, of `FIGURE_FORMATS`.
+        logs: The logs, by their names in the legend.
+        folder: Folder of the files. It is created if it does not exist.
+        width_in: Width of the figure, 3.5 or 7 in.
+        formats: Formats of the files, of `FIGURE_FORMATS`.
         force: True to overwrite existing files.
 
+    Returns:
+        The paths of the files.
+
     Raises:
-        UsageError: the width or a format does not exist, the logs differ in kind, or a file
-            exists.
+        UsageError: The width or a format does not exist, the errors of the logs have different
+            units, or a file exists.
     """
     form = make_print_size(width_in)
     drawings = {"overlay": partial(draw_overlay, logs, form)}
@@ -139,24 +148,28 @@ def write_report_figures(
     progress: Progress | None = None,
     pushed: TwinGrowth | None = None,
 ) -> list[Path]:
-    """Writes the figures of the report and returns the paths of the files.
+    """Writes the figures of a run's report as PNG files.
 
-    Figures for which the log has nothing to show are left out. Earlier figures in the folder
-    are replaced.
+    Figures for which the log has nothing to show are left out. Earlier files in the folder are
+    replaced.
 
     Args:
-        log: the log.
-        folder: the folder, created if it does not exist.
-        twin: the same experiment without operators; None to leave out `hands_moved`.
-        progress: called with the number of drawn figures and the number of all figures.
-        pushed: growth of pushed twins that were already computed; None to compute it.
+        log: Log of the run.
+        folder: Folder of the files. It is created if it does not exist.
+        twin: The same run without operators. None leaves out the figure `hands_moved`.
+        progress: Function that is called with the number of drawn figures and of all figures.
+        pushed: Growth of pushed twins, if the caller has computed it. None to compute it.
+
+    Returns:
+        The paths of the files.
     """
     drawings: dict[str, Callable[[], Figure]] = {}
     for name in list_drawable_figures(log):
         entry = FIGURES[name]
         if entry.in_report:
             drawings[name] = partial(entry.draw, log, REPORT_SIZE)
-    # these two need runs that the caller may have executed already
+
+    # These two figures need further runs, which the caller may have executed already.
     if twin is None:
         drawings.pop("hands_moved", None)
     else:
@@ -177,20 +190,24 @@ def _write(
     *,
     force: bool = True,
 ) -> list[Path]:
-    """Writes figures by name and returns the paths of the files.
+    """Draws figures, and writes each of them in all formats.
 
-    All formats and files are checked before the first figure is drawn.
+    All formats and file names are checked before the first figure is drawn, so that an error
+    does not leave half of the files behind.
 
     Args:
-        drawings: functions that draw the figures, by the names of the files.
-        folder: the folder, created if it does not exist.
-        form: size of the figures.
-        formats: formats of the files, of `FIGURE_FORMATS`.
-        progress: called with the number of drawn figures and the number of all figures.
+        drawings: Functions that draw the figures, by the names of the files.
+        folder: Folder of the files. It is created if it does not exist.
+        form: Size of the figures.
+        formats: Formats of the files, of `FIGURE_FORMATS`.
+        progress: Function that is called with the number of drawn figures and of all figures.
         force: True to overwrite existing files.
 
+    Returns:
+        The paths of the files.
+
     Raises:
-        UsageError: a format does not exist, or a file exists.
+        UsageError: A format does not exist, or a file exists.
     """
     kinds = list(dict.fromkeys(formats))
     for kind in kinds:
@@ -200,6 +217,7 @@ def _write(
     for name in drawings:
         for kind in kinds:
             refuse_existing(folder / f"{name}.{kind}", force=force)
+
     paths = []
     for drawn_count, (name, draw) in enumerate(drawings.items()):
         if progress is not None:
@@ -214,13 +232,15 @@ def _write(
 
 
 def _find_figure(log: Log, name: str) -> FigureEntry:
-    """Returns the figure of a name.
+    """Returns the registered figure of a name.
 
     Raises:
-        UsageError: there is no such figure, or the log has nothing to show in it.
+        UsageError: There is no such figure, or the log has nothing to show in it.
     """
     if name not in FIGURES:
-        hint = suggest_nearest(name, list(FIGURES)) or f"; there are {', '.join(FIGURES)}"
+        hint = suggest_nearest(name, list(FIGURES))
+        if not hint:
+            hint = f"; there are {', '.join(FIGURES)}"
         raise UsageError(f"no figure {name!r}{hint}")
     entry = FIGURES[name]
     reason = entry.absent(log)

@@ -1,12 +1,12 @@
-"""Figure of one run, or of several runs over one another, in four panels.
+"""Draws an overview of one run, or compares several runs, in four panels over time.
 
-The panels have the largest error, the largest speed, the largest torque and the oldest sample
-in use over time.
+The panels show the largest tracking error, the largest joint speed, the largest torque and the
+age of the oldest sample in use. A sample is a state that a site received from a peer.
 
 Invariant:
-    - In the figure of one run, a line is a site.
-    - In the figure of several runs, a line is a run: the largest value of its sites at any
-      time.
+    - In the figure of one run, each line is a site.
+    - In the figure of several runs, each line is a run. It shows the largest value of all sites
+      of the run at any time.
 """
 
 import textwrap
@@ -31,20 +31,22 @@ from .figure_entry import draws
 _HEIGHT_IN = 3.9
 _NARROW_HEIGHT_IN = 5.6
 _DECADES = 6.0
-"""Largest range of the axis of errors. An error below it has settled long ago."""
+"""Number of decades on the axis of errors. Smaller errors have settled long ago."""
 _LETTERS_PER_IN = 15.0
+"""Average number of letters of the title per inch."""
 _MAX_SPANS = 1_000
-"""Largest number of spans of time in the line of a run with several sites."""
+"""Largest number of spans of time for which the largest value of all sites is computed."""
 
 
 class _Panel(NamedTuple):
-    """A quantity that is shown in a panel.
+    """Quantity that one of the panels shows.
 
     Attributes:
-        name: name of the quantity.
-        find_unit: function that returns the unit of the quantity in a log.
-        compute: function that returns the quantity at the K records of a site, shape (K,).
-        log_scale: True to draw the quantity on a logarithmic axis.
+        name: Name of the quantity.
+        find_unit: Function that returns the unit of the quantity in a log. The unit of errors
+            depends on the scenario.
+        compute: Function that returns the quantity at the K records of a site, shape (K,).
+        log_scale: True for a logarithmic value axis.
     """
 
     name: str
@@ -54,24 +56,27 @@ class _Panel(NamedTuple):
 
 
 def _compute_largest_error(log: Log, site: str) -> Array:
-    """Returns the largest error of any joint or axis, shape (K,)."""
+    """Returns the largest error of any joint or task axis in each record, shape (K,)."""
     return largest_magnitude(log[site].e)
 
 
 def _compute_largest_speed(log: Log, site: str) -> Array:
-    """Returns the largest speed of any joint, shape (K,), rad/s."""
+    """Returns the largest speed of any joint in each record, shape (K,), in rad/s."""
     return largest_magnitude(log[site].qd)
 
 
 def _compute_largest_torque(log: Log, site: str) -> Array:
-    """Returns the largest torque of the controller at any joint, shape (K,), N m."""
+    """Returns the controller's largest torque at any joint, shape (K,), in N m."""
     return largest_magnitude(log[site].tau)
 
 
 def _compute_oldest_sample_ms(log: Log, site: str) -> Array:
-    """Returns the age of the oldest sample in use, shape (K,), ms; NaN without any sample."""
+    """Returns the age of the oldest sample in use in each record, shape (K,), in ms.
+
+    A record without any sample in use has the value NaN.
+    """
     ages_ms = site_signals.sample_ages_ms(log, site)
-    # numpy warns of a row without a number, so -inf stands for the unknown ages
+    # NumPy prints a warning for a row of NaN only. Therefore -inf stands for unknown ages.
     known_ms = np.where(np.isnan(ages_ms), -np.inf, ages_ms)
     oldest_ms: Array = known_ms.max(axis=1, initial=-np.inf)
     return np.where(np.isfinite(oldest_ms), oldest_ms, np.nan)
@@ -87,9 +92,9 @@ _PANELS = (
 
 @draws("overview", "errors, speeds, torques and ages of a run at a glance")
 def draw_overview(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns the figure of a run in four panels, with a line per site.
+    """Draws one run in four panels, with a line per site.
 
-    The title has the stability that the certificate states, and the settling time.
+    The title has the judgement whether the run was stable, and the settling time.
     """
     height_in = _NARROW_HEIGHT_IN if form.narrow else _HEIGHT_IN
     with style.time_figure(log, form, height_in) as plot:
@@ -120,14 +125,14 @@ def _compose_title(log: Log, form: FigureSize) -> str:
 
 
 def draw_overlay(logs: Mapping[str, Log], form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns the figure of several runs over one another, with a line per run.
+    """Draws several runs in the same four panels, with a line per run.
 
     Args:
-        logs: the logs of the runs, by the names in the legend.
-        form: size of the figure.
+        logs: Logs of the runs, by their names in the legend.
+        form: Size of the figure.
 
     Raises:
-        UsageError: there is no log, or the errors of the runs have different units.
+        UsageError: There is no log, or the errors of the runs have different units.
     """
     units = {site_signals.shared_unit(log) for log in logs.values()}
     if not units:
@@ -156,7 +161,7 @@ def draw_overlay(logs: Mapping[str, Log], form: FigureSize = REPORT_SIZE) -> Fig
 
 
 def _add_panels(figure: Figure, log: Log, form: FigureSize) -> list[Axes]:
-    """Returns the four panels with labels: two rows of two, or one below another if narrow."""
+    """Adds the four labelled panels to a figure, two beside each other unless it is narrow."""
     rows = 4 if form.narrow else 2
     columns = len(_PANELS) // rows
     grid = style.add_panels(figure, rows, columns, sharex=True)
@@ -168,12 +173,15 @@ def _add_panels(figure: Figure, log: Log, form: FigureSize) -> list[Axes]:
 
 
 def _list_lowest(panels: list[Axes], form: FigureSize) -> list[Axes]:
-    """Returns the lowest panel of each column."""
+    """Returns the lowest panel of each column, which gets the time axis."""
     return panels[3:] if form.narrow else panels[2:]
 
 
 def _style_run(number: int) -> dict[str, Any]:
-    """Returns the options of the line of a run: all colours solid, then again with dashes."""
+    """Returns the options of the line of a run.
+
+    Lines are solid until every colour is used. Further runs have the same colours with dashes.
+    """
     repetition = number // len(SITE_COLOURS)
     return {
         "color": SITE_COLOURS[number % len(SITE_COLOURS)],
@@ -186,10 +194,10 @@ def _compute_envelope(panel: _Panel, log: Log) -> tuple[Array, Array]:
     """Returns the largest value of all sites of a run in equal spans of time.
 
     Returns:
-        Middles of the spans, s, and largest values, NaN in a span without records, shape (S,)
-        each.
+        Middles of the spans in s, and largest values, each of shape (S,). The value of a span
+        without records is NaN.
     """
-    # at least two records of every site per span, on average
+    # At least two records of every site per span, on average.
     record_counts = [len(log[site]) for site in log.sites]
     span_count = max(1, min(_MAX_SPANS, min(record_counts) // 2))
     edges_s = np.linspace(0.0, recorded_end_s(log), span_count + 1)
@@ -203,12 +211,18 @@ def _compute_envelope(panel: _Panel, log: Log) -> tuple[Array, Array]:
 
 
 def _select_drawable(panel: _Panel, values: Array) -> Array:
-    """Returns values with NaN in place of those that a logarithmic axis cannot show."""
+    """Returns the values that a panel can show. On a logarithmic axis, zeros become NaN."""
     return style.positive(values) if panel.log_scale else values
 
 
 def _scale_axis(axes: Axes, panel: _Panel, columns: list[Array]) -> None:
-    """Scales the axis of values of a panel to all of its lines."""
+    """Scales the value axis of a panel to all of its lines.
+
+    Args:
+        axes: The panel.
+        panel: Quantity of the panel.
+        columns: Values of each line. NaN values are ignored.
+    """
     known = np.concatenate([values[np.isfinite(values)] for values in columns])
     largest = float(known.max(initial=0.0))
     if not panel.log_scale:

@@ -1,13 +1,16 @@
-"""Figure of the differences between a run and its pushed twins over time.
+"""Draws the differences between a run and its twins over time.
 
-The upper panel has the differences of the joint velocities on a logarithmic axis. A dashed line
-beside them has the rate of growth that the headline states. The lower panel has the speed of
-the run itself.
+A twin is a second execution of the same run in which the velocities received a small push.
+Twins show whether small disturbances grow or decay. The upper panel has the differences of the
+joint velocities on a logarithmic axis, on which exponential growth is a straight line. A dashed
+line beside them has the growth rate that the headline states. The lower panel has the joint
+speeds of the run itself.
 
 Invariant:
     - The differences are drawn as they were measured.
-    - The dashed line covers the times that its rate was fitted to.
-    - The line of a twin that was pushed again is interrupted at the new push.
+    - The dashed line covers the times to which its rate was fitted.
+    - If a twin was pushed again, because its difference had decayed to rounding errors, its
+      line is interrupted there.
 """
 
 import textwrap
@@ -40,9 +43,11 @@ from ..appearance import REPORT_SIZE, FigureSize
 from .figure_entry import draws
 
 _POINTS = 150
-"""Approximate number of points of a line; each is the largest value around its time."""
+"""Approximate number of points of a line. Each is the largest value around its time."""
 _SEVERAL_JOINTS_COLOUR = "#7a7a7a"
+"""Colour of pushes that move several joints."""
 _ESTIMATES_COLOUR = "#999933"
+"""Colour of pushes that change parameter estimates instead of velocities."""
 _ROUNDING: dict[str, Any] = {
     "color": style.FAINT,
     "alpha": 0.18,
@@ -66,10 +71,10 @@ class _DifferenceLine(NamedTuple):
     """A line of the upper panel.
 
     Attributes:
-        label: text of the line in the legend.
-        path: the difference between a twin and its run.
-        joints: indices of the joints that the drawn amplitude covers.
-        options: colour, width and dashes of the line.
+        label: Text of the line in the legend.
+        path: Difference between a twin and its run.
+        joints: Indices of the joints that the drawn amplitude covers.
+        options: Colour, width and dashes of the line.
     """
 
     label: str
@@ -79,14 +84,14 @@ class _DifferenceLine(NamedTuple):
 
 
 def draw_twins(pushed: PushedTwins, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns the figure of the differences of velocities, rad/s, above the speed of the run.
+    """Draws the differences of velocities in rad/s above the speed of the run.
 
     The figure has a line per push, or a line per joint if there was a single push. Without
     twins it shows the reason why there are none.
 
     Args:
-        pushed: a run and its pushed twins.
-        form: size of the figure.
+        pushed: A run and its pushed twins.
+        form: Size of the figure.
     """
     growth = pushed.growth
     if growth.twins is None or growth.worst is None:
@@ -116,7 +121,7 @@ def draw_twins(pushed: PushedTwins, form: FigureSize = REPORT_SIZE) -> Figure:
 
 @draws("twins", "growth or decay of small pushes", explain_not_repeatable, in_report=True)
 def _draw_log_twins(log: Log, form: FigureSize) -> Figure:
-    """Returns the figure of twins of a log that are pushed at its start."""
+    """Draws the differences of twins that are pushed at the start of a log's run."""
     growth = measure_twins(log, classify_log_end(log))
     return draw_twins(PushedTwins(log, 0.0, growth), form)
 
@@ -124,7 +129,8 @@ def _draw_log_twins(log: Log, form: FigureSize) -> Figure:
 def _list_lines(pushed: PushedTwins, twins: Twins) -> Iterator[_DifferenceLine]:
     """Yields the lines of the upper panel.
 
-    - A search for the sizes for which a push is linear has a line per size, light to dark.
+    - If pushes of several sizes were tried, to find those that act linearly, each size has a
+      line, from light to dark.
     - Several pushes have a line each. The push of one joint has the style of that joint.
     - A single push has a line per joint that it moved.
     """
@@ -151,7 +157,12 @@ def _list_lines(pushed: PushedTwins, twins: Twins) -> Iterator[_DifferenceLine]:
 
 
 def _style_joints(log: Log, joints: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Returns the style of each joint: the colour of its site, and dashes by its number."""
+    """Returns the line options of each joint: the colour of its site, and dashes by its number.
+
+    Args:
+        log: Log with the sites.
+        joints: Names of joints such as "m1 joint 2".
+    """
     styles = {}
     for name in joints:
         site, _, number = name.partition(" joint ")
@@ -163,7 +174,14 @@ def _style_joints(log: Log, joints: Sequence[str]) -> dict[str, dict[str, Any]]:
 def _draw_differences(
     axes: Axes, pushed: PushedTwins, lines: Sequence[_DifferenceLine], rated: PushGrowth
 ) -> None:
-    """Draws the lines of all differences, and the rate of one push beside its lines."""
+    """Draws the lines of all differences, and the growth rate of one push beside its lines.
+
+    Args:
+        axes: The panel.
+        pushed: A run and its pushed twins.
+        lines: Lines of the differences.
+        rated: Growth of the push whose rate is drawn.
+    """
     growth = pushed.growth
     drawn_s = growth.to_s - pushed.at_s
     step = max(1, int(drawn_s * BUCKETS_PER_S / _POINTS))
@@ -175,21 +193,26 @@ def _draw_differences(
         if line.path.push is rated.push:
             rated_traces.append((t_s, values))
 
-    # the lines of one push belong to one twin and have equal times
+    # All lines of one push belong to one twin. Therefore they have the same times.
     rated_t_s = rated_traces[0][0]
     envelope = np.fmax.reduce([values for _, values in rated_traces])
     _draw_rate(axes, pushed, rated, rated_t_s, envelope)
 
 
 def _trace_amplitude(line: _DifferenceLine, to_s: float, step: int) -> tuple[Array, Array]:
-    """Returns the times, s, and amplitudes, rad/s, of a line, shape (K,) each.
+    """Returns the points of a line. A point is the largest amplitude around its time.
 
-    A NaN after each push's part interrupts the line.
+    The amplitudes are computed as logarithms, because unstable twins grow beyond the range of
+    floating-point numbers.
 
     Args:
-        line: the line.
-        to_s: end of the line, in s.
-        step: number of intervals of the twin that a point of the line covers.
+        line: The line.
+        to_s: End of the line, in s.
+        step: Number of intervals of the twin that a point covers.
+
+    Returns:
+        Times in s and amplitudes in rad/s, each of shape (K,). A NaN amplitude after the part
+        of each push interrupts the line.
     """
     path = line.path
     amplitude = measure_amplitude(path, line.joints)
@@ -210,23 +233,24 @@ def _trace_amplitude(line: _DifferenceLine, to_s: float, step: int) -> tuple[Arr
 def _draw_rate(
     axes: Axes, pushed: PushedTwins, rated: PushGrowth, t_s: Array, values: Array
 ) -> None:
-    """Draws a dashed line with the rate of a push, just above the differences, and its value.
+    """Draws a dashed line with the growth rate of a push, just above the differences.
 
-    A push without a rate or without a clear trend has no such line.
+    The number of the rate is written beside the line. Nothing is drawn if the push has no rate
+    or no clear trend.
 
     Args:
-        axes: the panel.
-        pushed: a run and its pushed twins.
-        rated: growth of the push.
-        t_s: times of the differences, s, shape (K,).
-        values: largest differences of all joints, rad/s, shape (K,).
+        axes: The panel.
+        pushed: A run and its pushed twins.
+        rated: Growth of the push.
+        t_s: Times of the differences, in s, shape (K,).
+        values: Largest differences of all joints, in rad/s, shape (K,).
     """
     if not np.isfinite(rated.rate_per_s) or rated.trend is EnvelopeTrend.UNDECIDED:
         return
     from_s = pushed.growth.from_s
     to_s = pushed.growth.to_s
     if rated.ended_s is not None:
-        # the rate of a twin that ended early was fitted to the second half of its time
+        # The rate of a twin that ended early was fitted to the second half of its time.
         from_s = 0.5 * (pushed.at_s + rated.ended_s)
         to_s = rated.ended_s
     rows = (t_s >= from_s) & (t_s <= to_s) & (values > 0.0)
@@ -234,7 +258,7 @@ def _draw_rate(
         return
 
     line_t_s = t_s[rows]
-    # the lowest line of this slope that stays 15 % above all values
+    # The lowest line with this slope that stays 15 % above all values.
     heights = np.log(1.15 * values[rows]) - rated.rate_per_s * line_t_s
     level = float(np.max(heights))
     line = np.exp(np.minimum(level + rated.rate_per_s * line_t_s, MOST_LOG))
@@ -254,7 +278,10 @@ def _draw_rate(
 
 
 def _limit_differences(axes: Axes, form: FigureSize) -> None:
-    """Labels and limits the axis of differences, and shades rounding near any line."""
+    """Labels and limits the axis of differences.
+
+    Differences that are so small that they consist of rounding errors are shaded.
+    """
     axes.set_ylabel("difference of velocities (rad/s)")
     low, high = axes.get_ylim()
     if low < 10.0 * SMALLEST:
@@ -286,17 +313,18 @@ def _mark_push(axes: Axes, at_s: float, form: FigureSize) -> None:
 
 
 def _draw_speeds(axes: Axes, log: Log, twins: Twins, from_s: float) -> None:
-    """Draws the speed of the fastest joint of every site of the run, rad/s.
+    """Draws the speed of the fastest joint of every site of the run, in rad/s.
 
     Args:
-        axes: the panel.
-        log: the log of the run.
-        twins: the twins of the run, with the speeds of the run.
-        from_s: start of the time axis, in s.
+        axes: The panel.
+        log: Log of the run.
+        twins: Twins of the run, which also contain the speeds of the run.
+        from_s: Start of the time axis, in s.
     """
     t_s = twins.paths[0].t_s
     first = 0
     for site in log.sites:
+        # The columns of the speeds are the joints of all sites, one site after the other.
         end = first + log.scenario.layout(site).joints
         speed = twins.speed[:, first:end].max(axis=1)
         axes.plot(t_s, speed, **{**style.site_line(log, site, 0.9), "alpha": 0.6})
