@@ -1,8 +1,8 @@
-"""Colours of the sites, and widths, type sizes and resolutions of figures.
+"""Defines the colours of the sites, and the widths, type sizes and resolutions of figures.
 
-A site has the same colour in every figure and on every page. The first three colours are the
-"high contrast" set of Paul Tol's notes on colour: the colour blind can tell them apart, and
-they differ in lightness, also in grey print.
+A site is a process that controls one arm. It has the same colour in every figure and on every
+page. The first three colours are the "high contrast" set of Paul Tol's notes on colour: people
+with colour blindness can distinguish them, and they differ in lightness, also in grey print.
 
 Invariant:
     - Type in print is 8 pt throughout.
@@ -16,12 +16,18 @@ from ..errors import UsageError
 from ..scenario import Scenario
 
 SITE_COLOURS = ("#004488", "#bb5566", "#ddaa33", "#000000", "#66a3d2", "#7a7a7a")
+"""Colours of sites on white paper or a light page."""
 DARK_SITE_COLOURS = ("#79b0f2", "#f08a9b", "#e9bd4c", "#f2f2f2", "#9bd3f5", "#a3a3a3")
-"""Colours of the same sites on a dark page."""
+"""Colours of the same sites on a dark page, in the same order."""
 
 
 def list_site_colours(scenario: Scenario, colours: Sequence[str] = SITE_COLOURS) -> list[str]:
-    """Returns the colours of a palette in the order of a scenario's sites."""
+    """Returns the colours of a scenario's sites, in the order of the sites.
+
+    Args:
+        scenario: Scenario with the sites.
+        colours: Palette, such as `SITE_COLOURS` or `DARK_SITE_COLOURS`.
+    """
     indices = scenario.assign_colours(len(SITE_COLOURS))
     return [colours[index] for index in indices]
 
@@ -33,13 +39,13 @@ PAGE_IN = 7.0
 
 
 class FigureSize(NamedTuple):
-    """The measures of a figure.
+    """Width, type sizes and resolution of a figure.
 
     Attributes:
-        width_in: width of the figure, in inches.
-        tick_pt: type size of the numbers at the axes, in pt.
-        small_pt: type size of footnotes, in pt.
-        dpi: resolution of the figure as a picture.
+        width_in: Width of the figure, in inches.
+        tick_pt: Type size of the numbers at the axes, in pt.
+        small_pt: Type size of footnotes, in pt.
+        dpi: Resolution of the figure as a picture, in dots per inch.
     """
 
     width_in: float
@@ -58,13 +64,13 @@ REPORT_SIZE = FigureSize(width_in=PAGE_IN, tick_pt=7.0, small_pt=6.0, dpi=200)
 
 
 def make_print_size(width_in: float) -> FigureSize:
-    """Returns the size of a figure in a paper.
+    """Returns the size of a figure in a paper, with type of 8 pt.
 
     Args:
-        width_in: width in inches: 3.5 for one column, or 7 for two columns.
+        width_in: Width in inches: 3.5 for one column, or 7 for two columns.
 
     Raises:
-        UsageError: the width is neither of them.
+        UsageError: The width is neither of them.
     """
     if width_in not in (COLUMN_IN, PAGE_IN):
         raise UsageError(f"a figure is {COLUMN_IN:g} or {PAGE_IN:g} in wide, not {width_in}")

@@ -1,12 +1,14 @@
-"""Export a log for other tools, in one of the formats of the folder `exports`.
+"""Exports a log to a file or folder that other tools read, such as CSV, MATLAB or Parquet.
 
-Each format is a module of that folder with a constant `FORMAT`. `Exporter` finds the format,
-checks its settings and its path, and writes the export.
+A log is the MCAP file of a run. Each format is a module of the folder `exports` with a constant
+`FORMAT`. `Exporter` finds the format by its name, checks its settings and the output path, and
+writes the export. Formats of tables share `store_tables`.
 
 Invariant:
     - Numbers that are read back from an export equal those of the log, bit for bit.
     - An export describes itself: its session, and the unit, meaning and source of every column.
-    - An export is refused, if at all, before a log is read and before anything is written.
+    - An export that must be refused is refused before a log is read and before anything is
+      written.
 """
 
 import inspect
@@ -38,14 +40,14 @@ class ExportFormat(NamedTuple):
     """A format of exports, the constant `FORMAT` of a module in the folder `exports`.
 
     Attributes:
-        write: function that writes a log. Its arguments are the log (with `many` a list of
-            logs), the file or folder to write, and a function of type `Written` to report
-            progress. Its keyword-only parameters are the settings of the format. The function
-            returns a summary for the user, or None.
-        ending: end of the default path, which begins with the name of the log.
+        write: Function that writes a log. Its arguments are the log (a list of logs if `many`
+            is True), the file or folder to write, and a function of type `Written` that reports
+            progress. Its keyword-only parameters are the settings of the format. It returns a
+            summary for the user, or None.
+        ending: End of the default output path, which begins with the name of the log.
         folder: True if the format writes a folder.
-        extra: the arguments of `import_extra` if the format needs an optional package: the
-            module, the extra that installs it, and the features that need it; or ().
+        extra: If the format needs an optional package, the arguments of `import_extra`: the
+            module, the extra that installs it, and the features that need it. Otherwise empty.
         many: True if the format accepts several logs.
     """
 
@@ -59,19 +61,22 @@ class ExportFormat(NamedTuple):
 class Exporter:
     """An export of logs to a file or a folder.
 
+    Creating this object checks all arguments, so that a mistake is reported before the log is
+    read.
+
     Args:
-        form: name of the format.
-        path: the file or folder; None for a path next to the log, named after it.
+        form: Name of the format.
+        path: The file or folder. None for a path next to the log, with the name of the log.
         force: True to replace an earlier export.
-        log: path of the log, or of its first part.
-        settings: settings of the format by name, as a mapping or as pairs.
+        log: Path of the log, or of its first part.
+        settings: Settings of the format by name, as a mapping or as pairs.
 
     Attributes:
-        path: the file or folder.
+        path: The file or folder.
 
     Raises:
-        UsageError: there is no such format or setting, the path exists and `force` is False,
-            or a package is missing.
+        UsageError: There is no such format or setting, the path exists and `force` is False, or
+            a package is missing.
     """
 
     def __init__(
@@ -101,16 +106,16 @@ class Exporter:
         """Writes logs to the path of this export.
 
         Args:
-            *logs: the logs; a single log for most formats.
-            progress: called with the numbers of written and of all records.
+            *logs: The logs. Most formats accept only one.
+            progress: Function that is called with the numbers of written and of all records.
 
         Returns:
-            The summary of the format, or "".
+            The summary of the format for the user. Empty if the format has none.
 
         Raises:
-            LogError: a record cannot be read.
-            LogRefused: the disk is full.
-            UsageError: the path is not writable, or the format accepts a single log only.
+            LogError: A record cannot be read.
+            LogRefused: The disk is full.
+            UsageError: The path is not writable, or the format accepts a single log only.
         """
         if len(logs) > 1 and not self._format.many:
             raise UsageError(
@@ -120,6 +125,7 @@ class Exporter:
         done = 0
 
         def report_written(records: int) -> None:
+            """Adds a number of records to those that are written, and reports the progress."""
             nonlocal done
             done += records
             progress(done, total)
@@ -133,15 +139,18 @@ class Exporter:
 def _parse_settings(
     form: str, write: Callable[..., Any], settings: dict[str, Any]
 ) -> dict[str, Any]:
-    """Returns the settings of a format, converted to the types of its parameters.
+    """Converts the settings of a format to the types of its parameters.
 
     Args:
-        form: name of the format.
-        write: function whose keyword-only parameters, with their defaults, are the settings.
-        settings: the values by name, as numbers or texts.
+        form: Name of the format.
+        write: Function whose keyword-only parameters, with their defaults, are the settings.
+        settings: Values of settings by name, as numbers or texts.
+
+    Returns:
+        The converted settings by name.
 
     Raises:
-        UsageError: there is no such setting, or its value has another type.
+        UsageError: There is no such setting, or its value has another type.
     """
     types = {}
     for parameter in inspect.signature(write).parameters.values():
@@ -164,19 +173,23 @@ def store_tables(
     choose_name: Callable[[Table], str],
     store: Callable[[Table, str], Any],
 ) -> str:
-    """Stores every table of a log, and returns the description of the export as JSON.
+    """Stores every table of a log, and describes the export.
 
     Args:
-        log: the log.
-        written: called with the number of records of each table of records.
-        choose_name: function that returns the name of a table in the export.
-        store: function that stores a table under a name.
+        log: The log.
+        written: Function that is called with the number of records of each table.
+        choose_name: Function that returns the name of a table in the export.
+        store: Function that stores a table under a name.
+
+    Returns:
+        The description of the session and of all columns, as JSON text.
     """
     tables = {}
     for table in log.tables():
         name = choose_name(table)
         store(table, name)
         tables[name] = _describe_table(table)
+        # Progress is counted in records, which are the rows of the tables of states.
         is_state = table.kind == "state"
         written(len(table) if is_state else 0)
     version = collect_provenance()["version_trilat-net"]
@@ -192,7 +205,7 @@ def store_tables(
 
 
 def _describe_table(table: Table) -> JsonObject:
-    """Returns the meaning of a table's rows and of its columns."""
+    """Returns the meaning of a table's rows, and the unit, meaning and source of its columns."""
     columns = {}
     for column in table.columns:
         columns[column.name] = {
@@ -204,12 +217,12 @@ def _describe_table(table: Table) -> JsonObject:
 
 
 def describe_folder(log: Log, folder: Path, about: str) -> None:
-    """Writes the description of an exported folder, and the scenario, into the folder.
+    """Writes the description of an export, and the scenario, into an exported folder.
 
     Args:
-        log: the log.
-        folder: the exported folder.
-        about: the description, from `store_tables`.
+        log: The log.
+        folder: The exported folder.
+        about: Description of the export, from `store_tables`.
     """
     (folder / EXPORT_MANIFEST).write_bytes(about.encode())
     (folder / SCENARIO).write_bytes(log.scenario_text.encode())
@@ -219,10 +232,10 @@ def name_inside(table: Table, name: str, separator: str) -> str:
     """Returns the name of a table inside an exported file.
 
     Args:
-        table: the table.
-        name: the name of the table's site, or of a table without a site.
-        separator: text between the name and the kind of the table. Tables of records have no
-            kind in their names.
+        table: The table.
+        name: Name of the table's site, or of the table if it belongs to no site.
+        separator: Text between `name` and the kind of the table. It is not used for tables of
+            records, whose names have no kind.
     """
     return name if table.kind in ("", "state") else f"{name}{separator}{table.kind}"
 

@@ -1,12 +1,13 @@
-"""Types of the data that the scripts of a report's page, `report.js` and `arms.js`, read.
+"""Defines the data that a report's page contains for its scripts `report.js` and `arms.js`.
 
-The page holds one `PageData` as JSON. Long columns of numbers are encoded as base64. The tests
-of pages in browsers (`tests/page/whole_pages.py`) report every field that a script reads and
-that was not sent.
+The page of a report contains one `PageData` as JSON. `charts.ChartBuilder` computes it, and the
+scripts draw charts and arms from it in the browser. Long columns of numbers are encoded as
+base64.
 
 Invariant:
     - These types are the contract between the program and the scripts. A script reads no field
-      that is not declared here.
+      that is not declared here. The tests of pages in browsers (`tests/page/whole_pages.py`)
+      report every field that a script reads and that was not sent.
     - Every field is sent, whether or not it has its default value. A script never has to guess
       the meaning of an absent field.
     - The field `kind` names the kind of a chart or an arm. A script never infers the kind from
@@ -25,12 +26,13 @@ The lines of references, true values and limits have the colour "limit".
 
 
 class ColumnTable(msgspec.Struct, frozen=True):
-    """Columns of numbers over the ticks of a site.
+    """A table of numbers at ticks of a site. Lines of charts refer to its columns.
 
     Attributes:
-        rate_hz: rate of the ticks.
-        tick: the ticks, as base64 of little-endian int32.
-        columns: the columns, each as base64 of little-endian float32; NaN for a missing value.
+        rate_hz: Tick rate of the site, which converts ticks to times.
+        tick: Ticks of the rows, as base64 of little-endian int32.
+        columns: Values of each column, as base64 of little-endian float32. NaN stands for a
+            missing value.
     """
 
     rate_hz: int
@@ -42,11 +44,11 @@ class TableSeries(msgspec.Struct, frozen=True, kw_only=True):
     """A line of a chart over time, which draws a column of a table.
 
     Attributes:
-        label: name of the line.
-        colour: colour of the line.
-        table: index of the table in `PageData.tables`.
-        column: index of the column in the table.
-        dash: true for a dashed line.
+        label: Name of the line in the legend.
+        colour: Colour of the line.
+        table: Index of the table in `PageData.tables`.
+        column: Index of the column in the table.
+        dash: True for a dashed line.
     """
 
     label: str
@@ -60,9 +62,9 @@ class HistogramSeries(msgspec.Struct, frozen=True):
     """A line of a histogram.
 
     Attributes:
-        label: name of the line.
-        colour: colour of the line.
-        counts: the number of ticks in each bin.
+        label: Name of the line in the legend.
+        colour: Colour of the line.
+        counts: Number of ticks in each bin.
     """
 
     label: str
@@ -74,10 +76,10 @@ class DistributionSeries(msgspec.Struct, frozen=True):
     """A line of a cumulative distribution.
 
     Attributes:
-        label: name of the line.
-        colour: colour of the line.
-        dash: true for a dashed line.
-        values: the percentages at the chart's `x`, as base64 of little-endian float32.
+        label: Name of the line in the legend.
+        colour: Colour of the line.
+        dash: True for a dashed line.
+        values: Percentages at the chart's `x`, as base64 of little-endian float32.
     """
 
     label: str
@@ -87,13 +89,13 @@ class DistributionSeries(msgspec.Struct, frozen=True):
 
 
 class StatedLine(msgspec.Struct, frozen=True, rename={"from_s": "from", "to_s": "to"}):
-    """A horizontal dashed line at a stated value, such as a mean delay.
+    """A horizontal dashed line at a value that the scenario states, such as a mean delay.
 
     Attributes:
-        value: the value, in the unit of the chart.
-        colour: colour of the line.
-        from_s: start of the line, s; "from" in JSON.
-        to_s: end of the line, s; "to" in JSON.
+        value: The value, in the unit of the chart.
+        colour: Colour of the line.
+        from_s: Start of the line, in s. The field is called "from" in JSON.
+        to_s: End of the line, in s. The field is called "to" in JSON.
     """
 
     value: float
@@ -103,19 +105,20 @@ class StatedLine(msgspec.Struct, frozen=True, rename={"from_s": "from", "to_s": 
 
 
 class TimeChart(msgspec.Struct, frozen=True, kw_only=True, tag="time", tag_field="kind"):
-    """A chart over time.
+    """A chart over the time of the run.
 
     Attributes:
-        section: key of the section in `report.toml`.
-        title: title of the chart.
-        unit: unit of the values.
-        series: the lines of the chart.
-        sites: sites whose modes and changes are marked in the chart.
-        lines: horizontal lines at stated values.
-        links: true if changes of links are also marked, and stated lines lie above the series.
-        log: true for a logarithmic axis of values.
-        zero: true if the axis of values begins at 0.
-        margin: least space above the values, as a share of the largest value.
+        section: Key of the section of the page, as in `report.toml`.
+        title: Title of the chart.
+        unit: Unit of the values.
+        series: Lines of the chart.
+        sites: Names of the sites whose modes and changes are marked in the chart.
+        lines: Horizontal lines at stated values.
+        links: True if changes of links are also marked, and stated lines are drawn above the
+            series.
+        log: True for a logarithmic value axis.
+        zero: True if the value axis begins at 0.
+        margin: Least space above the values, as a share of the largest value.
     """
 
     section: str
@@ -133,15 +136,15 @@ class TimeChart(msgspec.Struct, frozen=True, kw_only=True, tag="time", tag_field
 class HistogramChart(
     msgspec.Struct, frozen=True, kw_only=True, tag="histogram", tag_field="kind"
 ):
-    """Counts of ticks over bins of equal width on a logarithmic axis.
+    """A histogram: the number of ticks in bins of equal width on a logarithmic axis.
 
     Attributes:
-        section: key of the section in `report.toml`.
-        title: title of the chart.
-        unit: unit of the edges.
-        series: the lines of the chart.
-        edges: edges of the B bins, B + 1 numbers.
-        periods: periods of the sites' loops, in the unit of the edges.
+        section: Key of the section of the page, as in `report.toml`.
+        title: Title of the chart.
+        unit: Unit of the edges.
+        series: Lines of the chart.
+        edges: Edges of the B bins, B + 1 numbers.
+        periods: Tick periods of the sites, in the unit of the edges. They are drawn as limits.
     """
 
     section: str
@@ -158,12 +161,12 @@ class DistributionChart(
     """Cumulative distributions of samples or ticks, in percent.
 
     Attributes:
-        section: key of the section in `report.toml`.
-        title: title of the chart.
-        unit: unit of `x`.
-        series: the lines of the chart.
-        x: the values on the horizontal axis, as base64 of little-endian float32.
-        log: true if the horizontal axis is logarithmic.
+        section: Key of the section of the page, as in `report.toml`.
+        title: Title of the chart.
+        unit: Unit of `x`.
+        series: Lines of the chart.
+        x: Values on the horizontal axis, as base64 of little-endian float32.
+        log: True if the horizontal axis is logarithmic.
     """
 
     section: str
@@ -178,15 +181,15 @@ Chart = TimeChart | HistogramChart | DistributionChart
 
 
 class PlanarArm(msgspec.Struct, frozen=True, kw_only=True, tag="planar", tag_field="kind"):
-    """An arm of two links in the picture of the arms.
+    """An arm of two links that moves in a plane.
 
     Attributes:
-        site: name of the site.
-        colour: index of the site.
-        table: index of the table with the actual and the desired angles of both joints, rad,
+        site: Name of the site.
+        colour: Index of the site, on which its colour depends.
+        table: Index of the table with the actual and the desired angles of both joints, in rad,
             and with the edges of the bodies.
-        bodies: number of bodies of the site's plant.
-        links_m: lengths of the links, m.
+        bodies: Number of bodies that the arm can touch.
+        links_m: Lengths of the links, in m.
     """
 
     site: str
@@ -197,15 +200,15 @@ class PlanarArm(msgspec.Struct, frozen=True, kw_only=True, tag="planar", tag_fie
 
 
 class ChainArm(msgspec.Struct, frozen=True, kw_only=True, tag="chain", tag_field="kind"):
-    """A chain in the picture of the arms.
+    """An arm of any number of joints in space. The page gets its joint positions in the picture.
 
     Attributes:
-        site: name of the site.
-        colour: index of the site.
-        table: index of the table with the coordinates, in the picture, of the points of the
-            actual arm, of the reference and of the shadow, and of the edges of the bodies.
-        bodies: number of bodies of the site's plant.
-        points: number of points: the joints without the base, and the end effector.
+        site: Name of the site.
+        colour: Index of the site, on which its colour depends.
+        table: Index of the table with coordinates in the picture: of the points of the actual
+            arm, of the reference and of the shadow, and of the edges of the bodies.
+        bodies: Number of bodies that the arm can touch.
+        points: Number of points of an arm: the joints without the base, and the end effector.
     """
 
     site: str
@@ -216,13 +219,13 @@ class ChainArm(msgspec.Struct, frozen=True, kw_only=True, tag="chain", tag_field
 
 
 class MarkedChange(msgspec.Struct, frozen=True):
-    """A change during the run.
+    """A change during the run, such as another delay of a link.
 
     Attributes:
-        n: number in the table of changes.
-        t: time from which the change applies, s.
-        site: site that applies the change.
-        link: the changed link; "" for a change of another kind.
+        n: Number in the table of changes.
+        t: Time from which the change applies, in s.
+        site: Name of the site that applies the change.
+        link: The changed link. Empty for a change of another kind.
     """
 
     n: int
@@ -232,13 +235,13 @@ class MarkedChange(msgspec.Struct, frozen=True):
 
 
 class ModeSpan(msgspec.Struct, frozen=True, array_like=True):
-    """An interval in which a site does not follow its peers; sent as a list.
+    """An interval in which a site does not follow its peers. It is sent as a list.
 
     Attributes:
-        colour: index of the site.
-        mode: mode of the site.
-        from_s: start of the interval, s.
-        to_s: end of the interval, s.
+        colour: Index of the site, on which its colour depends.
+        mode: Mode of the site.
+        from_s: Start of the interval, in s.
+        to_s: End of the interval, in s.
     """
 
     colour: int
@@ -248,11 +251,11 @@ class ModeSpan(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Palettes(msgspec.Struct, frozen=True):
-    """Colours of the sites in the notation of CSS.
+    """Colours of the sites, as CSS writes them.
 
     Attributes:
-        light: colours for light screens.
-        dark: colours for dark screens.
+        light: Colours for light screens.
+        dark: Colours for dark screens.
     """
 
     light: list[str]
@@ -260,17 +263,17 @@ class Palettes(msgspec.Struct, frozen=True):
 
 
 class PageData(msgspec.Struct, frozen=True, kw_only=True):
-    """The whole data of a page.
+    """All data of a page.
 
     Attributes:
-        end_s: end of the time axis, s.
-        colours: colours of the sites.
-        tables: tables of numbers, to which charts and arms refer by index.
-        charts: the charts, in the order of the page.
-        changes: the changes during the run.
-        spans: by site, the intervals in which the site does not follow its peers.
-        arms: the arms of the sites that have records.
-        bounds_m: left, right, bottom and top of the pictures of the arms, in the units of these
+        end_s: End of the time axis, in s.
+        colours: Colours of the sites.
+        tables: Tables of numbers, to which charts and arms refer by index.
+        charts: Charts in the order of the page.
+        changes: Changes during the run.
+        spans: For each site, the intervals in which it does not follow its peers.
+        arms: Arms of the sites that have records.
+        bounds_m: Left, right, bottom and top of the pictures of the arms, in the units of these
             pictures.
     """
 
@@ -284,6 +287,6 @@ class PageData(msgspec.Struct, frozen=True, kw_only=True):
     bounds_m: list[float]
 
     def to_builtins(self) -> dict[str, Any]:
-        """Returns the data as dictionaries, lists and plain values for JSON."""
+        """Returns the data as dictionaries, lists and plain values, ready for JSON."""
         plain: dict[str, Any] = msgspec.to_builtins(self)
         return plain

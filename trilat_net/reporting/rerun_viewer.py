@@ -1,14 +1,16 @@
-"""Show a log in the Rerun viewer, which the extra `view` installs.
+"""Shows a log in the Rerun viewer, an interactive program for plots and 3D scenes.
 
-`open_rerun` passes the log to Rerun together with a layout: pages of plots with a column per
-site and a row per quantity. Rerun reads the layout from a file, its "blueprint".
+Rerun reads the data of a log from its MCAP file, in channels with standard messages of ROS 2,
+and reads the layout of its views from another file, the "blueprint". `open_rerun` prepares both
+files and starts Rerun. The layout consists of pages of plots, with a column per site and a row
+per quantity. The extra `view` of the package installs Rerun.
 
 Invariant:
-    - A finished file with standard channels is opened itself. Any other log is first exported
-      as a ROS 2 bag into a temporary folder.
+    - A finished log that has standard channels is opened as it is. Any other log is first
+      exported as a ROS 2 bag into a temporary folder.
     - A plot has a single unit, and every curve has a name.
     - Quantities that a log lacks take no space.
-    - All views, names and colors are set in this module and none by the viewer, so that any two
+    - All views, names and colors are set by this module and none by the viewer, so that any two
       logs look alike.
 """
 
@@ -50,12 +52,13 @@ _QUIET_ENVIRONMENT = {"RERUN_ANALYTICS_ENABLED": "false", "RUST_LOG": "warn"}
 
 
 class ViewerOptions(NamedTuple):
-    """How a log is shown.
+    """Options of the command that shows a log.
 
     Attributes:
         full: True to show every record instead of the decimated standard channels.
         web: True to serve the viewer to a browser.
-        save: path of an .rrd file to write instead of opening the viewer, or None.
+        save: Path of an .rrd file to write instead of opening the viewer. None to open the
+            viewer.
     """
 
     full: bool = False
@@ -64,6 +67,7 @@ class ViewerOptions(NamedTuple):
 
 
 def _run_process(command: list[str], environment: Mapping[str, str]) -> int:
+    """Runs a command, and returns its exit code."""
     return subprocess.run(command, env=environment).returncode
 
 
@@ -77,24 +81,27 @@ def open_rerun(
     """Shows a log, and returns when the viewer is closed.
 
     Args:
-        paths: the file of the log, or its parts.
-        read_log: function that reads the log; called only if the log has to be exported.
-        options: how the log is shown.
-        print_line: function that prints a line for the user.
-        run_command: function that runs Rerun.
+        paths: File of the log, or its parts.
+        read_log: Function that reads the log. It is called only if the log must be exported.
+        options: How the log is shown.
+        print_line: Function that prints a line for the user.
+        run_command: Function that runs Rerun.
 
     Raises:
         UsageError: Rerun is not installed, or there is no display.
-        LogError: the log cannot be read.
+        LogError: The log cannot be read.
         RunFailed: Rerun ended with an error.
     """
     import_extra("rerun", "view", "viewers")
     _require_display(options)
     with tempfile.TemporaryDirectory(prefix="trilat-view-") as folder:
         path = paths[0]
-        # Rerun names a recording after its file, and a layout has to name the same recording
+        # Rerun names a recording after its file, and the layout must name the same recording.
+        # Therefore the file has a name that Rerun does not change.
         named_path = Path(folder) / f"{make_application_id(path)}.mcap"
-        if options.full or len(paths) > 1 or not read_ros2_channels(path):
+        has_several_parts = len(paths) > 1
+        must_export = options.full or has_several_parts or not read_ros2_channels(path)
+        if must_export:
             print_line("making standard channels of every record ...")
             export_ros2(read_log(), named_path)
             path = named_path
@@ -113,7 +120,11 @@ def open_rerun(
 
 
 def _require_display(options: ViewerOptions) -> None:
-    """Raises UsageError if the viewer would open a window and there is no display."""
+    """Checks that there is a display if the viewer would open a window.
+
+    Raises:
+        UsageError: There is no display.
+    """
     opens_window = options.save is None and not options.web
     has_display = "DISPLAY" in os.environ or "WAYLAND_DISPLAY" in os.environ
     if opens_window and sys.platform == "linux" and not has_display:
@@ -124,7 +135,7 @@ def _require_display(options: ViewerOptions) -> None:
 
 
 def make_application_id(path: Path) -> str:
-    """Returns the name of a log in the letters that Rerun allows for an application."""
+    """Returns the name of a log, with only the letters that Rerun allows for an application."""
     stem = path.name.removesuffix(ACTIVE_SUFFIX).removesuffix(".mcap")
     return re.sub(r"[^A-Za-z0-9_-]", "-", stem).lstrip("-") or "log"
 
@@ -132,15 +143,16 @@ def make_application_id(path: Path) -> str:
 def _list_commands(
     options: ViewerOptions, log: Path, layout: Path, print_line: Callable[[str], None]
 ) -> list[list[str]]:
-    """Returns the arguments of successive calls of Rerun.
+    """Returns the arguments of the calls of Rerun that show or save a log, in order.
 
-    A viewer listens on this machine alone. The address of a viewer for browsers is printed.
+    The viewer accepts connections from this machine only. The address of a viewer for browsers
+    is printed.
 
     Args:
-        options: how the log is shown.
-        log: the file of the log.
-        layout: the file of the layout.
-        print_line: function that prints a line for the user.
+        options: How the log is shown.
+        log: File of the log.
+        layout: File of the layout.
+        print_line: Function that prints a line for the user.
     """
     if options.save is not None:
         return _list_save_commands(log, layout, options.save)
@@ -156,9 +168,9 @@ def _list_commands(
 
 
 def _list_save_commands(log: Path, layout: Path, output: Path) -> list[list[str]]:
-    """Returns the arguments of two calls of Rerun that write log and layout to a file."""
-    # Rerun's own `--save` of several files ends with the file that was read first, and drops
-    # the rest of the others (measured with 0.41: up to the whole log)
+    """Returns the arguments of two calls of Rerun that write log and layout to one file."""
+    # Rerun's own `--save` of several files stops when the end of one file is reached, and drops
+    # the rest of the others (measured with Rerun 0.41: up to the whole log).
     recording = str(layout.with_name("log.rrd"))
     convert = ["mcap", "convert", str(log), "--application-id", log.stem]
     merge = ["rrd", "merge", recording, str(layout)]
@@ -180,12 +192,12 @@ _SESSION_CHANNELS = (EVENTS, LINES, FRAMES, DIAGNOSTICS)
 
 
 class PlotCurves(NamedTuple):
-    """The curves of a channel in a plot.
+    """The curves of one channel in a plot. A channel is a series of messages with a topic.
 
     Attributes:
-        entity: path at which Rerun stores the numbers of the channel.
-        names: names of all numbers, in order.
-        visible: for each number, True if the plot shows its curve.
+        entity: Path under which Rerun stores the numbers of the channel.
+        names: Names of all numbers in a message, in order.
+        visible: For each number, True if the plot shows its curve.
     """
 
     entity: str
@@ -194,11 +206,11 @@ class PlotCurves(NamedTuple):
 
 
 class CurvePlot(NamedTuple):
-    """A plot.
+    """A plot of one quantity of one site over time.
 
     Attributes:
-        title: title of the plot, with its unit.
-        curves: the curves of each of its channels.
+        title: Title of the plot, with its unit.
+        curves: Curves of each of its channels.
     """
 
     title: str
@@ -213,8 +225,8 @@ class PlotLayout(NamedTuple):
     """The layout of all views of a log.
 
     Attributes:
-        pages: the pages of plots by name.
-        lines: topic of the event lines; "" if the log has no such topic.
+        pages: Rows of plots on each page, by the name of the page.
+        lines: Topic of the event texts. Empty if the log has no such topic.
         arms: True if the arms are shown in space.
     """
 
@@ -224,15 +236,15 @@ class PlotLayout(NamedTuple):
 
 
 class _PlotRow(NamedTuple):
-    """A quantity with a plot per site.
+    """A row of a page: a quantity with a plot per site.
 
     Attributes:
-        quantity: name of the quantity.
-        unit: unit of the quantity; "" for a number.
-        sources: the channels of the quantity: each a name, the last part of a topic, and a
-            field. The field of joint states is one of their lists. The field of estimates is
-            a kind of inertial parameter, such as "m", or "" for planar arms. The field of
-            other channels is "".
+        quantity: Name of the quantity.
+        unit: Unit of the quantity. Empty for a plain number.
+        sources: Channels of the quantity. Each is the name of a channel, which is the last part
+            of its topic, and a field. The field of joint states is one of their lists. The
+            field of estimates is a kind of inertial parameter, such as "m", or empty for planar
+            arms. The field of other channels is empty.
     """
 
     quantity: str
@@ -283,16 +295,18 @@ _MAX_LEGEND_NAMES = 20
 
 
 def build_plot_layout(channels: Ros2Channels) -> PlotLayout:
-    """Returns the layout of the plots of standard channels.
+    """Arranges the plots of a log's standard channels on pages.
+
+    Pages and rows without any curve are left out.
 
     Args:
-        channels: the channels by topic: `<root>/<site>/<name>`, and `<root>/log` and others of
-            the session.
+        channels: Standard channels by topic. Topics of sites are `<root>/<site>/<name>`, those
+            of the session are `<root>/log` and others.
     """
     session_topics = [
         topic for topic in channels if _get_channel_name(topic) in _SESSION_CHANNELS
     ]
-    # a dictionary keeps the order of the sites
+    # A dictionary instead of a set keeps the order of the sites.
     roots: dict[str, None] = {}
     for topic in channels:
         if topic not in session_topics:
@@ -313,12 +327,16 @@ def build_plot_layout(channels: Ros2Channels) -> PlotLayout:
 
 
 def _get_channel_name(topic: str) -> str:
-    """Returns the last part of a topic."""
+    """Returns the last part of a topic, which is the name of its channel."""
     return topic.rpartition("/")[2]
 
 
 def _list_sent_rows(channels: Ros2Channels) -> tuple[_PlotRow, ...]:
-    """Returns a row per quantity that laws send, in the order of their declarations."""
+    """Returns a row for each quantity that control laws send to other sites.
+
+    The rows are in the order in which the laws declare the quantities. The metadata of a
+    channel has the name and the unit of its quantity.
+    """
     rows = {}
     for topic, channel in channels.items():
         name = _get_channel_name(topic)
@@ -333,9 +351,9 @@ def _build_row(channels: Ros2Channels, roots: Sequence[str], row: _PlotRow) -> l
     """Returns the plots of a quantity: a plot for each site that has its channels.
 
     Args:
-        channels: the channels by topic.
-        roots: first parts of the sites' topics, up to the name of the channel.
-        row: the quantity.
+        channels: Standard channels by topic.
+        roots: First parts of the sites' topics, up to the name of the channel.
+        row: The quantity.
     """
     plots = []
     for root in roots:
@@ -355,12 +373,15 @@ def _build_row(channels: Ros2Channels, roots: Sequence[str], row: _PlotRow) -> l
 
 
 def _select_curves(topic: str, field: str, channel: Ros2Channel) -> PlotCurves | None:
-    """Returns the curves of a channel, or None if the channel has no such curves.
+    """Returns the curves of a channel that belong to a quantity.
 
     Args:
-        topic: topic of the channel.
-        field: field of the channel, see `_PlotRow`.
-        channel: the channel.
+        topic: Topic of the channel.
+        field: Field of the channel, see `_PlotRow`.
+        channel: The channel.
+
+    Returns:
+        The curves. None if the channel has no such curves.
     """
     if channel.kind == STRING:
         return None
@@ -371,23 +392,36 @@ def _select_curves(topic: str, field: str, channel: Ros2Channel) -> PlotCurves |
     if channel.kind == JOINT_STATE:
         return _select_joint_states(topic, field, names)
     if channel_name == "tau_x":
-        # this quantity shares a plot with the torque of the same joints
+        # This quantity shares a plot with the torque of the same joints.
         names = [f"tau_x {name}" for name in names]
     return PlotCurves(topic, tuple(names), (True,) * len(names))
 
 
 def _name_curves(channel: Ros2Channel) -> list[str]:
-    """Returns the names of a channel's numbers, which combine the names along its axes."""
+    """Returns the names of a channel's numbers.
+
+    The metadata has a list of names for each axis of the numbers, such as "m1 m2; 1 2". The
+    name of a number combines one name of each axis.
+    """
     axes = [axis.split(" ") for axis in channel.about.get("names", "").split("; ")]
     return [" ".join(filter(None, parts)) for parts in product(*axes)]
 
 
 def _select_estimates(topic: str, kind: str, names: Sequence[str]) -> PlotCurves | None:
-    """Returns the curves of the estimates of a kind of parameter, such as "m" of "upper.m"."""
+    """Returns the curves of the estimates of one kind of inertial parameter.
+
+    Args:
+        topic: Topic of the channel.
+        kind: Kind of parameter, such as "m" for the masses. Empty for planar arms.
+        names: Names of all estimates, such as "upper.m" for the mass of the link "upper".
+
+    Returns:
+        The curves. None if the channel has no estimate of this kind.
+    """
     visible = []
     for name in names:
         _, dot, parameter = name.rpartition(".")
-        # planar arms have parameters without a link, and without a kind
+        # The parameters of planar arms have neither a link nor a kind in their names.
         parameter_kind = parameter.rstrip("xyz_") if dot else ""
         visible.append(parameter_kind == kind)
     if not any(visible):
@@ -396,10 +430,18 @@ def _select_estimates(topic: str, kind: str, names: Sequence[str]) -> PlotCurves
 
 
 def _select_joint_states(topic: str, field: str, names: Sequence[str]) -> PlotCurves | None:
-    """Returns the curves of a list of joint states: "position", "velocity" or "effort".
+    """Returns the curves of a list of joint states.
 
-    A channel holds the states of the joints, of the reference with the suffix "_ref", or of
-    both. If it holds both, the reference is shown among the positions only.
+    A channel contains the states of the joints, those of the reference (with the suffix
+    "_ref"), or both. If it contains both, the reference is shown only among the positions.
+
+    Args:
+        topic: Topic of the channel.
+        field: Name of the list: "position", "velocity" or "effort".
+        names: Names of all joints.
+
+    Returns:
+        The curves. None for the torques of a reference, which do not exist.
     """
     is_reference = all(name.endswith("_ref") for name in names)
     is_reference = is_reference or topic.endswith("/reference")
@@ -427,12 +469,12 @@ _TIMELINE = "message_publish_time"
 
 
 def save_blueprint(layout: PlotLayout, application: str, path: Path) -> None:
-    """Writes a layout as a blueprint of Rerun.
+    """Writes a layout as a blueprint, the file from which Rerun reads it.
 
     Args:
-        layout: the layout.
+        layout: The layout.
         application: Rerun's name of the recordings to which the layout applies.
-        path: the file.
+        path: The file.
 
     Raises:
         UsageError: Rerun is not installed.
@@ -485,11 +527,11 @@ def _make_plot_view(rrb: Any, plot: CurvePlot) -> Any:
 
 
 def _style_curves(curves: PlotCurves, first_color: int) -> Any:
-    """Returns the names and colors of curves, with references in pale colors.
+    """Returns the names and the colors of curves. References have pale colors.
 
     Args:
-        curves: the curves.
-        first_color: index of the color of the first curve; further curves have the next colors.
+        curves: The curves.
+        first_color: Index of the color of the first curve. Further curves have the next colors.
     """
     rr = import_extra("rerun", "view", "viewers")
     pale = cycle(_PALE_COLORS)

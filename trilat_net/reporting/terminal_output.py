@@ -1,11 +1,16 @@
-"""Terminal output shared by the commands: consoles, lines, tables, progress bar and warnings.
+"""Prints lines, tables, a progress bar and warnings to the terminal, for all commands.
+
+Texts may come from files or from other computers on the network. Such a text could contain
+control characters that move the cursor or hide other texts. Therefore every text passes through
+this module.
 
 Invariant:
     - No control character reaches a terminal, whatever the origin of a text: `TextConsole` and
       `print_line` escape control characters.
-    - Text from a file or a peer also passes `sanitize`, which limits its length.
-    - Library code does not know the progress bar: it calls a function with (done, total).
-    - The top of the module imports only Rich, so that `trilat --help` stays fast.
+    - Text from a file or from another process also passes `sanitize`, which limits its length.
+    - Code below the commands does not know the progress bar. It calls a function with
+      (done, total).
+    - The top of this module imports only Rich, so that `trilat --help` stays fast.
 """
 
 import json
@@ -39,15 +44,15 @@ Line feeds and tabs are not among them.
 
 
 def escape_controls(text: str) -> str:
-    """Returns a text with its control characters written out, as in <U+001B>."""
+    """Returns a text in which control characters are spelled out, as in <U+001B>."""
     return _CONTROLS.sub(lambda match: f"<U+{ord(match[0]):04X}>", text)
 
 
 class TextConsole(Console):
-    """A console that writes out the control characters of all texts, also those of tables."""
+    """A Rich console that spells out the control characters of all texts, also those of tables."""
 
     def render_str(self, text: str, **options: Any) -> Text:
-        """Returns a text as the console shows it, with control characters written out."""
+        """Converts a text to the type of Rich, with control characters spelled out."""
         return super().render_str(escape_controls(text), **options)
 
 
@@ -55,9 +60,9 @@ out = TextConsole(highlight=False)
 err = TextConsole(stderr=True, highlight=False)
 
 PATIENCE_S = 1.0
-"""Time until a progress bar appears, s."""
+"""Time until a progress bar appears, in s."""
 _REDRAW_PERIOD_S = 0.1
-"""Shortest time between two drawings of a progress bar, s."""
+"""Shortest time between two drawings of a progress bar, in s."""
 _MAX_DAMAGED = 3
 """Largest number of listed damaged parts of a log."""
 MAX_LETTERS = 4000
@@ -67,15 +72,27 @@ _PIPE_WIDTH = 160
 
 
 def sanitize(text: object, most: int = 300) -> str:
-    """Returns a printable text for a terminal, cut off after `most` characters."""
-    plain = "".join(
-        letter if letter.isprintable() else "\ufffd" for letter in str(text)[: most + 1]
-    )
-    return plain if len(plain) <= most else plain[:most] + "..."
+    """Returns the text of an object for a terminal.
+
+    Characters that cannot be printed become a replacement character. A text that is longer than
+    `most` characters is cut off.
+    """
+    # One character more than the limit tells whether the text is too long.
+    beginning = str(text)[: most + 1]
+    plain = "".join(letter if letter.isprintable() else "\ufffd" for letter in beginning)
+    if len(plain) <= most:
+        return plain
+    return plain[:most] + "..."
 
 
 def print_text(text: object, console: Console = out, head: str = "") -> None:
-    """Prints a sanitized line behind a head, without interpreting markup."""
+    """Prints a sanitized line. Rich's markup in the text is not interpreted.
+
+    Args:
+        text: The line.
+        console: The console, for standard output or standard error.
+        head: Text before the line, which is not sanitized.
+    """
     console.print(head + sanitize(text, MAX_LETTERS), markup=False, soft_wrap=True)
 
 
@@ -90,18 +107,18 @@ def print_error(text: object) -> None:
 
 
 def print_marked(mark: str, text: object) -> None:
-    """Prints a line behind a mark, which is in Rich's markup."""
+    """Prints a line behind a mark. The mark may have colours in Rich's markup."""
     out.print(f"{mark} {escape(sanitize(text, MAX_LETTERS))}", soft_wrap=True)
 
 
 def print_texts(texts: Iterable[object]) -> None:
-    """Prints lines as `print_text` does."""
+    """Prints several lines, each as `print_text` does."""
     for text in texts:
         print_text(text)
 
 
 def print_paths(paths: Iterable[Path]) -> None:
-    """Prints a line per written file."""
+    """Prints the paths of files that were written, a line each."""
     print_texts(f"  {path}" for path in paths)
 
 
@@ -109,20 +126,20 @@ def print_json(value: Any) -> None:
     """Prints a value as JSON.
 
     Raises:
-        ValueError: the value holds NaN or an infinite number.
+        ValueError: The value contains NaN or an infinite number.
     """
     text = json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False)
     print_line(_CONTROLS.sub(lambda match: f"\\u{ord(match[0]):04x}", text))
 
 
 def print_line(text: str) -> None:
-    """Prints and flushes a line, for programs that read the output."""
+    """Prints a line and flushes it, so that a program that reads the output gets it at once."""
     sys.stdout.write(escape_controls(text) + "\n")
     sys.stdout.flush()
 
 
 def print_table(table: "TextTable") -> None:
-    """Prints a table, at least `_PIPE_WIDTH` wide if the output is not a terminal."""
+    """Prints a table. If the output is not a terminal, it is at least `_PIPE_WIDTH` wide."""
     console = out
     if not out.is_terminal:
         width = max(out.width, _PIPE_WIDTH)
@@ -131,7 +148,12 @@ def print_table(table: "TextTable") -> None:
 
 
 def print_result(result: "Result", *, as_json: bool = False) -> None:
-    """Prints a result: its text, or its values as JSON."""
+    """Prints a result as text, or as JSON.
+
+    Args:
+        result: The result of a command.
+        as_json: True to print the values as JSON.
+    """
     if as_json:
         print_json(result.to_dict())
         return
@@ -148,7 +170,10 @@ def print_result(result: "Result", *, as_json: bool = False) -> None:
 
 @contextmanager
 def lines_aside(aside: bool) -> Iterator[None]:
-    """Redirects standard output to standard error, if `aside`: to keep the output for JSON."""
+    """Redirects standard output to standard error within a `with` statement, if `aside` is True.
+
+    A command with the option --json uses this, so that its standard output contains only JSON.
+    """
     with redirect_stdout(sys.stderr) if aside else nullcontext():
         yield
 
@@ -156,15 +181,18 @@ def lines_aside(aside: bool) -> Iterator[None]:
 def conclude_files(
     paths: Sequence[Path], folder: Path, *, as_json: bool = False, png: bool = False
 ) -> "tuple[Log, Conclusion]":
-    """Checks a log that was just recorded, writes its report and prints the conclusion.
+    """Checks a log that was just recorded, writes its report and prints the result.
 
     If the user interrupts the drawing, a note gives the command that draws the report later.
 
     Args:
-        paths: the files of the log.
-        folder: the folder of the report.
-        as_json: True to print the conclusion as JSON.
+        paths: Files of the log.
+        folder: Folder of the report.
+        as_json: True to print the result as JSON.
         png: True to write the figures as PNG files too.
+
+    Returns:
+        The log, and the result of the checks with the paths of the report.
     """
     from .conclude import conclude
 
@@ -185,10 +213,13 @@ def conclude_files(
 
 @contextmanager
 def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
-    """Yields a function that draws a progress bar when it is called with (done, total).
+    """Yields a function that draws a progress bar, for use in a `with` statement.
 
-    The function may be called at any rate. The bar appears after `PATIENCE_S`, and only on a
-    terminal.
+    The function is called with (done, total), at any rate. The bar appears after `PATIENCE_S`,
+    and only on a terminal.
+
+    Args:
+        label: Text before the bar.
     """
     if not err.is_interactive:
         yield lambda _done, _total: None
@@ -215,6 +246,7 @@ def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
     drawn_s = start_s
 
     def show(done: int, total: int) -> None:
+        """Draws the progress, unless the last drawing was very recent."""
         nonlocal drawn_s
         now_s = display.get_time()
         if now_s - start_s < PATIENCE_S:
@@ -235,12 +267,12 @@ def open_with_progress(first: Path, *more: Path, **allowed: Any) -> "Log":
     """Opens a log from its files with a progress bar, and warns of damage.
 
     Args:
-        first: the file of the log, or its first part.
-        *more: the other parts.
-        **allowed: further options of `open_log`.
+        first: File of the log, or its first part.
+        *more: The other parts.
+        **allowed: Further options of `open_log`.
 
     Raises:
-        LogError: a file is missing, is not an MCAP file, or is not a log of trilat-net.
+        LogError: A file is missing, is not an MCAP file, or is not a log of trilat-net.
     """
     from ..log.log_reader import open_log
 
@@ -251,7 +283,7 @@ def open_with_progress(first: Path, *more: Path, **allowed: Any) -> "Log":
 
 
 def warn_of_damage(log: "Log") -> None:
-    """Warns of damaged parts of a log, with the command that recovers the rest."""
+    """Prints which parts of a log are damaged, and the command that recovers the rest."""
     for path in log.sources:
         warn_if_unfinished(Path(path))
     for problem in (*log.damaged[:_MAX_DAMAGED], *log.unreadable[:_MAX_DAMAGED]):
@@ -264,7 +296,7 @@ def warn_of_damage(log: "Log") -> None:
 
 
 def warn_user_laws(log: "Log") -> None:
-    """Warns of the user laws that an execution of the log runs or is not allowed to run."""
+    """Prints which control laws of users a new execution of the log will run or may not run."""
     from ..scenario.code_consent import find_user_laws
 
     for law in find_user_laws(log.scenario):
@@ -275,10 +307,10 @@ def warn_user_laws(log: "Log") -> None:
 
 
 def warn_if_unfinished(path: Path) -> None:
-    """Warns of a file without a proper end, with the command that recovers its contents.
+    """Prints a note about a file without a proper end, and the command that recovers its contents.
 
     Raises:
-        LogError: the file cannot be read.
+        LogError: The file cannot be read.
     """
     from ..files import reading
     from ..log.mcap_records import RecordScanner

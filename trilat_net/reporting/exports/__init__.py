@@ -1,12 +1,12 @@
-"""The formats that logs are exported to, one module per format.
+"""Defines the formats to which logs are exported, one module per format.
 
-The name of a module is the name of its format. A module has a constant `FORMAT`, an
-`ExportFormat`. A further module in this folder is a further format.
+The name of a module is the name of its format. A module has a constant `FORMAT` of the type
+`export.ExportFormat`. Adding a module to this folder adds a format to `trilat export`.
 """
 
 import pkgutil
 
 
 def list_export_formats() -> list[str]:
-    """Returns the names of all formats."""
+    """Returns the names of all formats, which are those of the modules in this folder."""
     return [module.name for module in pkgutil.iter_modules(__path__)]

@@ -1,7 +1,8 @@
 """Exports a log as a folder of CSV files, a file per table.
 
-A file has a line of column names and then a line per row. Numbers are written as Python shows
-them, so that they are read back unchanged. A missing value is an empty field.
+A file has a line of column names and then a line per row. Numbers are written with as many
+digits as Python needs to read them back unchanged. A missing value is an empty field. Two more
+files describe the columns and contain the scenario.
 """
 
 import csv
@@ -16,7 +17,13 @@ _ROWS_AT_ONCE = 4096
 
 
 def _write(log: Log, folder: Path, written: Written) -> None:
-    """Writes the tables of a log, its scenario and their description into a folder."""
+    """Writes the tables of a log, their description and the scenario into a folder.
+
+    Args:
+        log: The log.
+        folder: Existing folder of the files.
+        written: Function that is called with the number of records written since its last call.
+    """
     description = store_tables(
         log,
         written,

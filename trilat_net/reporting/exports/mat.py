@@ -1,4 +1,9 @@
-"""Exports a log as a MATLAB file (.mat) with a struct per site and an array per column."""
+"""Exports a log as a MATLAB file (.mat) with a struct per site and an array per column.
+
+In MATLAB, `m1.q1_rad` is a column of the records of the site m1, and `m1.link.age_s_us` is a
+column of its statistics of links. The struct `events` has the events of the session. The text
+`about_json` describes all columns, and the text `scenario_toml` is the scenario.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -13,7 +18,7 @@ from ..export import ExportFormat, Written, name_inside, read_texts, store_table
 
 _EXTRA = ("scipy.io", "mat", "MAT files")
 _MAX_EXACT_INTEGER = 2**53
-"""Integers of at most this size are exact as doubles, the usual numbers of MATLAB."""
+"""Largest integer up to which all integers are exact as doubles, MATLAB's usual numbers."""
 _KEYWORDS = {
     "break", "case", "catch", "classdef", "continue", "else", "elseif", "end", "for",
     "function", "global", "if", "otherwise", "parfor", "persistent", "return", "spmd", "switch",
@@ -23,21 +28,25 @@ _KEYWORDS = {
 
 
 def _write(log: Log, path: Path, written: Written) -> None:
-    """Writes a struct per site, the struct `events`, and two texts.
+    """Writes the tables of a log as structs, their description and the scenario as texts.
 
-    Columns have names such as `m1.q1_rad` and `m1.link.age_s_us`. The texts are the
-    description, `about_json`, and the scenario, `scenario_toml`.
+    Args:
+        log: The log.
+        path: The file.
+        written: Function that is called with the number of records written since its last call.
 
     Raises:
-        UsageError: the log is too large for a MATLAB file.
+        UsageError: The log is too large for a MATLAB file.
     """
     variables: dict[str, Any] = {}
 
     def store(table: Table, table_name: str) -> None:
+        """Adds a table to the variables of the file under a name such as "m1" or "m1.link"."""
         struct = _build_struct(table)
         site, _, kind = table_name.partition(".")
         if kind:
-            # store_tables stores the records of a site before its other tables
+            # The struct of the site exists already, because `store_tables` stores the records
+            # of a site before its other tables.
             variables[site][kind] = struct
         else:
             variables[site] = struct
@@ -56,23 +65,27 @@ def _write(log: Log, path: Path, written: Written) -> None:
 
 
 def _name_table(table: Table) -> str:
-    """Returns the name of a table in the file; a site named like a keyword gets an ending."""
+    """Returns the name of a table in the file.
+
+    A site whose name is a keyword of MATLAB gets the ending "_site".
+    """
     name = f"{table.name}_site" if table.name in _KEYWORDS else table.name
     return name_inside(table, name, ".")
 
 
 def _build_struct(table: Table) -> dict[str, Any]:
-    """Returns a struct of the columns of a table, with their units in the field `units`."""
+    """Returns the columns of a table as fields of a struct, with their units in the field `units`."""
     struct = {column.name: _convert_column(column, table) for column in table.columns}
     struct["units"] = {column.name: column.unit for column in table.columns}
     return struct
 
 
 def _convert_column(column: Column, table: Table) -> Any:
-    """Returns a column for MATLAB.
+    """Converts the values of a column to a type that is convenient in MATLAB.
 
-    Texts are rows of characters in the tables of sites, and cells in the table of events.
-    Integers become doubles if all of them are exact as doubles. Stamps in ns stay integers.
+    Texts become rows of characters in the tables of sites, and cells in the table of events.
+    The table of events has no `kind`. Integers become doubles if all of them are exact as
+    doubles. Time stamps in ns stay integers.
     """
     if column.is_text:
         return read_texts(column) if table.kind else column.values.reshape(-1, 1)

@@ -1,4 +1,8 @@
-"""Exports a log as a NumPy file (.npz) with an array per column of its tables."""
+"""Exports a log as a NumPy file (.npz) with an array per column of its tables.
+
+The arrays have names such as "m1/q1_rad", "m1/link/age_s_us" and "events/text". The text
+"about_json" describes all columns, and the text "scenario_toml" is the scenario.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -12,14 +16,17 @@ from ..export import ExportFormat, Written, name_inside, read_texts, store_table
 
 
 def _write(log: Log, path: Path, written: Written) -> None:
-    """Writes the columns of a log as arrays, and two texts.
+    """Writes the columns of a log as arrays, and their description and the scenario as texts.
 
-    The arrays have names such as "m1/q1_rad", "m1/link/age_s_us" and "events/text". The texts
-    are the description, "about_json", and the scenario, "scenario_toml".
+    Args:
+        log: The log.
+        path: The file.
+        written: Function that is called with the number of records written since its last call.
     """
     arrays: dict[str, NDArray[Any]] = {}
 
     def store(table: Table, table_name: str) -> None:
+        """Adds the columns of a table to the arrays of the file."""
         for column in table.columns:
             arrays[f"{table_name}/{column.name}"] = _build_array(column)
 
@@ -27,12 +34,12 @@ def _write(log: Log, path: Path, written: Written) -> None:
     arrays["about_json"] = np.array(description)
     arrays["scenario_toml"] = np.array(log.scenario_text)
     with path.open("wb") as stream:
-        # the stubs of NumPy take every keyword for `allow_pickle`
+        # The type stubs of NumPy mistake every keyword for `allow_pickle`.
         np.savez(stream, **arrays)  # type: ignore[arg-type]
 
 
 def _name_table(table: Table) -> str:
-    """Returns the name of a table in the file."""
+    """Returns the name of a table in the file, such as "m1" or "m1/link"."""
     return name_inside(table, table.name, "/")
 
 

@@ -1,4 +1,8 @@
-"""Exports a log as a folder of Parquet files, a file per table."""
+"""Exports a log as a folder of Parquet files, a file per table.
+
+Parquet is a compressed column format that pandas, polars and DuckDB read. Two more files in the
+folder describe the columns and contain the scenario.
+"""
 
 import io
 from pathlib import Path
@@ -9,7 +13,13 @@ from ..export import ExportFormat, Written, describe_folder, store_tables
 
 
 def _write(log: Log, folder: Path, written: Written) -> None:
-    """Writes the tables of a log, its scenario and their description into a folder."""
+    """Writes the tables of a log, their description and the scenario into a folder.
+
+    Args:
+        log: The log.
+        folder: Existing folder of the files.
+        written: Function that is called with the number of records written since its last call.
+    """
     description = store_tables(
         log,
         written,
@@ -21,7 +31,7 @@ def _write(log: Log, folder: Path, written: Written) -> None:
 
 def _write_table(table: Table, path: Path) -> None:
     """Writes a table as a Parquet file."""
-    # written by Python and not by polars, so that a full disk is an OSError
+    # The file is written by Python and not by polars, so that a full disk raises OSError.
     buffer = io.BytesIO()
     to_data_frame(table).write_parquet(buffer, compression="zstd")
     path.write_bytes(buffer.getbuffer())
