@@ -1,13 +1,16 @@
-"""Text of a stability certificate, for the terminal and the report page.
+"""Composes the text of a stability certificate, for the terminal and for the page of a report.
 
-`describe_certificate` returns the sentences of both. The terminal adds tables of the premises
-and of the energies that changed V.
+A certificate judges from its log whether a run was stable, and gives the reasons. V is the
+energy function of the stability proof: it must not rise, except by energy that is accounted
+for. `describe_certificate` returns the sentences, which the terminal and the page share. The
+terminal adds tables of the premises, which are conditions of the stability theorem, and of the
+energies that changed V.
 
 Invariant:
-    - The terminal and the page show the same sentences.
+    - The terminal and the page have the same sentences.
     - The verdict comes first.
     - The listed energies add up: V at the end is V at the start plus all other entries, up to
-      the entries too small to be listed.
+      entries that are too small to be listed.
 """
 
 from collections.abc import Iterator, Sequence
@@ -29,7 +32,7 @@ from .result_text import MARKS, Block, MarkedText, TextTable
 MIN_ENERGY_SHARE = 1e-6
 """Smallest listed energy, as a share of the largest energy."""
 MAX_LISTED_LINKS = 6
-"""Largest number of links listed one by one; the energies of more links are summed."""
+"""Largest number of links that are listed. The energies of more links are summed."""
 _SOURCE_NAMES = {
     "rule": "rule for stale peers",
     "shares": "change of shares",
@@ -41,7 +44,7 @@ _HOLDS = {True: "holds", False: "fails", None: "undecided"}
 
 
 def compose_certificate(certificate: Certificate) -> Iterator[Block]:
-    """Yields the judgement and its grounds, then tables of the premises and the energies."""
+    """Yields the judgement and its reasons, then tables of the premises and the energies."""
     for line in describe_certificate(certificate):
         yield MarkedText(MARKS[line.mark], line.text)
 
@@ -75,7 +78,11 @@ def _tabulate_premises(premises: Sequence[Premise]) -> TextTable:
 
 
 def compose_twins(twins: PushedTwins) -> Iterator[Block]:
-    """Yields the sizes for which a push acts linearly, and a line on each push."""
+    """Yields the sizes for which a push acts linearly, and a line about each push.
+
+    A push is a small disturbance of a twin, a second execution of the run. It shows whether
+    disturbances grow.
+    """
     if twins.linear is not None or not twins.growth.pushes:
         yield twins.headline()
     yield from map(twins.describe, twins.growth.pushes)
@@ -88,9 +95,9 @@ class CertificateLine(NamedTuple):
     """A sentence of a certificate.
 
     Attributes:
-        mark: "ok" for a sentence that supports the stability of the run, "FAIL" for one against
-            stability, "open" for one that leaves the question open, or "note".
-        text: the sentence.
+        mark: "ok" if the sentence supports that the run was stable, "FAIL" if it speaks against
+            it, "open" if it leaves the question open, and "note" for other sentences.
+        text: The sentence.
     """
 
     mark: str
@@ -98,10 +105,11 @@ class CertificateLine(NamedTuple):
 
 
 def describe_certificate(certificate: Certificate) -> list[CertificateLine]:
-    """Returns the judgement and then its grounds, each as a marked sentence.
+    """Returns the judgement, and then its reasons, each as a marked sentence.
 
-    The grounds are V, the end of the run, the energy balance, the energy of the laws, the
-    roots, the twins that were pushed, and the log.
+    The reasons are: V; the end of the run; the energy balance; the energies of the control
+    laws; the characteristic roots; the twins, which are repeated runs with a small push; and
+    the log itself. Reasons that do not exist for a run are left out.
     """
     lines = _describe_verdict(certificate)
     if certificate.balance is not None:
@@ -113,7 +121,7 @@ def describe_certificate(certificate: Certificate) -> list[CertificateLine]:
         lines.append(CertificateLine(_OBSERVED_MARKS[observed.finding], observed.text))
     roots = certificate.roots
     if roots is not None:
-        # roots that are not exact cannot show stability
+        # Roots of an approximation cannot show stability.
         is_doubtful = roots.verdict == "stable" and not roots.exact
         mark = "note" if is_doubtful else _ROOT_MARKS.get(roots.verdict, "note")
         lines.append(CertificateLine(mark, roots.text))
@@ -128,7 +136,7 @@ def describe_certificate(certificate: Certificate) -> list[CertificateLine]:
 
 
 def _describe_verdict(certificate: Certificate) -> list[CertificateLine]:
-    """Returns the judgement, the verdict on V, and the end of the run."""
+    """Returns the judgement, the verdict about V, and the end of the run."""
     stability_mark = _JUDGEMENT_MARKS[certificate.stability]
     verdict_mark = "ok" if certificate.bounded_by_v else "open"
     if certificate.verdict.finding is StabilityFinding.BROKEN:
@@ -143,7 +151,7 @@ def _describe_verdict(certificate: Certificate) -> list[CertificateLine]:
 
 
 def _describe_evidence(certificate: Certificate) -> CertificateLine:
-    """Returns the line on the completeness and integrity of the log."""
+    """Returns the line that says whether the log is complete and intact."""
     evidence = certificate.evidence
     mark = "open" if evidence.reasons else "ok"
     if not evidence.integrity.passed:
@@ -152,7 +160,11 @@ def _describe_evidence(certificate: Certificate) -> CertificateLine:
 
 
 def _describe_paper_weights(certificate: Certificate) -> str:
-    """Returns the rise of V with the paper's weights; "" if these weights are right."""
+    """Returns how much V would have risen with the weights of the sites that the paper uses.
+
+    Returns:
+        A sentence. Empty if the paper's weights are right for this run.
+    """
     balance = certificate.paper_balance
     rise = certificate.paper_weights_rise
     if balance is None or rise is None:
@@ -163,7 +175,7 @@ def _describe_paper_weights(certificate: Certificate) -> str:
 
 
 def describe_judgement(certificate: Certificate) -> str:
-    """Returns the judgement in one line: its headline, and the reasons that leave it open."""
+    """Returns the judgement in one line, with the reasons that leave it open."""
     return "; ".join([certificate.headline(), *certificate.reasons])
 
 
@@ -186,7 +198,7 @@ _ROOT_MARKS = {"stable": "ok", "unstable": "open"}
 
 
 def _mark_twins(twins: TwinGrowth) -> str:
-    """Returns the mark of the sentence on twins that were pushed."""
+    """Returns the mark of the sentence about twins, see `CertificateLine`."""
     if not twins.pushes:
         return "note"
     if twins.grows or twins.departure is not None:
@@ -196,7 +208,11 @@ def _mark_twins(twins: TwinGrowth) -> str:
 
 
 def describe_balance(balance: EnergyBalance) -> str:
-    """Returns a sentence on how closely the energy balance closes."""
+    """Returns a sentence about the part of V that the energy balance leaves unexplained.
+
+    The controller acts only once per tick. The sentence therefore also says how small the
+    unexplained part is if the work of this sampling is accounted for.
+    """
     scale_j = balance.scale
     if scale_j <= ZERO_ENERGY_J:
         return "there is no energy in this run"
@@ -212,7 +228,11 @@ def describe_balance(balance: EnergyBalance) -> str:
 def list_energies(balance: EnergyBalance) -> list[tuple[str, float]]:
     """Returns V at the start, the energies that changed V, and V at the end, in J.
 
-    Energies below `MIN_ENERGY_SHARE` of the largest energy are left out.
+    Energies below `MIN_ENERGY_SHARE` of the largest energy are left out. If there are more than
+    `MAX_LISTED_LINKS` links, their energies are summed.
+
+    Returns:
+        Name and energy of each entry.
     """
     links: dict[str, Array] = {}
     sources: dict[str, Array] = {}
@@ -243,7 +263,7 @@ def list_energies(balance: EnergyBalance) -> list[tuple[str, float]]:
 
 
 def _compute_rest(balance: EnergyBalance) -> Array:
-    """Returns the change of V less all energies that changed V, shape (T,), J."""
+    """Returns the change of V that no listed energy explains, shape (T,), in J."""
     gained = sum(balance.work.values())
     lost = sum(balance.dissipation.values())
     explained = gained - lost + balance.sampling - balance.transfer
@@ -252,7 +272,10 @@ def _compute_rest(balance: EnergyBalance) -> Array:
 
 
 def _describe_v(balance: EnergyBalance, index: int) -> tuple[str, float]:
-    """Returns the name and the value in J of V at a tick; 0 for V below rounding."""
+    """Returns an entry for V at a tick: its name, and its value in J.
+
+    A V that is smaller than rounding errors counts as 0.
+    """
     energy_j = float(balance.V[index])
     shown_j = energy_j if energy_j > ZERO_ENERGY_J else 0.0
     return f"V at {balance.t_s[index]:.4g} s", shown_j

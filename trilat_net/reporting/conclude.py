@@ -1,11 +1,13 @@
-"""Conclude a finished run: check its log, and write its figures, page and summary.
+"""Concludes a finished run: checks its log, and writes its page and its summary.
 
-`conclude` is the work of `trilat report`. Its result, a `Conclusion`, is the text that commands
-print after a run.
+`conclude` does the work of `trilat report`. A check executes the sites of the log again, and
+compares the results with the records, bit for bit. The result is a `Conclusion`, whose text the
+commands print after a run.
 
 Invariant:
     - Every claim rests on a new execution of the log, made for this conclusion.
-    - The execution runs in another process while the figures are drawn.
+    - The execution runs in another process while the page is written, so that two processor
+      cores are used.
 """
 
 from collections.abc import Iterator
@@ -34,15 +36,15 @@ from .summary_text import format_run_lines
 
 @dataclass(frozen=True, repr=False)
 class Conclusion(CheckReport):
-    """The conclusion of a finished run.
+    """The result of checking and reporting a finished run.
 
     Attributes:
-        verdict: the judgement of the run's stability.
-        table: a row per site.
-        notes: lines on user laws, arms, links, changes, modes and clocks, and on the
-            certificate.
-        findings: the checks of the log.
-        paths: the files of the log, and the files that were written.
+        verdict: Judgement whether the run was stable.
+        table: Table with a row per site.
+        notes: Lines about users' control laws, arms, links, changes, modes and clocks, and
+            about the stability certificate.
+        findings: Results of the checks of the log.
+        paths: Files of the log, and files that were written.
     """
 
     verdict: CertificateLine
@@ -65,7 +67,7 @@ class Conclusion(CheckReport):
 
     @property
     def page(self) -> Path:
-        """The page of the report; without a page, the first path."""
+        """Path of the report's page. If no page was written, the first path."""
         pages = [path for path in self.paths if path.suffix == ".html"]
         return pages[0] if pages else self.paths[0]
 
@@ -76,12 +78,12 @@ class Conclusion(CheckReport):
         return f"{result}; {self.page}"
 
     def to_rows(self) -> list[dict[str, str]]:
-        """Returns a row per site."""
+        """Returns the table of sites as a list of dictionaries, one per site."""
         headers = self.table.headers
         return [dict(zip(headers, row, strict=False)) for row in self.table.rows]
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns plain values, with the keys of `trilat report --json`."""
+        """Returns the result as plain values, which `trilat report --json` prints."""
         return {
             "passed": self.passed,
             "verdict": self.verdict.text,
@@ -99,31 +101,31 @@ def conclude(
     min_coverage: float = MIN_COVERAGE,
     png: bool = False,
 ) -> Conclusion:
-    """Verifies a log, and writes its page and summary into a folder.
+    """Checks a log, and writes its page and its summary into a folder.
 
     Args:
-        log: a log that was opened from files.
-        folder: an existing folder.
-        progress: called with (done, total) while figures are drawn.
-        min_coverage: smallest share of every site's ticks that must be judged.
+        log: Log that was opened from files.
+        folder: Existing folder.
+        progress: Function that is called with (done, total) while figures are drawn.
+        min_coverage: Smallest share of every site's ticks that must be judged.
         png: True to write the figures as PNG files too.
 
     Raises:
-        LogError: a record cannot be read.
-        RunFailed: the process that executes the log was terminated.
+        LogError: A record cannot be read.
+        RunFailed: The process that executes the log was terminated.
     """
-    # Matplotlib takes a second, and `verify` needs none of it
+    # Importing Matplotlib takes a second, which `trilat verify` need not wait for.
     from .figures.registry import write_report_figures
     from .page import write_report
 
     findings: list[Finding] = []
-    # uses two cores: the log is executed while its figures are drawn
+    # Two processor cores are used: the log is executed while its figures are drawn.
     with worker_pool(1) as pool:
         allowed = dict(allowed_code)
         check = pool.submit(check_log_files, log.sources, min_coverage, allowed)
         twin = _run_without_operators(log)
         certificate = certify_run(log, min_coverage=min_coverage)
-        # raises, if at all, before anything is written
+        # A record that cannot be read raises here, before anything is written.
         run_lines = format_run_lines(log)
         figures: list[Path] = []
         if png:
@@ -136,6 +138,7 @@ def conclude(
             )
 
         def wait_for_findings() -> Iterator[Finding]:
+            """Yields the results of the checks, after the other process has finished them."""
             try:
                 findings.extend(check.result())
             except BrokenProcessPool:
@@ -161,16 +164,20 @@ def conclude(
 
 
 def _run_without_operators(log: Log) -> Log | None:
-    """Returns the same run without operators; None if it would not differ, or cannot run."""
-    # the twin of a run that failed would fail too, or hang
+    """Simulates the run of a log without the people or programs that moved the arms.
+
+    Returns:
+        The log of the simulation. None if it would not differ from the run, or cannot run.
+    """
+    # A run that failed would fail again, or hang. External arms cannot be simulated.
     has_failed = any(event.kind == "failed" for event in log.events)
     has_operators = any(site.hands for site in log.scenario.sites.values())
     if has_failed or log.scenario.external or not has_operators:
         return None
     try:
         return simulate_without_operators(log)
-    # a user law fails or is not allowed to run: the check of the log reports this
     except (ScenarioError, LawFailed):
+        # The control law of a user fails or may not run. The check of the log reports this.
         return None
 
 
@@ -194,7 +201,7 @@ def _tabulate_sites(log: Log) -> TextTable:
 
 
 def _list_site_cells(log: Log, site: str) -> list[str]:
-    """Returns the cells of a site; those after the number of records are "" without records."""
+    """Returns the cells of a site. Without records, only the name and the number are filled."""
     records = log[site]
     if not len(records):
         empty = [""] * (len(_HEADERS) - 1)
@@ -203,7 +210,7 @@ def _list_site_cells(log: Log, site: str) -> list[str]:
     missing = ticks - len(records) - log.absent_ticks(site)
     late_us = np.percentile(records.late_us, (50, 99, 100))
     busy_us = np.zeros(2)
-    # a record holds the computing time of the tick before, so that the first record has none
+    # A record has the computing time of the previous tick, so that the first record has none.
     if len(records) > 1:
         busy_us = np.percentile(records.busy_us, (50, 99))
     times = [f"{time_us:.0f}" for time_us in (*late_us, *busy_us)]

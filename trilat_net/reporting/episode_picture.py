@@ -1,11 +1,12 @@
-"""Pictures of an episode of a task, as arrays of pixels for a film.
+"""Draws pictures of an episode of a task, as arrays of pixels for a film.
 
-A picture has a panel per site with its arm, and in one panel the goal of the task.
+An episode is one attempt of a learned program at the task, see `trilat_net.studies`. A picture
+has a panel per site with its arm. One of the panels also shows the goal of the task.
 
 Invariant:
-    - A picture depends on the poses, the goal and the title alone.
-    - All pictures of an episode have the same size and the same limits of their axes, so that
-      motion in a film is motion of the arms.
+    - A picture depends only on the poses, the goal and the title.
+    - All pictures of an episode have the same size and the same axis limits, so that everything
+      that moves in the film is an arm or a body.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,7 +26,7 @@ from .appearance import SITE_COLOURS
 from .figures.arm_poses import project_arm_m, trace_bodies_m
 
 PANEL_PX = 240
-"""Side of a panel, pixels."""
+"""Side of a panel, in pixels."""
 _DPI = 100
 _MARGIN = 1.08
 """Half the side of a panel, as a multiple of the reach of its arm."""
@@ -47,8 +48,8 @@ class EpisodePicture:
     """Draws pictures of an episode, one after another, into the same panels.
 
     Args:
-        scenario: the experiment.
-        goal_site: the site whose panel shows the goal of the task.
+        scenario: Scenario of the task, with the arms.
+        goal_site: Name of the site whose panel shows the goal of the task.
     """
 
     def __init__(self, scenario: Scenario, goal_site: str) -> None:
@@ -70,14 +71,17 @@ class EpisodePicture:
         goal_m: Array | None,
         title: str,
     ) -> NDArray[np.uint8]:
-        """Returns a picture, shape (height, width, 3).
+        """Draws a picture.
 
         Args:
-            q_rad: joint angles by site, rad, shape (n,) each.
-            bodies: poses of the bodies of plants by site and name, shape (7,) each.
-            goal_m: position that the task asks for, m; None if the goal is not a position of
-                this arm.
-            title: text in the lower left corner of the first panel.
+            q_rad: Joint angles by site, in rad, shape (n,) each.
+            bodies: Poses of the bodies that the arms can touch, by site and name, shape (7,)
+                each.
+            goal_m: Position that the task asks for, in m. None if the goal is no position.
+            title: Text in the lower left corner of the first panel.
+
+        Returns:
+            Colours of the pixels (red, green, blue), shape (height, width, 3).
         """
         for number, (site, axes) in enumerate(self._panels.items()):
             arm = self._scenario.arms[site]
@@ -97,7 +101,13 @@ class EpisodePicture:
         return self._read_pixels()
 
     def _draw_bodies(self, axes: Axes, site: str, bodies: Mapping[str, Array]) -> None:
-        """Draws the edges of the bodies that the plant of a site moves."""
+        """Draws the edges of the bodies that a site's arm can touch.
+
+        Args:
+            axes: The panel.
+            site: Name of the site.
+            bodies: Pose of each body by name, shape (7,) each.
+        """
         if not bodies:
             return
         poses = np.concatenate(list(bodies.values()))
@@ -115,11 +125,11 @@ class EpisodePicture:
 
 
 def _scale_panel(axes: Axes, points_m: Array) -> None:
-    """Sets the limits of a panel to the reach of its arm, the sum of its links' lengths.
+    """Sets the axis limits of a panel to the reach of its arm, the sum of its links' lengths.
 
     Args:
-        axes: the panel.
-        points_m: base, joints and end effector in any pose, shape (L, 2) or (L, 3), m.
+        axes: The panel.
+        points_m: Base, joints and end effector in any pose, shape (L, 2) or (L, 3), in m.
     """
     lengths_m = np.linalg.norm(np.diff(points_m, axis=0), axis=1)
     half_m = _MARGIN * float(lengths_m.sum())
@@ -128,7 +138,13 @@ def _scale_panel(axes: Axes, points_m: Array) -> None:
 
 
 def _draw_arm(axes: Axes, points_m: Array, colour: str) -> None:
-    """Draws links, joints and base of an arm at points in the picture, shape (L, 2), m."""
+    """Draws the links, joints and base of an arm.
+
+    Args:
+        axes: The panel.
+        points_m: Base, joints and end effector in the picture, shape (L, 2), in m.
+        colour: Colour of the arm.
+    """
     axes.plot(*points_m.T, color=colour, linewidth=3.0, solid_capstyle="round")
     joints_m = points_m[1:]
     axes.plot(*joints_m.T, linestyle="none", marker="o", markersize=4.0, color=colour)
@@ -136,5 +152,5 @@ def _draw_arm(axes: Axes, points_m: Array, colour: str) -> None:
 
 
 def is_position(goal: Sequence[float] | Array, end_effector_m: Array) -> bool:
-    """True if a goal has as many numbers as the position of the end effector."""
+    """Returns True if a goal has as many numbers as the position of the end effector."""
     return np.shape(goal) == np.shape(end_effector_m)

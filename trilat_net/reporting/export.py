@@ -205,7 +205,7 @@ def store_tables(
 
 
 def _describe_table(table: Table) -> JsonObject:
-    """Returns the meaning of a table's rows, and the unit, meaning and source of its columns."""
+    """Returns the meaning of a table's rows, and unit, meaning and source of its columns."""
     columns = {}
     for column in table.columns:
         columns[column.name] = {

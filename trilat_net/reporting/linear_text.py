@@ -1,11 +1,14 @@
-"""Text of a linear analysis for the terminal.
+"""Composes the text of a linear analysis, as the command `trilat linear` prints it.
 
-The text consists of the equilibrium, the delays in use, a table of the rightmost roots, the
-verdict, the delay margin, the ports, and the edges of stability over a scenario key.
+A linear analysis linearises the coupled arms at a pose of rest, and computes whether small
+motions decay. The text has the equilibrium, the delays, a table of the rightmost roots of the
+characteristic equation, the verdict, the largest stable delay, the ports at which operators
+hold the arms, and the values of scenario keys at which stability changes.
 
 Invariant:
     - Every number has its unit.
-    - Roots that are zero by structure are counted, not listed.
+    - Roots that are zero by the structure of the system are counted, not listed, because they
+      say nothing about stability.
 """
 
 import math
@@ -27,7 +30,7 @@ _COLOURS = {"stable": "green", "unstable": "red", "at the edge": "yellow"}
 
 
 def compose_linear(analysis: LinearAnalysis) -> Iterator[Block]:
-    """Yields equilibrium, delays, roots, verdict, margin, notes, ports and edges, in order."""
+    """Yields equilibrium, delays, roots, verdict, margin, notes, ports and scans, in order."""
     yield from describe_equilibrium(analysis)
     yield from describe_effective_delays(analysis)
     yield ""
@@ -44,7 +47,12 @@ def compose_linear(analysis: LinearAnalysis) -> Iterator[Block]:
 
 
 def _describe_scan(scan: EdgeScan, name: str) -> str:
-    """Returns a line on the values of a key at which the stability of a scenario changes."""
+    """Returns a line with the values of a scenario key at which the stability changes.
+
+    Args:
+        scan: Result of a scan of the key's values.
+        name: Name of the scenario.
+    """
     edges = []
     for edge in scan.edges:
         state = "stable" if edge.stable_above else "unstable"
@@ -54,13 +62,17 @@ def _describe_scan(scan: EdgeScan, name: str) -> str:
 
 
 def describe_equilibrium(analysis: LinearAnalysis) -> Iterator[str]:
-    """Yields how the equilibrium was computed, its residual, and the pose of each site."""
+    """Yields how the equilibrium was computed, its residual, and the pose of each site.
+
+    If all sites have the same joint angles, a single line has them.
+    """
     rest = analysis.rest
     yield f"rest: {rest.how}; residual {rest.residual:.1g}"
     sites = analysis.conditions.sites
     angles = [q[: site.layout.joints] for site, q in zip(sites, rest.q, strict=True)]
-    # half a unit of the last digit that is shown
-    if not sites[0].layout.task and float(np.ptp(rest.q, axis=0).max()) < 5e-5:
+    is_joint_space = not sites[0].layout.task
+    # The limit is half a unit of the last digit that is printed.
+    if is_joint_space and float(np.ptp(rest.q, axis=0).max()) < 5e-5:
         yield f"  all sites at ({_list_numbers(angles[0])}) rad"
         return
     for site, q, pose in zip(sites, angles, analysis.end_effectors, strict=True):
@@ -72,11 +84,15 @@ def describe_equilibrium(analysis: LinearAnalysis) -> Iterator[str]:
 
 
 def _list_numbers(values: Array) -> str:
+    """Returns numbers with four decimals, separated by commas."""
     return ", ".join(f"{value:.4f}" for value in values)
 
 
 def describe_effective_delays(analysis: LinearAnalysis) -> Iterator[str]:
-    """Yields the delays in use, in one line if all are equal; of varying delays the means."""
+    """Yields the delay of the samples in use on each link, or one line if all delays are equal.
+
+    If the delays vary, the lines have the means.
+    """
     names = analysis.scenario.names
     age_s = analysis.conditions.age_s
     quantity = "mean delay in use" if analysis.conditions.varying else "delay in use"
@@ -90,11 +106,12 @@ def describe_effective_delays(analysis: LinearAnalysis) -> Iterator[str]:
 
 
 def tabulate_roots(analysis: LinearAnalysis) -> TextTable:
-    """Returns a table of the rightmost roots of the continuous loop, with their modes.
+    """Returns a table of the rightmost roots of the loop, with the motions that they describe.
 
-    If a root of the sampled loop differs, the table also has the roots of the sampled loop.
-    If the delays differ from tick to tick, the table has the roots of the sampled loop alone,
-    because the continuous loop only knows mean delays.
+    The roots are those of the continuous loop. If a root of the sampled loop, as it is computed
+    tick by tick, differs, the table also has the roots of the sampled loop. If the delays
+    differ from tick to tick, the table has only the roots of the sampled loop, because the
+    continuous loop has only mean delays.
     """
     spanned = analysis.decisive.span_s is not None
     roots = analysis.decisive.roots if spanned else analysis.continuous.roots
@@ -102,7 +119,7 @@ def tabulate_roots(analysis: LinearAnalysis) -> TextTable:
     differ = any(other is not None for other in sampled)
     rows = []
     for root, other in zip(roots, sampled, strict=True):
-        # the imaginary part of a real root may be -0.0, which would be shown as "-0"
+        # The imaginary part of a real root may be -0.0, which would be printed as "-0".
         row = [
             f"{root.s.real:.4g}",
             f"{root.s.imag:.4g}" if root.s.imag else "0",
@@ -123,7 +140,7 @@ def tabulate_roots(analysis: LinearAnalysis) -> TextTable:
 
 
 def describe_zero_roots(analysis: LinearAnalysis) -> str:
-    """Returns a sentence on the number and origin of the roots that are zero by structure."""
+    """Returns a sentence about the roots that are zero by the structure of the system."""
     count = analysis.decisive.zeros
     if not count:
         return "no root at zero"
@@ -135,7 +152,7 @@ def describe_zero_roots(analysis: LinearAnalysis) -> str:
 
 
 def describe_linear_verdict(analysis: LinearAnalysis) -> str:
-    """Returns the verdict with the growth rate and frequency of the rightmost root."""
+    """Returns the verdict, with the growth rate and the frequency of the rightmost root."""
     rightmost = analysis.decisive.rightmost
     drifting = analysis.decisive.drifting
     motions = "motions keep their" if drifting > 1 else "motion keeps its"
@@ -161,9 +178,12 @@ WEIGHTS_ALIKE = 1e-9
 
 
 def describe_ports(ports: PortAnalysis) -> list[str]:
-    """Returns the lines on passivity, absolute stability and transparency of the ports.
+    """Returns the lines about the ports, the places at which operators hold the arms.
 
-    If the loop is unstable without operators, or with a site clamped, the lines end there.
+    The lines are about passivity (the loop cannot generate energy at the ports), absolute
+    stability (the loop is stable with any passive operators) and transparency (the impedance
+    that an operator feels). If the loop is unstable without operators, or with a site clamped,
+    the lines end there.
     """
     lines = _describe_conditions(ports)
     if ports.verdict == "unstable":
@@ -193,7 +213,7 @@ def describe_ports(ports: PortAnalysis) -> list[str]:
 
 
 def _describe_conditions(ports: PortAnalysis) -> list[str]:
-    """Returns the lines on the analysed ports and on the grid of frequencies."""
+    """Returns the lines about the analysed ports and the grid of frequencies."""
     low_hz, high_hz = ports.band_hz
     conditions = f"operators and environments off, {low_hz:g}-{high_hz:g} Hz"
     grid = "(a grid refined at minima: evidence, no proof)"
@@ -205,7 +225,11 @@ def _describe_conditions(ports: PortAnalysis) -> list[str]:
 
 
 def _describe_port_passivity(ports: PortAnalysis) -> list[str]:
-    """Returns the lines on the passivity of all ports, of each joint, and of the proof's r."""
+    """Returns the lines about the passivity of all ports, of each joint, and of the proof.
+
+    The stability proof assumes operators that are passive in r, the velocity plus Lambda times
+    the error e, instead of the velocity.
+    """
     lines = []
     if ports.pole.order:
         kind = "as of free masses" if ports.pole.passive else "which no passive network has"
@@ -224,6 +248,12 @@ def _describe_port_passivity(ports: PortAnalysis) -> list[str]:
 
 
 def _describe_proof(ports: PortAnalysis, proof: Passivity) -> str:
+    """Returns a sentence about the passivity in r that the stability proof assumes.
+
+    Args:
+        ports: Analysed ports.
+        proof: Passivity in r, with the ports of each site weighted as in the proof.
+    """
     beta = ", ".join(f"{weight:.3g}" for weight in ports.beta)
     text = f"{_describe_passivity(proof)}; sites weighted {beta}"
     if np.ptp(ports.beta) > WEIGHTS_ALIKE:
@@ -236,12 +266,12 @@ def _describe_proof(ports: PortAnalysis, proof: Passivity) -> str:
 
 
 def _describe_passivity(passivity: Passivity, unit: str = "", kind: str = "") -> str:
-    """Returns a sentence on passivity; with a unit, also the damping that a port lacks.
+    """Returns a sentence about passivity, and about the damping that is missing.
 
     Args:
-        passivity: the result for one port or for all ports.
-        unit: the unit of the lacking damping; "" to leave the damping out.
-        kind: "joint" or "axis", the kind of the ports.
+        passivity: Result for one port or for all ports.
+        unit: Unit of the missing damping. Empty to leave out the damping.
+        kind: Kind of the ports, "joint" or "axis".
     """
     if passivity.passive:
         return "passive"
@@ -258,6 +288,7 @@ def _describe_passivity(passivity: Passivity, unit: str = "", kind: str = "") ->
 
 
 def _list_bands(bands: tuple[FrequencyBand, ...]) -> str:
+    """Returns frequency bands as text, at most `_MAX_BANDS` of them."""
     ranges = [f"{band.from_hz:.3g}-{band.to_hz:.3g}" for band in bands[:_MAX_BANDS]]
     text = f"at {', '.join(ranges)} Hz"
     if len(bands) > _MAX_BANDS:
@@ -266,6 +297,7 @@ def _list_bands(bands: tuple[FrequencyBand, ...]) -> str:
 
 
 def _describe_absolute_stability(ports: PortAnalysis) -> str:
+    """Returns whether passive operators can make the loop unstable, with the margin."""
     minima = ports.absolute
     if not minima.below:
         return "stable"
@@ -275,9 +307,13 @@ def _describe_absolute_stability(ports: PortAnalysis) -> str:
 
 
 def _describe_two_ports(ports: PortAnalysis) -> list[str]:
-    """Returns a line per failing two-port or group of them, and a line on those that hold."""
+    """Returns the lines about Llewellyn's criterion, which decides on stability for two sites.
+
+    Each pair of sites and joint is a two-port. A line describes a failing two-port, or a group
+    of them, and a last line counts those for which the criterion holds.
+    """
     failing = [two_port for two_port in ports.two_ports if two_port.minima.below]
-    # for arms of many joints, the failing two-ports of a pair of sites share a line
+    # For arms with many joints, the failing two-ports of a pair of sites share a line.
     groups: dict[tuple[object, ...], list[TwoPort]] = {}
     for two_port in failing:
         joint = two_port.joint if len(ports.joints) <= _MAX_SEPARATE_JOINTS else ""
@@ -295,7 +331,7 @@ def _describe_two_ports(ports: PortAnalysis) -> list[str]:
 
 
 def _describe_failing(ports: PortAnalysis, group: list[TwoPort]) -> str:
-    """Returns a line on failing two-ports of the same sites, with the least of their minima."""
+    """Returns a line about failing two-ports of the same sites, with their worst minimum."""
     worst = min(group, key=lambda two_port: two_port.minima.least)
     minima = worst.minima
     joints = [str(ports.axes.get(two_port.joint, two_port.joint)) for two_port in group]
@@ -314,7 +350,11 @@ def _describe_failing(ports: PortAnalysis, group: list[TwoPort]) -> str:
 
 
 def _describe_transparency(ports: PortAnalysis, transparency: Transparency) -> str:
-    """Returns a sentence on the impedance felt with the other site free and clamped."""
+    """Returns a sentence about the impedance that an operator feels.
+
+    The impedance is given with the other site free and with it clamped. The larger their ratio,
+    the better the operator can feel what the other site touches.
+    """
     unit = ports.impedance_unit(transparency.joint)
     port = ports.name_port(transparency.joint)
     free, clamped = transparency.interpolate_magnitudes(QUOTED_AT_HZ)

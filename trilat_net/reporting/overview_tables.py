@@ -1,11 +1,12 @@
-"""Text of the contents of log files: session, sites, links, channels, accounts and files.
+"""Composes the text of `trilat log info`, which describes the contents of log files.
 
-`compose_overview` composes the text of `trilat log info` from the facts of a `FileOverview`.
-The text begins with the session if the files hold a trilat-net log, and ends with a line per
-file.
+The facts come from a `FileOverview`. If the files are a log of trilat-net, the text has the
+session, the sites and the links. Then follow the channels (the series of messages in the
+files), the recorder's counts of messages, and a line per file.
 
 Invariant:
-    - Texts from a file pass `sanitize` or are cells of a table, which `result_text` sanitizes.
+    - Texts from a file pass `sanitize`, or are cells of a table, which `result_text` sanitizes.
+      A file therefore cannot control the terminal.
 """
 
 import re
@@ -19,15 +20,19 @@ from .result_text import Block, MarkedText, TextTable
 from .terminal_output import sanitize
 
 _MAX_GAPS = 4
-"""Largest number of listed gaps of a channel, and of listed damaged parts of a file."""
+"""Largest number of listed gaps of a channel, and of damaged parts of a file."""
 _VIEW_PREFIX = "/viz/"
 """First part of the names of standard channels for other tools."""
 _FAULTY_ACCOUNT = re.compile(r"(missing|duplicate|reordered|refilled|overflowed) [1-9]")
+"""Pattern of a fault in the recorder's counts, such as "missing 3"."""
 _SIZE_UNITS = {"GB": 10**9, "MB": 10**6, "kB": 10**3}
 
 
 def compose_overview(overview: FileOverview) -> Iterator[Block]:
-    """Yields the contents of log files: session, tables, accounts, origin and files."""
+    """Yields the contents of log files: session, tables, counts, origin and files.
+
+    If the files are no log of trilat-net, only the channels and the files are described.
+    """
     facts = overview.facts
     session: JsonObject | None = facts["session"]
     if session is not None:
@@ -148,11 +153,11 @@ def _compose_links(links: Mapping[str, JsonObject]) -> Iterator[Block]:
 def _compose_channels(
     channels: Mapping[str, JsonObject], session: JsonObject | None
 ) -> Iterator[Block]:
-    """Yields a table of the channels, and the missing ranges of each channel with gaps.
+    """Yields a table of the channels, and the missing numbers of each channel with gaps.
 
     Args:
-        channels: the channels by topic.
-        session: the session, whose topics are shortened; None if the files hold no session.
+        channels: Channels by topic.
+        session: The session, whose topics are shortened. None if the files contain no session.
     """
     if not channels:
         return
@@ -182,7 +187,11 @@ def _compose_channels(
 
 
 def _list_gaps(gaps: Sequence[tuple[int, int]]) -> str:
-    """Returns ranges of missing numbers, given by first and last number, as text."""
+    """Returns ranges of missing numbers as text, at most `_MAX_GAPS` of them.
+
+    Args:
+        gaps: First and last number of each range.
+    """
     ranges = []
     for first, last in gaps[:_MAX_GAPS]:
         ranges.append(f"{first}-{last}" if last > first else str(first))
@@ -193,7 +202,7 @@ def _list_gaps(gaps: Sequence[tuple[int, int]]) -> str:
 
 
 def _compose_views(views: Mapping[str, JsonObject]) -> Iterator[Block]:
-    """Yields a table of the standard channels that other tools read, if there are any."""
+    """Yields a table of the channels with standard messages, which other tools read."""
     if not views:
         return
     rows = []
@@ -205,7 +214,10 @@ def _compose_views(views: Mapping[str, JsonObject]) -> Iterator[Block]:
 
 
 def _compose_accounts(session: JsonObject) -> Iterator[Block]:
-    """Yields the number of channels without a fault, and the account of each other channel."""
+    """Yields the recorder's counts of the messages of each channel.
+
+    Only channels with a fault, such as missing messages, are listed. The others are counted.
+    """
     accounts: dict[str, str] = session["accounts"]
     prefix = f"/trilat/{session['session']}/"
     yield ""
@@ -225,7 +237,7 @@ def _compose_accounts(session: JsonObject) -> Iterator[Block]:
 
 
 def _compose_origin(session: JsonObject) -> Iterator[Block]:
-    """Yields the versions of the software and the platform that produced the log."""
+    """Yields the versions of the software and the machine that recorded the log."""
     versions: dict[str, str] = dict(session["versions"])
     version = versions.pop("trilat-net", "unknown")
     libraries = [f"{name} {library}" for name, library in versions.items()]
@@ -242,7 +254,7 @@ def _compose_origin(session: JsonObject) -> Iterator[Block]:
 
 
 def _compose_file(file: JsonObject) -> Iterator[Block]:
-    """Yields a line on a file, and a line on each of its damaged parts."""
+    """Yields a line about a file, and a line about each of its damaged parts."""
     name = file["path"]
     if file["part"]:
         name += f", part {file['part'].get('index', '?')}"
@@ -265,7 +277,7 @@ def _compose_file(file: JsonObject) -> Iterator[Block]:
 
 
 def _compose_line(heading: str, text: str) -> Iterator[Block]:
-    """Yields a text behind a bold heading; nothing for an empty text."""
+    """Yields a text behind a bold heading. Yields nothing for an empty text."""
     if text:
         yield MarkedText(f"[bold]{heading:<9}[/bold]", sanitize(text))
 
@@ -276,9 +288,9 @@ def _tabulate(
     """Yields an empty line and a table.
 
     Args:
-        headers: a text per column.
-        rows: rows of values; None is shown as a dash.
-        text_columns: number of first columns that hold texts; the others hold numbers.
+        headers: Header of each column.
+        rows: Values of each row. None is printed as a dash.
+        text_columns: Number of columns at the left that have texts. The others have numbers.
     """
     cells = [["-" if value is None else str(value) for value in row] for row in rows]
     yield ""
@@ -293,18 +305,19 @@ def _format_counts(channel: JsonObject) -> list[object]:
 
 
 def _format_percentiles(percentiles: JsonObject | None) -> list[str | None]:
-    """Returns median, 99th percentile and maximum as three cells; three None without values."""
+    """Returns median, 99th percentile and maximum as three cells, or None without values."""
     if percentiles is None:
         return [None, None, None]
     return [_format_number(percentiles[key]) for key in ("p50", "p99", "max")]
 
 
 def _format_number(value: float) -> str:
+    """Returns a number with four digits, or as an integer if it is 1000 or larger."""
     return f"{value:.0f}" if abs(value) >= 1000.0 else f"{value:.4g}"
 
 
 def _format_size(size_bytes: int) -> str:
-    """Returns a size with three digits and the largest unit that fits."""
+    """Returns a size with three digits, in the largest unit that fits."""
     for unit, unit_bytes in _SIZE_UNITS.items():
         if size_bytes >= unit_bytes:
             return f"{size_bytes / unit_bytes:.3g} {unit}"

@@ -200,7 +200,7 @@ class PlanarArm(msgspec.Struct, frozen=True, kw_only=True, tag="planar", tag_fie
 
 
 class ChainArm(msgspec.Struct, frozen=True, kw_only=True, tag="chain", tag_field="kind"):
-    """An arm of any number of joints in space. The page gets its joint positions in the picture.
+    """An arm of any number of joints in space, given by its joint positions in the picture.
 
     Attributes:
         site: Name of the site.

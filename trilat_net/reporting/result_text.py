@@ -1,12 +1,13 @@
-"""Text of results as a list of blocks, shown on the terminal, as plain text or as HTML.
+"""Represents the text of results as blocks, which become terminal output, plain text or HTML.
 
-A block is a line, a marked line (`MarkedText`) or a table (`TextTable`). Results of `studies`
-compose their blocks in a method `blocks`. Results of other packages, which do not depend on
-this one, have no such method: for these, `_COMPOSERS` names a function in this folder.
+A block is a line, a line behind a mark (`MarkedText`) or a table (`TextTable`). The results of
+`studies` return their blocks from a method `blocks`. Results of other packages must not depend
+on this package. For these, `_COMPOSERS` names the function in this folder that composes their
+blocks.
 
 Invariant:
-    - The terminal, the plain text and the HTML have the same blocks in the same order.
-    - Every cell of a table is text. All three forms show the same cells in the same order.
+    - Terminal, plain text and HTML have the same blocks in the same order.
+    - Every cell of a table is text. All three forms have the same cells in the same order.
 """
 
 import re
@@ -43,7 +44,7 @@ A hash is kept on one line so that it can be copied.
 
 
 def escape_text(text: str) -> str:
-    """Returns a text as HTML in which no line breaks within a hash."""
+    """Returns a text as HTML, in which no line break can split a hash."""
     return HASH.sub(r'<span style="white-space:nowrap">\g<0></span>', escape(text))
 
 
@@ -51,15 +52,15 @@ class TextTable(NamedTuple):
     """A table of texts.
 
     Attributes:
-        headers: a text per column; all empty for a table without a header line.
-        rows: lists of a text per column. A shorter row leaves its last cells empty. A row of
-            a single text in a wider table is the heading of a group of rows.
-        align: a letter per column, "l" for texts and "r" for numbers. The last letter also
-            holds for all further columns.
-        units: a unit per column, appended to the header; "" for a column without a unit. May
-            be shorter than `headers`.
-        styles: the styles of cells on a terminal, by the text of the cell, as in
-            {"fails": "yellow"}.
+        headers: Header of each column. If all are empty, the table has no header line.
+        rows: Cells of each row. A shorter row leaves its last cells empty. A row of a single
+            cell in a wider table is the heading of a group of rows.
+        align: A letter per column, "l" for texts and "r" for numbers. The last letter also
+            applies to all further columns.
+        units: Unit of each column, which is appended to the header. Empty for a column without
+            a unit. There may be fewer units than headers.
+        styles: Styles of cells on a terminal, by the text of the cell, as in {"fails":
+            "yellow"}.
     """
 
     headers: Sequence[str]
@@ -70,7 +71,7 @@ class TextTable(NamedTuple):
 
     @property
     def titles(self) -> list[str]:
-        """The headers with their units."""
+        """Headers of the columns with their units."""
         missing = len(self.headers) - len(self.units)
         units = [*self.units, *[""] * missing]
         columns = zip(self.headers, units, strict=False)
@@ -78,14 +79,14 @@ class TextTable(NamedTuple):
 
     @property
     def to_the_right(self) -> list[bool]:
-        """Per column, True if its cells are aligned to the right."""
+        """For each column, True if its cells are aligned to the right."""
         letters = self.align.ljust(len(self.headers), self.align[-1])
         return [letter == "r" for letter in letters]
 
     def rich(self) -> "Table":
         """Returns the table for a Rich console, without borders.
 
-        Cells are folded if the terminal is too narrow, except cells that hold only hashes.
+        Cells are folded if the terminal is too narrow, except those that consist of a hash.
         """
         from rich.table import Table
 
@@ -98,7 +99,8 @@ class TextTable(NamedTuple):
                 justify="right" if is_right else "left",
                 overflow="fold",
                 min_width=hash_width,
-                # Rich narrows columns that may wrap before it respects least widths
+                # Rich ignores the least width of a column that may wrap. Therefore a column of
+                # hashes may not wrap.
                 no_wrap=hash_width is not None and self._fits(index, hash_width),
             )
         for row in self.rows:
@@ -112,18 +114,18 @@ class TextTable(NamedTuple):
         return table
 
     def _list_cells(self, index: int) -> list[str]:
-        """Returns the cells of a column, without those that short rows leave out."""
+        """Returns the cells of a column. Rows that are too short have no cell in it."""
         return [row[index] for row in self.rows if index < len(row)]
 
     def _find_hash_width(self, index: int) -> int | None:
-        """Returns the length of the longest hash in a column; None without a hash."""
+        """Returns the length of the longest hash in a column. None if it has no hash."""
         widths = []
         for cell in self._list_cells(index):
             widths += [len(digits) for digits in HASH.findall(cell)]
         return max(widths, default=None)
 
     def _fits(self, index: int, width: int) -> bool:
-        """True if no cell of a column is longer than a width."""
+        """Returns True if no cell of a column is longer than a width."""
         return all(len(cell) <= width for cell in self._list_cells(index))
 
     def markdown(self) -> str:
@@ -144,6 +146,7 @@ class TextTable(NamedTuple):
         sides = ["right" if right else "left" for right in self.to_the_right]
 
         def render_row(cells: Sequence[str], tag: str) -> str:
+            """Returns a row of cells with an HTML tag, "td" or "th"."""
             html = ""
             for cell, side in zip(cells, sides, strict=False):
                 html += f'<{tag} style="text-align:{side}">{escape_text(cell)}</{tag}>'
@@ -158,7 +161,7 @@ class TextTable(NamedTuple):
     def lines(self) -> list[str]:
         """Returns the lines of the table, with columns aligned by spaces.
 
-        The first line holds the headers, unless all headers are empty.
+        The first line has the headers, unless all headers are empty.
         """
         table = list(self.rows)
         if any(self.titles):
@@ -184,12 +187,12 @@ def format_number(value: float | None, digits: int = 3) -> str:
 
 
 class MarkedText(NamedTuple):
-    """A line behind a mark.
+    """A line behind a mark, such as a green "ok".
 
     Attributes:
-        mark: the mark in Rich's markup, as in "[green]ok[/green]", or "".
-        text: the line.
-        failed: True if a command prints it to standard error.
+        mark: The mark in Rich's markup, as in "[green]ok[/green]". Empty for no mark.
+        text: The line.
+        failed: True if a command prints the line to standard error.
     """
 
     mark: str
@@ -197,7 +200,7 @@ class MarkedText(NamedTuple):
     failed: bool = False
 
     def lines(self) -> list[str]:
-        """Returns a list of a single line, without colours."""
+        """Returns a list with the line, without colours."""
         if not self.mark:
             return [self.text]
         mark = Text.from_markup(self.mark).plain
@@ -211,7 +214,7 @@ class MarkedText(NamedTuple):
 
 
 Block = str | MarkedText | TextTable
-"""A part of a result's text; "" is an empty line."""
+"""A part of a result's text. An empty text is an empty line."""
 
 _COMPOSERS = {
     "Certificate": "certificate_text:compose_certificate",
@@ -233,7 +236,7 @@ _COMPOSERS = {
 
 
 def compose(result: Result) -> list[MarkedText | TextTable]:
-    """Returns the lines and tables of a result, in order."""
+    """Returns the blocks of a result, in order."""
     compose_blocks = getattr(result, "blocks", None)
     if compose_blocks is None:
         compose_blocks = partial(_import_composer(result), result)
@@ -242,7 +245,11 @@ def compose(result: Result) -> list[MarkedText | TextTable]:
 
 
 def _import_composer(result: Result) -> Callable[[Result], Iterable[Block]]:
-    """Returns the function in `_COMPOSERS` for the nearest class of a result."""
+    """Imports the function that composes the text of a result, see `_COMPOSERS`.
+
+    A subclass of a listed class has the function of the listed class. Importing the module only
+    when it is needed keeps other commands fast.
+    """
     classes = [cls.__name__ for cls in type(result).__mro__]
     known = next(name for name in classes if name in _COMPOSERS)
     module_name, _, function_name = _COMPOSERS[known].partition(":")

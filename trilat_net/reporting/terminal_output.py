@@ -49,7 +49,7 @@ def escape_controls(text: str) -> str:
 
 
 class TextConsole(Console):
-    """A Rich console that spells out the control characters of all texts, also those of tables."""
+    """A Rich console that spells out the control characters of all texts, also in tables."""
 
     def render_str(self, text: str, **options: Any) -> Text:
         """Converts a text to the type of Rich, with control characters spelled out."""
@@ -170,7 +170,7 @@ def print_result(result: "Result", *, as_json: bool = False) -> None:
 
 @contextmanager
 def lines_aside(aside: bool) -> Iterator[None]:
-    """Redirects standard output to standard error within a `with` statement, if `aside` is True.
+    """Redirects standard output to standard error in a `with` statement, if `aside` is True.
 
     A command with the option --json uses this, so that its standard output contains only JSON.
     """
@@ -307,7 +307,7 @@ def warn_user_laws(log: "Log") -> None:
 
 
 def warn_if_unfinished(path: Path) -> None:
-    """Prints a note about a file without a proper end, and the command that recovers its contents.
+    """Prints a note about a file without a proper end, and the command that recovers it.
 
     Raises:
         LogError: The file cannot be read.

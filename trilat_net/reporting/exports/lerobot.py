@@ -1,17 +1,20 @@
 """Exports logs as a dataset of LeRobot, version 3.0, for learning from demonstrations.
 
-A dataset has frames at a fixed rate. A frame has the state of the slave, the command of every
-user, the shares of the users, and whether a person intervened in place of the program.
+LeRobot trains programs to move robots like people did. A dataset is a sequence of frames at a
+fixed rate, divided into episodes. A frame has the state of the slave arm, the command of every
+user, the dominance factors of the users (the weights with which the slave follows them), and
+whether a person intervened in place of the program.
 
 Invariant:
     - A frame has the newest record of every site at or before its time. Nothing is
       interpolated.
     - A frame is left out if such a record is older than the longer of two periods: that of the
-      site and that of the frames. Its episode ends, and the next episode begins after the gap.
+      site and that of the frames. Then its episode ends, and the next one begins after the gap.
     - Numbers are float32.
     - An orientation is six numbers, which never jump (see `trilat_net.log.orientations`).
     - With the setting `actions`, actions have the names and units of `action_features` of the
-      plugin `lerobot_robot_trilat`. A test compares the two.
+      plugin `lerobot_robot_trilat`, so that a trained program can command the plugin. A test
+      compares the two.
 """
 
 import json
@@ -68,11 +71,14 @@ _INDEX = {
 _PANDAS = {
     "pandas": json.dumps({"index_columns": ["task"], "column_indexes": [], "columns": [_INDEX]})
 }
-"""Metadata by which pandas, the reader of LeRobot, takes the texts of tasks as an index."""
+"""Metadata with which pandas, which LeRobot uses, reads the texts of tasks as an index."""
 _QUANTILES = (0.01, 0.1, 0.5, 0.9, 0.99)
+"""Quantiles that LeRobot expects among the statistics of a feature."""
 ACTIONS = ("tip", "joints")
-"""Kinds of actions besides what sites share: the modes in which the plugin's hand goes to a
-position.
+"""Kinds of actions: positions of the end effector, or joint angles.
+
+These are also the modes of the LeRobot plugin that moves an arm to a position. Without one of
+them, actions are the values that the sites exchange.
 """
 Names = dict[str, list[str]]
 """Names of the numbers of each feature."""
@@ -84,9 +90,9 @@ class _Frames(NamedTuple):
     """The F frames of a log.
 
     Attributes:
-        rows: rows of the frames' records in the log of each site, shape (F,) each.
-        episode: number of each frame's episode, from 0, shape (F,).
-        left_out: number of frames in gaps, which are left out.
+        rows: For each site, the index of each frame's record in the log, shape (F,).
+        episode: Number of each frame's episode, from 0, shape (F,).
+        left_out: Number of frames that are left out, because they lie in gaps.
     """
 
     rows: dict[str, Ints]
@@ -103,19 +109,23 @@ def _write(
     program: str = "",
     actions: str = "",
 ) -> str:
-    """Writes logs as one dataset, and returns a sentence on its size.
+    """Writes logs as one dataset.
 
     Args:
-        logs: the logs, at least one.
-        folder: the folder of the dataset.
-        written: called with the number of records of every log.
-        fps: number of frames a second.
-        program: the user that is the program; "" for the last user.
-        actions: kind of the actions, one of `ACTIONS`; "" for what sites share.
+        logs: The logs, at least one.
+        folder: Folder of the dataset.
+        written: Function that is called with the number of records of every log.
+        fps: Number of frames per second.
+        program: Name of the user that is the program. Empty for the last user.
+        actions: Kind of the actions, one of `ACTIONS`. Empty for the values that sites
+            exchange.
+
+    Returns:
+        A sentence about the size of the dataset.
 
     Raises:
-        LogError: a log has no frames, or the users or joints of the logs differ.
-        UsageError: a setting is not valid.
+        LogError: A log has no frames, or the users or joints of the logs differ.
+        UsageError: A setting is not valid.
     """
     _check_settings(fps, actions)
     names: Names = {}
@@ -169,7 +179,7 @@ def _check_settings(fps: int, actions: str) -> None:
     """Checks the settings of an export, see `_write`.
 
     Raises:
-        UsageError: a setting is not valid.
+        UsageError: A setting is not valid.
     """
     if fps < 1:
         raise UsageError(f"fps is a whole number of frames a second, not {fps}")
@@ -178,14 +188,19 @@ def _check_settings(fps: int, actions: str) -> None:
 
 
 def _write_json(folder: Path, files: dict[str, Any]) -> None:
-    """Writes JSON files into a folder, given their contents by name."""
+    """Writes JSON files into a folder.
+
+    Args:
+        folder: The folder.
+        files: Contents of the files by name.
+    """
     for file_name, content in files.items():
         text = json.dumps(content, indent=4) + "\n"
         (folder / file_name).write_text(text, encoding="utf-8", newline="\n")
 
 
 def _describe_session(log: Log, frames: _Frames) -> dict[str, Any]:
-    """Returns the description of the session of a log."""
+    """Returns the session of a log, its scenario, and the number of frames that are left out."""
     return {
         **log.session,
         "scenario": log.scenario_text,
@@ -194,7 +209,15 @@ def _describe_session(log: Log, frames: _Frames) -> dict[str, Any]:
 
 
 def _number_frames(dataset: Columns, fps: int) -> list[int]:
-    """Adds the time and the numbers of all frames, and returns each episode's first frame."""
+    """Adds the time and the numbers of all frames to a dataset.
+
+    Args:
+        dataset: Columns of all frames, to which columns are added.
+        fps: Number of frames per second.
+
+    Returns:
+        Index of the first frame of each episode.
+    """
     episode = dataset["episode_index"]
     index = np.arange(len(episode))
     starts = np.flatnonzero(np.diff(episode, prepend=-1))
@@ -206,13 +229,13 @@ def _number_frames(dataset: Columns, fps: int) -> list[int]:
 
 
 def _choose_frames(log: Log, fps: int) -> _Frames:
-    """Returns the frames of a log, at `fps` frames a second, and their records.
+    """Chooses the times of the frames of a log, and the records of each frame.
 
     The first frame is at the first time for which every site has a record. Records of a site
     that has diverged do not count.
 
     Raises:
-        LogError: a site has no records, or there is no time for which every site has a record.
+        LogError: A site has no records, or there is no time for which every site has a record.
     """
     rows = {site: np.flatnonzero(log[site].mode != "diverged") for site in log.sites}
     empty_sites = [site for site, site_rows in rows.items() if not len(site_rows)]
@@ -222,10 +245,12 @@ def _choose_frames(log: Log, fps: int) -> _Frames:
     for site, site_rows in rows.items():
         stamps_ns[site] = log[site].tick[site_rows] * NS_PER_S // log[site].rate_hz
 
+    # Frames are at equal steps over the time for which all sites have records.
     begin_ns = max(t_ns[0] for t_ns in stamps_ns.values())
     end_ns = min(t_ns[-1] for t_ns in stamps_ns.values())
     count = (end_ns - begin_ns) * fps // NS_PER_S + 1
     frame_ns = begin_ns + np.arange(count) * NS_PER_S // fps
+
     is_fresh = np.ones(len(frame_ns), dtype=np.bool_)
     for site, t_ns in stamps_ns.items():
         newest = np.searchsorted(t_ns, frame_ns, side="right") - 1
@@ -249,22 +274,26 @@ def _read_columns(
 ) -> tuple[Columns, Names]:
     """Returns the features of all frames of a log that follow from its records.
 
+    A feature is a vector per frame, such as the state of the slave.
+
     Args:
-        log: the log.
-        rows: rows of the frames' records of each site, shape (F,).
-        program: the user that is the program; "" for the last user.
-        actions: kind of the actions, one of `ACTIONS`, or "".
+        log: The log.
+        rows: For each site, the index of each frame's record, shape (F,).
+        program: Name of the user that is the program. Empty for the last user.
+        actions: Kind of the actions, one of `ACTIONS`, or empty.
 
     Returns:
-        The columns, and the names of the numbers of each feature with several numbers.
+        The columns of the features, and the names of the numbers of each vector.
 
     Raises:
-        LogError: the log has no slave or no user, or see `_read_commands`.
-        UsageError: the program is not a user.
+        LogError: The log has no slave or no user, or the users have no common action.
+        UsageError: The program is not a user.
     """
     slave, users = find_users(log.scenario)
     if not slave or not users:
         raise LogError(f"{log.source}: it has no slave that follows a master")
+
+    # The action of a frame is the command of the user with the largest dominance factor.
     alpha = trace_dominance(log, slave, log[slave].t_s[rows[slave]]).alpha
     shared = find_user_shares(log.scenario, alpha, program)
     commands, command_names = _read_commands(log, users, rows, actions)
@@ -297,10 +326,19 @@ def _read_columns(
 def _read_commands(
     log: Log, users: Sequence[str], rows: dict[str, Ints], actions: str
 ) -> tuple[list[Array], list[str]]:
-    """Returns the commands of every user, shape (F, n) each, and the names of their numbers.
+    """Returns the commands of every user.
+
+    Args:
+        log: The log.
+        users: Names of the sites of the users.
+        rows: For each site, the index of each frame's record, shape (F,).
+        actions: Kind of the actions, one of `ACTIONS`, or empty.
+
+    Returns:
+        The commands of each user, shape (F, n), and the names of their n numbers.
 
     Raises:
-        LogError: the users' arms have different joints, so that they have no common action.
+        LogError: The users' arms have different joints, so that they have no common action.
     """
     if actions == "tip":
         positions = []
@@ -334,13 +372,16 @@ def _read_commands(
 def _write_tables(
     folder: Path, dataset: Columns, starts: Sequence[int], tasks: list[str]
 ) -> dict[str, Any]:
-    """Writes the tables of a dataset, and returns the contents of its JSON file of statistics.
+    """Writes the tables of a dataset as Parquet files.
 
     Args:
-        folder: the folder of the dataset.
-        dataset: the columns of all frames.
-        starts: the first frame of each episode.
-        tasks: texts of the tasks.
+        folder: Folder of the dataset.
+        dataset: Columns of all frames.
+        starts: Index of the first frame of each episode.
+        tasks: Texts of the tasks.
+
+    Returns:
+        Statistics of the dataset, as contents of a JSON file.
     """
     pa = import_extra("pyarrow", *_EXTRA[1:])
     parquet = import_extra(*_EXTRA)
@@ -362,7 +403,7 @@ def _write_tables(
     for file_name, table in tables.items():
         path = folder / file_name
         path.parent.mkdir(parents=True, exist_ok=True)
-        # opened by Python and not by pyarrow, so that a full disk is an OSError
+        # The file is opened by Python and not by pyarrow, so that a full disk raises OSError.
         with path.open("wb") as stream:
             parquet.write_table(table, stream)
     statistics = {key: _compute_statistics(column) for key, column in dataset.items()}
@@ -372,14 +413,14 @@ def _write_tables(
 def _describe_dataset(
     fps: int, names: Names, columns: Columns, episodes: int, tasks: int
 ) -> dict[str, Any]:
-    """Returns the contents of the dataset's meta/info.json.
+    """Returns the contents of the file meta/info.json, in which LeRobot looks up the features.
 
     Args:
-        fps: number of frames a second.
-        names: names of the numbers of each feature.
-        columns: the columns of all frames.
-        episodes: number of episodes.
-        tasks: number of tasks.
+        fps: Number of frames per second.
+        names: Names of the numbers of each feature.
+        columns: Columns of all frames.
+        episodes: Number of episodes.
+        tasks: Number of tasks.
     """
     features = {}
     for key, column in columns.items():
@@ -408,7 +449,14 @@ def _describe_dataset(
 def _describe_episode(
     dataset: Columns, first: int, end: int, tasks: list[str]
 ) -> dict[str, Any]:
-    """Returns the row of an episode, with the frames `first` to `end` - 1."""
+    """Returns the row of an episode in the table of episodes.
+
+    Args:
+        dataset: Columns of all frames.
+        first: Index of the first frame of the episode.
+        end: Index after its last frame.
+        tasks: Texts of the tasks.
+    """
     row: dict[str, Any] = {
         "episode_index": int(dataset["episode_index"][first]),
         "tasks": [tasks[dataset["task_index"][first]]],
@@ -427,10 +475,13 @@ def _describe_episode(
 
 
 def _compute_statistics(column: NDArray[Any]) -> dict[str, list[float]]:
-    """Returns the statistics of a feature by which LeRobot scales it, with n numbers each.
+    """Computes the statistics of a feature with which LeRobot normalises it.
 
     Args:
-        column: the feature in F frames, shape (F, n) or (F,).
+        column: Feature in F frames, shape (F, n) or (F,).
+
+    Returns:
+        Each statistic by name, with n numbers.
     """
     rows = column.reshape(len(column), -1).astype(np.float64)
     statistics = {

@@ -74,7 +74,7 @@ def _name_table(table: Table) -> str:
 
 
 def _build_struct(table: Table) -> dict[str, Any]:
-    """Returns the columns of a table as fields of a struct, with their units in the field `units`."""
+    """Returns the columns of a table as fields of a struct, and their units in `units`."""
     struct = {column.name: _convert_column(column, table) for column in table.columns}
     struct["units"] = {column.name: column.unit for column in table.columns}
     return struct

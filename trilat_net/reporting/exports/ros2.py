@@ -1,8 +1,11 @@
-"""Exports a log as a ROS 2 bag: standard messages in an MCAP file of profile `ros2`.
+"""Exports a log as a ROS 2 bag: standard messages in an MCAP file of the profile `ros2`.
+
+A bag can be played with `ros2 bag play`, or read by tools for ROS. Its messages are those that
+the live bridge to ROS 2 would have published during the run.
 
 Invariant:
     - A bag has every record once, with its numbers and times. Nothing is decimated.
-    - The topics and their names and types are those of the live bridge
+    - The names and types of the topics are those of the live bridge
       (`trilat_net.log.ros2.published`).
     - The stamp of a header is the nominal time of its tick. The publish time of a message is
       the time of sending, and its log time is the time of arrival.
@@ -44,7 +47,7 @@ _RECORDS_PER_REPORT = 1000
 """Number of records between two reports of progress."""
 
 TimedMessages = tuple[int, int, list[tuple[str, bytes]]]
-"""Log time, ns, publish time, ns, and the messages with these times as pairs of topic and data.
+"""Log time in ns, publish time in ns, and the topic and data of each message with these times.
 """
 
 
@@ -53,22 +56,22 @@ def export_ros2(
 ) -> None:
     """Writes a log as a bag for `ros2 bag` and other players of bags.
 
-    The topics are those of the live bridge: `/<session>/<site>/joint_states` and others per
-    site, `/<session>/events` and `/<session>/log` of the session, `/tf` and `/diagnostics`. The
-    metadata of the channels have units, names and representations of orientations. An existing
-    file is replaced.
+    Topics of sites are `/<session>/<site>/joint_states` and others. Topics of the session are
+    `/<session>/events`, `/<session>/log`, `/tf` and `/diagnostics`. The metadata of the
+    channels have units, names and representations of orientations. An existing file is
+    replaced.
 
     Args:
-        log: the log.
-        path: the bag.
-        written: called with the number of records since its last call.
-        names: names of the topics: "crisp", "crtk", or a file of names as for
+        log: The log.
+        path: File of the bag.
+        written: Function that is called with the number of records written since its last call.
+        names: Names of the topics: "crisp", "crtk", or a file of names as for
             `trilat ros2 --names`.
 
     Raises:
-        LogError: a message of the log cannot be read.
-        UsageError: the names cannot be read.
-        OSError: the disk refused the data.
+        LogError: A message of the log cannot be read.
+        UsageError: The names cannot be read.
+        OSError: The disk refused the data.
     """
     table = read_topic_table(names)
     session = make_session_name(log.session.get("session", "") or log.scenario.name)
@@ -95,6 +98,8 @@ def export_ros2(
             )
             streams += [site_bag.iterate_records(), site_bag.iterate_statistics()]
         streams += [_iterate_events(log, session), _iterate_diagnostics(log, session)]
+
+        # Each stream is in the order of log times. Merging them keeps this order.
         for log_ns, publish_ns, messages in heapq.merge(*streams, key=itemgetter(0)):
             for topic, data in messages:
                 file.add_message(channel_numbers[f"/{topic}"], log_ns, data, publish_ns)
@@ -102,7 +107,7 @@ def export_ros2(
 
 
 def _add_quality(channel: ros2_messages.Ros2Channel) -> ros2_messages.Ros2Channel:
-    """Returns a channel with its quality of service in its metadata, as rosbag2 writes it."""
+    """Adds the quality of service to the metadata of a channel, as rosbag2 writes it."""
     text = _QOS
     values = _LATCHED if channel.latched else _VOLATILE
     for placeholder, value in values.items():
@@ -111,14 +116,14 @@ def _add_quality(channel: ros2_messages.Ros2Channel) -> ros2_messages.Ros2Channe
 
 
 class _SiteBag:
-    """The messages of one site in a bag.
+    """Converts the messages of one site for a bag.
 
     Args:
-        log: the log.
-        site: name of the site.
-        session: name of the session in topics.
-        table: names of the topics.
-        progress: called with the number of records since its last call.
+        log: The log.
+        site: Name of the site.
+        session: Name of the session in topics.
+        table: Names of the topics.
+        progress: Function that is called with the number of records since its last call.
     """
 
     def __init__(
@@ -145,7 +150,10 @@ class _SiteBag:
         return [(self._find_topic(topic), data) for topic, data in messages]
 
     def iterate_records(self) -> Iterator[TimedMessages]:
-        """Yields the messages of the records, in the order in which the records arrived."""
+        """Yields the messages that describe the records, in the order in which the records arrived.
+
+        The first messages also contain the description of the robot.
+        """
         records = self._log[self._site]
         shares = trace_dominance(self._log, self._site, records.t_s).alpha.tolist()
         log_ns = records.log_time_ns.tolist()
@@ -160,11 +168,11 @@ class _SiteBag:
             messages += [(FRAMES, data) for data in self._messages.pack_frames(record)]
             yield log_ns[row], publish_ns[row], messages
             if count % _RECORDS_PER_REPORT == 0 or count == len(records):
-                # the last report can be shorter than the others
+                # The last report can have fewer records than the others.
                 self._progress((count - 1) % _RECORDS_PER_REPORT + 1)
 
     def iterate_statistics(self) -> Iterator[TimedMessages]:
-        """Yields the messages of the link statistics, in the order of arrival."""
+        """Yields the messages about the links to the site, in the order of their arrival."""
         timed = self._log.timed_link_stats(self._site)
         rows = zip(
             timed.log_ns.tolist(), timed.publish_ns.tolist(), timed.messages, strict=True
@@ -175,12 +183,12 @@ class _SiteBag:
 
 
 def _find_epoch_ns(log: Log) -> int:
-    """Returns the Unix time of the epoch of a session, in ns; 0 in virtual time."""
+    """Returns the Unix time of the common start of a session, in ns. It is 0 in virtual time."""
     return int(log.session.get("epoch_unix_ns", "0"))
 
 
 def _iterate_events(log: Log, session: str) -> Iterator[TimedMessages]:
-    """Yields the messages of the events of a session."""
+    """Yields the messages about the events of a session."""
     timed = log.timed_events()
     rows = zip(timed.log_ns.tolist(), timed.publish_ns.tolist(), timed.messages, strict=True)
     for log_ns, publish_ns, event in rows:
@@ -190,10 +198,10 @@ def _iterate_events(log: Log, session: str) -> Iterator[TimedMessages]:
 
 
 def _iterate_diagnostics(log: Log, session: str) -> Iterator[TimedMessages]:
-    """Yields a message per second on the newest records of all sites.
+    """Yields a message per second about the newest records of all sites.
 
-    A message has the times of the last of these records, and never times before those of its
-    predecessor.
+    The times of a message are the latest times of these records, and never earlier than those
+    of the previous message.
     """
     parts = [log[site] for site in log.sites if len(log[site])]
     end_ns = max((int(part.t_ns.max()) for part in parts), default=-1)

@@ -148,7 +148,7 @@ def _plot_impedance(
 
 
 def _describe_ratios(responses: Sequence[Transparency]) -> str:
-    """Returns a line of a title with the clamped over the free impedance of each site, in dB."""
+    """Returns a line of a title with each site's ratio of clamped to free impedance, in dB."""
     ratios = [f"{response.operator_site} {response.ratio_db:+.1f} dB" for response in responses]
     text = f"\nclamped / free {', '.join(ratios)}"
     return text.replace("-", "\N{MINUS SIGN}")
