@@ -1,15 +1,16 @@
-"""Run an experiment with people: a session for each trial, and one page for all sessions.
+"""Runs an experiment with people: a live session per trial, on one set of browser pages.
 
-The participants open their pages once. For each trial this module starts a session, shows it on
-the pages, checks the log of the session, and notes the result. Between trials it collects
-consents and questionnaires.
+The participants open their pages once. For each trial of the protocol this module starts a
+session, shows it on the pages of the experimenter and the participants, checks the recorded
+log, and writes the result to the journal of the experiment. Between trials it collects consents
+and questionnaires.
 
 Invariant:
-    - A trial counts by its log alone. The log is in its final folder before the journal has the
-      trial. A process that dies at any moment therefore loses no trial whose session has ended,
-      and counts no other trial.
-    - Every attempt at a trial has a folder of its own. If the attempt does not count, the
-      folder stays, with a note of the reason.
+    - A trial counts only if its log exists and is valid. The log is moved to its final place
+      before the journal mentions the trial. If this process dies at any moment, no completed
+      trial is lost, and no incomplete trial is counted.
+    - Every attempt at a trial has its own folder. If the attempt does not count, its folder is
+      kept, together with a note of the reason.
 """
 
 import shutil
@@ -37,12 +38,14 @@ from .experiment_stage import Stage, TrialWatch
 from .page_server import PageOptions, PageServer
 
 ATTEMPTS = "tries"
-"""Folder of the attempts at trials, in the folder of the experiment."""
+"""Name of the folder of the attempts at trials, in the folder of the experiment."""
 POLL_NS = 20_000_000
 """Time between two checks for the replies of participants, in ns."""
 FAREWELL_NS = NS_PER_S
-"""Time between the last step and the end of the server, in ns: every page shows the end."""
+"""Time between the last step and the end of the server, in ns.
 
+In this time every page receives that the experiment has ended.
+"""
 EARLY_FAILURE_NS = 60 * NS_PER_S
 """Time within which a session that fails before its beginning would fail again, in ns."""
 
@@ -59,12 +62,12 @@ class ExperimentSessions:
     """The remaining steps of an experiment with people.
 
     Attributes:
-        experiment: the experiment.
-        stage: the part of the pages around the sessions.
-        clock: the clock of the stage.
-        run_session: runs the session of a trial.
-        ends: returns True once the experiment must end for now.
-        say: prints a line for the user.
+        experiment: The experiment, with its plan and its journals.
+        stage: What the pages show around the sessions. It collects the participants' replies.
+        clock: Clock of this process.
+        run_session: Function that runs the session of a trial.
+        ends: Function that returns True once the experiment must end for now.
+        say: Function that prints a line for the user.
     """
 
     experiment: Experiment
@@ -75,11 +78,14 @@ class ExperimentSessions:
     say: Callable[[str], None]
 
     def run(self) -> bool:
-        """Runs the remaining steps; returns False if the experiment was ended earlier.
+        """Runs the remaining steps. Steps that were completed earlier are skipped.
+
+        Returns:
+            True if all steps are completed. False if the experiment was ended earlier.
 
         Raises:
-            LogRefused: the disk refused a file; everything that was done is kept.
-            UsageError: the experiment is one of synthetic participants.
+            LogRefused: The disk refused a file. Everything that was done is kept.
+            UsageError: The experiment is one of synthetic participants.
         """
         trials = self.experiment.open_trials(people=True)
         notes = self.experiment.open_notes()
@@ -100,6 +106,10 @@ class ExperimentSessions:
     def _request_step(self, step: Step, rest_s: float = 0.0) -> bool:
         """Waits until every user has completed a step, and notes consents and answers.
 
+        Args:
+            step: The step.
+            rest_s: Rest before the step, in s.
+
         Returns:
             False if the experiment was ended before.
         """
@@ -109,6 +119,7 @@ class ExperimentSessions:
         request = self.stage.request_step(step, rest_s, done)
         note_count = len(self._notes.done)
         form_name = step.form.name if step.form else ""
+
         while not request.replies.keys() >= users.keys():
             if self.ends():
                 return False
@@ -139,7 +150,16 @@ class ExperimentSessions:
         text: str,
         answers: Mapping[str, float | None] = {},
     ) -> None:
-        """Adds a note to the journal, unless the journal has a note of this cell already."""
+        """Adds a note to the journal, unless the journal has a note of the same key already.
+
+        Args:
+            cell: Key of the note.
+            kind: Kind of the note, such as "consent" or "aborted".
+            who: Pseudonym of the participant, or of all participants of the trial.
+            number: Number of the trial.
+            text: Name of the questionnaire, or a reason.
+            answers: Answers to a questionnaire. None for an item without an answer.
+        """
         unix_s = round(self.clock.unix_ns() / NS_PER_S, 3)
         note = Note(
             cell=cell,
@@ -155,8 +175,11 @@ class ExperimentSessions:
     def _run_trial(self, step: Step) -> bool:
         """Repeats a trial until one attempt counts.
 
+        If the program was ended during this trial, a finished log of that attempt is counted,
+        and another attempt is noted as aborted.
+
         Returns:
-            False if the experiment was ended before.
+            False if the experiment was ended before an attempt counted.
         """
         plan = self.experiment.plan
         planned = step.planned
@@ -166,12 +189,14 @@ class ExperimentSessions:
         # The log exists if the program was killed before it had counted the trial.
         if path.exists() and not self._count_trial(trial, path):
             return True
+
         for last_attempt in self._list_attempts(planned)[-1:]:
             if any(last_attempt.glob("*.mcap*")):
                 self._record_aborted(planned, "the program was ended")
             else:
                 # The session of the attempt had not begun.
                 shutil.rmtree(last_attempt, ignore_errors=True)
+
         rest_s = plan.rest_before_s(planned)
         while not self._run_attempt(step, trial, path, rest_s):
             if self.ends():
@@ -201,8 +226,18 @@ class ExperimentSessions:
     ) -> bool:
         """Runs the session of a trial once all users are ready.
 
+        Args:
+            step: The step of the trial.
+            trial: The trial.
+            path: Final place of the log.
+            rest_s: Rest before the trial, in s.
+
         Returns:
             True if the trial counts.
+
+        Raises:
+            LogRefused: The disk refused the log.
+            RunFailed: The session failed before it began, and would fail again.
         """
         number = len(self._list_attempts(step.planned)) + 1
         begun_ns = self.clock.monotonic_ns()
@@ -213,7 +248,7 @@ class ExperimentSessions:
         has_begun = False
 
         def begins() -> bool:
-            """Returns True once all users are ready, and shows the trial."""
+            """Returns True once all users are ready. The pages then show the trial."""
             nonlocal has_begun
             if not has_begun and request.replies.keys() >= set(self.stage.users):
                 has_begun = True
@@ -234,6 +269,7 @@ class ExperimentSessions:
             if result.problems and elapsed_ns < EARLY_FAILURE_NS:
                 raise RunFailed("; ".join(result.problems))
             return False
+
         reason = _find_repeat_reason(watch, result)
         if not reason:
             result.log.replace(path)
@@ -245,14 +281,16 @@ class ExperimentSessions:
         return not reason
 
     def _count_trial(self, trial: ExperimentTrial, path: Path) -> str:
-        """Counts a trial by its log.
+        """Judges a trial by its log, and writes the result to the journal.
+
+        A log that cannot be judged is moved back to the folder of its attempt.
 
         Args:
-            trial: the trial.
-            path: the log, in its final folder.
+            trial: The trial.
+            path: The log, in its final place.
 
         Returns:
-            The reason why the trial does not count; "" if it counts.
+            The reason why the trial does not count. Empty if it counts.
         """
         attempts = self._list_attempts(trial.planned)[-1:]
         try:
@@ -261,6 +299,7 @@ class ExperimentSessions:
             folder = attempts[0] if attempts else self.experiment.folder
             path.replace(folder / path.name)
             return str(error)
+
         self._trials.add(entry)
         for folder in attempts:
             shutil.rmtree(folder, ignore_errors=True)
@@ -278,9 +317,9 @@ class ExperimentSessions:
 
 
 def _find_repeat_reason(watch: TrialWatch, result: SessionResult) -> str:
-    """Returns why a trial must be repeated; "" if the trial counts.
+    """Returns the reason why a trial must be repeated. Empty if it counts.
 
-    A trial in which an arm has diverged counts as failed.
+    A trial in which an arm has diverged is not repeated: it counts as failed.
     """
     if result.interrupted:
         return "the experiment was interrupted"
@@ -298,16 +337,16 @@ def run_with_people(
     """Continues an experiment with people on its page.
 
     Args:
-        experiment: the experiment.
-        options: how the page is served.
-        say: prints a line for the user.
+        experiment: The experiment.
+        options: How the page is served.
+        say: Function that prints a line for the user.
 
     Returns:
-        The exit code.
+        The exit code of the command.
 
     Raises:
-        LogRefused: the disk refused a file; everything that was done is kept.
-        UsageError: the experiment is one of synthetic participants.
+        LogRefused: The disk refused a file. Everything that was done is kept.
+        UsageError: The experiment is one of synthetic participants.
     """
     clock = SystemClock()
     plan = experiment.plan
@@ -321,7 +360,7 @@ def run_with_people(
             def run_session(
                 watch: TrialWatch, folder: Path, begins: Callable[[], bool]
             ) -> SessionResult:
-                """Runs the session of a trial; a signal to the session ends the experiment."""
+                """Runs the session of a trial. A signal to the session also ends the experiment."""
                 attend = partial(_show_session, page, idle, watch)
                 result = run_demo(
                     scenario=watch.trial.scenario,
@@ -359,7 +398,21 @@ def _show_session(
     endpoints: Sequence[str],
     _say: Callable[[str], None],
 ) -> Iterator[Callable[[], bool]]:
-    """Shows the session of a trial on the page while it runs: a `SessionAttendant`."""
+    """Shows the session of a trial on the pages, in the form of a `SessionAttendant`.
+
+    After the session the pages observe the experiment's own network connection, on which
+    nothing happens, so that the connection to the session can be closed.
+
+    Args:
+        page: Server of the pages.
+        idle: Network connection of the experiment.
+        watch: Judge of the trial.
+        session: Name of the session.
+        endpoints: Network addresses at which the session can be reached.
+
+    Yields:
+        A function that returns True once the session should end.
+    """
     with closing(ZenohBus([], endpoints)) as bus:
         page.show(bus, session)
         try:

@@ -1,11 +1,12 @@
-"""Limits on the connections that the page's server keeps open.
+"""Limits the number of connections that the page's server keeps open.
 
-A new connection is a stranger until the server knows its role. Then it is a page of that role.
-Both kinds are limited in number, so that nobody can keep others out by opening many of them.
+A new connection is a stranger until the server knows its role. Then it is a page of an
+experimenter, a user or a watcher. Both kinds are limited in number, so that nobody can keep
+others out by opening many connections.
 
 Invariant:
-    - The number of strangers is limited: silent or slow connections, and downloads. The oldest
-      stranger is closed for a new connection.
+    - The number of strangers is limited. Silent or slow connections and downloads are
+      strangers. The oldest one is closed for a new connection.
     - The number of pages is limited for each role. Watchers do not use up the places of other
       roles.
     - A page of an experimenter or a user is always accepted. If there are too many, the oldest
@@ -30,7 +31,7 @@ class Strangers:
     """The connections whose role is not known yet.
 
     Args:
-        refused: counts refusals by reason.
+        refused: Numbers of refusals by reason, to which closed connections are added.
     """
 
     def __init__(self, refused: Counter[str]) -> None:
@@ -48,17 +49,17 @@ class Strangers:
         self._connections[connection] = None
 
     def remove(self, connection: ServerConnection) -> None:
-        """Removes a connection that was closed or has a role now."""
+        """Removes a connection that was closed, or whose role is known now."""
         self._connections.pop(connection, None)
 
 
 class SeatedPage(Protocol):
-    """A page that counts towards the limit of its role.
+    """A page that counts towards the limit of its role. `page_server.Page` is such a page.
 
     Attributes:
-        role: the role of the page's user.
-        number: the number of the page; newer pages have larger numbers.
-        takes_part: whether the page holds arms and gives orders.
+        role: Role of the page's user.
+        number: Number of the page. Newer pages have larger numbers.
+        takes_part: True if the page may hold arms and give orders.
     """
 
     role: Role
@@ -70,18 +71,24 @@ Page = TypeVar("Page", bound=SeatedPage)
 
 
 def is_full(pages: Iterable[SeatedPage], role: Role) -> bool:
-    """Returns whether there are as many pages of a role as allowed."""
+    """Returns True if there are as many pages of a role as allowed."""
     role_pages = _list_pages_of_role(pages, role)
     return len(role_pages) >= MAX_PAGES[role.kind]
 
 
 def choose_page_to_close(pages: Iterable[Page], role: Role) -> Page | None:
-    """Returns the page to close for a new page of a role; None if there is room."""
+    """Chooses the page that must be closed to make room for a new page of a role.
+
+    Returns:
+        The page. None if there is room.
+    """
     role_pages = _list_pages_of_role(pages, role)
     if len(role_pages) < MAX_PAGES[role.kind]:
         return None
+
     oldest_first = sorted(role_pages, key=lambda page: page.number)
     if role.kind == "experimenter":
+        # A page that takes part may hold an arm. It is closed only if all pages take part.
         for page in oldest_first:
             if not page.takes_part:
                 return page
@@ -89,7 +96,7 @@ def choose_page_to_close(pages: Iterable[Page], role: Role) -> Page | None:
 
 
 def _list_pages_of_role(pages: Iterable[Page], role: Role) -> list[Page]:
-    """Returns the pages of a role; for a user, the pages of users of the same site."""
+    """Lists the pages of a role. For a user, these are the pages of users of the same site."""
     role_pages: list[Page] = []
     for page in pages:
         is_same_site = page.role.site == role.site

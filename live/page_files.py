@@ -1,8 +1,8 @@
-"""The files that the page's server sends: the page, and the results of an ended session.
+"""Selects the files that the page's server sends: the page, and the results of a session.
 
 Invariant:
     - A page runs scripts of its own server only. A report runs its own scripts, isolated from
-      the page.
+      the page, because it may come from somebody else's log.
     - Nobody can guess the address of a report or a log.
 """
 
@@ -29,7 +29,7 @@ _REPORT_POLICY = (
 )
 """Content security policy of a report and a log."""
 MAX_FILE_BYTES = 256 << 20
-"""Largest log that is sent to a page; the user opens a larger log in its folder."""
+"""Largest size of a log that is sent to a page. Users open a larger log in its folder."""
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; "
     "img-src 'self' data: blob:; connect-src 'self'; base-uri 'none'; "
@@ -39,10 +39,10 @@ _POLICY = (
 
 
 class PageFiles:
-    """The files of one server.
+    """The files that one server sends.
 
     Attributes:
-        results: the report and the log of the ended session, by their addresses.
+        results: Report and log of the ended session, by their addresses.
     """
 
     def __init__(self) -> None:
@@ -56,7 +56,14 @@ class PageFiles:
         self.results |= {f"/{secret}/{path.name}": path for path in sendable}
 
     def find(self, path: str) -> Response | None:
-        """Returns the response to a request for a path; None if there is no such file."""
+        """Returns the response to a request for a file.
+
+        Args:
+            path: Path of the requested address.
+
+        Returns:
+            The response. None if there is no such file.
+        """
         result = self.results.get(path)
         if result is not None and result.is_file():
             kind = _KINDS.get(result.suffix[1:], "application/octet-stream")
@@ -71,12 +78,13 @@ class PageFiles:
 
 
 def _list_assets() -> dict[str, tuple[str, bytes]]:
-    """Returns type and content of the page's own files, by their addresses."""
+    """Returns the media type and the content of the page's own files, by their addresses."""
     plot_assets = (resources.files("trilat_net.reporting") / "assets").iterdir()
     page_assets = (resources.files("live") / "assets").iterdir()
     assets = {}
     for file in [*page_assets, *plot_assets]:
         address = "/" + file.name
+        # The end of the name follows the last "." or "-", as in "uPlot-LICENSE".
         kind = _KINDS.get(file.name.rpartition(".")[2].rpartition("-")[2])
         is_report_asset = file.name.startswith("report.")
         if kind is not None and not is_report_asset and address not in assets:
@@ -89,10 +97,10 @@ def _make_response(kind: str, content: bytes, policy: str, cache: str) -> Respon
     """Returns the response that sends a file.
 
     Args:
-        kind: media type of the file.
-        content: bytes of the file.
-        policy: content security policy of the file.
-        cache: whether browsers may store the file, as in the header `Cache-Control`.
+        kind: Media type of the file.
+        content: Bytes of the file.
+        policy: Content security policy of the file.
+        cache: Whether browsers may store the file, as in the header `Cache-Control`.
     """
     headers = {
         "Content-Type": kind,

@@ -1,7 +1,10 @@
-"""Open a browser at a link whose token no other user of the machine may see.
+"""Opens a browser at a link that contains a secret token.
+
+Whoever knows the token can take part in the session. Other users of the same machine must not
+see it.
 
 Invariant:
-    - The token is in no command line, since every user of the machine can list those.
+    - The token is in no command line, because every user of the machine can list these.
     - The browser opens a file that only its user can read, and that redirects to the link. The
       file is removed once the page is open.
 """
@@ -16,7 +19,11 @@ from pathlib import Path
 
 
 class BrowserOpening:
-    """A file that redirects a browser to a link, until the page is open."""
+    """A file that redirects a browser to a link, until the page is open.
+
+    Args:
+        link: The link, with its token.
+    """
 
     def __init__(self, link: str) -> None:
         self._target_link = link
@@ -29,13 +36,16 @@ class BrowserOpening:
             webbrowser.open(self.write().as_uri())
 
     def write(self) -> Path:
-        """Writes the file that redirects to the link, and returns its path.
+        """Writes the file that redirects to the link.
 
-        The file is in a folder of the home directory: confined browsers (snap) can read neither
-        /tmp nor hidden folders.
+        The file is in a folder of the home directory, because browsers that run confined (as a
+        snap) can read neither /tmp nor hidden folders.
+
+        Returns:
+            The path of the file.
 
         Raises:
-            OSError: the file cannot be written.
+            OSError: The file cannot be written.
         """
         # `mkdtemp` creates the folder with mode 0700.
         self._folder = Path(tempfile.mkdtemp(prefix="trilat-live-", dir=Path.home()))
@@ -52,7 +62,7 @@ class BrowserOpening:
         return file
 
     def remove_file(self) -> None:
-        """Removes the file."""
+        """Removes the file, if it exists."""
         if self._folder is not None:
             shutil.rmtree(self._folder, ignore_errors=True)
             self._folder = None

@@ -1,17 +1,24 @@
-"""The server of the page of a session: files by HTTP, and a socket for frames and orders.
+"""Serves the web page of a session: its files over HTTP, and its data over a WebSocket.
 
-The server runs in a thread of its own and observes a session. The session neither waits for the
-server nor needs it: if the server fails, the session continues. In an experiment the server
-shows one session after the other, with a `Stage` around them. If the machine has a browser, the
-server opens it.
+A session is a run in which several processes ("sites") each control one robot arm. A page shows
+the arms while they move. Depending on its role it may also hold an arm, change the delay of
+links, or stop the arms. The server sends frames, which describe the present state, and receives
+messages of the page. It reads the messages that the sites exchange, as a recorder does.
+
+The server runs in a thread of its own. The session neither waits for the server nor needs it:
+if the server fails, the session continues. In an experiment with people, the server shows one
+session after the other, and a `Stage` controls the steps around them. If the machine has a
+browser, the server opens it.
 
 Invariant:
-    - A page receives a frame when it has drawn an earlier frame. A slow page therefore sees
-      fewer frames, and nobody waits for it. The frame always has the newest state.
-    - Pages of another origin, pages without a token, and messages that are too many, too large
-      or not of the page's role are refused and counted. None of their contents reaches a site.
-    - `page_entrance` limits the number of pages of each role.
-    - One thread serves all pages and receives the session's messages.
+    - A page receives a frame only when it has drawn an earlier one. A slow page therefore sees
+      fewer frames, and nobody waits for it. Each frame has the newest state.
+    - Requests from pages of another web site, requests without a token, and messages that are
+      too many, too large or not allowed for the page's role are refused and counted. None of
+      their contents reaches a site.
+    - The number of pages of each role is limited, see `page_entrance`.
+    - One thread serves all pages and receives the session's messages, so that no locks are
+      needed.
 """
 
 import asyncio
@@ -97,7 +104,7 @@ SWITCH_POLL_NS = 10_000_000
 WAITING_FRAME_STEP = 10
 """Number of frame periods between two frames before a session begins."""
 POINTS_PER_FRAME = 240
-"""Largest number of points of the plots in a frame; a page that was away longer has a gap."""
+"""Largest number of points of the plots in a frame. A page that was away longer has a gap."""
 _POLICY_VIOLATION = 1008
 """Code with which the server closes a socket (RFC 6455)."""
 _BROKEN = {1002: "broken frames", 1007: "no text", 1009: "too large"}
@@ -105,7 +112,7 @@ _BROKEN = {1002: "broken frames", 1007: "no text", 1009: "too large"}
 _SILENT = logging.getLogger("trilat.page")
 _SILENT.addHandler(logging.NullHandler())
 _SILENT.propagate = False
-"""The logger of the socket library: messages of strangers are counted, and print nothing."""
+"""Logger of the WebSocket library. It prints nothing, because strangers could flood it."""
 
 RESULTS_TIMEOUT_NS = 600_000_000_000
 """Longest time for which an open page can load the report and the log, in ns."""
@@ -116,14 +123,14 @@ _NO_HTTP = b"HTTP/1.1 400 Bad Request\r\nContent-Length: 0\r\nConnection: close\
 
 
 class Visitor(ServerConnection):
-    """A connection to the server.
+    """A connection to the server, which may or may not become a page.
 
-    Data that are not a request of a page are counted. The reply to data that are not HTTP is
-    400.
+    Any program can connect. Data that are not a request of a browser are counted, and answered
+    with the HTTP status 400.
 
     Attributes:
-        refused: counts refusals by reason.
-        strangers: the connections whose role is not known yet.
+        refused: Numbers of refusals by reason.
+        strangers: List of the connections whose role is not known yet.
     """
 
     refused: Counter[str]
@@ -132,23 +139,23 @@ class Visitor(ServerConnection):
     _is_counted = False
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Adds the connection to the strangers."""
+        """Adds the connection to those whose role is not known yet."""
         super().connection_made(transport)
         self.strangers.add(self)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Removes the connection from the strangers."""
+        """Removes the connection from those whose role is not known yet."""
         self.strangers.remove(self)
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        """Notes that the connection has sent data, and handles the data."""
+        """Processes data, and notes that the connection has sent some."""
         # Browsers open connections in advance and close some unused; those are not counted.
         self._has_received = True
         super().data_received(data)
 
     def send_data(self) -> None:
-        """Sends pending data; counts a failed handshake first."""
+        """Sends waiting data. A handshake that failed is counted first."""
         problem = self.protocol.handshake_exc
         if problem is not None and self._has_received and not self._is_counted:
             self._is_counted = True
@@ -159,27 +166,27 @@ class Visitor(ServerConnection):
 
 
 class Page:
-    """A connected page.
+    """A connected page, and what it has received so far.
 
     Attributes:
-        connection: the socket of the page.
-        number: the number of the page; pages are counted from 1.
-        role: the rights of the page's user, and the site whose user's view is shown.
-        hands: the hands of the page at the arms.
-        takes_part: whether the page may give orders.
-        asks: the pages that must allow this page to take part, and the time of the request, in
-            ns; None without a request.
-        wake: set when there is a frame that the page has not received.
-        drawn: number of the last frame that the page has drawn.
-        sent: number of the last frame that was sent to the page.
-        notified: number of the frame sent before that.
-        unseen: numbers of the frames that the page has not drawn yet.
-        points: how many points of the plots the page has received.
-        energies: how many points of the energies the page has received.
-        events: how many events the page has received.
-        greeted: whether the page has received the constants of the running session.
-        limits: the limits of the page's message rates.
-        excess: the number of messages that exceeded the limit of all messages.
+        connection: WebSocket of the page.
+        number: Number of the page. Pages are counted from 1.
+        role: Rights of the page's user, and the site whose user's view the page shows.
+        hands: Connections with which the page holds and moves arms.
+        takes_part: True if the page may give orders.
+        asks: Pages that must allow this page to take part, and the time of the request in ns.
+            None if the page has not requested it.
+        wake: Event that is set when there is a frame that the page has not received.
+        drawn: Number of the last frame that the page has drawn.
+        sent: Number of the last frame that was sent to the page.
+        notified: Number of the frame that was sent before the last one.
+        unseen: Numbers of the frames that were sent but not drawn yet.
+        points: Number of points of the plots that the page has received.
+        energies: Number of points of the energy plot that the page has received.
+        events: Number of events that the page has received.
+        greeted: True if the page has received the constants of the running session.
+        limits: Limits of the page's message rates.
+        excess: Number of messages that exceeded the common limit of all messages.
     """
 
     def __init__(
@@ -212,14 +219,14 @@ class Page:
 
 @dataclass(frozen=True, slots=True)
 class PageOptions:
-    """How a page is served.
+    """Options of the command line that concern the page.
 
     Attributes:
-        host: the address to listen at.
-        port: the port; 0 for any.
-        insecure: whether an address outside this machine is allowed without encryption.
-        opens: whether a browser is opened, if there is one.
-        tls: the folder of a member's keys for encryption; None for no encryption.
+        host: Address at which the server listens.
+        port: Port at which the server listens. 0 for any free port.
+        insecure: True if an address outside this machine is allowed without encryption.
+        opens: True to open a browser, if there is one.
+        tls: Folder with the keys of a member, which are used for encryption. None for none.
     """
 
     host: str = "127.0.0.1"
@@ -229,10 +236,10 @@ class PageOptions:
     tls: Path | None = None
 
     def make_context(self) -> ssl.SSLContext | None:
-        """Returns the settings of the encryption, or None without encryption.
+        """Returns the settings of the encryption. Returns None if the page is not encrypted.
 
         Raises:
-            UsageError: the keys cannot be used.
+            UsageError: The keys cannot be used.
         """
         if self.tls is None:
             return None
@@ -246,7 +253,7 @@ class PageOptions:
         """Checks that the address is free, and that it is safe or declared as `insecure`.
 
         Raises:
-            UsageError: the address cannot be used.
+            UsageError: The address cannot be used.
         """
         if self.make_context() is None and self.host not in HERE and not self.insecure:
             raise UsageError(
@@ -264,23 +271,25 @@ class PageOptions:
 
 
 class PageServer:
-    """Serves the page of a session; a context manager that opens a browser when it is entered.
+    """Serves the page of a session while a `with` statement runs.
+
+    Entering the statement starts the server and opens a browser.
 
     Args:
-        bus: a bus that reaches the session.
-        clock: the clock of this process.
-        session: the session's name.
-        options: how the page is served.
-        ends: whether pages may end the session.
-        say: prints a line for the user.
-        stage: the stage of an experiment; None without an experiment.
+        bus: Network connection that reaches the session.
+        clock: Clock of this process.
+        session: Name of the session.
+        options: How the page is served.
+        ends: True if experimenters may end the session from their page.
+        say: Function that prints a line for the user.
+        stage: The steps of an experiment with people. None if there is no experiment.
 
     Attributes:
-        address: the link for an experimenter, with its token.
-        end_requested: set once a page has requested the end.
-        files: the files that are sent by HTTP.
-        refused: counts refused messages and requests by reason.
-        view: the session.
+        address: Link for an experimenter, with its token.
+        end_requested: Event that is set when a page has requested the end of the session.
+        files: Files that are sent over HTTP.
+        refused: Numbers of refused messages and requests, by reason.
+        view: Present state of the session.
     """
 
     def __init__(
@@ -326,6 +335,11 @@ class PageServer:
         self._thread = threading.Thread(target=self._run, name="page", daemon=True)
 
     def __enter__(self) -> "PageServer":
+        """Starts the server, prints its link and opens a browser.
+
+        Raises:
+            UsageError: The server cannot listen at its address.
+        """
         self._thread.start()
         self._ready.wait()
         if self._problem is not None:
@@ -339,6 +353,7 @@ class PageServer:
         return self
 
     def __exit__(self, *_: object) -> None:
+        """Ends the server. Waits at most five seconds for its thread."""
         self._ending.set()
         if self._loop is not None and self._stop is not None:
             # The loop of the server may have ended already.
@@ -350,14 +365,19 @@ class PageServer:
     def show(self, bus: Bus, session: str) -> None:
         """Shows another session from now on.
 
-        On return, the bus of the previous session is no longer used.
+        This method waits until the server's thread no longer uses the bus of the previous
+        session, so that the caller may close it.
+
+        Args:
+            bus: Network connection that reaches the session.
+            session: Name of the session.
         """
         self._next_session = bus, session
         while self._next_session is not None and self._thread.is_alive():
             self._clock.sleep_until(self._clock.monotonic_ns() + SWITCH_POLL_NS)
 
     def _switch_session_if_requested(self) -> None:
-        """Shows the session of the last call of `show`, which then returns."""
+        """Switches to the session of the last call of `show`, in the server's thread."""
         if self._next_session is not None:
             bus, session = self._next_session
             try:
@@ -366,7 +386,7 @@ class PageServer:
                 self._next_session = None
 
     def _switch_session(self, bus: Bus, session: str) -> None:
-        """Observes another session, whose state is new to all pages."""
+        """Observes another session. All pages receive its state from the beginning."""
         self._bus = bus
         self.view = SessionView(bus, self._clock, session)
         self._frames = SessionFrames(self.view)
@@ -382,7 +402,10 @@ class PageServer:
             page.greeted = False
 
     def _run(self) -> None:
-        """Serves pages until the end, and restarts the server after a failure."""
+        """Runs the server in its thread until the end, and restarts it after a failure.
+
+        A failure before the server was ready is kept for `__enter__`, which raises it.
+        """
         raise_priority(NICE)
         while not self._ending.is_set() and self._problem is None:
             try:
@@ -398,16 +421,16 @@ class PageServer:
             self._ready.set()
 
     def report_refusals(self) -> None:
-        """Prints how many messages were refused, by reason."""
+        """Prints how many messages and requests were refused, by reason."""
         for reason, count in sorted((+self.refused).items()):
             self._say(f"the page refused {count_nouns(count, 'message')} or requests: {reason}")
 
     def _count_failure(self, part: str, error: Exception) -> None:
-        """Counts a failure of the page, and prints the first failure of a kind.
+        """Counts a failure of the page, and prints the first failure of each kind.
 
         Args:
-            part: the part of the page that failed.
-            error: the error.
+            part: Part of the page that failed.
+            error: The error.
         """
         reason = f"{part} failed: {type(error).__name__}"
         self.refused[reason] += 1
@@ -417,7 +440,7 @@ class PageServer:
                 self._say(f"the page continues, though its {reason}: {error}")
 
     async def _serve(self) -> None:
-        """Serves pages until the end."""
+        """Serves pages until the end is requested."""
         self._loop = asyncio.get_running_loop()
         self._stop = asyncio.Event()
         members = {"refused": self.refused, "strangers": Strangers(self.refused)}
@@ -453,12 +476,12 @@ class PageServer:
 
     @property
     def _base_address(self) -> str:
-        """The address of the page, without query and token."""
+        """Address of the page, without query and token."""
         host = f"[{self._host}]" if ":" in self._host else self._host
         return f"{self._scheme}://{host}:{self._port}/"
 
     def _print_links(self) -> None:
-        """Prints the links of the other roles, once the scenario is known."""
+        """Prints the links for users and watchers, once the scenario and thus the users are known."""
         scenario = self.view.scenario
         if self._links_are_printed or (scenario is None and self._stage is None):
             return
@@ -476,7 +499,7 @@ class PageServer:
     async def _tick(self) -> None:
         """Receives the session's messages and makes a frame, thirty times a second.
 
-        A failure of one step does not prevent the other steps.
+        If one step fails, the failure is counted and the other steps continue.
         """
         while True:
             begun_ns = self._clock.monotonic_ns()
@@ -500,7 +523,7 @@ class PageServer:
             await asyncio.sleep(max(0.002, 1.0 / FRAMES_PER_S - spent_s))
 
     def _poll_stage(self) -> None:
-        """Lets the stage judge new records, and marks the stage's moments in the log."""
+        """Lets the experiment judge the new records, and marks its moments in the log."""
         if self._stage is None:
             return
         users = [
@@ -510,7 +533,7 @@ class PageServer:
             self._desk.mark(next(iter(self.view.sites)), moment)
 
     def _make_frame(self) -> None:
-        """Makes the next frame, and collects the replies of sites for the pages."""
+        """Makes the next frame, and collects the sites' replies to orders for the pages."""
         self._frame_number += 1
         for site, channel, is_accepted, text in self._desk.replies:
             notice = {
@@ -527,7 +550,13 @@ class PageServer:
         self._frames_as_site.clear()
 
     def _answer_http(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Returns the response to a request for a file; None opens a socket."""
+        """Returns the response to an HTTP request.
+
+        The library calls this function for each request, before it opens a WebSocket.
+
+        Returns:
+            The response with a file or an error. None to open a WebSocket.
+        """
         try:
             target = urlsplit(request.path)
             problem = self._find_refusal(request, target.query)
@@ -548,7 +577,12 @@ class PageServer:
         return response or connection.respond(HTTPStatus.NOT_FOUND, "there is no such file\n")
 
     def _find_refusal(self, request: Request, query: str) -> str | None:
-        """Returns why a request is refused; None if it is accepted."""
+        """Returns the reason why a request must be refused. Returns None if it is accepted.
+
+        Args:
+            request: The request.
+            query: Query of its address, with the token.
+        """
         host = request.headers.get("Host", "")
         name = urlsplit(f"//{host}").hostname or ""
         # The name of another web site may resolve to this machine (DNS rebinding).
@@ -562,16 +596,22 @@ class PageServer:
         return None
 
     async def _serve_page(self, connection: ServerConnection) -> None:
-        """Serves one page until its connection ends."""
+        """Serves one page until its connection ends.
+
+        A page of a user takes part at once. A page of an experimenter does so if no other page
+        of an experimenter takes part.
+        """
         assert connection.request is not None
         role = self._links.find(urlsplit(connection.request.path).query)
         assert role is not None, "a request without a role has been refused"
         self._page_count += 1
         hands = PageHands(self._bus, self._clock, self.view.session, f"page {self._page_count}")
+
         takes_part = role.kind == "user"
         if role.kind == "experimenter":
             takes_part = not any(other.takes_part for other in self.experimenters)
         page = Page(connection, self._page_count, role, hands, takes_part=takes_part)
+
         self._close_page_for(role)
         self._pages.add(page)
         if isinstance(connection, Visitor):
@@ -595,7 +635,7 @@ class PageServer:
             self._pages.discard(page)
 
     def _close_page_for(self, role: Role) -> None:
-        """Closes a page for a new page of a role, if there are as many as allowed."""
+        """Closes an older page if there are too many pages of a role for a new one."""
         page = choose_page_to_close(self._pages, role)
         if page is None:
             return
@@ -609,7 +649,11 @@ class PageServer:
         task.add_done_callback(self._closing.discard)
 
     def _receive(self, page: Page, text: str | bytes) -> None:
-        """Handles a message of a page, unless the page exceeds its limits."""
+        """Decodes and handles a message of a page, unless the page sends too many.
+
+        A message that releases an arm is always handled, because holding the arm could be
+        dangerous.
+        """
         now_ns = self._clock.monotonic_ns()
         if not page.limits.allows(PageMessage, now_ns):
             page.excess += 1
@@ -669,13 +713,13 @@ class PageServer:
             self.end_requested.set()
 
     def _request_part(self, page: Page, want: bool) -> None:
-        """Handles a page's request to take part.
+        """Handles a page's request to take part, or to take part no longer.
 
         If other pages hold an arm, the page takes part only if they agree.
 
         Args:
-            page: the page.
-            want: False if the page no longer takes part.
+            page: The page.
+            want: True to take part.
         """
         if not want:
             page.takes_part = False
@@ -689,7 +733,7 @@ class PageServer:
 
     @property
     def experimenters(self) -> set[Page]:
-        """The open pages of experimenters."""
+        """Open pages of experimenters."""
         return {page for page in set(self._pages) if page.role.kind == "experimenter"}
 
     def _answer_request(self, page: Page, answer: AnswerPage) -> None:
@@ -704,7 +748,8 @@ class PageServer:
     def _settle_requests(self) -> None:
         """Decides on requests to take part that nobody has answered in time.
 
-        The page takes part if the asked pages have gone or hold no arm.
+        The page may take part if the asked pages have gone, or if the time is over and they no
+        longer hold an arm.
         """
         now_ns = self._clock.monotonic_ns()
         for page in self._pages:
@@ -712,12 +757,13 @@ class PageServer:
                 continue
             asked_pages, asked_ns = page.asks
             remaining = asked_pages & self._pages
-            if not remaining or now_ns - asked_ns > ANSWER_TIMEOUT_NS:
+            is_too_late = now_ns - asked_ns > ANSWER_TIMEOUT_NS
+            if not remaining or is_too_late:
                 page.takes_part = not any(map(self._list_held_sites, remaining))
                 page.asks = None
 
     def _list_held_sites(self, page: Page) -> list[str]:
-        """Returns the sites whose arms a page holds."""
+        """Lists the sites whose arms a page holds, according to the newest frame."""
         sites = (self._frame or {}).get("sites", {})
         held_sites: list[str] = []
         for name, site in sites.items():
@@ -756,11 +802,12 @@ class PageServer:
                 await page.connection.send(payload, text=True)
 
     def _is_frame_due(self, page: Page, *, has_begun: bool) -> bool:
-        """Returns whether the page is to receive the newest frame.
+        """Returns True if the page should receive the newest frame now.
 
         Args:
-            page: the page.
-            has_begun: False before the session has a frame, when pages receive fewer frames.
+            page: The page.
+            has_begun: False before the session has a frame. Then pages receive a message only
+                now and then.
         """
         if len(page.unseen) >= FRAMES_AHEAD or page.sent == self._frame_number:
             return False
@@ -784,7 +831,12 @@ class PageServer:
         return {"hello": fields}
 
     def _describe_stage(self, page: Page, t_s: float | None = None) -> dict[str, Any]:
-        """Returns the stage for a page; {} without an experiment."""
+        """Returns the present step of the experiment for a page. Empty without an experiment.
+
+        Args:
+            page: The page.
+            t_s: Time of the arms on the page, in s. None without arms.
+        """
         if self._stage is None:
             return {}
         role = page.role
@@ -810,7 +862,7 @@ class PageServer:
         }
 
     def _list_requests(self, page: Page) -> list[int]:
-        """Returns the numbers of the pages that ask this page whether they may take part."""
+        """Lists the numbers of the pages that ask this page whether they may take part."""
         numbers: list[int] = []
         for other in self._pages:
             if other.asks is not None:
@@ -820,10 +872,10 @@ class PageServer:
         return numbers
 
     def _list_notices(self, page: Page) -> list[dict[str, Any]]:
-        """Returns the replies of sites that a page has not received yet.
+        """Lists the replies of sites that a page has not received yet.
 
         The replies name keys and commands, which only an experimenter can use. Pages of other
-        roles only receive which sites were not stopped.
+        roles receive only which sites refused to stop.
         """
         notices = [notice for notice in self._notices if notice["n"] > page.notified]
         if page.role.kind == "experimenter":
@@ -836,7 +888,7 @@ class PageServer:
         return refused_stops
 
     def _describe_as_site(self, site: str) -> dict[str, Any]:
-        """Returns the frame for the user of a site."""
+        """Returns the frame for the user of a site, who sees the other arms with their delay."""
         if site not in self._frames_as_site:
             assert self._frame is not None
             self._frames_as_site[site] = self._frames.describe_as(
@@ -845,10 +897,14 @@ class PageServer:
         return {**self._frames_as_site[site], "points": [], "energies": [], "events": []}
 
     def _describe_all(self, page: Page) -> dict[str, Any]:
-        """Returns the frame for a page that sees everything, with new points and events."""
+        """Returns the frame for a page that sees everything, with new points and events.
+
+        The first frame of a page has all points that are kept.
+        """
         frames = self._frames
         view = self.view
         is_first = page.points == 0 and page.energies == 0
+        # More than all points that are kept.
         limit = 100_000 if is_first else POINTS_PER_FRAME
         points = frames.points.since(page.points, limit)
         energies = frames.energies.since(page.energies, limit)
@@ -860,17 +916,21 @@ class PageServer:
 
 
 def _has_screen() -> bool:
-    """Returns whether this machine can show a browser."""
+    """Returns True if this machine can show a browser."""
     if not sys.platform.startswith("linux"):
         return True
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 class PageAttendant(ExitStack):
-    """The page of a session that this process runs.
+    """Serves the page of a session that this process runs itself.
 
-    A `PageAttendant` is a context manager: the page is served until the context ends, so that
-    it can show the report after the session.
+    The page is served while a `with` statement runs, so that it can show the report after the
+    session.
+
+    Args:
+        options: How the page is served.
+        clock: Clock of this process.
     """
 
     def __init__(self, options: PageOptions, clock: Clock) -> None:
@@ -883,7 +943,16 @@ class PageAttendant(ExitStack):
     def attend(
         self, session: str, endpoints: Sequence[str], say: Callable[[str], None]
     ) -> Iterator[Callable[[], bool]]:
-        """Serves the page of a session until a page requests the end: a `SessionAttendant`."""
+        """Serves the page of a session, in the form of a `SessionAttendant`.
+
+        Args:
+            session: Name of the session.
+            endpoints: Network addresses at which the session can be reached.
+            say: Function that prints a line for the user.
+
+        Yields:
+            A function that returns True once a page has requested the end of the session.
+        """
         bus = self.enter_context(closing(ZenohBus([], endpoints)))
         page = PageServer(bus, self._clock, session, self._options, ends=True, say=say)
         self._page = self.enter_context(page)
@@ -891,10 +960,13 @@ class PageAttendant(ExitStack):
         self._page.report_refusals()
 
     def offer_results(self, paths: Iterable[Path]) -> None:
-        """Offers files of the ended session to experimenters while their page is open.
+        """Offers files of the ended session to experimenters, as long as their page is open.
 
         Ctrl-C ends the offer. The address of a file cannot be guessed, and only these pages
         receive it.
+
+        Args:
+            paths: The files, such as the report and the log.
         """
         page = self._page
         clock = self._clock
@@ -912,7 +984,14 @@ class PageAttendant(ExitStack):
 def show_on_page(
     options: PageOptions, clock: Clock, session: str, say: Callable[[str], None], bus: Bus
 ) -> Iterator[tuple[SessionView, Callable[[], None]]]:
-    """Serves a page of a running session; the `SessionOnlooker` of `trilat watch --page`."""
+    """Serves a page of a running session, in the form of a `SessionOnlooker`.
+
+    The command `trilat watch --page` uses this function.
+
+    Yields:
+        The state of the session, and a function that does nothing, because the server updates
+        the page by itself.
+    """
     with PageServer(bus, clock, session, options, say=say) as page:
         yield page.view, lambda: None
         page.report_refusals()

@@ -1,14 +1,16 @@
-"""The present state of a running session, as an observer knows it from its messages.
+"""Keeps the present state of a running session, as an observer learns it from its messages.
 
-The pages of a session and `trilat watch` show this state. An observer receives the same
-messages as the recorder, and sends nothing to the sites except requests for missing messages.
+A session is a run in which several processes ("sites") each control one robot arm. Every site
+publishes a record per tick of its control loop, statistics of its links, and events. An
+observer receives the same messages as the recorder, and sends nothing to the sites except
+requests for missing messages. The pages of a session and `trilat watch` show this state.
 
 Invariant:
     - The observer receives every record. It requests missing records from the buffers of the
       sites, as a recorder does, so that the energies equal those of the log. Pages show fewer
       records, always the newest.
     - An observer that joins late does not request earlier records. It requests all events,
-      because they contain the changes.
+      because they contain the changes that were made.
     - A site has ended if its `end` event says so, never because it is silent. On a busy machine
       a running site may be silent for long, and its records are used when they arrive.
 """
@@ -51,13 +53,13 @@ T = TypeVar("T")
 
 
 class Tail(Generic[T]):
-    """The last entries of a growing sequence, for readers that know only a part of it.
+    """The last entries of a growing sequence, for readers that know only its beginning.
 
     Args:
-        most: the largest number of entries that are kept.
+        most: Largest number of entries that are kept.
 
     Attributes:
-        count: the number of entries that have been added.
+        count: Number of entries that have been added, including those no longer kept.
     """
 
     def __init__(self, most: int) -> None:
@@ -65,35 +67,50 @@ class Tail(Generic[T]):
         self.count = 0
 
     def add(self, entry: T) -> None:
-        """Adds an entry."""
+        """Adds an entry. If there are too many, the oldest is removed."""
         self._entries.append(entry)
         self.count += 1
 
     def since(self, count: int, most: int) -> list[T]:
-        """Returns the entries after the first `count`, at most the newest `most`."""
+        """Returns the entries that a reader does not know yet.
+
+        Args:
+            count: Number of entries that had been added when the reader last asked.
+            most: Largest number of entries to return. Older ones are left out.
+        """
         size = len(self._entries)
         new_count = min(self.count - count, most, size)
         return [self._entries[index] for index in range(size - new_count, size)]
 
 
 class SiteView:
-    """One running site: its reception, its newest record and its statistics.
+    """What the observer knows about one site: its newest messages, and which are missing.
+
+    Args:
+        bus: Network connection that reaches the session.
+        session: Name of the session.
+        scenario: Scenario of the session.
+        name: Name of the site.
+        boot: Random number that identifies this start of the site.
+        window: Latest records of the site.
 
     Attributes:
-        glides: whether the site follows the rule `glide`.
-        peers: the names of its peers.
-        layout: the layout of its records, if it continues without a lost peer, else None.
-        hand: its live hand, if people can hold its arm.
-        reception: which of its messages have arrived.
-        window: its latest records.
-        holder: the person or program that took hold of its arm last.
-        stopped_by: the person or program that ordered its last stop, as its events say.
-        bodies: poses of its plant's bodies by tick, as far back as the window reaches.
-        dropped: counts dropped messages by reason.
-        repair: requests its missing messages.
-        record: its newest record; None before the first.
-        stats: its newest statistics; None before the first.
-        first_tick: the tick of the first record, if the observer has joined late; else 0.
+        glides: True if the site stops smoothly when it loses its peers (the rule `glide`), so
+            that it has alarms.
+        peers: Names of the sites whose states the site receives.
+        layout: Numbers of joints and peers in its records, if the site continues without a lost
+            peer. Otherwise None.
+        hand: Settings for people who hold its arm. None if nobody can hold it.
+        reception: Which of its messages have arrived.
+        window: Its latest records.
+        holder: Person or program that took hold of its arm last.
+        stopped_by: Person or program that ordered its last stop, according to its events.
+        bodies: Poses of the bodies that its arm can touch, by tick, as far back as `window`.
+        dropped: Numbers of dropped messages by reason.
+        repair: Requests for its missing messages.
+        record: Its newest record. None before the first one.
+        stats: Its newest statistics. None before the first one.
+        first_tick: Tick of the first record if the observer has joined late, otherwise 0.
     """
 
     def __init__(
@@ -122,11 +139,14 @@ class SiteView:
         self.first_tick = 0
 
     def find_alarm(self, session: str, name: str) -> LifeAlarm | None:
-        """Returns the alarm of the site; None if there is none.
+        """Returns the present alarm of the site, such as a stop or a fault.
 
         Args:
-            session: the session's name.
-            name: the site's name.
+            session: Name of the session.
+            name: Name of the site.
+
+        Returns:
+            The alarm. None if there is none, or if the site has ended.
         """
         record = self.record
         if record is None or not self.glides or self.ended:
@@ -153,10 +173,7 @@ class SiteView:
 
     @property
     def complete(self) -> int:
-        """The last tick up to which no record can arrive any more; -1 before the first.
-
-        All records up to that tick have arrived or are lost.
-        """
+        """Last tick up to which every record has arrived or is lost for good; -1 before the first."""
         account = self.reception.accounts[topics.STATE]
         gap = account.find_requestable_gap()
         if gap is None:
@@ -166,22 +183,23 @@ class SiteView:
 
 
 class SessionView:
-    """A session as an observer knows it; `poll` receives the messages that have arrived.
+    """What an observer knows about a session. `poll` receives the messages that have arrived.
 
     Args:
-        bus: a bus that reaches the session.
-        clock: the clock of this process.
-        session: the session's name.
+        bus: Network connection that reaches the session.
+        clock: Clock of this process.
+        session: Name of the session.
 
     Attributes:
-        scenario: the scenario of the session; None until a member has sent it.
-        sites: the running sites by name; {} until all of them run.
-        members: the identities of the members that have replied.
-        links: the present settings of every link, as tables.
-        dominance: the dominance matrix that was requested last, by site.
-        energy: the running energy; None until all sites run.
-        events: the events, oldest first.
-        dropped: counts dropped messages by reason.
+        scenario: Scenario of the session. None until a member has sent it.
+        sites: The running sites by name. Empty until all of them run.
+        members: Identities of the members (sites and recorders) that have replied.
+        links: Present settings of every link, as tables.
+        dominance: For each site, the weights with which it was last told to follow its peers.
+        energy: The energy function V of the stability proof, computed while the session runs.
+            None until all sites run.
+        events: The events, oldest first.
+        dropped: Numbers of dropped messages by reason.
     """
 
     def __init__(self, bus: Bus, clock: Clock, session: str) -> None:
@@ -217,14 +235,14 @@ class SessionView:
         return self._finished or all(site.ended for site in self.sites.values())
 
     def finish(self) -> None:
-        """Marks the session as ended; called by the process that has seen all sites end."""
+        """Marks the session as ended. The process that has seen all sites end calls this method."""
         self._finished = True
 
     def silence_s(self, site: SiteView) -> float:
         """Returns for how long a running site has been silent, in s.
 
-        A silence shorter than `MIN_SILENCE_NS` is reported as 0.0, as is that of a site that
-        has ended.
+        A silence shorter than `MIN_SILENCE_NS` counts as 0, because it is normal. A site that
+        has ended is not silent.
         """
         received_ns = site.reception.last_received_ns
         if received_ns is None or site.ended:
@@ -234,7 +252,7 @@ class SessionView:
 
     @property
     def session_silence_s(self) -> float:
-        """For how long all running sites have been silent, in s."""
+        """Time for which all running sites have been silent, in s."""
         running = [site for site in self.sites.values() if not site.ended]
         return min((self.silence_s(site) for site in running), default=0.0)
 
@@ -260,7 +278,11 @@ class SessionView:
         self.links.advance_to(max(times_ns, default=0))
 
     def advance_energy(self) -> EnergyCourse | None:
-        """Returns V at the ticks completed since the last call; None if there are none."""
+        """Computes the energies V at the ticks that were completed since the last call.
+
+        Returns:
+            The energies over time. None if no tick was completed.
+        """
         if self.energy is None:
             return None
         complete = {name: site.complete for name, site in self.sites.items()}
@@ -271,13 +293,13 @@ class SessionView:
     ) -> Mapping[str, int]:
         """Returns the tick at which a site's user sees each peer.
 
-        That is the tick of the sample in use or, if the scenario delays the picture further,
-        of an earlier sample.
+        This is the tick of the sample that the site uses. If the scenario delays the picture
+        further, it is the tick of an earlier sample.
 
         Args:
-            site: the site of the user.
-            tick: the tick of the site's record.
-            used: the ticks of the samples in use at that tick, by peer.
+            site: Name of the user's site.
+            tick: Tick of the site's record.
+            used: For each peer, the tick of the sample in use at that tick.
         """
         assert self.scenario is not None
         if site not in self._pictures:
@@ -288,7 +310,7 @@ class SessionView:
         return peer_ticks
 
     def _connect_to_sites(self) -> None:
-        """Reads the replies of members; creates the sites once all of them run."""
+        """Receives the replies of members, and creates the sites once all of them run."""
         for info in self._query.poll():
             self.members[info.member] = info
             if self.scenario is None and info.scenario:
@@ -304,7 +326,7 @@ class SessionView:
             self._create_sites(self.scenario)
 
     def _create_sites(self, scenario: Scenario) -> None:
-        """Creates the views of all sites, which have replied and run."""
+        """Creates the views of all sites, which must have replied and run."""
         windows = {name: RecordWindow(scenario, name) for name in scenario.names}
         self.links = LinkTables(scenario.links, scenario.timeline)
         self.dominance = {site: dict(scenario.dominance[site]) for site in scenario.names}
@@ -320,12 +342,10 @@ class SessionView:
             )
 
     def _receive(self, inbound: InboundMessage) -> None:
-        """Reads a message of a site, and stores its contents.
-
-        A message of a member that is not a site, such as the recorder, is ignored.
+        """Decodes a message, and stores its contents if it comes from a site.
 
         Raises:
-            WireError: the message cannot be read.
+            WireError: The message cannot be decoded.
         """
         parts = topics.parse_key(inbound.key)
         site = None if parts is None else self.sites.get(parts.member)
@@ -352,7 +372,15 @@ class SessionView:
                 self._store(parts.member, site, channel, message.content)
 
     def _accept_new_boot(self, name: str, payload: bytes) -> bool:
-        """Follows another boot of a site if the event is a join; otherwise returns False."""
+        """Follows a site that was started again, if an event says that it has joined the session.
+
+        Args:
+            name: Name of the site.
+            payload: The event.
+
+        Returns:
+            True if the event belongs to a new start of the site that may join.
+        """
         event = decode(payload, Event)
         site = self.sites[name]
         is_join = event.kind == "join" and event.member == name
@@ -365,9 +393,13 @@ class SessionView:
         return True
 
     def _skip_records_before(self, site: SiteView, content: State | LinkStats | Event) -> None:
-        """Ignores the records before the first message, if the observer has joined late.
+        """Gives up the records before the first message, if the observer has joined late.
 
         All events of the site are still requested.
+
+        Args:
+            site: The site.
+            content: The first message of the site.
         """
         tick = content.tick if isinstance(content, State | LinkStats) else 0
         if tick / site.window.rate_hz < LATE_S:
@@ -380,7 +412,7 @@ class SessionView:
     def _store(
         self, name: str, site: SiteView, channel: str, content: State | LinkStats | Event
     ) -> None:
-        """Stores the contents of a message, and applies the changes in it."""
+        """Stores the contents of a message."""
         if isinstance(content, State):
             self._store_record(name, site, content)
         elif isinstance(content, LinkStats):
@@ -402,7 +434,7 @@ class SessionView:
             self._apply_change(name, change)
 
     def _store_event(self, name: str, site: SiteView, event: Event) -> None:
-        """Stores an event, and reads who holds the arm or has stopped it."""
+        """Stores an event. It may say who holds the arm, who has stopped it, or what has changed."""
         self.events.add(event)
         if event.kind == "hand":
             holder, separator, _ = event.text.partition(f" {TAKEN} ")
@@ -414,9 +446,13 @@ class SessionView:
                 self._apply_change(name, event.command)
 
     def _apply_change(self, site: str, text: str) -> None:
-        """Applies a change to links, shares and the energy.
+        """Applies a change to the links, the dominance factors and the energies.
 
-        A change is in a record and in an event of its site, and is applied once.
+        A change is in a record and in an event of its site. It is applied only once.
+
+        Args:
+            site: Name of the site that made the change.
+            text: The change as JSON.
         """
         if self.scenario is None or self.energy is None:
             return

@@ -1,7 +1,8 @@
-"""Watch a running session until it ends, in a terminal or on a page.
+"""Shows a running session until it ends, in a terminal or on a web page.
 
-`watch_session` connects to the session and updates a display: the rows of `trilat watch` in a
-terminal, or the page of `trilat live`. If standard input is a terminal, a key stops every arm.
+`watch_session` connects to the session and updates a display. The display is a table in the
+terminal (`trilat watch`), or a page (`trilat watch --page`). If standard input is a terminal, a
+key stops every arm.
 """
 
 import os
@@ -33,9 +34,10 @@ STOP_KEYS = frozenset(" sS")
 SessionOnlooker = Callable[
     [Bus], AbstractContextManager[tuple[SessionView, Callable[[], None]]]
 ]
-"""A function of a bus that reaches a session; it returns a context that shows the session.
+"""Function that shows a session, given a network connection that reaches the session.
 
-The context yields the view of the session, and a function that is called often to update it.
+It returns a context manager. The session is shown while its `with` statement runs. It yields the
+state of the session, and a function that must be called often to update the display.
 """
 
 
@@ -50,19 +52,19 @@ def watch_session(
     """Shows a running session until it ends or a signal arrives.
 
     Args:
-        session: the session's name.
-        connection: the endpoints and keys.
-        clock: the clock of this process.
-        show: shows the session.
-        say: prints a line for the user.
-        timeout_s: longest wait for a reply of a site, in s.
+        session: Name of the session.
+        connection: Network addresses and keys.
+        clock: Clock of this process.
+        show: Function that shows the session.
+        say: Function that prints a line for the user.
+        timeout_s: Longest wait for a reply of a site, in s.
 
     Returns:
-        The exit code.
+        The exit code of the command.
 
     Raises:
-        SessionError: there is no such session, or no site replies in time.
-        UsageError: an endpoint cannot be used.
+        SessionError: There is no such session, or no site replies in time.
+        UsageError: A network address cannot be used.
     """
     with Interrupt() as interrupt:
         names = embedded_names_reader(session)
@@ -90,13 +92,14 @@ def watch_session(
 
 
 class SessionWatch:
-    """The texts that a terminal shows of a session.
+    """The texts that a terminal shows about a session.
 
     Args:
-        bus: a bus that reaches the session.
-        clock: the clock of this process.
-        session: the session's name.
-        as_site: the site whose user's view is shown; "" shows all sites.
+        bus: Network connection that reaches the session.
+        clock: Clock of this process.
+        session: Name of the session.
+        as_site: Site whose user's view is shown: the other arms with their delay. Empty to show
+            all sites without delay.
     """
 
     def __init__(self, bus: Bus, clock: Clock, session: str, as_site: str = "") -> None:
@@ -105,7 +108,11 @@ class SessionWatch:
         self._as_site = as_site
 
     def update(self) -> None:
-        """Receives the messages that have arrived, and computes V for the complete ticks."""
+        """Receives the messages that have arrived, and updates the text about the energy V.
+
+        V is the energy function of the stability proof. It must not rise, except by the energy
+        that people and walls supply.
+        """
         view = self.view
         view.poll()
         if self._as_site and view.scenario is not None:
@@ -121,7 +128,7 @@ class SessionWatch:
 
     @property
     def title(self) -> str:
-        """The session and its state: V, that it has ended, or how long it has been silent."""
+        """Name and state of the session: V, that it has ended, or how long it has been silent."""
         view = self.view
         silence_s = view.session_silence_s
         state = f"as {self._as_site} knows it" if self._as_site else self._energy_text
@@ -135,7 +142,7 @@ class SessionWatch:
 
     @property
     def alarms(self) -> list[tuple[str, LifeAlarm]]:
-        """The sites that hold, are stopped or in fault, with their alarms, while they run."""
+        """Names and alarms of the sites that hold, are stopped or have a fault."""
         view = self.view
         alarms = []
         for name, site in view.sites.items():
@@ -149,8 +156,8 @@ class SessionWatch:
     def rows(self) -> list[SiteRow]:
         """Returns the row of each site.
 
-        With `as_site`, the row of a peer has the angles and the time that the user of that site
-        sees, and nothing else.
+        With `as_site`, the row of another site has only the angles and the time that the user
+        of `as_site` sees.
         """
         view = self.view
         scenario = view.scenario
@@ -183,7 +190,18 @@ class SessionWatch:
 def show_in_terminal(
     clock: Clock, session: str, as_site: str, console: Console, bus: Bus
 ) -> Iterator[tuple[SessionView, Callable[[], None]]]:
-    """The `SessionOnlooker` of a terminal."""
+    """Shows a session in the terminal, in the form of a `SessionOnlooker`.
+
+    Args:
+        clock: Clock of this process.
+        session: Name of the session.
+        as_site: Site whose user's view is shown. Empty to show all sites.
+        console: Console of the terminal.
+        bus: Network connection that reaches the session.
+
+    Yields:
+        The state of the session, and a function that updates the display.
+    """
     watch = SessionWatch(bus, clock, session, as_site)
     desk = OrderDesk(bus, clock, session)
     with _read_keys() as read_keys, SessionDisplay(console, clock) as display:
@@ -219,7 +237,7 @@ def _read_keys() -> Iterator[Callable[[], str] | None]:
         import tty
 
         keyboard = sys.stdin.fileno()
-        # The keys of a terminal go to its foreground process group only.
+        # A process in the background must not read the keys of the terminal.
         if os.tcgetpgrp(keyboard) != os.getpgrp():
             raise OSError
         settings = termios.tcgetattr(keyboard)
@@ -229,7 +247,7 @@ def _read_keys() -> Iterator[Callable[[], str] | None]:
         return
 
     def read() -> str:
-        """Returns the keys pressed since the last call; "" if the terminal has gone."""
+        """Returns the keys pressed since the last call. Empty if the terminal has gone."""
         with suppress(OSError):
             if select.select([keyboard], [], [], 0.0)[0]:
                 return os.read(keyboard, 64).decode(errors="replace")

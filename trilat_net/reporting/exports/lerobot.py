@@ -200,7 +200,7 @@ def _write_json(folder: Path, files: dict[str, Any]) -> None:
 
 
 def _describe_session(log: Log, frames: _Frames) -> dict[str, Any]:
-    """Returns the session of a log, its scenario, and the number of frames that are left out."""
+    """Returns the session of a log, its scenario, and the number of omitted frames."""
     return {
         **log.session,
         "scenario": log.scenario_text,

@@ -150,7 +150,7 @@ class _SiteBag:
         return [(self._find_topic(topic), data) for topic, data in messages]
 
     def iterate_records(self) -> Iterator[TimedMessages]:
-        """Yields the messages that describe the records, in the order in which the records arrived.
+        """Yields the messages that describe the records, in the order of their arrival.
 
         The first messages also contain the description of the robot.
         """
@@ -183,7 +183,7 @@ class _SiteBag:
 
 
 def _find_epoch_ns(log: Log) -> int:
-    """Returns the Unix time of the common start of a session, in ns. It is 0 in virtual time."""
+    """Returns the Unix time of a session's common start, in ns. It is 0 in virtual time."""
     return int(log.session.get("epoch_unix_ns", "0"))
 
 
