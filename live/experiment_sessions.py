@@ -360,7 +360,7 @@ def run_with_people(
             def run_session(
                 watch: TrialWatch, folder: Path, begins: Callable[[], bool]
             ) -> SessionResult:
-                """Runs the session of a trial. A signal to the session also ends the experiment."""
+                """Runs the session of a trial. A signal to it also ends the experiment."""
                 attend = partial(_show_session, page, idle, watch)
                 result = run_demo(
                     scenario=watch.trial.scenario,

@@ -1,14 +1,15 @@
-"""The steps of an experiment on its pages: consent, readiness, trials, questionnaires.
+"""Controls what the pages of an experiment show: consent, readiness, trials, questionnaires.
 
-The `Stage` is the part of the pages around the sessions: it requests steps from the users and
-collects their replies. A `TrialWatch` judges a trial while its session runs.
+A trial is one execution of a task by the participants, in a session of its own. The `Stage`
+requests the steps between the trials from the users and collects their replies. A `TrialWatch`
+judges a trial while its session runs.
 
 Invariant:
     - A reply counts only for the step that the page showed, and only from the first page of a
       user's site.
-    - A trial is judged by every record of the slave, as it is later judged by its log.
+    - A trial is judged by every record of the slave arm, as it is later judged by its log.
     - Rests and absences are measured on the monotonic clock.
-    - The pages of users never show the condition.
+    - The pages of users never show the condition of the experiment.
 """
 
 from collections.abc import Collection, Sequence
@@ -40,17 +41,17 @@ Json = dict[str, Any]
 
 
 class TrialWatch:
-    """A trial while its session runs.
+    """Judges a trial while its session runs.
 
     Args:
-        trial: the trial.
-        clock: the clock of this process.
+        trial: The trial.
+        clock: Clock of this process.
 
     Attributes:
-        trial: the trial.
-        judge: judges the trial, record by record.
-        aborted: why the trial must be repeated; "" if it need not be repeated.
-        diverged: whether an arm has diverged, which makes the trial fail.
+        trial: The trial.
+        judge: Judges the records of the trial, one after another.
+        aborted: Reason why the trial must be repeated. Empty if it need not be repeated.
+        diverged: True if an arm has diverged, which makes the trial fail.
     """
 
     def __init__(self, trial: ExperimentTrial, clock: Clock) -> None:
@@ -75,11 +76,11 @@ class TrialWatch:
         """Judges the records that have arrived.
 
         Args:
-            view: the session.
-            absent: the users whose page has been absent for too long.
+            view: Present state of the session.
+            absent: Sites of the users whose page has been absent for too long.
 
         Returns:
-            Moments to mark in the log.
+            Texts that the log should keep as marks of this moment.
         """
         if self.over or self.judge.outcome is not None or not view.running:
             return []
@@ -95,7 +96,11 @@ class TrialWatch:
         return self._judge_records(view)
 
     def _judge_records(self, view: SessionView) -> list[str]:
-        """Judges the complete records up to the outcome; returns moments to mark in the log."""
+        """Judges the complete records up to the outcome of the trial.
+
+        Returns:
+            Texts that the log should keep as marks of this moment.
+        """
         slave = view.sites[self.trial.slave]
         number = self.trial.planned.number
         moments: list[str] = []
@@ -125,11 +130,16 @@ class TrialWatch:
         return moments
 
     def describe(self, t_s: float, site: str) -> Json:
-        """Returns the target as a page draws it.
+        """Describes the present target for the page that draws it.
 
         Args:
-            t_s: the time of the arms on the page, in s.
-            site: the site of the page's user; "" for other pages.
+            t_s: Time in the trial of the arms on the page, in s.
+            site: Name of the site of the page's user. Empty for other pages, which see the
+                middle of all users' targets.
+
+        Returns:
+            Position and width of the target, the corridor to it if there is one, and the
+            remaining time, ready for JSON.
         """
         goal = self.judge.goal
         trial = self.trial
@@ -152,12 +162,12 @@ class TrialWatch:
 
 @dataclass
 class StepRequest:
-    """A step that the users have to complete.
+    """A step that the users must complete.
 
     Attributes:
-        step: the step.
-        from_ns: the end of the users' rest; earlier replies are refused.
-        replies: for each user who has completed the step, by site, the answers and the number
+        step: The step.
+        from_ns: End of the users' rest, in ns. Earlier replies are refused.
+        replies: For each user who has completed the step, by site, the answers and the number
             of the page that sent them.
     """
 
@@ -167,15 +177,19 @@ class StepRequest:
 
 
 class Stage:
-    """The part of the pages around the sessions of an experiment.
+    """What the pages show around the sessions of an experiment.
 
-    The experiment requests steps and sets the phase that the pages show. The page's server
+    The experiment requests steps and sets the phase. The page's server, in another thread,
     calls `poll`, `accept` and `describe`.
 
+    Args:
+        plan: Plan of the experiment.
+        clock: Clock of this process.
+
     Attributes:
-        users: the sites of the participants.
-        shows_ages: whether pages first show the ages of samples. A staircase hides them,
-            because they could reveal the answer.
+        users: Names of the sites of the participants.
+        shows_ages: True if the pages show the ages of samples at first. A staircase, which asks
+            participants for differences, hides them, because they could reveal the answer.
     """
 
     def __init__(self, plan: ExperimentPlan, clock: Clock) -> None:
@@ -197,9 +211,9 @@ class Stage:
         """Requests that the users complete a step.
 
         Args:
-            step: the step.
-            rest_s: the rest before the step, in s.
-            done: the sites of users who have completed the step already.
+            step: The step.
+            rest_s: Rest before the step, in s.
+            done: Sites of users who have completed the step already.
 
         Returns:
             The request, which collects the replies.
@@ -225,11 +239,11 @@ class Stage:
         self._phase = "checking"
 
     def show_feedback(self, entry: TrialEntry | None, why: str = "") -> None:
-        """Shows the feedback of the protocol on a trial, or why the trial must be repeated.
+        """Shows the participants the result of a trial, or why the trial must be repeated.
 
         Args:
-            entry: the result of the trial; None if it must be repeated.
-            why: the reason for the repetition.
+            entry: Result of the trial. None if it must be repeated.
+            why: Reason for the repetition.
         """
         self._feedback = {"why": why, "measures": {}}
         names = self._plan.protocol.feedback
@@ -245,27 +259,30 @@ class Stage:
         self._phase = "over"
 
     def poll(self, view: SessionView, pages: Sequence[tuple[str, int]]) -> list[str]:
-        """Judges the records that have arrived, and follows which users are present.
+        """Judges the records that have arrived, and notes which users are present.
 
         Args:
-            view: the session.
-            pages: site and number of each user's page.
+            view: Present state of the session.
+            pages: Site and number of each user's page.
 
         Returns:
-            Moments to mark in the log.
+            Texts that the log should keep as marks of this moment.
         """
         now_ns = self._clock.monotonic_ns()
         request = self._request
-        # The first page of a site has the smallest number.
+
+        # The first page of a site has the smallest number. Only this page counts.
         self._holders = {}
         for site, number in pages:
             self._holders[site] = min(number, self._holders.get(site, number))
         self._page_seen_ns |= dict.fromkeys(self._holders, now_ns)
+
         if request is not None and request.step.kind == "trial":
             # A user who leaves is not ready any more.
             for site, (_, page) in list(request.replies.items()):
                 if self._holders.get(site) != page:
                     del request.replies[site]
+
         if self._watch is None:
             return []
         if view.running and self._phase == "starting":
@@ -281,9 +298,9 @@ class Stage:
         """Applies a message of a page.
 
         Args:
-            site: the site of the user; "" for an experimenter.
-            page: the number of the page.
-            message: the message.
+            site: Name of the user's site. Empty for an experimenter.
+            page: Number of the page.
+            message: The message.
 
         Returns:
             False if the message was not requested from that page.
@@ -306,7 +323,7 @@ class Stage:
         return True
 
     def _abort_trial(self, site: str, why: str) -> bool:
-        """Aborts the running trial; returns False if no trial runs."""
+        """Aborts the running trial. Returns False if no trial runs."""
         watch = self._watch
         if watch is None or watch.over:
             return False
@@ -315,13 +332,16 @@ class Stage:
         return True
 
     def describe(self, role: str, site: str, page: int, t_s: float | None) -> Json:
-        """Returns the stage as a page shows it.
+        """Describes the present step for a page.
 
         Args:
-            role: the role of the page.
-            site: the site of the page's user, or "".
-            page: the number of the page.
-            t_s: the time of the arms on the page, in s; None without arms.
+            role: Role of the page.
+            site: Name of the site of the page's user, or empty.
+            page: Number of the page.
+            t_s: Time of the arms on the page, in s. None without arms.
+
+        Returns:
+            Phase, step, task, users and further fields that the role may see, ready for JSON.
         """
         step = self._step
         request = self._request
@@ -361,11 +381,11 @@ class Stage:
         return fields
 
     def _describe_users(self, step: Step, done_sites: Collection[str]) -> list[Json]:
-        """Returns the users with their pseudonyms and states.
+        """Describes the users: pseudonym, and whether they are present or done.
 
         Args:
-            step: the step.
-            done_sites: the sites of the users who have completed the step.
+            step: The step.
+            done_sites: Sites of the users who have completed the step.
         """
         users: list[Json] = []
         for site, pseudonym in zip(self.users, step.planned.group, strict=True):
@@ -376,7 +396,7 @@ class Stage:
         return users
 
     def _describe_for_experimenter(self, step: Step) -> Json:
-        """Returns the fields that only experimenters may see."""
+        """Returns the fields that only experimenters may see, such as the condition."""
         planned = step.planned
         condition = planned.condition
         if planned.phase:
@@ -390,7 +410,10 @@ class Stage:
         }
 
     def _describe_for_user(self, step: Step, site: str, page: int) -> Json:
-        """Returns the fields for a page of a user."""
+        """Returns the fields for the page of a user, such as the questionnaire.
+
+        The field "second" tells that another page of the same site counts.
+        """
         pseudonyms = dict(zip(self.users, step.planned.group, strict=True))
         fields: Json = {
             "who": pseudonyms[site],

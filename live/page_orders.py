@@ -1,19 +1,21 @@
-"""The messages that a page may send, the roles of users, and the orders to the sites.
+"""Defines the messages that a page may send, the roles of users, and the orders to the sites.
 
-The page's server reads each message with `read_page_message`, checks with `Role.may` that the
-page's user has the right to send the message, and passes it on: `PageHands` moves the arms that
-a page holds, and `OrderDesk` sends the other orders to the sites and receives their replies.
+A page is shown in a browser. Its user may be an experimenter, a user who holds one arm, or a
+watcher. The page's server reads each message with `read_page_message`, and checks with
+`Role.may` that the user has the right to send it. Then `PageHands` moves the arms that a page
+holds, and `OrderDesk` sends other orders to the sites and receives their replies.
 
 Invariant:
     - A valid message has one of the types below, finite numbers in range, and names of the
       session. Messages of a kind may not arrive more often than its rate allows. Any other
       message is counted and dropped.
     - The sites decide whether they accept an order.
-    - Only the newest order for a link or a row of shares waits to be sent.
+    - Of several orders for the same link, or for the dominance factors of the same site, only
+      the newest one waits to be sent.
     - One query at a time is open at each site, besides the query that stops its arm.
     - A token grants a role and, to a user, a site. The rest of a link may lower the role, but
       never raise it.
-    - Every link has a token, on loopback as well, because other users of the machine can
+    - Every link has a token, also on this machine, because other users of the machine can
       connect there too.
     - Every role may stop the arms.
 """
@@ -48,9 +50,9 @@ MAX_PENDING = 256
 TOKEN_BYTES = 16
 """Size of a link's token."""
 RELEASE = "release"
-"""The subject of pending orders that let an arm follow again or end its fault."""
+"""Subject of waiting orders that let an arm follow again or end its fault."""
 MIN_RAMP_S = 0.25
-"""Duration of a change of shares that somebody drags, in s."""
+"""Duration of a change of dominance factors that somebody drags with the mouse, in s."""
 
 Name = Annotated[str, Meta(max_length=64)]
 Numbers = Annotated[list[float], Meta(max_length=12)]
@@ -61,23 +63,28 @@ Count = Annotated[int, Meta(ge=0, lt=2**53)]
 class PageMessage(
     msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="do"
 ):
-    """A message of a page; its tag names the kind."""
+    """A message of a page. Its field `do` names the kind."""
 
 
 class Seen(PageMessage, frozen=True, kw_only=True, tag="seen"):
-    """The page has drawn frame `n`, so that the next frame may be sent."""
+    """The page has drawn the frame with the number `n`, so that the next frame may be sent."""
 
     n: Count
 
 
 class TakePart(PageMessage, frozen=True, kw_only=True, tag="control"):
-    """The page begins to hold arms and to give orders, or ends it."""
+    """The page asks to hold arms and give orders (`want` is True), or no longer does so."""
 
     want: bool
 
 
 class AnswerPage(PageMessage, frozen=True, kw_only=True, tag="answer"):
-    """A page that holds an arm allows another page to take part, or refuses."""
+    """A page that holds an arm allows another page to take part, or refuses.
+
+    Attributes:
+        page: Number of the other page.
+        yes: True to allow it.
+    """
 
     page: Count
     yes: bool
@@ -88,11 +95,11 @@ class StopArms(PageMessage, frozen=True, kw_only=True, tag="stop"):
 
 
 class ReleaseArms(PageMessage, frozen=True, kw_only=True, tag="release"):
-    """Stopped arms must follow again, or the faults of arms must end.
+    """Stopped arms must follow their peers again, or the faults of arms must end.
 
     Attributes:
-        order: "enable" for stopped arms, "reset" for arms in fault.
-        sites: the sites of these arms.
+        order: "enable" for stopped arms, "reset" for arms with a fault.
+        sites: Names of the sites of these arms.
     """
 
     order: Literal["enable", "reset"]
@@ -100,14 +107,24 @@ class ReleaseArms(PageMessage, frozen=True, kw_only=True, tag="release"):
 
 
 class SetLink(PageMessage, frozen=True, kw_only=True, tag="link"):
-    """New settings of a link, as `trilat set` accepts them."""
+    """New settings of a link, such as its delay, as `trilat set` accepts them.
+
+    Attributes:
+        link: Name of the link, such as "m1->s".
+        to: The settings by name.
+    """
 
     link: Name
     to: Annotated[dict[Name, float | Name], Meta(max_length=8)]
 
 
 class SetShares(PageMessage, frozen=True, kw_only=True, tag="shares"):
-    """A new row of the dominance matrix."""
+    """New dominance factors of a site, which are the weights with which it follows its peers.
+
+    Attributes:
+        site: Name of the site.
+        to: The factor of each peer by name.
+    """
 
     site: Name
     to: Annotated[dict[Name, float], Meta(max_length=16)]
@@ -120,7 +137,7 @@ class MarkMoment(PageMessage, frozen=True, kw_only=True, tag="mark"):
 
 
 class ShowAges(PageMessage, frozen=True, kw_only=True, tag="ages"):
-    """The pages of users begin to show the age of their peers' poses, or stop showing it."""
+    """The pages of users must show the age of their peers' poses, or no longer show it."""
 
     shown: bool
 
@@ -129,10 +146,10 @@ class MoveHand(PageMessage, frozen=True, kw_only=True, tag="hand"):
     """The page takes hold of an arm, moves it, or releases it.
 
     Attributes:
-        site: the site of the arm.
+        site: Name of the site of the arm.
         grip: False to release the arm.
-        to: the target of the end effector in m, or of the joints in rad; for an arm that is
-            pushed, the force in N.
+        to: Target of the end effector in m, or of the joints in rad. For an arm that is pushed,
+            the force in N.
     """
 
     site: Name
@@ -141,16 +158,16 @@ class MoveHand(PageMessage, frozen=True, kw_only=True, tag="hand"):
 
 
 class EndSession(PageMessage, frozen=True, kw_only=True, tag="end"):
-    """The session must end, in order."""
+    """The session must end in an orderly way."""
 
 
 class DoStep(PageMessage, frozen=True, kw_only=True, tag="step"):
     """A user has completed a step of an experiment: has agreed, is ready, or has answered.
 
     Attributes:
-        key: the key of the step, as the server sent it to the page.
-        answers: the answers to a questionnaire, in the order of its items; None for an item
-            without an answer.
+        key: Key of the step, as the server sent it to the page.
+        answers: Answers to a questionnaire, in the order of its items. None for an item without
+            an answer.
     """
 
     key: Name
@@ -158,7 +175,11 @@ class DoStep(PageMessage, frozen=True, kw_only=True, tag="step"):
 
 
 class AbortTrial(PageMessage, frozen=True, kw_only=True, tag="abort"):
-    """The running trial must end, and be repeated later."""
+    """The running trial must end, and be repeated later.
+
+    Attributes:
+        why: The reason, for the journal of the experiment.
+    """
 
     why: Annotated[str, Meta(max_length=200)] = ""
 
@@ -185,11 +206,14 @@ _RATES: dict[type[PageMessage], tuple[float, int]] = {
 
 @dataclass(slots=True)
 class _TokenBucket:
-    """A bucket of tokens, one of which is removed by each message.
+    """State of a limit on a message rate, by the method of the token bucket.
+
+    Tokens are added at the allowed rate, up to the largest burst. Each message removes one. A
+    message that finds no token exceeds the limit.
 
     Attributes:
-        tokens: the tokens in the bucket.
-        filled_ns: the time of the last message, in ns; 0 before the first message.
+        tokens: Number of tokens in the bucket.
+        filled_ns: Time of the last message, in ns. 0 before the first message.
     """
 
     tokens: float
@@ -197,7 +221,7 @@ class _TokenBucket:
 
 
 class MessageLimits:
-    """The limits of a page's message rates: token buckets for each kind and for all kinds."""
+    """Limits of a page's message rates, for each kind of message and for all kinds together."""
 
     def __init__(self) -> None:
         self._buckets = {
@@ -205,7 +229,12 @@ class MessageLimits:
         }
 
     def allows(self, kind: type[PageMessage], now_ns: int) -> bool:
-        """Returns whether a message of a kind is allowed now, and counts the message if so."""
+        """Returns True if a message is allowed now, and then counts it.
+
+        Args:
+            kind: Kind of the message.
+            now_ns: Present time, in ns.
+        """
         if kind not in _RATES:
             return True
         rate, burst = _RATES[kind]
@@ -222,10 +251,10 @@ class MessageLimits:
 
 
 def read_page_message(text: str | bytes) -> PageMessage:
-    """Returns the message of a page.
+    """Decodes a message of a page.
 
     Raises:
-        WireError: the text is not a valid message, or a number is out of range.
+        WireError: The text is not a valid message, or a number is out of range.
     """
     try:
         # All numbers are finite: JSON has no infinity, and the decoder refuses 1e999.
@@ -237,19 +266,20 @@ def read_page_message(text: str | bytes) -> PageMessage:
 
 @dataclass(frozen=True, slots=True)
 class Role:
-    """The rights of a page's user, and the view of the arms.
+    """The rights of a page's user, and the arms that the page shows.
 
     Attributes:
-        kind: an experimenter may do everything, a user holds the arm of one site, and a watcher
-            may only stop the arms.
-        site: the site whose user's view is shown; "" shows all arms without delay.
+        kind: An experimenter may do everything, a user may hold the arm of one site, and a
+            watcher may only stop the arms.
+        site: Name of the site whose user's view is shown: the other arms with their delay.
+            Empty to show all arms without delay.
     """
 
     kind: Literal["experimenter", "user", "watcher"] = "experimenter"
     site: str = ""
 
     def may(self, message: PageMessage) -> bool:
-        """Returns whether this role may send a message."""
+        """Returns True if this role may send a message."""
         if isinstance(message, Seen | StopArms) or self.kind == "experimenter":
             return True
         if self.kind != "user":
@@ -260,7 +290,7 @@ class Role:
 
     @property
     def noun(self) -> str:
-        """The noun for the role in the sentence of an event."""
+        """The noun for the role in the sentence of an event, such as "the user of m1"."""
         if self.kind == "experimenter":
             return "the experimenter"
         if self.kind == "user":
@@ -269,7 +299,7 @@ class Role:
 
     @property
     def query(self) -> str:
-        """The query of this role's link."""
+        """The query part of this role's link, such as "as=m1"."""
         parts = ["watch"] if self.kind == "watcher" else []
         if self.site:
             parts.append(f"as={self.site}")
@@ -277,7 +307,10 @@ class Role:
 
 
 class RoleLinks:
-    """The links of a served page, with a token for each role."""
+    """Makes the links of a page with their secret tokens, and recognises their roles.
+
+    The token of a role is computed from a random secret, so that it need not be stored.
+    """
 
     def __init__(self) -> None:
         self._secret = secrets.token_bytes(TOKEN_BYTES)
@@ -285,13 +318,25 @@ class RoleLinks:
     def link(self, address: str, role: Role) -> str:
         """Returns the link of a role.
 
-        The token is in the fragment, which a browser does not send to a server by itself.
+        The token is in the fragment of the link, which a browser does not send to other
+        servers.
+
+        Args:
+            address: Address of the page.
+            role: The role.
         """
         query = f"?{role.query}" if role.query else ""
         return f"{address}{query}#token={self._make_token(role)}"
 
     def find(self, query: str) -> Role | None:
-        """Returns the role that a link's query grants; None if no role has its token."""
+        """Returns the role that a link grants.
+
+        Args:
+            query: Query part of a request, which contains the token.
+
+        Returns:
+            The role. None if the token is not that of any role.
+        """
         fields = parse_qs(query, keep_blank_values=True)
         token = fields.get("token", [""])[0]
         site = fields.get("as", [""])[0]
@@ -313,16 +358,21 @@ class RoleLinks:
         return digest[:TOKEN_BYTES].hex()
 
     def _is_token(self, token: str, role: Role) -> bool:
-        """Returns whether a token is that of a role."""
+        """Returns True if a token is that of a role."""
         role_token = self._make_token(role)
         return hmac.compare_digest(token.encode(), role_token.encode())
 
 
 class PageHands:
-    """The hands of one page, one for each arm that the page has held.
+    """Holds and moves arms on behalf of one page.
 
-    The page's own messages are the heartbeat of its hands: if they stop, the site releases the
-    arm.
+    The page's own messages serve as heartbeat: if they stop, the site releases the arm.
+
+    Args:
+        bus: Network connection that reaches the session.
+        clock: Clock of this process.
+        session: Name of the session.
+        source: Name of the page, with which it introduces itself to the sites.
     """
 
     def __init__(self, bus: Bus, clock: Clock, session: str, source: str) -> None:
@@ -334,11 +384,11 @@ class PageHands:
         self._held_sites: set[str] = set()
 
     def move(self, order: MoveHand, *, pushes: bool) -> None:
-        """Sends a hand message to the site of an arm.
+        """Sends the site of an arm how the page holds it.
 
         Args:
-            order: the message of the page.
-            pushes: whether the hand applies a force instead of moving a target.
+            order: Message of the page.
+            pushes: True if the page applies a force instead of moving a target.
         """
         site = order.site
         if site not in self._senders:
@@ -364,7 +414,13 @@ class PageHands:
             self.move(MoveHand(site=site, grip=False), pushes=False)
 
     def holds(self, site: str, source: int) -> bool:
-        """Returns whether this page is the holder that a site's record names by `source`."""
+        """Returns True if this page holds the arm of a site.
+
+        Args:
+            site: Name of the site.
+            source: Number of the holder according to the site's record. 0 if nobody holds the
+                arm.
+        """
         sender = self._senders.get(site)
         return source != 0 and sender is not None and sender.boot == source
 
@@ -373,9 +429,9 @@ class _OpenQuery(NamedTuple):
     """A request that waits for the reply of a site.
 
     Attributes:
-        inbox: receives the reply.
-        sent_ns: the time of sending, in ns.
-        request: the request.
+        inbox: Inbox that receives the reply.
+        sent_ns: Time of sending, in ns.
+        request: The request.
     """
 
     inbox: Inbox
@@ -384,12 +440,19 @@ class _OpenQuery(NamedTuple):
 
 
 class OrderDesk:
-    """The orders of all pages to the sites.
+    """Sends the orders of all pages to the sites, and collects the replies.
+
+    Args:
+        bus: Network connection that reaches the session.
+        clock: Clock of this process.
+        session: Name of the session.
+        refused: Numbers of refused orders by reason, to which this object adds. None for new
+            ones.
 
     Attributes:
-        replies: the replies that have not been read yet: the site, the channel of the order,
-            whether it is accepted, and the text.
-        refused: counts refused orders by reason.
+        replies: Replies that have not been read yet: name of the site, channel of the order,
+            whether it is accepted, and text.
+        refused: Numbers of refused orders by reason.
     """
 
     def __init__(
@@ -408,16 +471,16 @@ class OrderDesk:
     def queue_change(
         self, order: Order, sites: Collection[str], links: Collection[str], source: str = ""
     ) -> None:
-        """Queues a change of a link or of shares.
+        """Queues a change of a link or of dominance factors.
 
-        The change replaces a pending change of the same link or row of shares. A change of an
-        unknown site or link is refused.
+        The change replaces a waiting change of the same link or site. A change of an unknown
+        site or link is refused.
 
         Args:
-            order: the new settings of a link, or a new row of shares.
-            sites: the sites of the session.
-            links: the links of the session.
-            source: who sends the order, for the site's event.
+            order: New settings of a link, or new dominance factors of a site.
+            sites: Names of the sites of the session.
+            links: Names of the links of the session.
+            source: Who sends the order, for the site's event.
         """
         if isinstance(order, SetLink):
             if order.link not in links:
@@ -435,11 +498,11 @@ class OrderDesk:
         self._enqueue(site, request.link, _add_source(request, source))
 
     def stop(self, sites: Iterable[str], source: str = "") -> None:
-        """Orders sites to stop at once, ahead of all pending orders.
+        """Orders sites to stop at once, ahead of all waiting orders.
 
         Args:
-            sites: the names of the sites.
-            source: who sends the order, for the sites' events.
+            sites: Names of the sites.
+            source: Who sends the order, for the sites' events.
         """
         request = _add_source(ChangeRequest(order="stop"), source)
         for site in sites:
@@ -451,9 +514,9 @@ class OrderDesk:
         """Queues orders that let arms follow again, or end their faults.
 
         Args:
-            order: the order and the sites of the arms.
-            sites: the sites of the session.
-            source: who sends the order, for the sites' events.
+            order: The order, and the sites of the arms.
+            sites: Names of the sites of the session.
+            source: Who sends the order, for the sites' events.
         """
         request = _add_source(ChangeRequest(order=order.order), source)
         for site in order.sites:
@@ -463,16 +526,16 @@ class OrderDesk:
                 self.refused["no such site"] += 1
 
     def _enqueue(self, site: str, subject: str, request: ChangeRequest) -> None:
-        """Queues a request, which replaces a pending request of the same subject.
+        """Queues a request, which replaces a waiting request about the same subject.
 
-        A request of a new subject is dropped if too many requests wait.
+        A request about a new subject is dropped if too many requests wait.
         """
         is_replacement = (site, subject) in self._pending
         if is_replacement or len(self._pending) < MAX_PENDING:
             self._pending[site, subject] = request
 
     def _send_request(self, site: str, channel: str, request: ChangeRequest) -> None:
-        """Sends a request to a site, and keeps the query until the site replies."""
+        """Sends a request to a site, and waits for the reply in `poll`."""
         key = topics.key(self._session, site, channel)
         inbox = self._bus.query(key, encode(request))
         sent_ns = self._clock.monotonic_ns()
@@ -483,7 +546,7 @@ class OrderDesk:
         self._enqueue(site, f"mark {text}", ChangeRequest(mark=text))
 
     def poll(self) -> None:
-        """Reads the replies of the sites, and sends each site its next pending request."""
+        """Receives the replies of the sites, and sends each site its next waiting request."""
         now_ns = self._clock.monotonic_ns()
         for (site, channel), query in list(self._open_queries.items()):
             reply = query.inbox.poll()
@@ -504,8 +567,8 @@ class OrderDesk:
     ) -> None:
         """Stores a reply for the pages, or repeats a refused stop without its source.
 
-        A site of an older program does not know the source and refuses the whole request, but
-        its arm has to stop too. A reply that cannot be read is counted.
+        A site of an older program does not know the field `source` and refuses the whole
+        request, but its arm must stop too. A reply that cannot be decoded is counted.
         """
         try:
             reply = decode(payload, ChangeReply)
@@ -521,15 +584,15 @@ class OrderDesk:
 
 
 def _add_source(request: ChangeRequest, source: str) -> ChangeRequest:
-    """Returns a request with its source; "" leaves the request unchanged."""
+    """Returns a request that names its source. An empty source leaves it unchanged."""
     return msgspec.structs.replace(request, source=source) if source else request
 
 
 def _make_link_request(order: SetLink) -> ChangeRequest:
     """Returns the request for new settings of a link.
 
-    Without a preset, a delay with a deviation becomes a gamma distribution, and a delay
-    without a deviation is constant.
+    The page sets a delay and its standard deviation. Unless it names a preset, a delay with a
+    deviation becomes a gamma distribution, and a delay without one is constant.
     """
     settings: dict[str, Any] = dict(order.to)
     if "preset" not in settings and "delay_ms" in settings:
@@ -544,5 +607,5 @@ def _make_link_request(order: SetLink) -> ChangeRequest:
 
 
 def _is_zero(value: float | str) -> bool:
-    """Returns whether a setting is the number 0; a text is not, the site will refuse it."""
+    """Returns True if a setting is the number 0. A text is not, and the site will refuse it."""
     return str(value) in ("0.0", "-0.0")

@@ -481,7 +481,7 @@ class PageServer:
         return f"{self._scheme}://{host}:{self._port}/"
 
     def _print_links(self) -> None:
-        """Prints the links for users and watchers, once the scenario and thus the users are known."""
+        """Prints the links for users and watchers, once the users are known."""
         scenario = self.view.scenario
         if self._links_are_printed or (scenario is None and self._stage is None):
             return
@@ -888,7 +888,7 @@ class PageServer:
         return refused_stops
 
     def _describe_as_site(self, site: str) -> dict[str, Any]:
-        """Returns the frame for the user of a site, who sees the other arms with their delay."""
+        """Returns the frame for the user of a site, who sees the other arms delayed."""
         if site not in self._frames_as_site:
             assert self._frame is not None
             self._frames_as_site[site] = self._frames.describe_as(

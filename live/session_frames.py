@@ -1,16 +1,17 @@
-"""The content of the pages of a running session, as JSON objects.
+"""Composes the messages with which the pages of a running session are drawn, as JSON objects.
 
 A page first receives the constants of the session, such as the shapes of the arms. Then it
-receives about 30 frames a second: a frame has the present state of each arm and link, and new
-points of the plots.
+receives about 30 frames a second. A frame has the present state of each arm and link, and the
+new points of the plots.
 
 Invariant:
     - A frame is computed from the records since the previous frame. It describes the whole
       state, so that a page may miss frames.
-    - The plots have the extremes of the records between two frames.
-    - Forces are those ON the arm, in N. The forces of people and of the law follow from their
-      torque: torque = J^T force, with the Jacobian J. Near a singular pose the force is the
-      smallest force that explains the torque.
+    - The plots have the extremes of the records between two frames, so that short peaks are
+      visible.
+    - Forces are those that act on the arm, in N. The forces of people and of the control law
+      follow from their torque: torque = J^T force, with the Jacobian J of the end effector.
+      Near a singular pose the force is the smallest one that explains the torque.
     - The frame for the user of a site contains the pose of each peer at one tick only: the tick
       of the sample in use, or of the delayed picture (`SessionView.find_peer_ticks`).
 """
@@ -65,11 +66,11 @@ def _round(values: Array, digits: int = 5) -> list[Any]:
 
 
 class ArmFrames:
-    """The part of the frames that describes one arm: shape, pose, reference pose and forces.
+    """Composes the parts of frames that describe one arm: shape, pose and forces.
 
     Args:
-        scenario: the scenario of the session.
-        site: the site of the arm.
+        scenario: Scenario of the session.
+        site: Name of the site of the arm.
     """
 
     def __init__(self, scenario: Scenario, site: str) -> None:
@@ -84,7 +85,7 @@ class ArmFrames:
         self._rows = build_arm_rows(scenario, site)
 
     def describe(self) -> Json:
-        """Returns the constants of the arm."""
+        """Returns the constants of the arm, such as its joints, walls and limits."""
         model = self._model
         spec = self._spec
         colours = self._scenario.assign_colours(COLOURS)
@@ -114,7 +115,7 @@ class ArmFrames:
         }
 
     def _describe_hand(self) -> Json | None:
-        """Returns the constants of the live hand; None if the arm has none."""
+        """Returns how people can hold the arm. Returns None if nobody can hold it."""
         hand = self._hand
         if hand is None:
             return None
@@ -145,14 +146,14 @@ class ArmFrames:
         return {**pose, "tick": -1, "bodies": []}
 
     def describe_now(self, records: AlignedRecords) -> tuple[Json, list[float]]:
-        """Returns the present state of the arm, and extremes since the previous frame.
+        """Returns the present state of the arm, and the extremes since the previous frame.
 
         Args:
-            records: the records since the previous frame; the last record is the present.
+            records: Records since the previous frame. The last one is the present.
 
         Returns:
-            The state, and the largest norm of the error, torque of a joint in N m, hand force
-            in N and wall force in N.
+            The state. The largest norm of the error, torque of a joint in N m, force of people
+            in N, and wall force in N.
         """
         split = split_torque(records, self._scenario)
         hand_force = self._compute_hand_force(records, split)
@@ -184,8 +185,8 @@ class ArmFrames:
     def _place_reference(self, records: AlignedRecords) -> Array:
         """Returns the points of the reference pose in the last record, in m.
 
-        The reference of a shared pose is one point; a reference of the joints has a point for
-        each joint.
+        If the sites exchange poses of the end effector, the reference is one point. Otherwise
+        it is a point for each joint.
         """
         points_m: Array
         if self._model.shares_pose:
@@ -196,7 +197,12 @@ class ArmFrames:
         return points_m
 
     def _describe_grip(self, records: AlignedRecords, force: Array) -> Json:
-        """Returns the state of the live hand in the last record; {} without a live hand."""
+        """Returns who holds the arm in the last record, and how. Empty if nobody can hold it.
+
+        Args:
+            records: Records since the previous frame.
+            force: Force of people in the last record, in N.
+        """
         if not records.hand.size:
             return {}
         grip = HandInForce.read(records.hand[-1].tolist())
@@ -225,10 +231,12 @@ class ArmFrames:
         return split.end_effector.find_force(torque, _MIN_SINGULAR_SHARE)
 
     def _compute_pull(self, records: AlignedRecords, split: TorqueSplit) -> list[float]:
-        """Returns the force of the law that a user feels in the last record, in N.
+        """Returns the force of the control law that a user feels in the last record, in N.
 
-        The force follows from the law's torque without gravity compensation. Returns [] if the
-        masses of the arm are not known.
+        The force follows from the law's torque without gravity compensation.
+
+        Returns:
+            The components of the force. Empty if the masses of the arm are not known.
         """
         if not self._spec.arm.known:
             return []
@@ -249,15 +257,15 @@ class ArmFrames:
 
 
 class SessionFrames:
-    """The frames of one session; `make_frame` is called at the rate of the pages.
+    """Composes the frames of one session, at the rate of the pages.
 
     Args:
-        view: the session.
+        view: Present state of the session.
 
     Attributes:
-        points: rows of the plots, in the order of `columns`.
-        energies: rows of the energy plot: time in s, V in J, and the energy that operator and
-            environment have supplied, in J.
+        points: Rows of the plots. `describe` names their columns.
+        energies: Rows of the energy plot: time in s, energy function V of the stability proof
+            in J, and the energy that operators and environment have supplied, in J.
     """
 
     def __init__(self, view: SessionView) -> None:
@@ -274,7 +282,11 @@ class SessionFrames:
         self._turns: defaultdict[tuple[str, str], BodyTurns] = defaultdict(BodyTurns)
 
     def describe(self) -> Json:
-        """Returns the constants of the session: its sites, links and columns of plots."""
+        """Returns the constants of the session: its sites, links, and columns of plots.
+
+        Before the session runs, it returns the members that are present and those that are
+        missing.
+        """
         view = self._view
         scenario = view.scenario
         # Prepared before the session runs, because loading the compiled arms takes seconds.
@@ -316,7 +328,8 @@ class SessionFrames:
     def make_frame(self) -> Json | None:
         """Returns the present state, and adds the points of the plots.
 
-        Returns None until every site has a record.
+        Returns:
+            The frame. None until every site has a record.
         """
         view = self._view
         has_all_records = all(site.record is not None for site in view.sites.values())
@@ -324,6 +337,7 @@ class SessionFrames:
             return None
         if not self._arms:
             self.describe()
+
         sites: Json = {}
         point: list[float | None] = []
         t_s = 0.0
@@ -353,7 +367,7 @@ class SessionFrames:
         self.points.add([round(t_s, 4), *rounded])
 
     def _add_energies(self) -> None:
-        """Adds points of V and the supplied energy, at most one per `ENERGY_PERIOD_S`."""
+        """Adds points to the energy plot, at most one per `ENERGY_PERIOD_S`."""
         course = self._view.advance_energy()
         if course is None:
             return
@@ -364,7 +378,11 @@ class SessionFrames:
                 self.energies.add([t_s, V, supplied])
 
     def describe_session_as_user(self) -> Json:
-        """Returns the constants of the session for the page of a site's user."""
+        """Returns the constants of the session for the page of a site's user.
+
+        Links and dominance factors are left out, because they could reveal the condition of an
+        experiment.
+        """
         constants = self.describe()
         if not constants["running"]:
             return constants
@@ -372,12 +390,12 @@ class SessionFrames:
         return {**constants, **hidden}
 
     def describe_as(self, frame: Json, site: str, *, ages: bool) -> Json:
-        """Returns a frame for the user of a site, with the site's view of its peers.
+        """Returns a frame for the user of a site, with the other arms as the site knows them.
 
         Args:
-            frame: the newest frame of `make_frame`.
-            site: the site of the user.
-            ages: whether each peer has the age of the pose that is drawn, in ms.
+            frame: Newest frame of `make_frame`.
+            site: Name of the user's site.
+            ages: True to add the age of each peer's pose, in ms.
         """
         local = frame["sites"][site]
         ticks = self._view.find_peer_ticks(site, local["tick"], local["used"])
@@ -401,7 +419,16 @@ class SessionFrames:
         }
 
     def _compute_age_ms(self, site: str, tick: int, t_s: float) -> float | None:
-        """Returns the age at `t_s` of a site's record; None before the first record."""
+        """Returns the age of a site's record at a time, in ms.
+
+        Args:
+            site: Name of the site.
+            tick: Tick of the record. It is -1 before the first record.
+            t_s: The time, in s.
+
+        Returns:
+            The age. None before the first record.
+        """
         if tick < 0:
             return None
         rate_hz = self._view.sites[site].window.rate_hz
@@ -411,7 +438,7 @@ class SessionFrames:
     def _describe_peer(self, site: str, peer: str, tick: int) -> Json:
         """Returns the pose of a peer at a tick, for the user of a site.
 
-        If the record of that tick is missing, the pose is that of the frame before.
+        If the record of that tick is missing, the pose is that of the previous frame.
         """
         pose = self._peer_poses.get((site, peer)) or self._arms[peer].describe_start()
         view = self._view.sites[peer]
@@ -423,7 +450,7 @@ class SessionFrames:
         return pose
 
     def _describe_site(self, name: str, site: SiteView) -> tuple[Json, list[float]]:
-        """Returns the present state of a site, and extremes since the previous frame."""
+        """Returns the present state of a site, and the extremes since the previous frame."""
         record = site.record
         stats = site.stats
         assert record is not None
@@ -473,7 +500,7 @@ class SessionFrames:
         return state, extremes, newest_tick > previous_tick
 
     def _describe_link(self, name: str) -> Json:
-        """Returns the present state of a link."""
+        """Returns the present state of a link: age of samples, settings and counts."""
         view = self._view
         peer, _, receiver = name.partition("->")
         receiving = view.sites[receiver]
@@ -505,7 +532,7 @@ class SessionFrames:
 
 
 def _count_samples(receiving: SiteView, peer: str) -> Json:
-    """Returns the delay and the counts of a peer's samples; {} before the first statistics."""
+    """Returns delay and counts of a peer's samples. Empty before the first statistics."""
     stats = receiving.stats
     if stats is None:
         return {}
@@ -520,7 +547,8 @@ def _count_samples(receiving: SiteView, peer: str) -> Json:
 def _describe_alarm(alarm: LifeAlarm) -> Json:
     """Returns an alarm for a page.
 
-    The page has a button for the order, so the advice does not name a shell command.
+    The page has a button for the command that ends the alarm, so that the advice does not name
+    a shell command.
     """
     advice = alarm.before if alarm.order else alarm.advice
     return {"word": alarm.word, "reason": alarm.reason, "advice": advice, "order": alarm.order}

@@ -173,7 +173,7 @@ class SiteView:
 
     @property
     def complete(self) -> int:
-        """Last tick up to which every record has arrived or is lost for good; -1 before the first."""
+        """Last tick up to which all records have arrived or are lost; -1 before the first."""
         account = self.reception.accounts[topics.STATE]
         gap = account.find_requestable_gap()
         if gap is None:
@@ -235,7 +235,7 @@ class SessionView:
         return self._finished or all(site.ended for site in self.sites.values())
 
     def finish(self) -> None:
-        """Marks the session as ended. The process that has seen all sites end calls this method."""
+        """Marks the session as ended. The process that saw all sites end calls it."""
         self._finished = True
 
     def silence_s(self, site: SiteView) -> float:
@@ -372,7 +372,7 @@ class SessionView:
                 self._store(parts.member, site, channel, message.content)
 
     def _accept_new_boot(self, name: str, payload: bytes) -> bool:
-        """Follows a site that was started again, if an event says that it has joined the session.
+        """Follows a site that was started again, if an event says that it has joined.
 
         Args:
             name: Name of the site.
@@ -434,7 +434,7 @@ class SessionView:
             self._apply_change(name, change)
 
     def _store_event(self, name: str, site: SiteView, event: Event) -> None:
-        """Stores an event. It may say who holds the arm, who has stopped it, or what has changed."""
+        """Stores an event, and applies the news about the arm's holder and changes in it."""
         self.events.add(event)
         if event.kind == "hand":
             holder, separator, _ = event.text.partition(f" {TAKEN} ")

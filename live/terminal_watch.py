@@ -36,7 +36,7 @@ SessionOnlooker = Callable[
 ]
 """Function that shows a session, given a network connection that reaches the session.
 
-It returns a context manager. The session is shown while its `with` statement runs. It yields the
+It returns a context manager. The session is shown in its `with` statement. It yields the
 state of the session, and a function that must be called often to update the display.
 """
 
@@ -128,7 +128,7 @@ class SessionWatch:
 
     @property
     def title(self) -> str:
-        """Name and state of the session: V, that it has ended, or how long it has been silent."""
+        """Name and state of the session: V, its end, or how long it has been silent."""
         view = self.view
         silence_s = view.session_silence_s
         state = f"as {self._as_site} knows it" if self._as_site else self._energy_text
