@@ -1,8 +1,8 @@
-"""Hold the findings of checks: the name of the check, its result, and every problem.
+"""Defines the results of checks: whether each check passed, and the problems that it found.
 
 Invariant:
-    - A finding with a problem has not passed.
-    - Problems beyond `MAX_LISTED_PROBLEMS` are only counted.
+    - A check with a problem has not passed.
+    - At most `MAX_LISTED_PROBLEMS` problems of a check are stored. Further ones are counted.
 """
 
 from dataclasses import dataclass, field
@@ -12,16 +12,17 @@ from ..errors import CodeWithheld
 from ..results import Result
 
 MAX_LISTED_PROBLEMS = 1000
-"""Largest number of problems that a finding keeps; further problems are only counted."""
+"""Largest number of problems that a finding stores. Further problems are only counted."""
 
 
 class ProblemPlace(NamedTuple):
-    """A problem of a file.
+    """A problem in a file, and the place where it was found.
 
     Attributes:
-        file: name of the file.
-        offset: byte of the problem, or first byte of its chunk; None: the whole file.
-        text: description of the problem.
+        file: Name of the file.
+        offset: Offset of the problem in the file, or of the chunk that contains it, in bytes.
+            None if the problem concerns the whole file.
+        text: Description of the problem.
     """
 
     file: str
@@ -34,18 +35,19 @@ class ProblemPlace(NamedTuple):
 
 @dataclass(slots=True)
 class Finding:
-    """The result of one check.
+    """Result of one check.
 
     Attributes:
-        check: name of the check: for a file "whole", "checksums", "records" or "index"; for a
-            trilat-net log also "sequence", "accounts", "chain", "schema", "times", "rates" or
-            "scenario"; for an execution its subject.
-        text: the result in one line.
+        check: Name of the check. Every file is checked for "whole", "checksums", "records" and
+            "index", and a log of trilat-net also for "sequence", "accounts", "chain", "schema",
+            "times", "rates" and "scenario". When a run is executed again and compared, the name
+            is the subject of the comparison.
+        text: The result in one line.
         passed: True if the check passed.
-        judged: False if the check needs code from outside that may not run; the check then did
-            not pass.
-        places: the problems, at most `MAX_LISTED_PROBLEMS`.
-        wrong: number of problems.
+        judged: False if the check was not possible, because it would run code from outside that
+            the user has not permitted. The check has not passed then.
+        places: The problems, at most `MAX_LISTED_PROBLEMS`.
+        wrong: Number of problems, including those that are not stored.
     """
 
     check: str
@@ -56,28 +58,38 @@ class Finding:
     wrong: int = 0
 
     def add(self, file: str, offset: int | None, text: str) -> None:
-        """Adds a problem."""
+        """Adds a problem, so that the check has not passed.
+
+        Args:
+            file: Name of the file.
+            offset: Offset of the problem in the file. None if it concerns the whole file.
+            text: Description of the problem.
+        """
         self.passed = False
         self.wrong += 1
         if len(self.places) < MAX_LISTED_PROBLEMS:
             self.places.append(ProblemPlace(file, offset, text))
 
     def summary(self) -> str:
-        """Returns the first problem, and the number of further problems."""
+        """Returns the first problem and the number of further problems, as a text."""
         first = str(self.places[0])
         return f"{first}; and {self.wrong - 1} more" if self.wrong > 1 else first
 
     def conclude(self, sound: str) -> "Finding":
-        """Sets the text of the finding and returns the finding.
+        """Sets the text of the finding after all problems were added.
 
         Args:
-            sound: the text if there is no problem; else the text is the summary of problems.
+            sound: The text to use if there is no problem. Otherwise the text summarises the
+                problems.
+
+        Returns:
+            This finding.
         """
         self.text = self.summary() if self.wrong else sound
         return self
 
     def to_row(self) -> dict[str, Any]:
-        """Returns the finding as plain values for JSON."""
+        """Returns the result as plain values for JSON, without the problems."""
         return {
             "label": self.check,
             "text": self.text,
@@ -87,7 +99,7 @@ class Finding:
 
 
 class Findings(dict[str, Finding]):
-    """The findings of checks by name; a finding is created when it is first used."""
+    """Findings of several checks by name. A finding is created when it is used first."""
 
     def __missing__(self, check: str) -> Finding:
         self[check] = finding = Finding(check)
@@ -95,10 +107,10 @@ class Findings(dict[str, Finding]):
 
 
 class CheckReport(Result):
-    """A result of several checks.
+    """Base class of results that consist of several checks.
 
     Attributes:
-        findings: one finding per check.
+        findings: One finding for each check.
     """
 
     findings: list[Finding]
@@ -110,11 +122,15 @@ class CheckReport(Result):
 
     @property
     def exit_code(self) -> int:
-        """1 if a check failed; that of `CodeWithheld` if a check was not judged; else 0."""
+        """Exit code of a command that reports these checks.
+
+        1 if a check failed. Otherwise the exit code of `CodeWithheld` if a check was not
+        possible because of code that may not run. Otherwise 0.
+        """
         if any(finding.judged and not finding.passed for finding in self.findings):
             return 1
         return 0 if self.passed else CodeWithheld.exit_code
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a row per check."""
+        """Returns a row for each check."""
         return [finding.to_row() for finding in self.findings]

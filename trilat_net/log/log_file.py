@@ -1,13 +1,13 @@
-"""The file of a log while it is written.
+"""Writes the file of a log so that it survives crashes, power failures and full disks.
 
-The file is called run.mcap.active at first, and run.mcap once it is complete.
+The file is called run.mcap.active while it is recorded, and run.mcap after it is complete.
 
 Invariant:
-    - Flushed data survive the death of the process, and synced data survive a loss of power.
-    - Only a finished log has the final name, and nothing is replaced without `force`.
-    - Disk space for the end of the file is reserved, so that on a full disk the file ends in
-      order, with all data that were written.
-    - Syncing runs in a thread unless `durable` is set.
+    - Flushed data survive the death of the process. Synced data survive a loss of power.
+    - Only a finished log gets the final name. An existing file is replaced only with `force`.
+    - Disk space for the end of the file is reserved. If the disk becomes full, the file still
+      ends as the format requires, with all data that were written before.
+    - Syncing may block for a long time. It runs in a thread unless `durable` is set.
 """
 
 import errno
@@ -28,19 +28,22 @@ from .log_layout import active_path
 from .mcap_records import MAGIC
 
 DISK_FULL_ERRNOS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
-"""Errors of a disk that accepts no more data."""
+"""Error numbers of a disk that accepts no more data."""
 RESERVE_STEP_BYTES = 1 << 19
-"""Step by which a reserve grows, in bytes."""
+"""Step by which the reserved space grows, in bytes."""
 
 
 class DiskReserve:
-    """Space reserved on a disk by a file without a name.
+    """Disk space that is reserved by a temporary file without a name.
+
+    When the space is needed, the temporary file is closed, and the space can be used by another
+    file on the same disk.
 
     Args:
-        folder: a folder on the disk.
+        folder: Any folder on the disk.
 
     Attributes:
-        size: reserved space, in bytes.
+        size: Reserved space, in bytes.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -50,13 +53,16 @@ class DiskReserve:
         self._is_possible = True
 
     def grow(self, size: int) -> None:
-        """Reserves at least `size` bytes.
+        """Reserves at least `size` bytes in total.
+
+        Nothing happens if this disk does not support it, or if the space was released before.
 
         Raises:
-            OSError: the disk has no room.
+            OSError: The disk has no room.
         """
         if not self._is_possible or size <= self.size:
             return
+        # Rounded up to a multiple of the step: -(-a // b) rounds a / b up.
         new_size = -(-size // RESERVE_STEP_BYTES) * RESERVE_STEP_BYTES
         try:
             if self._file is None:
@@ -70,7 +76,7 @@ class DiskReserve:
             self.size = new_size
 
     def release(self) -> None:
-        """Releases the space; nothing can be reserved afterwards."""
+        """Makes the space available to other files. Nothing can be reserved afterwards."""
         self._is_possible = False
         self.size = 0
         if self._file is not None:
@@ -79,7 +85,13 @@ class DiskReserve:
 
 
 def _allocate(descriptor: int, begin: int, end: int) -> None:
-    """Allocates the bytes of a file from `begin` to before `end`, if necessary by writing."""
+    """Allocates the bytes of a file from the offset `begin` to before the offset `end`.
+
+    If the file system cannot allocate space, zeros are written.
+
+    Raises:
+        OSError: The disk has no room.
+    """
     if hasattr(os, "posix_fallocate"):
         try:
             os.posix_fallocate(descriptor, begin, end - begin)
@@ -94,11 +106,18 @@ def _allocate(descriptor: int, begin: int, end: int) -> None:
 
 
 SYNC_PERIOD_NS = 1_000_000_000
-"""Period of syncing in a thread, in ns."""
+"""Period with which a thread syncs the file, in ns."""
 
 
 class FileSync:
-    """Syncing of one file: at every flush if `durable`, else once a second in a thread."""
+    """Syncs the data of one file to the disk, so that they survive a loss of power.
+
+    Args:
+        descriptor: Descriptor of the file.
+        durable: True to sync in every call, which blocks. Otherwise a thread syncs once a
+            second.
+        now_ns: Function that returns the time in ns.
+    """
 
     def __init__(self, descriptor: int, durable: bool, now_ns: Callable[[], int]) -> None:
         self._descriptor = descriptor
@@ -109,10 +128,10 @@ class FileSync:
         self._disk_error: OSError | None = None
 
     def sync_new(self) -> None:
-        """Syncs new data to the disk: now, or in a thread when a period has passed.
+        """Syncs new data to the disk: at once, or in a thread if a period has passed.
 
         Raises:
-            OSError: the disk refuses the data, or has refused earlier data.
+            OSError: The disk refuses the data, or has refused earlier data.
         """
         if self._durable:
             _datasync(self._descriptor)
@@ -127,24 +146,29 @@ class FileSync:
             self._thread.start()
 
     def _run(self) -> None:
+        """Syncs the file in the thread, and stores an error for the next call of `sync_new`."""
         try:
             _datasync(self._descriptor)
         except OSError as error:
             self._disk_error = error
 
     def wait(self) -> None:
-        """Waits for the thread, after which the file may be closed."""
+        """Waits until the thread has ended. The file may be closed afterwards."""
         if self._thread is not None:
             self._thread.join()
 
 
 def _datasync(descriptor: int) -> None:
-    # `fdatasync` syncs only the metadata that reading the file needs.
+    """Syncs the data of a file to the disk.
+
+    Where the system has `fdatasync`, it is preferred to `fsync`, because it leaves out metadata
+    that are not necessary to read the file.
+    """
     getattr(os, "fdatasync", os.fsync)(descriptor)
 
 
 RESERVE_MARGIN_BYTES = 1 << 16
-"""Space that is reserved for the accounts, in bytes."""
+"""Space that is reserved for the counts of messages at the end, in bytes."""
 _ELSEWHERE = "take another disk with -o"
 _ADVICE = {
     errno.ENOSPC: ("the disk is full", f"make room, or {_ELSEWHERE}"),
@@ -156,31 +180,34 @@ _ADVICE = {
     errno.EIO: ("the disk fails", _ELSEWHERE),
     errno.EROFS: ("the disk has become read-only", _ELSEWHERE),
 }
+"""Problem and advice for the user, by the error number of the disk."""
 
 
 class LogFile:
-    """A file that is written in order, and survives any end of its writer; a context manager.
+    """File of a log that is written from its beginning to its end; a context manager.
 
     Written data stay in memory until `flush`, so that the file always ends at the end of a
-    flush.
+    flush, whenever the process may be killed.
 
     Args:
-        path: name of the complete file.
-        force: True if the file may replace another one.
-        durable: True to sync the file at every flush; else once a second, in a thread.
-        working: name of the file until it is complete; by default `active_path(path)`.
-        room: space reserved for the end; by default a `DiskReserve` in the file's folder.
-        opened: opens a file without a buffer, by name and mode.
-        now_ns: the clock.
+        path: Name of the complete file.
+        force: True if the file may replace an existing one.
+        durable: True to sync the file at every flush. Otherwise a thread syncs it once a
+            second.
+        working: Name of the file until it is complete. None uses `active_path(path)`.
+        room: Space that is reserved for the end. None uses a `DiskReserve` in the file's
+            folder.
+        opened: Function that opens a file without a buffer, by name and mode. For tests.
+        now_ns: Function that returns the time in ns. None uses the clock of the system.
 
     Attributes:
-        path: name of the complete file.
-        working: name of the file until it is complete.
-        size: number of flushed bytes.
-        disk_error: the first error of the disk, or None.
+        path: Name of the complete file.
+        working: Name of the file until it is complete.
+        size: Number of flushed bytes.
+        disk_error: The first error of the disk. None if there was no error.
 
     Raises:
-        UsageError: the file exists, or cannot be created.
+        UsageError: The file exists, or cannot be created.
     """
 
     def __init__(
@@ -213,29 +240,36 @@ class LogFile:
             self._raw.fileno(), durable, now_ns or SystemClock().monotonic_ns
         )
         self._pending = bytearray()
-        self._written = 0  # bytes of `_pending` that the operating system has accepted
+        # Number of bytes of `_pending` that the operating system has accepted.
+        self._written = 0
+        # Number of bytes that the end of the file will need.
         self._end_bytes = 0
+        # The last bytes that were written, as many as the end mark has.
         self._tail = b""
+        # True if the disk accepted no data, even with the reserved space.
         self._broken = False
         self._closed = False
+        # True if the file has got its final name.
         self._published = False
 
     def write(self, data: bytes, /) -> int:
-        """Adds bytes, which the next `flush` writes."""
+        """Stores bytes that the next `flush` will write, and returns their number."""
         self._pending += data
         return len(data)
 
     def reserve(self, size: int) -> None:
-        """Sets the number of bytes that the end of the file will take."""
+        """Sets the number of bytes that the end of the file will need."""
         self._end_bytes = size
 
     def flush(self) -> None:
-        """Writes all pending data, in one piece if the operating system accepts that.
+        """Writes all stored data, in one piece if the operating system accepts that.
+
+        If the disk is full, the reserved space is released and used for these data.
 
         Raises:
-            OSError: the disk refuses the data. At the first such error, the pending data have
-                still been written if the reserved space sufficed. Only the end of the file may
-                follow.
+            OSError: The disk refuses the data. When this happens for the first time, the data
+                have been written nevertheless if the reserved space was sufficient. Only the
+                end of the file may be written afterwards.
         """
         if self._broken and self.disk_error:
             raise self.disk_error
@@ -255,18 +289,26 @@ class LogFile:
             raise
 
     def _write_pending(self) -> None:
+        """Passes the stored data to the operating system, and remembers the end of the file.
+
+        After an error, the next call continues behind the bytes that were accepted.
+
+        Raises:
+            OSError: The disk refuses the data.
+        """
         while self._written < len(self._pending):
             accepted = self._raw.write(memoryview(self._pending)[self._written :])
             if not accepted:
                 raise OSError(errno.EIO, os.strerror(errno.EIO))
             self._written += accepted
-        self._tail = bytes((self._tail + self._pending[-len(MAGIC) :])[-len(MAGIC) :])
+        mark_bytes = len(MAGIC)
+        self._tail = bytes((self._tail + self._pending[-mark_bytes:])[-mark_bytes:])
         self.size += self._written
         self._pending = bytearray()
         self._written = 0
 
     def _cut_off(self) -> None:
-        """Removes the data of an incomplete flush."""
+        """Removes the data of an incomplete flush, so that the file ends at the one before."""
         self._broken = True
         self._pending = bytearray()
         self._written = 0
@@ -275,15 +317,17 @@ class LogFile:
 
     @property
     def whole(self) -> bool:
-        """True once the file ends with the end mark."""
+        """True if the file ends with the end mark."""
         return self._tail == MAGIC and self.size > len(MAGIC) and not self._broken
 
     def close(self) -> None:
-        """Closes the file; a complete file gets its final name, an empty file is removed.
+        """Closes the file. A complete file gets its final name, and an empty file is removed.
+
+        An incomplete file keeps its working name. Further calls have no effect.
 
         Raises:
-            UsageError: a file with the final name exists by now.
-            OSError: the disk refuses the data.
+            UsageError: A file with the final name has appeared since the start.
+            OSError: The disk refuses the data.
         """
         if self._closed:
             return
@@ -306,21 +350,21 @@ class LogFile:
         sync_folder(self.path.parent)
 
     def discard(self) -> None:
-        """Closes the file and removes it."""
+        """Closes and removes the file."""
         with suppress(OSError):
             self.close()
         self.working.unlink(missing_ok=True)
         self.size = 0
 
     def end(self, error: BaseException | None = None) -> None:
-        """Closes the file.
+        """Closes the file, and explains an error of the disk to the user.
 
         Args:
-            error: the error that ended the writing, or None.
+            error: The error that ended the writing. None if there was no error.
 
         Raises:
-            LogRefused: the disk refuses the data, or has refused them as `error` states. The
-                text states which data are kept, and where.
+            LogRefused: The disk refuses the data, or has refused them as `error` states. The
+                text states which data are saved, and where.
         """
         try:
             self.close()
@@ -338,7 +382,11 @@ class LogFile:
         self.end(error)
 
     def refused(self, error: OSError) -> LogRefused:
-        """Returns the error for a closed file whose data the disk refused."""
+        """Returns the error for the user after the disk refused data.
+
+        The file must be closed. The text states the problem, which data are saved, and what the
+        user can do.
+        """
         problem, advice = _ADVICE.get(
             error.errno or 0, (error.strerror or str(error), _ELSEWHERE)
         )
@@ -350,7 +398,7 @@ class LogFile:
             )
         if not self.size:
             return LogRefused(f"{self.path}: {problem}; nothing was written; {advice}")
-        # On Windows, another program may have the file open that should be replaced.
+        # On Windows, the file to replace may be open in another program.
         if self.whole and self.disk_error is None:
             return LogRefused(
                 f"{self.path}: {problem}; the finished log is {self.working}: give it a name"
@@ -363,7 +411,10 @@ class LogFile:
 
 
 def _describe_content(path: Path) -> str:
-    """Returns the numbers of records and other messages in a finished log, as a text."""
+    """Returns the numbers of records and other messages in a finished log, as a text.
+
+    The numbers are read from the statistics at the end of the file.
+    """
     from mcap.reader import make_reader
 
     with path.open("rb") as stream:

@@ -1,9 +1,14 @@
-"""Define the layout of a log: file names, metadata, channels, channel filter and provenance.
+"""Defines the layout of a log: its file names, its metadata and its channels.
+
+A log is the MCAP file of a run. A recording that is split has several files, the parts. The
+metadata of a log state the session, the filter of the recorded channels, and the provenance:
+the program that wrote the log, with its versions.
 
 Invariant:
-    - A channel that the filter excludes is neither in the file nor in its accounts. The file
-      states the filter.
-    - The provenance holds versions, commit and platform, but no path, time or host name.
+    - A channel that the filter excludes is neither in the file nor in the counts of messages.
+      The file states the filter.
+    - The provenance contains versions, commit and platform, but no path, time or host name, so
+      that equal runs have equal logs.
 """
 
 import glob
@@ -26,41 +31,62 @@ from ..net.bus import matches_key
 from ..net.messages import Event, LinkStats, RecorderStats, State
 
 ACTIVE_SUFFIX = ".active"
-"""Ending of a file's name until it is complete."""
+"""Suffix of a log's file name while the log is being recorded."""
 _PART_STEM = re.compile(r"(.+)-(\d{3,})")
-"""Stem of a part's file name: stem of the log, and number of the part."""
+"""Stem of a part's file name: stem of the log's name, and number of the part."""
 _CHUNK = re.compile(r"\*\*?|(?:\$\*|[^*$#?])+", re.DOTALL)
-"""A part of a key expression, between slashes."""
+"""Valid part of a Zenoh key expression, between slashes."""
 
 
 def active_path(path: Path) -> Path:
-    """Returns the name of a log while it is written.
+    """Returns the name of a log's file while the log is being recorded.
 
-    A path without a name, such as ".", is returned as it is, and is refused as a folder.
+    A path without a name, such as ".", is returned unchanged, because the caller refuses it as
+    a folder.
     """
     return path.with_name(path.name + ACTIVE_SUFFIX) if path.name else path
 
 
 def describe_unfinished(path: Path) -> str:
-    """Returns a hint at an unfinished log if the finished log does not exist; else ""."""
+    """Suggests how to recover a log that was never finished.
+
+    A log has the suffix `.active` while it is being recorded. If a user asks for a log that
+    does not exist, but the `.active` file does, the recording was probably interrupted.
+
+    Args:
+        path: The log that the user asked for.
+
+    Returns:
+        A continuation of an error message that names the unfinished file and the command to
+        recover it. Empty if there is no such file, or if the log exists.
+    """
     unfinished = active_path(path)
     if path.exists() or not unfinished.exists():
         return ""
     return (
-        f"; {unfinished} is there, which was not finished; "
+        f"; but there is {unfinished}, whose recording was not finished; "
         f"make it whole with: trilat log recover {unfinished}"
     )
 
 
 def part_path(path: Path, number: int) -> Path:
-    """Returns the name of a part of a log; number 0 is the log itself."""
+    """Returns the file name of a part of a log, such as run-002.mcap for part 2 of run.mcap.
+
+    Args:
+        path: Name of the log.
+        number: Number of the part. 0 returns the name of the log.
+    """
     return path.with_name(f"{path.stem}-{number:03}{path.suffix}") if number else path
 
 
 def find_parts(path: Path) -> dict[int, Path]:
-    """Returns the existing files of a log, finished or not, by the number of the part.
+    """Finds the existing files of a log, whether they are finished or not.
 
-    A file without a number is part 1.
+    Args:
+        path: Name of the log. It counts as part 1 if the file exists.
+
+    Returns:
+        The files, by the number of the part.
     """
     parts: dict[int, Path] = {}
     for file in (path, active_path(path)):
@@ -76,45 +102,46 @@ def find_parts(path: Path) -> dict[int, Path]:
 
 @dataclass(frozen=True, slots=True)
 class ChannelFilter:
-    """A filter of channels by key expressions.
+    """Filter that selects the channels to record by Zenoh key expressions.
 
     Attributes:
-        include: expressions of accepted channels; empty: all channels.
-        exclude: expressions of channels that are not accepted, even if they are included.
+        include: Expressions of channels to record. If there are none, all channels are
+            recorded.
+        exclude: Expressions of channels that are not recorded, even if they are included.
     """
 
     include: tuple[str, ...] = ()
     exclude: tuple[str, ...] = ()
 
     def accepts(self, key: str) -> bool:
-        """True if the filter accepts a channel, by its key."""
+        """Returns True if the channel with a key is recorded."""
         if any(matches_key(expression, key) for expression in self.exclude):
             return False
-        return not self.include or any(
-            matches_key(expression, key) for expression in self.include
-        )
+        if not self.include:
+            return True
+        return any(matches_key(expression, key) for expression in self.include)
 
     def facts(self) -> Mapping[str, str]:
-        """Returns the filter as metadata of the session; {} if it accepts all channels."""
+        """Returns the filter as metadata of the session. Empty if all channels are recorded."""
         texts = {"include": " ".join(self.include), "exclude": " ".join(self.exclude)}
         return {name: text for name, text in texts.items() if text}
 
 
 ALL_CHANNELS = ChannelFilter()
-"""The filter that accepts all channels."""
+"""The filter that records all channels."""
 
 
 def parse_channel_filter(include: Collection[str], exclude: Collection[str]) -> ChannelFilter:
-    """Returns the filter that the options of a command describe.
+    """Parses the options `--include` and `--exclude` of a command.
 
     A leading slash, as in topics, is ignored.
 
     Args:
-        include: key expressions of `--include`.
-        exclude: key expressions of `--exclude`.
+        include: Key expressions of `--include`.
+        exclude: Key expressions of `--exclude`.
 
     Raises:
-        UsageError: a text is not a key expression, and would match no channel.
+        UsageError: A text is not a key expression, so that it would match no channel.
     """
     for option, texts in (("--include", include), ("--exclude", exclude)):
         for text in texts:
@@ -138,11 +165,18 @@ def parse_filter_facts(about: Mapping[str, str]) -> ChannelFilter:
 
 
 _PACKAGES = ("numpy", "numba", "msgpack", "msgspec", "mcap", "eclipse-zenoh")
-"""Packages whose versions are part of the provenance."""
+"""Packages whose versions the provenance states."""
 
 
 def _run_git(*arguments: str) -> str | None:
-    """Returns the output of git for this source tree; None if it is not a checkout."""
+    """Runs git in the source tree of this program.
+
+    Args:
+        *arguments: Arguments of git, such as "rev-parse", "HEAD".
+
+    Returns:
+        The output. None if the source tree is no checkout, or if git fails.
+    """
     root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists():
         return None
@@ -158,7 +192,7 @@ def _run_git(*arguments: str) -> str | None:
 
 @cache
 def collect_provenance() -> dict[str, str]:
-    """Returns versions, commit and platform of the program, as metadata of a log."""
+    """Returns versions, commit and platform of this program, as metadata of a log."""
     commit = _run_git("rev-parse", "HEAD")
     changed = _run_git("status", "--porcelain", "--untracked-files=no")
     facts = {
@@ -178,24 +212,31 @@ def collect_provenance() -> dict[str, str]:
 
 
 VIZ_ROOT = "/viz/"
-"""Prefix of the topics of channels for viewers."""
+"""Prefix of the topics that are written for viewers such as Foxglove."""
 MAX_TIME_NS = (1 << 64) - 1
-"""Largest time stamp of a message in a file; larger times are reduced to it."""
+"""Largest time stamp of a message in a file. Later times are stored as this time."""
 SESSION = "trilat.session"
+"""Name of the metadata that describe the session."""
 PART = "trilat.part"
+"""Name of the metadata that state which part of a log the file is."""
 ACCOUNTS = "trilat.accounts"
+"""Name of the metadata with the numbers of received and missing messages of each channel."""
 SCENARIO = "scenario.toml"
+"""Name of the attachment with the text of the scenario."""
 CHANNEL_TYPES: dict[str, type[msgspec.Struct]] = {
     topics.STATE: State,
     topics.LINK: LinkStats,
     topics.EVENT: Event,
     topics.STATS: RecorderStats,
 }
+"""Type of the messages of each channel."""
 EXECUTED_SITES_KEY = "rerun_executed"
-"""Key of the session's metadata, in the log of a rerun: the sites that the rerun executed."""
+"""Key of the session's metadata that lists the sites that a rerun executed. The records of the
+other sites are copied from the original log.
+"""
 RERUN_DRIVER = "rerun"
-"""Driver of the log of a rerun."""
+"""Value of the metadata `driver` in the log of a rerun."""
 SITE_CHANNELS = (topics.STATE, topics.LINK, topics.EVENT)
-"""Channels of a site. Their messages are numbered, so that missing messages are known."""
+"""Channels of a site. Their messages are numbered, so that missing messages are noticed."""
 RECORDER_CHANNELS = (topics.EVENT, topics.STATS)
 """Channels of the recorder."""

@@ -1,11 +1,16 @@
-"""Check of the bytes of an MCAP file: its checksums, its records, and its index.
+"""Checks the bytes of an MCAP file: its checksums, its records and its index.
 
-Conformance with every rule of the format is left to other programs (pymcap-cli doctor).
+An MCAP file consists of records. Messages are packed into compressed chunks. The index at the
+end of the file states where the chunks are, and each chunk is followed by an index of its
+messages. This module recomputes all checksums, and builds the index again from the records to
+compare it with the index in the file. Other programs (pymcap-cli doctor) check that a file
+conforms with every rule of the format.
 
 Invariant:
-    - Each problem is reported once, with its offset; its consequences are not reported.
-    - An index is compared with the records in the file, and never followed.
-    - Every MCAP file is accepted.
+    - Each problem is reported once, with its offset. Problems that follow from another one are
+      not reported.
+    - An index is compared with the records in the file, and never used to find them.
+    - Every MCAP file is accepted, not only logs of trilat-net.
 """
 
 from array import array
@@ -21,19 +26,24 @@ from . import mcap_records
 from .findings import Findings
 
 _INDEX_HEAD_BYTES = 6
-"""Size of a message index before its entries: channel and length of the entries."""
+"""Size of the fields before the entries of a message index, in bytes: channel and length."""
 
 
 class FileCheck:
     """Check of one file, record by record.
 
+    The caller reads the file, passes each record to `check_record`, and calls `finish` at the
+    end.
+
     Args:
-        file: name of the file.
-        scanner: finds the records of the file.
-        findings: receives the problems, as "whole", "checksums", "records" and "index".
+        file: Name of the file.
+        scanner: Scanner that finds the records of the file.
+        findings: Receives the problems under the names "whole" (damaged or missing parts),
+            "checksums", "records" and "index".
 
     Attributes:
-        counts: numbers of bytes, chunks and messages, and of checksums that were compared.
+        counts: Numbers of bytes, chunks and messages in the file, and of compared checksums
+            ("crcs").
     """
 
     def __init__(
@@ -46,18 +56,21 @@ class FileCheck:
         self._end = 0
         # Schemas and channels, by opcode and number.
         self._defined: dict[tuple[int, int], Any] = {}
-        # Entries that the index should have, and has, by the opcode of the index record and the
-        # offset of the indexed record.
+        # Entries that the index should contain, and entries that it contains, by the opcode of
+        # the entry and the offset of the indexed record.
         self._expected_index: dict[tuple[int, int], Any] = {}
         self._stated_index: dict[tuple[int, int], Any] = {}
-        # Statistics, end of the data and footer: (offset, record) by opcode.
+        # Statistics, end of the data and footer as (offset, record), by opcode.
         self._end_records: dict[int, Any] = {}
         self._undefined_channels: set[int] = set()
-        # Of the last chunk, by channel: the offset of the message index, and the log times and
-        # offsets of the messages. None after a chunk that cannot be read.
+        # Offset of the message index of each channel, for the last chunk. None after a chunk
+        # that cannot be read.
         self._message_indexes: dict[int, int] | None = None
+        # Log times and offsets of each channel's messages in the last chunk, alternately.
         self._entries: dict[int, array[int]] = {}
-        self._has_unreadable = False  # an unreadable record may have defined a channel
+        # An unreadable record may have defined a channel, so that undefined channels are not
+        # reported after it.
+        self._has_unreadable = False
 
     def check_record(
         self, frame: mcap_records.RecordFrame, content: bytes, data: bytes
@@ -65,13 +78,14 @@ class FileCheck:
         """Checks one record of the file.
 
         Args:
-            frame: place of the record.
-            content: content of the record.
-            data: unpacked records of a chunk; empty if the chunk cannot be unpacked.
+            frame: Place of the record.
+            content: Content of the record.
+            data: Unpacked records of a chunk. Empty for other records, and if the chunk cannot
+                be unpacked.
         """
         self._end = frame.end + len(mcap_records.MAGIC)
         if frame.offset == len(mcap_records.MAGIC) and frame.opcode != Opcode.HEADER:
-            self._add("records", frame.offset, "the first record is no header")
+            self._add("records", frame.offset, "the first record is not a header")
         try:
             self._check_content(frame, content, data)
         except mcap_records.UnreadableRecord as error:
@@ -80,11 +94,17 @@ class FileCheck:
             self._has_unreadable = True
 
     def _add(self, check: str, offset: int, text: str) -> None:
+        """Adds a problem at an offset of the file to the finding of a check."""
         self._findings[check].add(self._file, offset, text)
 
     def _check_content(
         self, frame: mcap_records.RecordFrame, content: bytes, data: bytes
     ) -> None:
+        """Checks a record according to its kind.
+
+        Raises:
+            UnreadableRecord: The record makes no sense, or its checksum differs.
+        """
         match frame.opcode:
             case Opcode.CHUNK:
                 self._check_chunk(frame, content, data)
@@ -97,14 +117,18 @@ class FileCheck:
             case kind if kind in mcap_records.KINDS:
                 self._check_other(frame, content, mcap_records.parse_record(kind, content))
             case kind if kind < 0x80:
-                self._add(
-                    "records", frame.offset, f"a record of kind {kind} is none of the format"
-                )
+                self._add("records", frame.offset, f"the format has no records of kind {kind}")
 
     def _check_other(
         self, frame: mcap_records.RecordFrame, content: bytes, record: Any
     ) -> None:
-        """Checks metadata, an attachment, or a record at the end of the file."""
+        """Checks metadata or an attachment, or stores a record at the end of the file.
+
+        The records at the end are compared with the data when the whole file has been read.
+
+        Raises:
+            UnreadableRecord: The checksum of an attachment differs.
+        """
         match frame.opcode:
             case Opcode.METADATA:
                 self._expected_index[Opcode.METADATA_INDEX, frame.offset] = (
@@ -133,30 +157,54 @@ class FileCheck:
                 self._end_records[frame.opcode] = frame.offset, record
 
     def _define(self, frame: mcap_records.RecordFrame, opcode: int, content: bytes) -> None:
-        """Checks a schema or a channel; repeated definitions must be equal."""
+        """Checks the definition of a schema or a channel.
+
+        A definition may be repeated, but must not change. A channel must name a schema that was
+        defined before, or 0 for no schema.
+
+        Args:
+            frame: Place of the record that contains the definition, which may be a chunk.
+            opcode: Kind of the definition.
+            content: Content of the definition.
+        """
         record = mcap_records.parse_record(opcode, content)
         name = "schema" if opcode == Opcode.SCHEMA else "channel"
         if self._defined.setdefault((opcode, record.id), record) != record:
-            self._add("records", frame.offset, f"{name} {record.id} is not what it was before")
+            self._add(
+                "records", frame.offset, f"{name} {record.id} is defined again, differently"
+            )
         schema = record.schema_id if opcode == Opcode.CHANNEL else 0
         if schema and (Opcode.SCHEMA, schema) not in self._defined and not self._has_unreadable:
-            text = f"channel {record.id} names schema {schema}, which comes nowhere before"
+            text = f"channel {record.id} names schema {schema}, which is not defined before"
             self._add("records", frame.offset, text)
 
     def _check_message(
         self, frame: mcap_records.RecordFrame, data: bytes, begin: int, end: int
     ) -> tuple[int, int]:
-        """Checks a message; returns its channel and its log time."""
+        """Checks that a message belongs to a channel that was defined before.
+
+        Each undefined channel is reported once.
+
+        Args:
+            frame: Place of the record that contains the message, which may be a chunk.
+            data: Bytes that contain the message.
+            begin: Offset of the message's first byte in `data`.
+            end: Offset of the first byte after the message.
+
+        Returns:
+            The channel and the log time of the message.
+
+        Raises:
+            UnreadableRecord: The message is too short.
+        """
         if end - begin < mcap_records.MESSAGE_HEAD.size:
             raise mcap_records.UnreadableRecord("a message is shorter than its head")
         channel, _, log_ns, _ = mcap_records.MESSAGE_HEAD.unpack_from(data, begin)
-        if (
-            Opcode.CHANNEL,
-            channel,
-        ) not in self._defined and channel not in self._undefined_channels:
+        is_defined = (Opcode.CHANNEL, channel) in self._defined
+        if not is_defined and channel not in self._undefined_channels:
             self._undefined_channels.add(channel)
             if not self._has_unreadable:
-                text = f"messages of channel {channel}, which comes nowhere before"
+                text = f"messages of channel {channel}, which is not defined before"
                 self._add("records", frame.offset, text)
         self.counts["messages"] += 1
         return channel, log_ns
@@ -164,6 +212,16 @@ class FileCheck:
     def _check_chunk(
         self, frame: mcap_records.RecordFrame, content: bytes, data: bytes
     ) -> None:
+        """Checks the records of a chunk, and notes the entries that the index should contain.
+
+        Args:
+            frame: Place of the chunk.
+            content: Content of the chunk.
+            data: Unpacked records of the chunk. Empty if they could not be unpacked.
+
+        Raises:
+            UnreadableRecord: The chunk cannot be unpacked, or contains an invalid record.
+        """
         self._message_indexes = None
         head = self._scanner.head(frame)
         self.counts["chunks"] += 1
@@ -179,18 +237,28 @@ class FileCheck:
             elif opcode in mcap_records.DEFINITIONS:
                 self._define(frame, opcode, data[begin:end])
             else:
-                self._add("records", frame.offset, f"a chunk holds a record of kind {opcode}")
+                self._add(
+                    "records", frame.offset, f"a chunk contains a record of kind {opcode}"
+                )
+
         self._message_indexes = {}
-        # The offsets of the message indexes are added when those records follow.
+        # The offsets of the message indexes are added to the dictionary when those records
+        # follow.
         entry = frame.size, head.start_ns, head.end_ns, self._message_indexes
         self._expected_index[Opcode.CHUNK_INDEX, frame.offset] = entry
 
     def _check_message_index(self, frame: mcap_records.RecordFrame, content: bytes) -> None:
+        """Compares the index of one channel's messages with the messages of the last chunk.
+
+        Raises:
+            UnreadableRecord: The length of the index is wrong.
+        """
         if self._message_indexes is None:
             return  # the chunk could not be read
         channel = int.from_bytes(content[:2], "little")
         length = int.from_bytes(content[2:6], "little")
         body = content[_INDEX_HEAD_BYTES:]
+        # An entry is a log time and an offset of 8 bytes each.
         if length != len(content) - _INDEX_HEAD_BYTES or length % 16:
             raise mcap_records.UnreadableRecord(
                 f"a message index of {count_nouns(len(body), 'byte')} says that it has {length}"
@@ -199,16 +267,21 @@ class FileCheck:
         stated = _sort_by_offset(body)
         expected = _sort_by_offset(self._entries.get(channel, b""))
         if not np.array_equal(stated, expected):
-            text = f"the index of channel {channel} in a chunk is not what is there"
+            text = f"the index of channel {channel} in a chunk differs from its messages"
             self._add("index", frame.offset, text)
 
     def finish(self) -> None:
-        """Reports the damaged parts, and compares the end of a finished file with its data."""
+        """Reports the damaged parts, and compares the end of the file with the data.
+
+        The end is compared only if the file was finished and has no damaged part, because
+        everything would differ otherwise.
+        """
         scanner = self._scanner
         if not scanner.begins:
             problem = "does not begin as an MCAP file does" if scanner.size else "is empty"
             self._add("whole", 0, problem)
             return
+
         for damage in scanner.damaged:
             self._add("whole", damage.offset, str(damage))
         if scanner.torn is not None:
@@ -224,17 +297,17 @@ class FileCheck:
         if not self._has_unreadable:
             self._compare_index()
             self._compare_statistics()
-        footer = self._scanner.footer()
         if Opcode.DATA_END not in self._end_records:
-            self._add("records", self._scanner.size, "there is no end of the data")
+            self._add("records", self._scanner.size, "the record that ends the data is missing")
             return
+
         offset, data_end = self._end_records[Opcode.DATA_END]
-        self.counts["crcs"] += bool(data_end.data_section_crc)
-        if (
-            data_end.data_section_crc
-            and self._scanner.crc(0, offset) != data_end.data_section_crc
-        ):
+        stated_crc = data_end.data_section_crc  # 0 if there is no checksum
+        self.counts["crcs"] += bool(stated_crc)
+        if stated_crc and self._scanner.crc(0, offset) != stated_crc:
             self._add("checksums", offset, "the CRC of the data differs")
+
+        footer = self._scanner.footer()
         if footer is not None and footer.summary_crc:
             self.counts["crcs"] += 1
             if not self._scanner.is_summary_intact(footer):
@@ -242,20 +315,25 @@ class FileCheck:
                 self._add("checksums", offset, "the CRC of the index differs")
 
     def _compare_index(self) -> None:
-        """Compares the index with the records; kinds that the index lacks are not required."""
+        """Compares the index with the records of the file.
+
+        The index need not contain all kinds of records. But if it contains one record of a
+        kind, it must contain all of them.
+        """
         indexed_kinds = {opcode for opcode, _ in self._stated_index}
         for (opcode, offset), entry in sorted(self._expected_index.items()):
             if opcode not in indexed_kinds:
                 continue
             if self._stated_index.pop((opcode, offset), None) != entry:
                 name = _INDEXED_NAMES[opcode]
-                text = f"the {name} that begins here is not in the index as it is"
+                text = f"the {name} that begins here is not in the index, or with other values"
                 self._add("index", offset, text)
         for opcode, offset in sorted(self._stated_index):
-            text = f"the index names {_INDEXED_NAMES[opcode]} that is not there"
+            text = f"the index names {_INDEXED_NAMES[opcode]} that does not exist"
             self._add("index", offset, text)
 
     def _compare_statistics(self) -> None:
+        """Compares the numbers in the statistics record, if there is one, with the file."""
         if Opcode.STATISTICS not in self._end_records:
             return
         offset, statistics = self._end_records[Opcode.STATISTICS]
@@ -270,12 +348,16 @@ class FileCheck:
         }
         for name, (stated, actual) in counts.items():
             if stated != actual:
-                text = f"the statistics say {stated} {name}, there are {actual}"
+                text = f"the statistics state {stated} {name}, but there are {actual}"
                 self._add("index", offset, text)
 
 
 def _sort_by_offset(entries: "bytes | array[int]") -> NDArray[np.uint64]:
-    """Returns the (log time, offset) pairs of a message index, sorted by offset."""
+    """Returns the pairs (log time, offset) of a message index, sorted by offset.
+
+    Args:
+        entries: Log times and offsets, alternately.
+    """
     pairs = np.frombuffer(entries, dtype="<u8").reshape(-1, 2)
     return pairs[np.argsort(pairs[:, 1], kind="stable")]
 

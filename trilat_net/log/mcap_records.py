@@ -1,14 +1,16 @@
-"""Records of MCAP files: scanning a file, and unpacking its chunks.
+"""Finds and decodes the records of MCAP files, also of damaged files.
 
-A record is an opcode (1 byte), the length of its content (8 bytes) and the content; see the
-specification at mcap.dev. A chunk is a record whose content is packed records. The `mcap`
-package parses the content of other records.
+An MCAP file is a sequence of records. A record is an opcode (1 byte), the length of its content
+(8 bytes) and the content, see the specification at mcap.dev. A chunk is a record whose content
+is a sequence of compressed records. The `mcap` package decodes the content of the other
+records.
 
 Invariant:
-    - No number in a file is trusted. Nothing outside the file is read. A chunk is unpacked to
-      at most the size that its packed size allows, and only if its head agrees with its data.
+    - No number in a file is trusted. Nothing outside the file is read. A chunk is unpacked only
+      if its head agrees with its data, and only up to a size that is reasonable for its
+      compressed size.
     - Every function raises `UnreadableRecord` for bytes that make no sense.
-    - After such bytes, the scan of a file resumes at the next readable chunk.
+    - After such bytes, the scan of a file continues at the next readable chunk.
 """
 
 import os
@@ -30,57 +32,61 @@ from mcap.opcode import Opcode
 from ..errors import count_nouns
 
 MAGIC = b"\x89MCAP0\r\n"
-"""First and last bytes of a file."""
+"""Mark at the beginning and at the end of every file."""
 RECORD_HEAD = struct.Struct("<BQ")
+"""Head of a record before its content: opcode and length of the content."""
 RECORD_HEAD_BYTES = RECORD_HEAD.size
-"""Size of a record before its content, in bytes: opcode and length."""
+"""Size of the head of a record, in bytes."""
 MESSAGE_HEAD = struct.Struct("<HIQQ")
 """Head of a message before its payload: channel, sequence, log time, publish time."""
-OP_MESSAGE = int(Opcode.MESSAGE)  # a member of an enumeration compares slowly
+OP_MESSAGE = int(Opcode.MESSAGE)
+"""Opcode of a message, as an int, because members of an enumeration compare slowly."""
 DEFINITIONS = (Opcode.SCHEMA, Opcode.CHANNEL)
+"""Kinds of the records that define schemas and channels."""
 FOOTER_BYTES = RECORD_HEAD_BYTES + 20 + len(MAGIC)
 """Size of a finished file's footer and end mark, in bytes."""
 MAX_DAMAGED_PARTS = 100
-"""Number of damaged parts of a file after which reading ends."""
+"""Number of damaged parts of a file after which reading is given up."""
 
 MAX_UNPACKED_BYTES = 32 << 20
-"""Largest size to which any chunk may unpack, in bytes."""
+"""Size to which any chunk may unpack, in bytes."""
 MAX_UNPACKED_RATIO = 32
-"""Larger chunks may unpack to this many times their packed size."""
+"""Large chunks may unpack to this multiple of their compressed size, if that is more."""
 MAX_WINDOW_BYTES = 32 << 20
 """Largest window that a Zstandard frame may require, in bytes."""
 COMPRESSIONS = (b"zstd", b"lz4")
-"""Supported compressions of chunks; chunks may also be uncompressed."""
+"""Supported compressions of chunks. Chunks may also be uncompressed."""
 COMPRESSION_NAME_OFFSET = 28
-"""Offset of the compression's name in the content of a chunk.
-
-The length of the name (4 bytes) precedes the name.
-"""
+"""Offset of the compression's name, with its length before it, in the content of a chunk."""
 MAX_HEAD_BYTES = COMPRESSION_NAME_OFFSET + 4 + 32 + 8
 """Largest size of a chunk's head, with a compression name of at most 32 bytes."""
 
+# Fields of a chunk's head: first log time, last log time, unpacked size, checksum, and the
+# length of the compression's name. The name and the compressed size follow.
 _FIXED_HEAD = struct.Struct("<QQQII")
 _SIZE = struct.Struct("<Q")
+# Number of bytes that are read together in the search for a chunk.
 _SCAN_BYTES = 1 << 20
+# Name of a supported compression, preceded by its length.
 _COMPRESSION_NAME = re.compile(
     b"|".join(re.escape(struct.pack("<I", len(name)) + name) for name in COMPRESSIONS)
 )
 
 
 class UnreadableRecord(Exception):  # noqa: N818 - describes a part of a file
-    """A part of a file makes no sense; the text states the reason. Raised within `log` only."""
+    """A part of a file makes no sense. The text states the reason. Used only within `log`."""
 
 
 class ChunkHead(NamedTuple):
-    """Head of a chunk.
+    """Head of a chunk, which describes the compressed records that follow.
 
     Attributes:
-        start_ns: first log time of the chunk's messages.
-        end_ns: last log time of the chunk's messages.
-        size: size of the unpacked records, in bytes.
-        crc: CRC-32 of the unpacked records; 0 if there is no checksum.
-        compression: name of the compression; "" if the records are not compressed.
-        data_offset: offset of the packed records in the content of the chunk.
+        start_ns: First log time of the chunk's messages, in ns.
+        end_ns: Last log time of the chunk's messages, in ns.
+        size: Size of the unpacked records, in bytes.
+        crc: CRC-32 of the unpacked records. It is 0 if there is no checksum.
+        compression: Name of the compression. Empty if the records are not compressed.
+        data_offset: Offset of the compressed records in the content of the chunk.
     """
 
     start_ns: int
@@ -92,11 +98,14 @@ class ChunkHead(NamedTuple):
 
 
 def parse_chunk_head(content: bytes, length: int) -> ChunkHead:
-    """Returns the head of a chunk.
+    """Decodes the head of a chunk, and checks that it agrees with the length of the chunk.
 
     Args:
-        content: content of the chunk, of which the first `MAX_HEAD_BYTES` suffice.
-        length: length of the whole content.
+        content: Content of the chunk. Its first `MAX_HEAD_BYTES` bytes suffice.
+        length: Length of the whole content, in bytes.
+
+    Raises:
+        UnreadableRecord: The head is incomplete or contradicts the length.
     """
     try:
         start_ns, end_ns, size, crc, name_bytes = _FIXED_HEAD.unpack_from(content)
@@ -121,7 +130,11 @@ def parse_chunk_head(content: bytes, length: int) -> ChunkHead:
 
 
 def unpack_chunk(content: bytes) -> bytes:
-    """Returns the unpacked records of a chunk, whose checksum is right if it has one."""
+    """Unpacks the records of a chunk, and checks them against the chunk's head.
+
+    Raises:
+        UnreadableRecord: The chunk cannot be unpacked, or its size or its checksum is wrong.
+    """
     head = parse_chunk_head(content, len(content))
     limit = max(MAX_UNPACKED_BYTES, MAX_UNPACKED_RATIO * len(content))
     if head.size > limit:
@@ -140,10 +153,18 @@ def unpack_chunk(content: bytes) -> bytes:
 
 
 def _unpack(head: ChunkHead, data: memoryview) -> bytes:
+    """Unpacks the compressed records of a chunk.
+
+    The memory is bounded by the size that the head states, even if the data would unpack to
+    more.
+
+    Raises:
+        UnreadableRecord: The data are damaged, or the compression is not supported.
+    """
     try:
         if head.compression == "zstd":
             declared = zstandard.get_frame_parameters(data).content_size
-            # The library would allocate the declared size, whatever it is.
+            # The library would allocate the size that the frame declares, however large.
             if declared not in (head.size, zstandard.CONTENTSIZE_UNKNOWN):
                 raise UnreadableRecord(
                     f"a chunk of {count_nouns(head.size, 'byte')} unpacks to {declared}"
@@ -151,13 +172,14 @@ def _unpack(head: ChunkHead, data: memoryview) -> bytes:
             unpacker = zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW_BYTES)
             return unpacker.decompress(data, head.size)
         if head.compression == "lz4":
-            # One byte more than stated reveals data that is too long.
+            # One byte more than the head states reveals data that are too long.
             unpacked: bytes = lz4.frame.LZ4FrameDecompressor().decompress(
                 data, max_length=head.size + 1
             )
             return unpacked
     except (zstandard.ZstdError, RuntimeError, ValueError, OverflowError, MemoryError) as error:
         raise UnreadableRecord(f"a chunk cannot be unpacked: {error}") from None
+
     if head.compression:
         raise UnreadableRecord(
             f"a chunk is packed by {head.compression!r}, which is not supported"
@@ -166,7 +188,17 @@ def _unpack(head: ChunkHead, data: memoryview) -> bytes:
 
 
 def iterate_records(data: bytes | bytearray) -> Iterator[tuple[int, int, int]]:
-    """Yields (opcode, begin, end) of the contents of the records in an unpacked chunk."""
+    """Yields the places of the records in an unpacked chunk.
+
+    Args:
+        data: The unpacked chunk.
+
+    Yields:
+        The opcode of a record, the offset of its content, and the offset after its content.
+
+    Raises:
+        UnreadableRecord: The last record is incomplete.
+    """
     unpack = RECORD_HEAD.unpack_from
     size = len(data)
     end = 0
@@ -182,12 +214,12 @@ def iterate_records(data: bytes | bytearray) -> Iterator[tuple[int, int, int]]:
 
 
 class RecordFrame(NamedTuple):
-    """Place of a record in a file.
+    """Kind and place of a record in a file.
 
     Attributes:
-        offset: offset of the record's first byte in the file.
-        opcode: kind of the record.
-        length: length of the record's content, in bytes.
+        offset: Offset of the record's first byte in the file.
+        opcode: Kind of the record.
+        length: Length of the record's content, in bytes.
     """
 
     offset: int
@@ -196,7 +228,7 @@ class RecordFrame(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Size of the record including opcode and length, in bytes."""
+        """Size of the record with its head, in bytes."""
         return RECORD_HEAD_BYTES + self.length
 
     @property
@@ -206,12 +238,12 @@ class RecordFrame(NamedTuple):
 
 
 class Damage(NamedTuple):
-    """An unreadable part of a file.
+    """Part of a file that cannot be read.
 
     Attributes:
-        offset: offset of the part's first byte.
-        length: length of the part, in bytes.
-        problem: description of the problem.
+        offset: Offset of the part's first byte.
+        length: Length of the part, in bytes.
+        problem: Description of the problem.
     """
 
     offset: int
@@ -223,19 +255,20 @@ class Damage(NamedTuple):
 
 
 class RecordScanner:
-    """Scanner of the records of a file.
+    """Scanner that finds the records of a file, and skips damaged parts.
 
     Args:
-        stream: the file, opened for reading; the file begins at the current position.
+        stream: The file, opened for reading. It begins at the current position of the stream.
 
     Attributes:
-        size: size of the file, in bytes.
+        size: Size of the file, in bytes.
         begins: True if the file begins with the mark of MCAP files.
         ends: True if the file ends with a footer and the end mark.
-        finished: True once a finished file has been read to its end.
-        trailing: number of bytes after the end mark, once the mark has been read.
-        damaged: parts that could not be read so far, without a torn end.
-        torn: the end that was cut off, once everything before it has been read; else None.
+        finished: True if the file was finished and has been read to its end.
+        trailing: Number of bytes after the end mark, if the mark has been read.
+        damaged: Damaged parts that were found so far, except a missing end.
+        torn: The part from which the end of the file is missing. None if it is not missing, or
+            has not been reached yet.
     """
 
     def __init__(self, stream: BinaryIO) -> None:
@@ -251,20 +284,21 @@ class RecordScanner:
         self.torn: Damage | None = None
 
     def read(self, offset: int, length: int) -> bytes:
-        """Returns the bytes of a part of the file; fewer at the end of the file."""
+        """Returns bytes of the file. At the end of the file, there are fewer than `length`."""
         self._stream.seek(self._base + offset)
         return self._stream.read(max(0, min(length, self.size - offset)))
 
     def frames(self) -> Iterator[RecordFrame]:
-        """Yields the place of every record; every call starts anew.
+        """Yields the place of every record. Every call starts at the beginning of the file.
 
-        Parts that make no sense are skipped, and added to `damaged`.
+        Parts that make no sense are skipped and added to `damaged`.
         """
         self.damaged = []
         self.torn = None
         self.finished = False
         offset = len(MAGIC)
-        search_start = offset  # where the search for a chunk starts after a damaged record
+        # Offset at which the search for a chunk starts after a damaged record.
+        search_start = offset
         while len(self.damaged) < MAX_DAMAGED_PARTS:
             try:
                 frame = self._frame_at(offset)
@@ -275,18 +309,20 @@ class RecordScanner:
                         f"a record (footer) of {count_nouns(frame.length, 'byte')} is none"
                     )
             except UnreadableRecord as error:
-                # The length of the previous record may be wrong: search that record, too.
+                # The length of the previous record may be wrong, so that the search includes
+                # it.
                 resumed_at = self._resume(search_start, offset, str(error))
                 if resumed_at is None:
                     return
                 offset = resumed_at
                 search_start = resumed_at
                 continue
+
             yield frame
             if frame.opcode == Opcode.FOOTER:
                 self._end_at(frame.end)
                 return
-            # A readable chunk is trusted; the length of any other record may be wrong.
+            # The length of a readable chunk is trusted. That of any other record may be wrong.
             search_start = frame.end if frame.opcode == Opcode.CHUNK else frame.offset + 1
             offset = frame.end
         self.torn = Damage(
@@ -294,7 +330,11 @@ class RecordScanner:
         )
 
     def _end_at(self, footer_end: int) -> None:
-        """Notes whether the end mark follows the footer."""
+        """Checks that the end mark follows the footer, and sets the attributes about the end.
+
+        Args:
+            footer_end: Offset of the first byte after the footer.
+        """
         rest = self.size - footer_end
         self.finished = self.read(footer_end, len(MAGIC)) == MAGIC
         self.trailing = max(0, rest - len(MAGIC)) if self.finished else 0
@@ -302,15 +342,18 @@ class RecordScanner:
             self.torn = Damage(footer_end, rest, "its last mark is cut off")
 
     def _resume(self, search_start: int, offset: int, problem: str) -> int | None:
-        """Notes a damaged part, and returns the offset of the next readable chunk.
+        """Notes a damaged part, and finds the next readable chunk.
+
+        If there is none, the rest of the file is damaged. The end of the file still counts as
+        present if the file ends with a footer.
 
         Args:
-            search_start: offset at which the search for a chunk starts.
-            offset: offset of the unreadable record.
-            problem: description of the problem.
+            search_start: Offset at which the search for a chunk starts.
+            offset: Offset of the unreadable record.
+            problem: Description of the problem.
 
         Returns:
-            The offset; None if no readable chunk follows.
+            The offset of the chunk. None if no readable chunk follows.
         """
         chunk_offset = self._find_chunk(search_start)
         if chunk_offset is not None:
@@ -329,7 +372,7 @@ class RecordScanner:
         """Returns the place of the record that begins at an offset.
 
         Raises:
-            UnreadableRecord: there is no record within the file.
+            UnreadableRecord: There is no record, or it reaches beyond the end of the file.
         """
         head = self.read(offset, RECORD_HEAD_BYTES)
         if len(head) < RECORD_HEAD_BYTES:
@@ -350,18 +393,26 @@ class RecordScanner:
         return self.read(frame.offset + RECORD_HEAD_BYTES, frame.length)
 
     def head(self, frame: RecordFrame) -> ChunkHead:
-        """Returns the head of a chunk."""
+        """Returns the head of a chunk, without reading the whole chunk.
+
+        Raises:
+            UnreadableRecord: The head makes no sense.
+        """
         content = self.read(frame.offset + RECORD_HEAD_BYTES, min(frame.length, MAX_HEAD_BYTES))
         return parse_chunk_head(content, frame.length)
 
     def _find_chunk(self, offset: int) -> int | None:
-        """Returns the offset of the first readable chunk at or after an offset, or None.
+        """Finds the first readable chunk at or after an offset.
 
-        Chunks are found by the name of their compression.
+        A chunk is recognised by the name of its compression, which has a fixed place in its
+        head. Therefore uncompressed chunks are not found.
+
+        Returns:
+            The offset of the chunk. None if there is no such chunk.
         """
         lead_bytes = RECORD_HEAD_BYTES + COMPRESSION_NAME_OFFSET
         for window_offset in range(offset, self.size, _SCAN_BYTES):
-            # The window also holds the compression's name of a chunk that begins at its end.
+            # The window is so long that it contains the head of a chunk that begins at its end.
             window = self.read(window_offset, _SCAN_BYTES + lead_bytes + 8)
             for match in _COMPRESSION_NAME.finditer(window):
                 start = window_offset + match.start() - lead_bytes
@@ -375,19 +426,19 @@ class RecordScanner:
         return None
 
     def crc(self, begin: int, end: int) -> int:
-        """Returns the CRC-32 of the file from offset `begin` to before offset `end`."""
+        """Computes the CRC-32 of the file from offset `begin` to before offset `end`."""
         crc = 0
         for offset in range(begin, end, _SCAN_BYTES):
             crc = zlib.crc32(self.read(offset, min(_SCAN_BYTES, end - offset)), crc)
         return crc
 
     def footer(self) -> records.Footer | None:
-        """Returns the footer of a finished file, or None if the file is not finished."""
+        """Returns the footer of a finished file. None if the file is not finished."""
         content = self.read(max(0, self.size - FOOTER_BYTES) + RECORD_HEAD_BYTES, 20)
         return parse_record(Opcode.FOOTER, content) if self.ends else None
 
     def is_summary_intact(self, footer: records.Footer) -> bool:
-        """True if the summary has the checksum that the footer states."""
+        """Returns True if the summary has the checksum that the footer states."""
         begin = footer.summary_start
         last = self.size - FOOTER_BYTES
         if not 0 <= begin <= last:
@@ -396,16 +447,27 @@ class RecordScanner:
 
 
 def has_right_crc(attachment: bytes) -> bool:
-    """True if the content of an attachment agrees with the checksum at its end.
+    """Returns True if the content of an attachment agrees with the checksum at its end.
 
-    A checksum of 0 stands for no checksum.
+    A checksum of 0 means that there is no checksum.
     """
     crc = int.from_bytes(attachment[-4:], "little")
     return not crc or zlib.crc32(memoryview(attachment)[:-4]) == crc
 
 
 def parse_record(opcode: int, content: bytes) -> Any:
-    """Returns a parsed record of the `mcap` package, for the kinds in `KINDS`."""
+    """Decodes a record with the `mcap` package.
+
+    Args:
+        opcode: Kind of the record, which must be in `KINDS`.
+        content: Content of the record.
+
+    Returns:
+        The record as an object of the package.
+
+    Raises:
+        UnreadableRecord: The content cannot be decoded.
+    """
     try:
         return KINDS[opcode].read(_Content(BytesIO(content)))
     except (McapError, struct.error, ValueError, OverflowError) as error:
@@ -416,7 +478,7 @@ def parse_record(opcode: int, content: bytes) -> Any:
 
 
 class _Content(ReadDataStream):
-    """Stream of a record's content, for which reading beyond the end is an error."""
+    """Stream of a record's content that raises an error if it is read beyond its end."""
 
     def read(self, length: int) -> bytes:
         data = super().read(length)
@@ -426,11 +488,10 @@ class _Content(ReadDataStream):
 
 
 def _opcode_name(opcode: int) -> str:
-    return (
-        Opcode(opcode).name.lower().replace("_", " ")
-        if opcode in _OPCODES
-        else f"kind {opcode}"
-    )
+    """Returns the name of a kind of records, such as "chunk index", for error messages."""
+    if opcode not in _OPCODES:
+        return f"kind {opcode}"
+    return Opcode(opcode).name.lower().replace("_", " ")
 
 
 _OPCODES = frozenset(Opcode)
@@ -438,4 +499,4 @@ KINDS: dict[int, Any] = {
     kind: getattr(records, kind.name.title().replace("_", ""))
     for kind in _OPCODES - {OP_MESSAGE, Opcode.MESSAGE_INDEX, Opcode.CHUNK}
 }
-"""Kinds of records that `parse_record` reads."""
+"""Class of the `mcap` package for each kind of record that `parse_record` decodes."""

@@ -1,14 +1,16 @@
-"""Writer of MCAP files.
+"""Writes MCAP files.
 
-Messages go into chunks, chunks into a stream, and an index to the end of the file. The package
-`mcap` has a writer as well, but that writer keeps a dictionary for every chunk, which takes
-46 MiB an hour at ten chunks a second with twelve channels, and needs three times as long. The
-tests read the files of this writer with that package.
+Messages are collected into chunks, which are compressed and written to a stream. The index is
+written at the end of the file. The package `mcap` has a writer as well, but that writer keeps a
+dictionary for every chunk, which takes 46 MiB an hour at ten chunks a second with twelve
+channels, and needs three times the computing time. The tests read the files of this writer with
+that package.
 
 Invariant:
-    - The same calls give the same bytes.
-    - Memory grows only by the packed index of the chunks.
-    - The length of the file's end is known at any time, so that disk space can be reserved.
+    - The same calls produce the same bytes.
+    - Memory grows only by the encoded index entries of the chunks.
+    - The length of the file's end is known at any time, so that disk space can be reserved for
+      it.
 """
 
 import struct
@@ -24,7 +26,9 @@ from .mcap_records import MAGIC, OP_MESSAGE, RECORD_HEAD
 from .running_digest import DIGESTS, RunningDigest
 
 CHUNK_BYTES = 1 << 20
+"""Size of the messages in a chunk, in bytes before compression, from which it is closed."""
 
+# Fields of fixed size, in the order of the specification at mcap.dev.
 _MESSAGE = struct.Struct("<BQHIQQ")
 _CHUNK = struct.Struct("<QQQI")
 _FOOTER = struct.Struct("<BQQQI")
@@ -37,70 +41,74 @@ _SUMMARY = (
     Opcode.ATTACHMENT_INDEX,
     Opcode.METADATA_INDEX,
 )
-"""Kinds of the records in the summary at the end of a file, in their order."""
+"""Kinds of the records in the summary at the end of a file, in the order of the file."""
 _COMPRESSION = "zstd"
 _FIXED_END_BYTES = 512
-"""Largest size of the records at the end whose number does not grow, in bytes.
+"""Upper bound of the size of those records at the end whose number does not grow, in bytes.
 
-These are the statistics without the counts of channels, the offsets of six groups, the end of
-the data, the footer and the end mark.
+These are the statistics without the counts of channels, the offsets of six groups of records,
+the end of the data, the footer and the end mark.
 """
 
 
 class Sink(Protocol):
-    """A file, or a buffer that keeps bytes until `flush`.
+    """A file, or a buffer that keeps the bytes until `flush` is called.
 
     If the sink has a method `reserve(size)`, the writer calls it with the number of bytes that
-    the end of the file will take.
+    the end of the file will need.
     """
 
     def write(self, data: bytes, /) -> int:
-        """Writes bytes, and returns their number."""
+        """Writes or stores bytes, and returns their number."""
 
     def flush(self) -> None:
-        """Writes all bytes that are kept in the buffer."""
+        """Writes all bytes that are stored in the buffer."""
 
 
 def pack_text(text: str) -> bytes:
-    """Returns a text in the form of a record: its length, then its bytes in UTF-8."""
+    """Encodes a text as the format requires: its length in bytes, then its bytes in UTF-8."""
     # The name of a file may contain surrogates, which UTF-8 cannot encode.
     data = text.encode(errors="backslashreplace")
     return _pack_bytes(data)
 
 
 def pack_text_map(texts: Mapping[str, str]) -> bytes:
-    """Returns a map of texts in the form of a record."""
+    """Encodes a map of texts: its length in bytes, then each key and each value."""
     data = b"".join(pack_text(key) + pack_text(value) for key, value in texts.items())
     return _pack_bytes(data)
 
 
 def _pack_bytes(data: bytes) -> bytes:
-    """Returns bytes behind their number in 32 bits."""
+    """Returns bytes, preceded by their number in 32 bits."""
     return struct.pack("<I", len(data)) + data
 
 
 def _pack_long_bytes(data: bytes) -> bytes:
-    """Returns bytes behind their number in 64 bits."""
+    """Returns bytes, preceded by their number in 64 bits."""
     return struct.pack("<Q", len(data)) + data
 
 
 def pack_record(opcode: int, body: bytes) -> bytes:
-    """Returns a record: opcode, length and content."""
+    """Encodes a record: opcode, length of the content, and content."""
     return RECORD_HEAD.pack(opcode, len(body)) + body
 
 
 class McapWriter:
-    """Writer of one file, from its first byte to its end mark.
+    """Writer of one MCAP file, from its first byte to its end mark.
+
+    First the schemas and channels are registered, then messages are added. `finish` completes
+    the file.
 
     Args:
-        stream: receives the bytes; it is flushed whenever a chunk is complete.
-        library: name of the program.
-        profile: the MCAP profile.
-        chunk_bytes: size of a chunk's records from which on the chunk is closed.
+        stream: File or buffer that receives the bytes. It is flushed whenever a chunk is
+            complete.
+        library: Name of the program, which the file states.
+        profile: MCAP profile, which the file states.
+        chunk_bytes: Size of the messages in a chunk from which the chunk is closed, in bytes.
 
     Attributes:
-        position: number of bytes written.
-        messages: number of messages added.
+        position: Number of bytes written.
+        messages: Number of messages added.
     """
 
     def __init__(
@@ -112,14 +120,15 @@ class McapWriter:
         self._reserve: Callable[[int], None] | None = getattr(stream, "reserve", None)
         self._chunk_bytes = chunk_bytes
         self._compressor = zstandard.ZstdCompressor()
+        # Messages that were not written yet, in the form of records.
         self._open_chunk = bytearray()
-        # Index of the open chunk: per channel log time, offset, log time, offset, ...
+        # Index of the open chunk: for each channel log time, offset, log time, offset, ...
         self._entries: dict[int, list[int]] = {}
-        # Number of messages per channel.
+        # Number of messages of each channel.
         self._counts: dict[int, int] = {}
-        # First and last log time of all chunks.
+        # First and last log time of the closed chunks. None before the first chunk.
         self._span_ns: tuple[int, int] | None = None
-        # Records of the summary and their numbers, by kind.
+        # Encoded records of the summary, and their numbers, by kind.
         self._summary = {opcode: bytearray() for opcode in _SUMMARY}
         self._summary_counts: Counter[Opcode] = Counter()
         self._chain = RunningDigest()
@@ -135,7 +144,7 @@ class McapWriter:
         return offset
 
     def _add_to_summary(self, opcode: Opcode, body: bytes) -> bytes:
-        """Adds a record to the summary, and returns the record."""
+        """Adds a record to the summary of the file, and returns the encoded record."""
         record = pack_record(opcode, body)
         self._summary[opcode] += record
         self._summary_counts[opcode] += 1
@@ -143,16 +152,18 @@ class McapWriter:
 
     @property
     def end_bytes(self) -> int:
-        """Largest number of bytes that `finish` will write besides the open chunk."""
+        """Upper bound of the bytes that `finish` will write, without the open chunk."""
         summary_bytes = sum(map(len, self._summary.values()))
         return summary_bytes + 10 * len(self._counts) + _FIXED_END_BYTES
 
     @property
     def open_chunk_bytes(self) -> int:
-        """Largest number of bytes that the open chunk will take in the file."""
+        """Upper bound of the bytes that the open chunk will take in the file."""
         if not self._open_chunk:
             return 0
         messages = self.messages - self._chain.messages
+        # An index entry has 16 bytes, the index of a channel 25 bytes more, and the head of the
+        # chunk and its entry in the summary less than 200 bytes.
         index_bytes = 16 * messages + 25 * len(self._entries) + 200
         # Zstandard may expand data that it cannot compress, by less than 1/128.
         data_bytes = len(self._open_chunk) + len(self._open_chunk) // 128
@@ -160,12 +171,21 @@ class McapWriter:
 
     @property
     def duration_s(self) -> float:
-        """Time from the first to the last message in closed chunks, by log times, in s."""
+        """Time from the first to the last message in closed chunks by log time, in s."""
         first_ns, last_ns = self._span_ns or (0, 0)
         return (last_ns - first_ns) * 1e-9
 
     def register_schema(self, name: str, encoding: str, data: bytes) -> int:
-        """Writes a schema, and returns its number."""
+        """Writes a schema, which describes the messages of a channel.
+
+        Args:
+            name: Name of the schema.
+            encoding: Encoding of the schema.
+            data: Content of the schema.
+
+        Returns:
+            The number of the schema.
+        """
         number = self._summary_counts[Opcode.SCHEMA] + 1
         body = struct.pack("<H", number) + pack_text(name) + pack_text(encoding)
         body += _pack_bytes(data)
@@ -180,13 +200,18 @@ class McapWriter:
         schema_id: int,
         metadata: Mapping[str, str] | None = None,
     ) -> int:
-        """Writes a channel before the open chunk, and returns the channel's number.
+        """Writes the definition of a channel.
+
+        The messages of the open chunk follow it in the file.
 
         Args:
-            topic: topic of the channel.
-            message_encoding: encoding of the messages.
-            schema_id: number of the schema; 0 for a channel without a schema.
-            metadata: metadata of the channel.
+            topic: Topic of the channel.
+            message_encoding: Encoding of the messages.
+            schema_id: Number of the schema. 0 is a channel without a schema.
+            metadata: Metadata of the channel.
+
+        Returns:
+            The number of the channel.
         """
         number = len(self._counts) + 1
         body = struct.pack("<HH", number, schema_id)
@@ -201,14 +226,14 @@ class McapWriter:
     def add_message(
         self, channel_id: int, log_time: int, data: bytes, publish_time: int, sequence: int = 0
     ) -> None:
-        """Adds a message to the open chunk.
+        """Adds a message to the open chunk, and closes the chunk if it is large enough.
 
         Args:
-            channel_id: number of the channel.
-            log_time: time of the arrival, ns.
-            data: payload of the message.
-            publish_time: time of the sending, ns.
-            sequence: sequence number of the message.
+            channel_id: Number of the channel.
+            log_time: Time of the arrival, in ns.
+            data: Payload of the message.
+            publish_time: Time of the sending, in ns.
+            sequence: Sequence number of the message.
         """
         chunk = self._open_chunk
         self._entries[channel_id] += (log_time, len(chunk))
@@ -222,7 +247,12 @@ class McapWriter:
             self.flush()
 
     def add_metadata(self, name: str, data: Mapping[str, str]) -> None:
-        """Writes a metadata record, before the open chunk."""
+        """Writes a metadata record. The messages of the open chunk follow it in the file.
+
+        Args:
+            name: Name of the metadata.
+            data: The metadata.
+        """
         content = pack_text(name) + pack_text_map(data)
         if name != DIGESTS:
             self._chain.add_entry(Opcode.METADATA, content)
@@ -234,7 +264,15 @@ class McapWriter:
     def add_attachment(
         self, create_time: int, log_time: int, name: str, media_type: str, data: bytes
     ) -> None:
-        """Writes an attachment, before the open chunk; times are in ns, 0 if unknown."""
+        """Writes an attachment. The messages of the open chunk follow it in the file.
+
+        Args:
+            create_time: Time at which the attachment was created, in ns. 0 if it is unknown.
+            log_time: Time at which it was recorded, in ns. 0 if it is unknown.
+            name: Name of the attachment.
+            media_type: Media type of the attachment.
+            data: Content of the attachment.
+        """
         times = struct.pack("<QQ", log_time, create_time)
         names = pack_text(name) + pack_text(media_type)
         body = times + names + _pack_long_bytes(data)
@@ -247,7 +285,7 @@ class McapWriter:
         self._add_to_summary(Opcode.ATTACHMENT_INDEX, index)
 
     def flush(self) -> None:
-        """Closes the open chunk, if it has messages, and flushes the stream."""
+        """Closes the open chunk, if it contains messages, and flushes the stream."""
         if self._open_chunk:
             self._close_chunk()
         if self._reserve is not None:
@@ -255,7 +293,13 @@ class McapWriter:
         self._stream.flush()
 
     def close_digest(self) -> dict[str, str]:
-        """Writes the digests of all contents, and returns them; only `finish` may follow."""
+        """Closes the open chunk, and writes the digests of all contents as metadata.
+
+        Only `finish` may be called afterwards.
+
+        Returns:
+            The metadata with the digests.
+        """
         if self._open_chunk:
             self._close_chunk()
         facts = self._chain.facts()
@@ -263,11 +307,16 @@ class McapWriter:
         return facts
 
     def _close_chunk(self) -> None:
-        """Writes the open chunk and the indexes of its messages, and adds it to the summary."""
+        """Writes the open chunk and the indexes of its messages.
+
+        The chunk consists of a head and the compressed messages. An index for each channel
+        follows, with the times and offsets of its messages. The entry of the chunk in the
+        summary states where these indexes are.
+        """
         self._chain.add_records(self._open_chunk, self.messages - self._chain.messages)
         data = self._compressor.compress(self._open_chunk)
         used = {channel: entries for channel, entries in self._entries.items() if entries}
-        # every other entry is a log time
+        # Log times and offsets alternate in the entries.
         start_ns = min(min(entries[::2]) for entries in used.values())
         end_ns = max(max(entries[::2]) for entries in used.values())
         unpacked_bytes = len(self._open_chunk)
@@ -275,6 +324,7 @@ class McapWriter:
         head = _CHUNK.pack(start_ns, end_ns, unpacked_bytes, crc) + pack_text(_COMPRESSION)
         record = pack_record(Opcode.CHUNK, head + _pack_long_bytes(data))
         chunk_offset = self._write(record)
+
         index_start = self.position
         index_offsets = b""
         for channel, entries in used.items():
@@ -282,22 +332,29 @@ class McapWriter:
             index_offset = self._write(pack_record(Opcode.MESSAGE_INDEX, body))
             index_offsets += struct.pack("<HQ", channel, index_offset)
             self._entries[channel] = []
-        # The fields of a chunk index in their order; see the specification of MCAP.
+
+        # The fields of a chunk index in their order, see the specification of MCAP.
         index = struct.pack("<QQQQ", start_ns, end_ns, chunk_offset, len(record))
         index += _pack_bytes(index_offsets)
         index += struct.pack("<Q", self.position - index_start) + pack_text(_COMPRESSION)
         index += struct.pack("<QQ", len(data), unpacked_bytes)
         self._add_to_summary(Opcode.CHUNK_INDEX, index)
+
         first_ns, last_ns = self._span_ns or (start_ns, end_ns)
         self._span_ns = min(first_ns, start_ns), max(last_ns, end_ns)
         self._open_chunk.clear()
 
     def finish(self) -> None:
-        """Closes the open chunk, writes the index and the end mark, and flushes the stream."""
+        """Completes the file.
+
+        Writes the open chunk, the summary with the index and the statistics, a table of the
+        offsets in the summary, the footer and the end mark, and flushes the stream.
+        """
         if self._open_chunk:
             self._close_chunk()
         self._write(pack_record(Opcode.DATA_END, struct.pack("<I", 0)))
         self._add_to_summary(Opcode.STATISTICS, self._pack_statistics())
+
         summary_start = self.position
         offsets = b""
         crc = 0
@@ -309,14 +366,18 @@ class McapWriter:
             offset_body = struct.pack("<BQQ", opcode, group_start, len(group))
             offsets += pack_record(Opcode.SUMMARY_OFFSET, offset_body)
         offsets_start = self._write(offsets)
-        # The checksum covers the footer up to the checksum itself.
+
+        # The checksum covers the summary and the footer, up to the checksum itself.
         footer = _FOOTER.pack(Opcode.FOOTER, 20, summary_start, offsets_start, 0)[:-4]
         crc = zlib.crc32(footer, zlib.crc32(offsets, crc))
         self._write(footer + struct.pack("<I", crc) + MAGIC)
         self._stream.flush()
 
     def _pack_statistics(self) -> bytes:
-        """Returns the content of the statistics record."""
+        """Encodes the content of the statistics record.
+
+        It contains the numbers of all kinds of records, and the first and last log time.
+        """
         first_ns, last_ns = self._span_ns or (0, 0)
         head = _STATISTICS.pack(
             self.messages,

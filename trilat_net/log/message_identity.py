@@ -1,8 +1,11 @@
-"""Identity of a message by its content: sender, channel, number and sending time.
+"""Identifies a message by its content: sender, channel, number and sending time.
+
+The checks and the recovery of logs use the identity to find messages that are in the wrong
+place of a file.
 
 Invariant:
-    - The identity depends on the content of the message alone, and never on where the message
-      is stored, so that its place in a file can be compared with the identity.
+    - The identity depends only on the content of the message, and never on its place in the
+      file, so that the two can be compared.
 """
 
 import hashlib
@@ -16,14 +19,17 @@ AnyMessage = messages.State | messages.LinkStats | messages.Event | messages.Rec
 
 
 class MessageIdentity(NamedTuple):
-    """The identity of one message.
+    """Identity of one message.
 
     Attributes:
-        sender: the member that published the message.
-        channel: name of the channel: "state", "link", "event" or "stats".
-        number: number of the message in its channel; -1 if the message states no number.
-        sequence: sequence number of the message in a file; -1 if the message states no number.
-        sent_ns: sending time, ns since the epoch; None if the message states no time.
+        sender: Name of the member, a site or the recorder, that published the message.
+        channel: Name of the channel: "state" (records), "link" (statistics), "event" or
+            "stats".
+        number: Number of the message in its channel. It is -1 if the message states no number.
+        sequence: Sequence number of the message in a log. It is -1 if the message states no
+            number.
+        sent_ns: Sending time, in ns after the start of the session. None if the message states
+            no time.
     """
 
     sender: str
@@ -34,9 +40,18 @@ class MessageIdentity(NamedTuple):
 
 
 def compute_virtual_boot(scenario_sha256: str, site: str) -> int:
-    """Returns the boot of a site in virtual time, from the scenario's hash and the site's name.
+    """Computes the boot of a site in a run in virtual time.
 
-    By the boot, every message of a run in virtual time identifies its scenario.
+    The boot identifies one start of a site. It is a random number in live sessions. In virtual
+    time, it is derived from the scenario, so that runs are reproducible and every message of a
+    run identifies its scenario.
+
+    Args:
+        scenario_sha256: SHA-256 of the scenario, in hexadecimal digits.
+        site: Name of the site.
+
+    Returns:
+        A number of 64 bits.
     """
     digest = hashlib.sha256(f"{scenario_sha256}/{site}".encode()).digest()
     return int.from_bytes(digest[:8], "big")
@@ -46,9 +61,9 @@ def identify_message(message: AnyMessage, rate_hz: int) -> MessageIdentity:
     """Returns the identity of a message.
 
     Args:
-        message: the message.
-        rate_hz: tick rate of the sender, on which the numbers of statistics depend; any number
-            for other messages.
+        message: The message.
+        rate_hz: Tick rate of the sender. The numbers of statistics depend on it. For other
+            messages, any number will do.
     """
     match message:
         case messages.State():

@@ -1,11 +1,14 @@
-"""Digest chain of a log, which reveals changes of the log.
+"""Computes the digests of a log, which reveal that the log was changed after it was recorded.
 
-The chain has two SHA-256 digests: of all messages in order, and of everything that describes
-them. It protects against alterations, but not against a file that was written anew; signatures
-protect against that.
+A log contains two SHA-256 digests: one of all messages in order, and one of everything that
+describes the messages (metadata, scenario, schemas and channels). If a log has several parts,
+each part repeats the digest of the previous one, so that the digests form a chain. The digests
+reveal alterations. They cannot show that a whole file was written anew with new digests.
+Signatures protect against that (`log_signature`).
 
 Invariant:
-    - The digests depend on the records of the file, and not on chunks or their compression.
+    - The digests depend on the records of the file, and not on their division into chunks or on
+      the compression.
     - Any change of a message, of its times or number, of metadata, scenario, schema or channels
       changes one of the digests.
 """
@@ -19,18 +22,24 @@ from ..errors import count_nouns
 from .log_layout import SESSION
 
 DIGESTS = "trilat.chain"
-"""Name of the metadata at the end of a log that contain the digests."""
+"""Name of the metadata with the digests, at the end of a log."""
 DIGESTS_KEY = "digest_chain"
-"""Entry of the session's metadata that announces the chain and names its algorithm."""
+"""Key of the session's metadata that announces the digests and names their algorithm."""
 ALGORITHM = "sha256"
+"""Name of the algorithm."""
 RECOVERED = "trilat.recovered"
-"""Name of the metadata of a recovered log that describe its source and its losses."""
+"""Name of the metadata that describe the source and the losses of a recovered log."""
 PREVIOUS_DIGEST_KEY = "previous_records"
-"""Entry of a part's metadata: the digest of the messages in the previous part."""
+"""Key of a part's metadata with the digest of the messages in the previous part."""
 
 
 class DigestState(StrEnum):
-    """Agreement of a file with its digest chain, from best to worst."""
+    """Result of comparing a file with its digests, in order from the best to the worst.
+
+    INTACT: the file agrees with its digests. ABSENT: an old program wrote the file, without
+    digests. OPEN: the file was not finished or is damaged, so that it cannot be compared.
+    CHANGED: the file differs from its digests, or the digests were removed.
+    """
 
     INTACT = "intact"
     ABSENT = "absent"
@@ -39,11 +48,11 @@ class DigestState(StrEnum):
 
 
 class Integrity(NamedTuple):
-    """Agreement of a log with its digest chain.
+    """Result of comparing a log with its digests, with an explanation.
 
     Attributes:
-        state: the agreement.
-        text: a sentence that describes the agreement.
+        state: The result.
+        text: A sentence that explains it.
     """
 
     state: DigestState
@@ -51,36 +60,45 @@ class Integrity(NamedTuple):
 
     @property
     def passed(self) -> bool:
-        """False if something was changed, or if records were removed."""
+        """False if something in the file was changed or removed."""
         return self.state is not DigestState.CHANGED
 
 
 class RunningDigest:
-    """The digests of one file while it is written or read.
+    """Digests of one file, computed while the file is written or read.
 
     Attributes:
-        messages: number of messages added.
+        messages: Number of messages added.
     """
 
     def __init__(self) -> None:
         self.messages = 0
         self._records = hashlib.sha256()
-        self._descriptions: set[bytes] = set()  # digests of the describing records
+        # A digest of each record that describes the messages. A set, because such a record may
+        # be repeated, and because the order of these records does not matter.
+        self._descriptions: set[bytes] = set()
 
     def add_records(self, data: bytes | bytearray | memoryview, messages: int) -> None:
-        """Adds messages in the form of records of the file, and their number."""
+        """Adds messages in the order of the file.
+
+        Args:
+            data: The messages in the form of records of the file.
+            messages: Their number.
+        """
         self._records.update(data)
         self.messages += messages
 
     def add_entry(self, opcode: int, content: bytes) -> None:
-        """Adds a header, metadata, an attachment, a schema or a channel.
+        """Adds a record that describes the messages. Repeated records count once.
 
-        Repeated entries count once.
+        Args:
+            opcode: Kind of the record: header, metadata, attachment, schema or channel.
+            content: Content of the record.
         """
         self._descriptions.add(hashlib.sha256(bytes([opcode]) + content).digest())
 
     def facts(self) -> dict[str, str]:
-        """Returns the metadata that close the chain, with digests in hexadecimal."""
+        """Returns the digests in hexadecimal digits, as metadata for the end of the file."""
         about = hashlib.sha256(b"".join(sorted(self._descriptions))).hexdigest()
         digests = {"records": self._records.hexdigest(), "about": about}
         return {"algorithm": ALGORITHM, "messages": str(self.messages), **digests}
@@ -88,10 +106,10 @@ class RunningDigest:
     def judge(
         self, metadata: Mapping[str, Mapping[str, str]], *, finished: bool, damaged: bool
     ) -> Integrity:
-        """Returns the agreement of the file with the chain that the file states.
+        """Compares a file that was read with the digests that it states.
 
         Args:
-            metadata: all metadata of the file, by name.
+            metadata: All metadata of the file, by name.
             finished: True if the file was finished.
             damaged: True if a part of the file cannot be read.
         """
@@ -102,6 +120,7 @@ class RunningDigest:
         if stated is None:
             is_announced = DIGESTS_KEY in metadata.get(SESSION, {})
             return _judge_without_chain(is_announced=is_announced, finished=finished)
+
         computed = self.facts()
         if computed == dict(stated):
             since = ""
@@ -112,6 +131,8 @@ class RunningDigest:
                 f"and all metadata{since}"
             )
             return Integrity(DigestState.INTACT, agrees)
+
+        # If a part of the file is damaged, messages are missing without any change.
         lacks_messages = (
             stated.get("about") == computed["about"]
             and stated.get("messages") != computed["messages"]
@@ -127,7 +148,12 @@ class RunningDigest:
 
 
 def _judge_without_chain(*, is_announced: bool, finished: bool) -> Integrity:
-    """Returns the agreement of a file that states no digests."""
+    """Judges a file that contains no digests.
+
+    Args:
+        is_announced: True if the beginning of the file announces digests.
+        finished: True if the file was finished.
+    """
     if not is_announced:
         return Integrity(DigestState.ABSENT, "no digest chain: an older program made it")
     if not finished:
@@ -142,3 +168,4 @@ _COVERED = {
     "records": "its messages",
     "about": "its metadata, scenario, schemas or channels",
 }
+"""What has changed if an entry of the digests differs, as a noun phrase."""

@@ -543,8 +543,8 @@ class SiteLog:
     )
     mem = _RecordField(
         record_columns.decode_strings,
-        "State of the site and its control law that no other field contains, shape (K,), a list "
-        "of numbers each.",
+        "State of the site and its control law that no other field contains, shape (K,), a "
+        "list of numbers each.",
     )
     t_ns = _RecordField(
         record_columns.decode_ints,

@@ -1,14 +1,16 @@
-"""Records of a chunk that was cut off, block by block.
+"""Recovers the records of a chunk that was cut off, block by block.
 
-The checksum of a chunk covers all of its records, so it proves nothing once the end is missing.
-A block is a piece of data that the compression unpacks as a whole.
+An MCAP file stores messages in compressed chunks. If a recording is interrupted, the last chunk
+may be incomplete. The checksum of a chunk covers all of its records, so that it proves nothing
+if the end is missing. But the compressed data consist of blocks, pieces that can be unpacked as
+a whole, and all complete blocks can be used.
 
 Invariant:
-    - The records of a block are used together or not at all: damage in the packed bytes of a
-      block may falsify any of its records, including records that still look right.
-    - Packed bytes are read up to the first doubtful page: a page that holds nothing but zeros
-      was never written, and one that equals another page of the file was written to the wrong
-      place.
+    - The records of a block are used together or not at all, because damage in the compressed
+      bytes of a block may falsify any of its records, including records that still look right.
+    - Compressed bytes are read up to the first doubtful page. A page that contains only zeros
+      was never written to the disk. A page that is equal to another page of the file was
+      written to the wrong place.
 """
 
 from collections.abc import Callable, Iterator
@@ -32,24 +34,26 @@ from .mcap_records import (
 )
 
 PAGE_BYTES = 4096
-"""Size of a page, in bytes. Memory and disks lose or misplace whole pages of a file."""
+"""Size of a page, in bytes. Operating systems and disks lose or misplace whole pages of a file.
+"""
 MAX_SALVAGE_BYTES = 64 << 20
-"""Largest part of a cut chunk that is read, in bytes."""
+"""Largest part of an incomplete chunk that is read, in bytes."""
+# Blocks of a Zstandard frame, from RFC 8878, section 3.1.1.2.
 _BLOCK_HEAD_BYTES = 3
 _RUN_LENGTH_BLOCK = 1
 _MAX_BLOCK_BYTES = 1 << 17
 
 InnerRecord = tuple[int, bytes]
-"""A record of a chunk: its opcode and its content."""
+"""A record inside a chunk: its opcode and its content."""
 
 
 class TornChunk(NamedTuple):
-    """A chunk that reaches beyond the end of its file.
+    """Chunk that reaches beyond the end of its file.
 
     Attributes:
-        head: head of the chunk.
-        packed: packed bytes of the chunk that are present and can be trusted.
-        offset: offset of the first packed byte in the file.
+        head: Head of the chunk.
+        packed: Compressed bytes of the chunk that exist and can be trusted.
+        offset: Offset of the first compressed byte in the file.
     """
 
     head: ChunkHead
@@ -58,11 +62,16 @@ class TornChunk(NamedTuple):
 
     @classmethod
     def read(cls, scanner: RecordScanner, offset: int) -> "TornChunk":
-        """Returns the chunk at an offset of a file.
+        """Reads the chunk at an offset of a file.
+
+        Args:
+            scanner: Scanner of the file.
+            offset: Offset of the chunk.
 
         Raises:
-            UnreadableRecord: the head of the chunk makes no sense.
+            UnreadableRecord: The head of the chunk makes no sense.
         """
+        # Missing bytes are replaced by zeros, so that an incomplete head is refused below.
         record_head = scanner.read(offset, RECORD_HEAD_BYTES).ljust(RECORD_HEAD_BYTES, b"\0")
         _, length = RECORD_HEAD.unpack(record_head)
         begin = offset + RECORD_HEAD_BYTES
@@ -70,15 +79,19 @@ class TornChunk(NamedTuple):
         head = parse_chunk_head(content, length)
         if head.end_ns < head.start_ns:
             raise UnreadableRecord("a chunk ends before it begins")
-        trusted = find_doubtful_page(scanner, begin, begin + len(content)) - begin
-        packed = content[head.data_offset : max(head.data_offset, trusted)]
+
+        trusted_bytes = find_doubtful_page(scanner, begin, begin + len(content)) - begin
+        packed = content[head.data_offset : max(head.data_offset, trusted_bytes)]
         return cls(head, packed, begin + head.data_offset)
 
     def iterate_blocks(self) -> Iterator[list[InnerRecord]]:
-        """Yields the records that end in each block, until a block cannot be unpacked.
+        """Yields the records of each block, until a block is damaged or incomplete.
+
+        A record that continues in the next block is yielded with the block that contains its
+        end.
 
         Raises:
-            UnreadableRecord: the bytes that were unpacked last are not a record.
+            UnreadableRecord: The unpacked bytes are not a record.
         """
         unpacked = bytearray()
         for block in self._unpack():
@@ -88,7 +101,11 @@ class TornChunk(NamedTuple):
             yield complete_records
 
     def _unpack(self) -> Iterator[bytes]:
-        """Yields the unpacked blocks, until one is damaged or the size exceeds the limit."""
+        """Yields the unpacked blocks, until a block is damaged or incomplete.
+
+        It also stops if the blocks are larger together than the head of the chunk states.
+        Without a compression, a block is a page of the file.
+        """
         unpackers: dict[str, Callable[[bytes], Iterator[bytes]]] = {
             "": partial(_iterate_pages, offset=self.offset),
             "zstd": _unpack_zstd,
@@ -108,19 +125,20 @@ class TornChunk(NamedTuple):
 
 
 def find_doubtful_page(scanner: RecordScanner, begin: int, end: int) -> int:
-    """Returns the offset of the first doubtful page in a part of a file.
+    """Finds the first page in a part of a file that was probably not written correctly.
 
-    A page is doubtful if it is empty, or if the file also contains it elsewhere before the end
-    of the part.
+    A page is doubtful if it contains only zeros, or if an equal page exists elsewhere in the
+    file before the end of the part.
 
     Args:
-        scanner: reads the file.
-        begin: offset of the part's first byte.
-        end: offset of the first byte after the part.
+        scanner: Scanner of the file.
+        begin: Offset of the part's first byte.
+        end: Offset of the first byte after the part.
 
     Returns:
-        The offset of the page; `end` if no page is doubtful.
+        The offset of the page. It is `end` if no page is doubtful.
     """
+    # The first boundary of a page in the part: -(-a // b) rounds a / b up.
     first_page = -(-begin // PAGE_BYTES) * PAGE_BYTES
     offsets: dict[bytes, int] = {}
     for offset in range(first_page, end, PAGE_BYTES):
@@ -130,6 +148,7 @@ def find_doubtful_page(scanner: RecordScanner, begin: int, end: int) -> int:
             break
         if len(page) == PAGE_BYTES:
             offsets[page] = offset
+
     first_doubtful = end
     for offset in range(0, min(first_page, scanner.size), PAGE_BYTES):
         page = scanner.read(offset, PAGE_BYTES)
@@ -140,8 +159,11 @@ def find_doubtful_page(scanner: RecordScanner, begin: int, end: int) -> int:
 def _split_records(data: bytearray) -> tuple[list[InnerRecord], int]:
     """Returns the complete records at the beginning of unpacked bytes, and their total size.
 
+    Args:
+        data: The unpacked bytes. They begin with a record.
+
     Raises:
-        UnreadableRecord: the bytes are not a record.
+        UnreadableRecord: The bytes are not a record.
     """
     complete: list[InnerRecord] = []
     end = 0
@@ -158,7 +180,12 @@ def _split_records(data: bytearray) -> tuple[list[InnerRecord], int]:
 
 
 def _iterate_pages(packed: bytes, offset: int = 0) -> Iterator[bytes]:
-    """Yields bytes that begin at an offset of the file, split at the pages of the file."""
+    """Splits bytes at the boundaries of the pages of their file.
+
+    Args:
+        packed: The bytes.
+        offset: Offset of the first byte in the file.
+    """
     start = 0
     while start < len(packed):
         end = start + PAGE_BYTES - (offset + start) % PAGE_BYTES
@@ -167,7 +194,11 @@ def _iterate_pages(packed: bytes, offset: int = 0) -> Iterator[bytes]:
 
 
 def _unpack_zstd(packed: bytes) -> Iterator[bytes]:
-    """Yields the unpacked complete blocks of a Zstandard frame (RFC 8878, section 3.1.1.2)."""
+    """Yields the unpacked blocks of a Zstandard frame, as far as they are complete.
+
+    A frame consists of a header and blocks (RFC 8878, section 3.1.1.2). The head of a block has
+    3 bytes: bit 0 marks the last block, bits 1 and 2 are the kind, and the others the size.
+    """
     unpacker: Any = zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW_BYTES).decompressobj()
     start = zstandard.frame_header_size(packed)
     unpacker.decompress(packed[:start])
@@ -177,8 +208,9 @@ def _unpack_zstd(packed: bytes) -> Iterator[bytes]:
         is_last = bool(block_head & 1)
         kind = block_head >> 1 & 3
         size = block_head >> 3
-        # A run-length block holds one byte, and `size` is the length of the run.
-        end = start + _BLOCK_HEAD_BYTES + (1 if kind == _RUN_LENGTH_BLOCK else size)
+        # A run-length block contains one byte, and `size` is the number of repetitions.
+        content_bytes = 1 if kind == _RUN_LENGTH_BLOCK else size
+        end = start + _BLOCK_HEAD_BYTES + content_bytes
         if size > _MAX_BLOCK_BYTES or end > len(packed):
             return
         yield unpacker.decompress(packed[start:end])
@@ -186,7 +218,7 @@ def _unpack_zstd(packed: bytes) -> Iterator[bytes]:
 
 
 def _unpack_lz4(packed: bytes) -> Iterator[bytes]:
-    """Yields the unpacked data of an LZ4 frame, page by page."""
+    """Yields the unpacked data of an LZ4 frame, page by page, as far as they are complete."""
     unpacker = lz4.frame.LZ4FrameDecompressor()
     for page in _iterate_pages(packed):
         yield unpacker.decompress(page)
