@@ -146,12 +146,12 @@ SAID: dict[str, tuple[Callable[[], bytes], set[str], str]] = {
     "a number twice": (
         lambda: edited(DATA, record=lambda r: {**r, "tick": 5} if r["tick"] == 6 else r),
         {"sequence", "accounts"},
-        "number 5 is there twice",
+        "number 5 occurs twice",
     ),
     "a message of another site": (
         lambda: edited(DATA, record=lambda r: {**r, "site": "m2"} if r["site"] == "m1" else r),
         {"schema"},
-        "a message says that it is of 'm2'",
+        "a message states the sender 'm2'",
     ),
     "a message that is none": (
         lambda: edited(DATA, record=lambda r: {**r, "q": [1.0]} if r["tick"] == 3 else r),

@@ -188,7 +188,7 @@ def test_recorder_that_comes_after_return_knows_what_was_not_made(tmp_path: Path
     assert log.missing("m") == away
     assert len(log["s"]) == 1600
     assert log.missing("s") == 0
-    assert "agree with what is there" in [
+    assert "agree with the messages" in [
         finding.text for finding in check_file(session.path).findings
     ]
 

@@ -1,16 +1,20 @@
-"""Convert a log to data tables, with a row per record, arrival, statistics message or event.
+"""Converts a log to data tables, with a row per record, arrival, statistics message or event.
+
+The tables are exported to CSV, Parquet and data frames. A record is the result of one tick of a
+site's control loop, a site being a process that runs one arm.
 
 Invariant:
-    - Every number is that of the record, or follows from the record exactly (an age is a
-      difference of stamps). The only exception is an orientation, which is a unit quaternion
-      whose sign continues from row to row, because the rotation vector of the record jumps
-      where it passes half a turn (see `orientations`). The meaning of the column states that.
+    - Every number is a number of the record, or follows from the record exactly (an age is a
+      difference of time stamps). The only exception are orientations. A record contains an
+      orientation as a rotation vector, which jumps where it passes half a turn. The table
+      contains it as a unit quaternion, whose sign continues from row to row (see
+      `orientations`), and the meaning of the column states that.
     - The name of a column ends in its unit. A missing value is null, never a number.
-    - Units come from the schema, and meanings from the docstrings of the message types. Units
-      and names of the numbers that a law sends come from the law's declaration. There is no
-      second list of them.
-    - A number out of range, or an arrival of a peer that a site does not have, is a `LogError`
-      that names the file (`source`).
+    - Units come from the schema of the messages, and meanings from the docstrings of the
+      message types. Units and names of the numbers that a control law sends come from the
+      law's declaration. Thus nothing is described in two places.
+    - A number out of range, or an arrival from a peer that a site does not have, raises a
+      `LogError` that names the file (`source`).
 """
 
 import dataclasses
@@ -54,43 +58,43 @@ UNIT_SUFFIXES = {
     "ns/s": "ppb",
     "byte": "bytes",
 }
-"""Endings of column names, by unit."""
+"""Last part of a column's name, by unit."""
 EVENTS_TABLE = "events"
-"""Name of the table of events."""
+"""Name of the table with the events."""
 SITE_TABLE_KINDS = ("state", "link", "arrivals")
-"""Kinds of the tables of a site."""
+"""Kinds of tables that each site has."""
 _NONE_BELOW_0 = {"age_us", "delay_us", "delay_max_us", "rtt_us"}
-"""Statistics in which -1 stands for a missing value."""
+"""Fields of the statistics in which -1 means that there is no value."""
 _JOINT_VECTORS = ("q", "qd", "q_des", "qd_des", "tau", "tau_x")
-"""Vectors of a record that have a number per joint, in joint space."""
+"""Vectors of a record with a number per joint, if the sites share joint positions."""
 _TASK_VECTORS = {
     **dict.fromkeys(("q_des", "x"), ("m", "rad")),
     **dict.fromkeys(("qd_des", "xd"), ("m/s", "rad/s")),
     "wrench": ("N", "N m"),
 }
-"""Vectors of a record that have a number per coordinate of the task, with the units of
-positions and of orientations.
+"""Vectors of a record with a number per coordinate of the end effector, if the sites share
+its position or pose. The units are those of the three position coordinates and of the others.
 """
 
 
 _POSES = ("q_des", "x")
-"""Vectors of `_TASK_VECTORS` with an orientation; the others have angular velocities or
-torques.
+"""Vectors of `_TASK_VECTORS` that contain an orientation. The other ones contain an angular
+velocity or a torque.
 """
 _STEADY_QUATERNION = "a unit quaternion w, x, y, z, each nearest to the one before"
 """Part of the meaning of orientation columns."""
 
 
 class Column(NamedTuple):
-    """A column of a table.
+    """One column of a table.
 
     Attributes:
-        name: name of the column, which ends in its unit.
-        values: the values, shape (K,): numbers, or texts as objects.
-        unit: unit of the values; "" for texts and counts.
-        meaning: description of the values.
-        source: field of the message from which the values come.
-        known: True for the rows that have a value, shape (K,); None if all rows have a value.
+        name: Name of the column, which ends in its unit.
+        values: The values, shape (K,): numbers, or texts as objects.
+        unit: Unit of the values. Empty for texts and counts.
+        meaning: Description of the values.
+        source: Field of the message from which the values are taken.
+        known: True for the rows that have a value, shape (K,). None if all rows have one.
     """
 
     name: str
@@ -112,9 +116,11 @@ class Column(NamedTuple):
         return np.where(self.known, self.values, np.nan)
 
     def rows(self, first: int, last: int) -> list[Any]:
-        """Returns the values of rows `first` to `last` - 1 as plain Python values.
+        """Returns the values of some rows as plain Python values, with None for missing values.
 
-        Missing values are None.
+        Args:
+            first: Index of the first row.
+            last: Index after the last row.
         """
         values: list[Any] = self.values[first:last].tolist()
         if self.known is None:
@@ -127,13 +133,13 @@ class Column(NamedTuple):
 
 @dataclass(frozen=True)
 class Table:
-    """A table of columns with equal lengths.
+    """Table of columns with equal lengths.
 
     Attributes:
-        name: name of the site, or "events".
-        kind: kind of a site's table, one of `SITE_TABLE_KINDS`; else "".
-        about: description of a row.
-        columns: the columns.
+        name: Name of the site, or "events".
+        kind: Kind of a site's table, one of `SITE_TABLE_KINDS`. Empty for other tables.
+        about: Description of a row.
+        columns: The columns.
     """
 
     name: str
@@ -148,7 +154,7 @@ class Table:
         """Returns a column by its name.
 
         Raises:
-            KeyError: the table has no column of that name.
+            KeyError: The table has no column of that name.
         """
         columns = {column.name: column for column in self.columns}
         if name not in columns:
@@ -157,11 +163,13 @@ class Table:
 
     @property
     def label(self) -> str:
-        """Name of the table as the name of a file: "m1_link", "events"."""
+        """Name of the table that is suitable for a file: "m1_link", "events"."""
         return f"{self.name}_{self.kind}" if self.kind else self.name
 
 
+# An entry of the section "Attributes:" in a docstring: name of the field and its meaning.
 _FIELD = re.compile(r"^ {4}(\w+): (.*(?:\n {8,}.*)*)", re.MULTILINE)
+# Units of fields for which the schema states no unit.
 _UNITS_BY_NAME = {"t_ns": "ns", "sent_ns": "ns", "tick": "tick"}
 _UNITS_BY_ENDING = {"ns": "ns", "us": "us", "ppb": "ns/s"}
 _COMPLETE_TEXTS = {
@@ -174,16 +182,16 @@ _COMPLETE_TEXTS = {
     "refused": "per peer, samples whose stamp was out of range",
     "lost": "per peer, samples that the link's model lost",
 }
-"""Meanings of fields whose text in the docstring refers to the field before."""
+"""Meanings of fields whose text in the docstring refers to the previous field."""
 
 
 class FieldDoc(NamedTuple):
     """Documentation of a field of a message.
 
     Attributes:
-        unit: unit of the field; "" without a unit.
-        text: meaning of the field.
-        kind: type of the field in JSON Schema.
+        unit: Unit of the field. Empty if it has no unit.
+        text: Meaning of the field.
+        kind: Type of the field in JSON Schema.
     """
 
     unit: str
@@ -193,31 +201,39 @@ class FieldDoc(NamedTuple):
 
 @cache
 def read_field_docs(kind: type[msgspec.Struct]) -> dict[str, FieldDoc]:
-    """Returns the documentation of the fields of a message type, in order of definition."""
+    """Returns the documentation of a message type's fields, in the order of definition.
+
+    The meanings are taken from the docstring of the type, and the units from its JSON Schema.
+
+    Args:
+        kind: Type of the messages.
+    """
     texts = dict(_FIELD.findall(inspect.getdoc(kind) or ""))
     texts |= {name: _COMPLETE_TEXTS[name] for name in texts.keys() & _COMPLETE_TEXTS.keys()}
     properties: dict[str, dict[str, Any]] = json_schema(kind)["properties"]
     docs = {}
     for name, entry in properties.items():
-        by_name = _UNITS_BY_NAME.get(name, _UNITS_BY_ENDING.get(name.rpartition("_")[2], ""))
-        text = " ".join(texts.get(name, entry.get("description", "")).split()).rstrip(".")
-        docs[name] = FieldDoc(entry.get("x-unit", by_name), text, entry["type"])
+        ending = name.rpartition("_")[2]
+        default_unit = _UNITS_BY_NAME.get(name, _UNITS_BY_ENDING.get(ending, ""))
+        text = texts.get(name, entry.get("description", ""))
+        one_line = " ".join(text.split()).rstrip(".")
+        docs[name] = FieldDoc(entry.get("x-unit", default_unit), one_line, entry["type"])
     return docs
 
 
 def to_int_array(
     values: Iterable[int], source: str, field: str, kind: Any = np.int64
 ) -> NDArray[Any]:
-    """Returns integers as an array.
+    """Converts integers to an array.
 
     Args:
-        values: the integers.
-        source: name of the file, for the error.
-        field: name of the field, for the error.
-        kind: data type of the array.
+        values: The integers.
+        source: Name of the file for the error message.
+        field: Name of the field for the error message.
+        kind: Data type of the array.
 
     Raises:
-        LogError: a number does not fit into the data type.
+        LogError: A number does not fit into the data type.
     """
     try:
         return np.fromiter(values, kind)
@@ -228,13 +244,13 @@ def to_int_array(
 def _make_time_columns(
     tick: Ints | None, t_s: NDArray[Any], log_ns: Ints, publish_ns: Ints
 ) -> Iterator[Column]:
-    """Yields the columns of the nominal time, the tick, and the times of arrival and sending.
+    """Yields the columns of the nominal time, the tick, and the arrival and sending times.
 
     Args:
-        tick: ticks, shape (K,); None: no column of ticks.
-        t_s: nominal times since the epoch, s, shape (K,); NaN: unknown.
-        log_ns: times of arrival, Unix ns, shape (K,).
-        publish_ns: times of sending, Unix ns, shape (K,).
+        tick: Ticks, shape (K,). None if the table has no column of ticks.
+        t_s: Nominal times since the session's start, shape (K,), in s. NaN if unknown.
+        log_ns: Times of arrival at the recorder, in Unix time, shape (K,), in ns.
+        publish_ns: Times of sending, in Unix time, shape (K,), in ns.
     """
     known: NDArray[np.bool_] = ~np.isnan(t_s)
     yield Column(
@@ -266,33 +282,67 @@ def _make_time_columns(
 
 
 def _make_vector_columns(site: SiteLog, arm: ArmModel) -> Iterator[Column]:
-    docs = read_field_docs(State)
+    """Yields the columns of the vectors in the records: motion, torques and parameters.
+
+    Args:
+        site: Records of the site.
+        arm: Model of the site's arm. It determines which coordinates the sites share.
+    """
     task = _TASK_VECTORS if arm.shares_pose else {}
-    for field in (*(name for name in _JOINT_VECTORS if name not in task), *task):
-        if field in task:
-            is_pose = field in _POSES and arm.counts.shared == POSE
-            for n, axis in enumerate(TASK_AXES[: POSITION if is_pose else arm.counts.shared]):
-                text = f"{docs[field].text}, along {axis}"
-                yield _make_number_column(
-                    site=site,
-                    field=field,
-                    n=n,
-                    stem=f"{field}_{axis}",
-                    unit=task[field][n >= POSITION],
-                    text=text,
-                )
-            if is_pose:
-                yield from _make_orientation_columns(site, field, docs[field].text)
-            continue
-        units = arm.joint_units(docs[field].unit)
-        for n, (unit, joint) in enumerate(zip(units, arm.joint_names, strict=True)):
-            text = f"{docs[field].text}, joint {n + 1}" + f", {joint}" * (arm.chain is not None)
-            yield _make_number_column(
-                site=site, field=field, n=n, stem=f"{field}{n + 1}", unit=unit, text=text
-            )
+    for field in _JOINT_VECTORS:
+        if field not in task:
+            yield from _make_joint_columns(site, arm, field)
+    for field, units in task.items():
+        yield from _make_task_columns(site, arm, field, units)
+    yield from _make_parameter_columns(site, arm)
+
+
+def _make_joint_columns(site: SiteLog, arm: ArmModel, field: str) -> Iterator[Column]:
+    """Yields the columns of a vector that has a number per joint."""
+    doc = read_field_docs(State)[field]
+    units = arm.joint_units(doc.unit)
+    for n, (unit, joint) in enumerate(zip(units, arm.joint_names, strict=True)):
+        text = f"{doc.text}, joint {n + 1}"
+        if arm.chain is not None:
+            text += f", {joint}"
+        yield _make_number_column(
+            site=site, field=field, n=n, stem=f"{field}{n + 1}", unit=unit, text=text
+        )
+
+
+def _make_task_columns(
+    site: SiteLog, arm: ArmModel, field: str, units: tuple[str, str]
+) -> Iterator[Column]:
+    """Yields the columns of a vector that has a number per coordinate of the end effector.
+
+    Args:
+        site: Records of the site.
+        arm: Model of the site's arm.
+        field: Name of the vector.
+        units: Units of the position coordinates and of the other coordinates.
+    """
+    text = read_field_docs(State)[field].text
+    has_orientation = field in _POSES and arm.counts.shared == POSE
+    count = POSITION if has_orientation else arm.counts.shared
+    for n, axis in enumerate(TASK_AXES[:count]):
+        yield _make_number_column(
+            site=site,
+            field=field,
+            n=n,
+            stem=f"{field}_{axis}",
+            unit=units[n >= POSITION],
+            text=f"{text}, along {axis}",
+        )
+    if has_orientation:
+        yield from _make_orientation_columns(site, field, text)
+
+
+def _make_parameter_columns(site: SiteLog, arm: ArmModel) -> Iterator[Column]:
+    """Yields the columns of the estimated parameters of the arm's dynamics."""
+    doc = read_field_docs(State)["theta_hat"]
     for n, (parameter, unit) in enumerate(arm.parameters):
         stem = f"theta_hat{n + 1}"
-        text = f"{docs['theta_hat'].text}, parameter {n + 1}"
+        text = f"{doc.text}, parameter {n + 1}"
         if arm.chain is not None:
             link, _, symbol = parameter.rpartition(".")
             stem = f"theta_hat{1 + n // LINK_PARAMETERS}_{symbol}"
@@ -303,7 +353,13 @@ def _make_vector_columns(site: SiteLog, arm: ArmModel) -> Iterator[Column]:
 
 
 def _make_orientation_columns(site: SiteLog, field: str, text: str) -> Iterator[Column]:
-    """Yields the columns of the orientation of a pose, as a quaternion."""
+    """Yields the four columns of the orientation in a pose, as a unit quaternion.
+
+    Args:
+        site: Records of the site.
+        field: Name of the vector that contains the poses.
+        text: Meaning of the vector.
+    """
     quaternions = compute_quaternions(getattr(site, field)[:, POSITION:])
     for name, values in zip(QUATERNION_AXES, quaternions.T, strict=True):
         meaning = f"{text}, {name[1]} of its orientation as {_STEADY_QUATERNION}"
@@ -325,19 +381,19 @@ def _make_number_column(
     text: str,
     known: NDArray[np.bool_] | None = None,
 ) -> Column:
-    """Returns the column of a number of a vector.
+    """Returns the column of one number of a vector.
 
     Args:
-        site: the records.
-        field: name of the vector.
-        n: index of the number in the vector.
-        stem: name of the column without its unit.
-        unit: unit of the number.
-        text: meaning of the number.
-        known: True for the rows that have a value, shape (K,); None if all rows have a value.
+        site: Records of the site.
+        field: Name of the vector.
+        n: Index of the number in the vector.
+        stem: Name of the column without its unit.
+        unit: Unit of the number.
+        text: Meaning of the number.
+        known: True for the rows that have a value, shape (K,). None if all rows have one.
     """
     suffix = UNIT_SUFFIXES.get(unit, "")
-    # a stem such as "base_m" already ends in the unit
+    # A stem such as "base_m" ends in the unit already.
     if suffix and stem != suffix and not stem.endswith(f"_{suffix}"):
         stem = f"{stem}_{suffix}"
     values = np.ascontiguousarray(getattr(site, field)[:, n])
@@ -347,16 +403,17 @@ def _make_number_column(
 
 
 def _make_sent_columns(site: SiteLog) -> Iterator[Column]:
-    """Yields the columns of the numbers that the site's law sends."""
+    """Yields the columns of the numbers that the site's control law sends to its peers."""
     for n, entry in enumerate(site.channel.entries(site.peers)):
         (name, unit, length, _) = entry.vector
-        peer = entry.peer
-        stem = f"ch_{name}" + f"_{peer}" * bool(peer) + f"_{entry.position + 1}" * (length > 1)
+        stem = f"ch_{name}"
+        if entry.peer:
+            stem += f"_{entry.peer}"
+        text = f"{name} that the law sends to {entry.peer or 'all'}"
+        if length > 1:
+            stem += f"_{entry.position + 1}"
+            text += f", number {entry.position + 1}"
         suffix = UNIT_SUFFIXES.get(unit) or _to_word(unit).strip("_")
-        text = (
-            f"{name} that the law sends to {peer or 'all'}"
-            + f", number {entry.position + 1}" * (length > 1)
-        )
         values = np.ascontiguousarray(site.ch[:, n])
         yield Column(
             name=f"{stem}_{suffix}" if suffix else stem,
@@ -368,7 +425,14 @@ def _make_sent_columns(site: SiteLog) -> Iterator[Column]:
 
 
 def _make_hand_columns(site: SiteLog, arm: ArmModel, mode: str) -> Iterator[Column]:
-    """Yields the columns of the action of a live hand."""
+    """Yields the columns of the operator, the person or program that moves the arm.
+
+    Args:
+        site: Records of the site.
+        arm: Model of the site's arm.
+        mode: How the operator moves the arm: to a target of the tip ("tip") or of the joints
+            ("joint"), or by a force ("force").
+    """
     held: NDArray[np.bool_] = site.hand[:, 2] > 0.0
     yield _make_number_column(
         site=site,
@@ -385,34 +449,42 @@ def _make_hand_columns(site: SiteLog, arm: ArmModel, mode: str) -> Iterator[Colu
     for n, (name, text) in enumerate(meanings.items(), 1):
         yield Column(
             name=f"hand_{name}",
+            # Floating-point numbers represent integers exactly up to 2^53.
             values=np.clip(site.hand[:, n], -1, 2**53).astype(np.int64),
             unit="",
             meaning=text,
             source=f"hand[{n}]",
             known=held,
         )
-    names = arm.joint_names if mode == "joint" else TASK_AXES[:POSITION]
+
+    # The target and its rate of change follow, or the force alone.
+    axes = arm.joint_names if mode == "joint" else TASK_AXES[:POSITION]
     units = {"tip": ("m", "m/s"), "joint": ("rad", "rad/s"), "force": ("N", "")}[mode]
     size = (site.layout.hand - 3) // 2
-    quantity = "force" if mode == "force" else "target"
-    for n in range(2 * size if quantity == "target" else size):
-        stem, unit = (quantity, units[0]) if n < size else (f"{quantity}_rate", units[1])
-        meaning = f"{stem.replace('_', ' ')} of the hand, {names[n % size]}"
-        yield _make_number_column(
-            site=site,
-            field="hand",
-            n=3 + n,
-            stem=f"hand_{stem}_{names[n % size]}",
-            unit=unit,
-            text=meaning,
-            known=held,
-        )
+    quantities = ["force"] if mode == "force" else ["target", "target_rate"]
+    for row, quantity in enumerate(quantities):
+        for n in range(size):
+            yield _make_number_column(
+                site=site,
+                field="hand",
+                n=3 + row * size + n,
+                stem=f"hand_{quantity}_{axes[n]}",
+                unit=units[row],
+                text=f"{quantity.replace('_', ' ')} of the hand, {axes[n]}",
+                known=held,
+            )
 
 
 def _make_bodies_columns(site: SiteLog, bodies: Iterable[str]) -> Iterator[Column]:
-    """Yields the columns of the poses of the bodies of the site's plant."""
+    """Yields the columns of the poses of the bodies in the site's simulated environment.
+
+    Args:
+        site: Records of the site.
+        bodies: Names of the bodies, in the order of the records.
+    """
+    pose_length = POSITION + len(QUATERNION_AXES)
     for number, body in enumerate(bodies):
-        first = (POSITION + len(QUATERNION_AXES)) * number
+        first = pose_length * number
         for n, axis in enumerate("xyz", first):
             text = f"{axis} of the place of {body}, a body of its plant"
             yield _make_number_column(
@@ -420,9 +492,8 @@ def _make_bodies_columns(site: SiteLog, bodies: Iterable[str]) -> Iterator[Colum
             )
         first += POSITION
         quaternions = align_signs(site.bodies[:, first : first + len(QUATERNION_AXES)])
-        for n, (name, values) in enumerate(
-            zip(QUATERNION_AXES, quaternions.T, strict=True), first
-        ):
+        axes = zip(QUATERNION_AXES, quaternions.T, strict=True)
+        for n, (name, values) in enumerate(axes, first):
             text = (
                 f"orientation of {body}, a body of its plant, {name[1]} of {_STEADY_QUATERNION}"
             )
@@ -436,7 +507,12 @@ def _make_bodies_columns(site: SiteLog, bodies: Iterable[str]) -> Iterator[Colum
 
 
 def build_state_table(site: SiteLog, scenario: Scenario) -> Table:
-    """Returns the table of the records of a site, in order of their ticks."""
+    """Builds the table of the records of a site, in the order of their ticks.
+
+    Args:
+        site: Records of the site.
+        scenario: Scenario of the session.
+    """
     docs = read_field_docs(State)
     arm = scenario.arms[site.name]
     live = scenario.sites[site.name].find_live_hand()
@@ -448,36 +524,11 @@ def build_state_table(site: SiteLog, scenario: Scenario) -> Table:
     )
     columns += _make_vector_columns(site, arm)
     columns += _make_sent_columns(site)
-    columns += [] if live is None else _make_hand_columns(site, arm, live.mode)
+    if live is not None:
+        columns += _make_hand_columns(site, arm, live.mode)
     columns += _make_bodies_columns(site, scenario.bodies_m(site.name))
     for peer in site.peers:
-        used = site.used[peer]
-        rate_hz = scenario.sites[peer].rate_hz
-        known: NDArray[np.bool_] = used >= 0
-        age_ms = (site.t_ns - used * NS_PER_S // rate_hz) / 1e6
-        source = f"used.{peer}"
-        text = f"tick of the sample of {peer} in use"
-        columns.append(
-            Column(
-                name=f"used_{peer}_tick",
-                values=used,
-                unit="tick",
-                meaning=text,
-                source=source,
-                known=known,
-            )
-        )
-        text = f"now minus the stamp of the sample of {peer} in use"
-        columns.append(
-            Column(
-                name=f"age_{peer}_ms",
-                values=age_ms,
-                unit="ms",
-                meaning=text,
-                source=f"t_ns, {source}",
-                known=known,
-            )
-        )
+        columns += _make_sample_columns(site, peer, scenario.sites[peer].rate_hz)
     for field in ("late_us", "busy_us", "sent_ns"):
         unit, text, _ = docs[field]
         columns.append(
@@ -488,16 +539,47 @@ def build_state_table(site: SiteLog, scenario: Scenario) -> Table:
     return Table(site.name, "state", f"a tick of {site.name}", tuple(columns))
 
 
-def build_arrivals_table(site: SiteLog, source: str, *, live: bool) -> Table:
-    """Returns the table of the samples that arrived at a site, in order of arrival.
+def _make_sample_columns(site: SiteLog, peer: str, rate_hz: int) -> Iterator[Column]:
+    """Yields the columns of the peer's sample that the control law uses: its tick and age.
 
     Args:
-        site: the records.
-        source: name of the file, for errors.
-        live: whether the session was live, so that delays were measured.
+        site: Records of the site.
+        peer: Name of the peer.
+        rate_hz: Tick rate of the peer, in Hz.
+    """
+    used = site.used[peer]
+    known: NDArray[np.bool_] = used >= 0
+    age_ms = (site.t_ns - used * NS_PER_S // rate_hz) / 1e6
+    source = f"used.{peer}"
+    yield Column(
+        name=f"used_{peer}_tick",
+        values=used,
+        unit="tick",
+        meaning=f"tick of the sample of {peer} in use",
+        source=source,
+        known=known,
+    )
+    yield Column(
+        name=f"age_{peer}_ms",
+        values=age_ms,
+        unit="ms",
+        meaning=f"now minus the stamp of the sample of {peer} in use",
+        source=f"t_ns, {source}",
+        known=known,
+    )
+
+
+def build_arrivals_table(site: SiteLog, source: str, *, live: bool) -> Table:
+    """Builds the table of the peers' samples that arrived at a site, in the order of arrival.
+
+    Args:
+        site: Records of the site.
+        source: Name of the file for error messages.
+        live: True if the session was live, so that the delays were measured. In virtual time
+            they are the ages of the samples.
 
     Raises:
-        LogError: a record lists an arrival of a peer that the site does not have.
+        LogError: A record contains an arrival from a peer that the site does not have.
     """
     counts, entries = site.arrivals
     index = entries[:, 0]
@@ -506,6 +588,7 @@ def build_arrivals_table(site: SiteLog, source: str, *, live: bool) -> Table:
             f"{source}: a record of {site.name} lists an arrival of a peer "
             "that it does not have"
         )
+    # Index of the record that contains each arrival.
     row = np.repeat(np.arange(len(site)), counts)
     names = np.array(site.peers, dtype=np.object_)[index]
     delay = "the age of its stamp; in virtual time every sample arrives at the next tick"
@@ -542,46 +625,51 @@ def build_arrivals_table(site: SiteLog, source: str, *, live: bool) -> Table:
 
 
 def build_link_table(site: SiteLog, timed: TimedMessages[LinkStats], source: str) -> Table:
-    """Returns the table of the statistics of a site, in order of their ticks."""
+    """Builds the table of the statistics messages of a site, in the order of their ticks.
+
+    A field that is a map from peers to numbers becomes a column per peer.
+
+    Args:
+        site: Records of the site.
+        timed: The statistics messages, with their times.
+        source: Name of the file for error messages.
+
+    Raises:
+        LogError: A number is out of range.
+    """
     stats = timed.messages
     tick = to_int_array((s.tick for s in stats), source, "tick")
     t_s = to_int_array((s.t_ns for s in stats), source, "t_ns") / NS_PER_S
     columns = list(_make_time_columns(tick, t_s, timed.log_ns, timed.publish_ns))
     for field, (unit, text, kind) in read_field_docs(LinkStats).items():
         if field in ("v", "site", "boot", "tick", "t_ns"):
-            continue
-        values = [getattr(s, field) for s in stats]
+            continue  # the same in every row, or a column already
+        fields = [getattr(s, field) for s in stats]
         if kind == "object":
-            names: Iterable[str] = site.peers
+            keys: Iterable[str] = site.peers
             if field == "dropped":
-                names = _list_reasons(values)
-            columns += [_make_entry_column(source, field, name, values) for name in names]
-        elif kind == "integer":
-            columns.append(
-                Column(
-                    name=field,
-                    values=to_int_array(values, source, field),
-                    unit=unit,
-                    meaning=text,
-                    source=field,
-                )
-            )
+                keys = _list_reasons(fields)
+            columns += [_make_entry_column(source, field, key, fields) for key in keys]
+            continue
+
+        values: NDArray[Any]
+        if kind == "integer":
+            values = to_int_array(fields, source, field)
         else:
-            columns.append(
-                Column(
-                    name=field,
-                    values=np.array(values, dtype=np.object_),
-                    unit=unit,
-                    meaning=text,
-                    source=field,
-                )
-            )
+            values = np.array(fields, dtype=np.object_)
+        columns.append(Column(name=field, values=values, unit=unit, meaning=text, source=field))
     about = f"statistics of {site.name}'s loop and links, ten times a second"
     return Table(site.name, "link", about, tuple(columns))
 
 
 def _list_reasons(dropped: Iterable[Mapping[str, int]]) -> list[str]:
-    """Returns the reasons for which messages were dropped, one for each column name."""
+    """Returns the reasons why messages were dropped, in the order in which they first occur.
+
+    Reasons that lead to the same column name count once.
+
+    Args:
+        dropped: Numbers of dropped messages by reason, for each statistics message.
+    """
     reasons: dict[str, str] = {}
     for counts in dropped:
         for reason in sorted(counts):
@@ -590,24 +678,24 @@ def _list_reasons(dropped: Iterable[Mapping[str, int]]) -> list[str]:
 
 
 def _to_word(text: str) -> str:
-    """Returns a text as a part of a column name: small letters, digits and underscores."""
+    """Converts a text to a part of a column name: small letters, digits and underscores."""
     return re.sub(r"[^a-z0-9]+", "_", text.lower())[:31]
 
 
 def _make_entry_column(
     source: str, field: str, name: str, values: Sequence[Mapping[str, int]]
 ) -> Column:
-    """Returns the column of one key of a field of the statistics that is a map.
+    """Returns the column of one key of a field that is a map.
 
     Args:
-        source: name of the file, for errors.
-        field: name of the field.
-        name: the key: a peer, or a reason of `dropped`.
-        values: the maps, a row each.
+        source: Name of the file for error messages.
+        field: Name of the field of the statistics.
+        name: The key: a peer, or a reason why messages were dropped.
+        values: The maps, one per row.
     """
     unit, text, _ = read_field_docs(LinkStats)[field]
     stem, _, ending = field.rpartition("_") if unit else (field, "", "count")
-    # `dropped` has no entry for a reason for which no message was dropped
+    # `dropped` has no entry for a reason if no message was dropped for that reason.
     absent = 0 if field == "dropped" else None
     numbers = [value.get(name, absent) for value in values]
     lowest = 0 if field in _NONE_BELOW_0 else -math.inf
@@ -623,48 +711,47 @@ def _make_entry_column(
 
 
 def build_events_table(timed: TimedMessages[Event], source: str) -> Table:
-    """Returns the table of the events, in order of their arrival at the recorder."""
+    """Builds the table of the events, in the order of their arrival at the recorder.
+
+    Args:
+        timed: The events, with their times.
+        source: Name of the file for error messages.
+
+    Raises:
+        LogError: A number is out of range.
+    """
     events = timed.messages
     t_ns = to_int_array((event.t_ns for event in events), source, "t_ns")
+    # Events before the start of the session have the time -1.
     t_s = np.where(t_ns >= 0, t_ns / NS_PER_S, np.nan)
     columns = list(_make_time_columns(None, t_s, timed.log_ns, timed.publish_ns))
     for field, (unit, text, kind) in read_field_docs(Event).items():
         if field in ("v", "t_ns"):
             continue
-        values = [getattr(event, field) for event in events]
+        fields = [getattr(event, field) for event in events]
+        values: NDArray[Any]
         if kind == "integer":
+            # The boot is a random number of 64 bits.
             bits = np.uint64 if field == "boot" else np.int64
-            columns.append(
-                Column(
-                    name=field,
-                    values=to_int_array(values, source, field, bits),
-                    unit=unit,
-                    meaning=text,
-                    source=field,
-                )
-            )
+            values = to_int_array(fields, source, field, bits)
         else:
-            columns.append(
-                Column(
-                    name=field,
-                    values=np.array(list(map(_to_text, values)), dtype=np.object_),
-                    unit=unit,
-                    meaning=text,
-                    source=field,
-                )
-            )
+            values = np.array(list(map(_to_text, fields)), dtype=np.object_)
+        columns.append(Column(name=field, values=values, unit=unit, meaning=text, source=field))
     return Table(EVENTS_TABLE, "", "something that happened once", tuple(columns))
 
 
 def _to_text(value: str | Mapping[str, Any]) -> str:
-    """Returns a field of an event as text; a map per member as JSON, "" if it is empty."""
+    """Converts a field of an event to a text.
+
+    A map becomes JSON, and an empty map an empty text.
+    """
     if isinstance(value, str):
         return value
     return json.dumps(value, sort_keys=True) if value else ""
 
 
 def to_pandas_frame(table: Table) -> "pandas.DataFrame":
-    """Returns a table as a pandas data frame.
+    """Converts a table to a pandas data frame.
 
     A missing value is None in a column of texts, and NaN in a column of numbers.
 
@@ -681,7 +768,7 @@ def to_pandas_frame(table: Table) -> "pandas.DataFrame":
 
 
 def to_data_frame(table: Table) -> "polars.DataFrame":
-    """Returns a table as a polars data frame.
+    """Converts a table to a polars data frame. A missing value is null.
 
     Raises:
         UsageError: polars is not installed.

@@ -1,11 +1,15 @@
-"""Signatures of logs: Ed25519 signatures of a log's digest chain, in a separate file.
+"""Signs logs, and checks their signatures.
 
-A signature covers what the digest chain covers: all messages, and everything that describes
-them, but not how they are packed. It therefore also holds for a copy that was packed anew.
+A log contains digests of its contents (`running_digest`). The owner of a private key signs
+these digests with the method Ed25519. The signature is stored in a separate file beside the
+log. Anybody who has the public key can check that the log is exactly the one that was signed.
+
+A signature covers all messages and everything that describes them, but not the compression.
+Therefore it is also valid for a copy of the log that was compressed differently.
 
 Invariant:
-    - A log is read, and never written.
-    - Only a log that agrees with its digest chain is signed.
+    - A log is only read, and never changed.
+    - Only a log that agrees with its digests is signed.
 """
 
 import base64
@@ -37,21 +41,22 @@ from .mcap_reader import McapReader, Progress
 from .running_digest import DIGESTS, DigestState, Integrity
 
 SUFFIX = ".sig"
-"""Suffix of a signature's file, which follows the whole name of the log."""
+"""Suffix of the signature's file, after the whole name of the log."""
 _FORMAT = "trilat-net log signature 1"
+"""Name and version of the format, at the beginning of the signed bytes."""
 _MAX_BYTES = 65_536
-"""Largest size of a key's file and of a signature's file, in bytes."""
+"""Largest size of the file of a key or of a signature, in bytes."""
 
 
 class LogSignature(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Content of a signature's file.
 
     Attributes:
-        format: name and version of the format.
-        chain: the digests that are signed, as the log's chain states them.
-        public_key: public key of the signer, 32 bytes in base64. Readers decide whether they
-            trust the key.
-        signature: the signature, 64 bytes in base64.
+        format: Name and version of the format.
+        chain: The signed digests, as the log states them.
+        public_key: Public key of the signer, 32 bytes in base64. It is not trusted: whoever
+            checks the log supplies a key of a signer whom they trust.
+        signature: The signature, 64 bytes in base64.
     """
 
     format: str
@@ -61,16 +66,22 @@ class LogSignature(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def create_signing_keys(path: str | Path) -> tuple[Path, Path]:
-    """Creates a pair of keys, and returns the names of their files.
+    """Creates a pair of keys for signing logs, as `trilat keys pair` does.
 
-    The private key is PATH.key, which only the user may read. The public key is PATH.pub. The
-    command is `trilat keys pair`.
+    The private key is written to PATH.key, which only the user may read. The public key is
+    written to PATH.pub.
 
     >>> [file.name for file in tn.create_signing_keys("lab")]
     ['lab.key', 'lab.pub']
 
+    Args:
+        path: Name of the files without their suffixes.
+
+    Returns:
+        The files of the private and of the public key.
+
     Raises:
-        UsageError: one of the files exists, or cannot be written.
+        UsageError: One of the files exists, or cannot be written.
     """
     path = Path(path)
     if not path.name:
@@ -96,17 +107,24 @@ def sign_log(
     force: bool = False,
     progress: Progress | None = None,
 ) -> Path:
-    """Signs a finished log, and returns the name of the signature's file.
-
-    The command is `trilat log sign`.
+    """Signs a finished log, as `trilat log sign` does.
 
     >>> path = tn.simulate("two_sites", duration_s=0.1).save("signed.mcap")
     >>> tn.sign_log(path, tn.create_signing_keys("mine")[0]).name
     'signed.mcap.sig'
 
+    Args:
+        path: The log.
+        key_file: File of the private key.
+        force: True if an existing signature may be replaced.
+        progress: Function that is called after every record of the log.
+
+    Returns:
+        The file of the signature.
+
     Raises:
-        LogError: the log cannot be read, has no digest chain, or does not agree with the chain.
-        UsageError: the key file is not a private key, other users can read it, or there is a
+        LogError: The log cannot be read, has no digests, or does not agree with its digests.
+        UsageError: The key file is not a private key, other users can read it, or there is a
             signature already.
     """
     path = Path(path)
@@ -146,30 +164,46 @@ def sign_log(
 def check_signatures(
     paths: Sequence[Path], key_file: Path, progress: Progress | None = None
 ) -> Finding:
-    """Checks that logs are equal to those that the owner of a public key signed.
+    """Checks that logs are those that the owner of a public key has signed.
 
     Args:
-        paths: the logs, each with its signature's file beside it.
-        key_file: file of the public key.
-        progress: called after every record of a log.
+        paths: The logs. The file of the signature is beside each log.
+        key_file: File of the public key.
+        progress: Function that is called after every record of a log.
+
+    Returns:
+        The finding, with a problem for each log whose signature is missing or invalid.
 
     Raises:
-        LogError: a log cannot be read.
-        UsageError: the key file is not a public key.
+        LogError: A log cannot be read.
+        UsageError: The key file is not a public key.
     """
     key = _load_key(
         key_file, Ed25519PublicKey, "public Ed25519 key; trilat keys pair NAME makes NAME.pub"
     )
-    found = Finding("signature")
+    finding = Finding("signature")
     for path in paths:
-        if problem := _find_problem(path, key, progress):
-            found.add(str(path), None, problem)
+        problem = _find_problem(path, key, progress)
+        if problem:
+            finding.add(str(path), None, problem)
     files = "file is" if len(paths) == 1 else count_nouns(len(paths), "file is", "files are")
-    return found.conclude(f"the {files} as the owner of {key_file} signed")
+    return finding.conclude(f"the {files} as the owner of {key_file} signed")
 
 
 def _find_problem(path: Path, key: Ed25519PublicKey, progress: Progress | None) -> str:
-    """Returns the problem of a log's signature, or "" if the signature is right."""
+    """Checks the signature of one log.
+
+    Args:
+        path: The log.
+        key: Public key of the signer.
+        progress: Function that is called after every record of the log.
+
+    Returns:
+        Description of the problem. Empty if the signature is valid.
+
+    Raises:
+        LogError: The log cannot be read.
+    """
     file = path.with_name((path.name or "log") + SUFFIX)
     try:
         with open_regular(file) as stream:
@@ -179,7 +213,7 @@ def _find_problem(path: Path, key: Ed25519PublicKey, progress: Progress | None) 
         return f"there is no signature {file}"
     except OSError as error:
         return f"{file} cannot be read: {error.strerror}"
-    except ValueError as error:  # of msgspec and of base64
+    except ValueError as error:  # msgspec and base64 raise it
         return f"{file} is no signature of this program: {error}"
     if stated.format != _FORMAT:
         return f"{file} is of another version: {stated.format[:40]!r}"
@@ -197,13 +231,28 @@ def _find_problem(path: Path, key: Ed25519PublicKey, progress: Progress | None) 
 
 
 def _signed_bytes(chain: Mapping[str, str]) -> bytes:
-    """Returns the bytes that a signature signs: the format and the digests."""
+    """Returns the bytes that are signed: the name of the format, and the digests.
+
+    Args:
+        chain: The digests, as the log states them.
+    """
     facts = json.dumps(dict(chain), sort_keys=True, separators=(",", ":"))
     return f"{_FORMAT}\n{facts}".encode()
 
 
 def _read_chain(path: Path, progress: Progress | None) -> tuple[Integrity, dict[str, str]]:
-    """Returns a log's agreement with its digest chain, and the digests that it states."""
+    """Reads a log, and compares it with its digests.
+
+    Args:
+        path: The log.
+        progress: Function that is called after every record of the log.
+
+    Returns:
+        The result of the comparison, and the digests that the log states.
+
+    Raises:
+        LogError: The log cannot be read.
+    """
     with reading(path) as stream:
         reader = McapReader(stream, str(path), progress, kept=False)
         deque(reader.messages(), maxlen=0)
@@ -214,20 +263,20 @@ def _read_chain(path: Path, progress: Progress | None) -> tuple[Integrity, dict[
 
 
 def _load_key(path: Path, kind: Any, expected: str) -> Any:
-    """Returns the key in a file.
+    """Reads a key from a file.
 
     Args:
-        path: the file.
-        kind: class of the key.
-        expected: noun phrase for such a key, in the error.
+        path: The file.
+        kind: Class of the key.
+        expected: Description of the expected key for the error message.
 
     Raises:
-        UsageError: the file is not such a key.
+        UsageError: The file is not such a key.
     """
     with reading(path, UsageError) as stream:
         data = stream.read(_MAX_BYTES)
     key: object = None
-    # TypeError: the key needs a password.
+    # A key that needs a password raises a TypeError.
     with suppress(ValueError, TypeError, UnsupportedAlgorithm):
         if kind is Ed25519PrivateKey:
             key = serialization.load_pem_private_key(data, password=None)

@@ -1,11 +1,15 @@
-"""Reader of MCAP files, chunk by chunk, and contents of a trilat-net log by topic.
+"""Reads MCAP files chunk by chunk, and collects the messages of a log by topic.
+
+`McapReader` reads any MCAP file. `read_contents` uses it to read a log of trilat-net
+completely.
 
 Invariant:
-    - The reader holds one chunk at a time. Unreadable parts are skipped and reported.
-    - Messages of a log stay bytes until they are decoded.
-    - Channels for viewers (/viz) are skipped.
-    - A channel whose messages would need too much memory is read up to its share of the memory;
-      the other channels are read completely.
+    - The reader has one unpacked chunk in memory at a time. Parts that cannot be read are
+      skipped and reported.
+    - The messages of a log stay encoded until they are needed.
+    - Channels that are written for viewers (/viz) are skipped.
+    - The memory is bounded, even if a file was made to do harm. A channel whose messages would
+      need too much memory is read in part. The other channels are read completely.
 """
 
 import math
@@ -35,53 +39,61 @@ _READ = {
     Opcode.ATTACHMENT,
     Opcode.HEADER,
 }
-"""Kinds of records that are read; a reader of the whole file needs no indexes."""
+"""Kinds of records that are read. The indexes are not needed to read a whole file."""
 
 KEPT_BYTES = 64 << 20
-"""Memory that the kept messages of any file may take, in bytes."""
+"""Memory that the messages of any file may take, in bytes."""
 KEPT_RATIO = 300
-"""The kept messages of larger files may take this many times the size of the file.
+"""The messages of a larger file may take this multiple of the size of the file.
 
-Logs of arms at rest in virtual time have the largest honest ratio, of about 120.
+The largest ratio of logs that trilat-net writes is about 120, for arms at rest in virtual time.
 """
 CHANNEL_SHARE = 1 / 3
-"""Largest share of that memory for one channel."""
+"""Largest fraction of this memory for one channel."""
 _DECODED_BYTES = 3_000
 _LONG_BYTES = 300
 _LONG_RATIO = 24
-"""Memory of a decoded message: _DECODED_BYTES, and for every byte of its payload beyond
-_LONG_BYTES another _LONG_RATIO bytes.
+"""Estimate of the memory of a decoded message: _DECODED_BYTES, and _LONG_RATIO bytes for every
+byte of its payload beyond _LONG_BYTES.
 """
 _NAME_BYTES = 600
 _NAME_RATIO = 20
-"""Memory of a channel: _NAME_BYTES, and _NAME_RATIO bytes for every byte of its record."""
+"""Estimate of the memory of a channel's definition: _NAME_BYTES, and _NAME_RATIO bytes for
+every byte of its record.
+"""
 
 Progress = Callable[[int, int], None]
-"""Receives the progress of a task: (bytes done, all bytes)."""
+"""Function that receives the progress of a task: the processed bytes, and all bytes."""
 Watch = Callable[[mcap_records.RecordFrame, bytes, bytes], None]
-"""Receives a record of a file: its place, its content, and the unpacked records of a chunk.
+"""Function that receives a record of a file: its place, its content, and its unpacked records.
 
-The unpacked records are empty if the chunk is unreadable.
+Only a chunk has unpacked records. They are empty if the chunk cannot be unpacked.
 """
 
 
 def shift_progress(progress: Progress | None, before: int, total: int) -> Progress | None:
-    """Returns a progress of one file within `total` bytes, of which `before` are done."""
+    """Returns a function that reports the progress of one file as that of several files.
+
+    Args:
+        progress: Function that receives the progress of all files. None if nobody needs it.
+        before: Size of the files that were read before, in bytes.
+        total: Size of all files, in bytes.
+    """
     if progress is None:
         return None
     return lambda done, _: progress(before + done, total)
 
 
 class ChannelInfo(NamedTuple):
-    """A channel as its file describes it.
+    """Description of a channel in a file.
 
     Attributes:
-        topic: topic of the channel.
-        encoding: encoding of the messages.
-        schema: name of the messages' schema; "" without a schema.
-        schema_encoding: encoding of the schema.
-        metadata: metadata of the channel.
-        schema_data: content of the schema.
+        topic: Topic of the channel.
+        encoding: Encoding of the messages.
+        schema: Name of the schema of the messages. Empty if the channel has no schema.
+        schema_encoding: Encoding of the schema.
+        metadata: Metadata of the channel.
+        schema_data: Content of the schema.
     """
 
     topic: str
@@ -93,14 +105,14 @@ class ChannelInfo(NamedTuple):
 
 
 class McapMessage(NamedTuple):
-    """One message.
+    """One message of a file.
 
     Attributes:
-        topic: topic of its channel; "" if the file does not define the channel.
-        payload: bytes of the message, as published.
-        log_time_ns: arrival, Unix ns.
-        publish_time_ns: sending time that the message states, Unix ns.
-        sequence: number of the message, modulo 2^32.
+        topic: Topic of the channel. Empty if the file does not define the channel.
+        payload: Bytes of the message, as published.
+        log_time_ns: Time of arrival at the recorder, in Unix time, in ns.
+        publish_time_ns: Time of sending, in Unix time, in ns.
+        sequence: Sequence number of the message, modulo 2^32.
     """
 
     topic: str
@@ -111,28 +123,33 @@ class McapMessage(NamedTuple):
 
 
 class McapReader:
-    """One pass over a file.
+    """Reader of one MCAP file, from its beginning to its end.
 
     Args:
-        stream: the file, opened for reading.
-        name: name of the file in errors.
-        progress: called after every record of the file.
-        kept: True if the caller keeps the messages: then their memory is limited, see
+        stream: The file, opened for reading.
+        name: Name of the file for error messages.
+        progress: Function that is called after every record of the file.
+        kept: True if the caller stores the messages. Their memory is limited then, see
             `KEPT_RATIO`.
 
     Attributes:
-        metadata, attachments: metadata and attachments read so far, by name.
-        channels: channels read so far, by topic; the first definition of a channel counts.
-        library: program that wrote the file, as its header states.
-        chunks: number of chunks read so far, by compression ("" without compression).
-        packed_bytes, unpacked_bytes: sizes of these chunks in the file, and unpacked.
-        size: size of the file, in bytes.
-        offset: offset of the record of the file that is being read.
-        complete: True once a finished file has been read to the last byte of its end mark.
-        scanner: finds the records of the file.
-        watch: receives every record of the file before the messages of the record, if it is
-            set. It also receives the records after `MAX_DAMAGED_PARTS` damaged parts, where
-            the reader gives up, and those of a file without the mark at its beginning.
+        metadata: Metadata read so far, by name.
+        attachments: Attachments read so far, by name.
+        channels: Descriptions of the channels read so far, by topic. If a topic is defined
+            repeatedly, the first definition counts.
+        library: Program that wrote the file, as the header states.
+        chunks: Number of chunks read so far, by compression. The key is empty for chunks that
+            are not compressed.
+        packed_bytes: Size of these chunks in the file, in bytes.
+        unpacked_bytes: Size of these chunks after unpacking, in bytes.
+        size: Size of the file, in bytes.
+        offset: Offset of the record that is being read.
+        complete: True if the file was finished and has been read completely.
+        scanner: Scanner that finds the records of the file.
+        watch: Function that receives every record of the file, before the messages of the
+            record are yielded. If it is set, it also receives the records of a file that does
+            not begin as an MCAP file does, and the records after so many damaged parts that the
+            reader gives up (`MAX_DAMAGED_PARTS`). None if nobody needs the records.
     """
 
     def __init__(
@@ -148,7 +165,8 @@ class McapReader:
         self.channels: dict[str, ChannelInfo] = {}
         self.library = ""
         self.chunks: Counter[str] = Counter()
-        self.packed_bytes = self.unpacked_bytes = 0
+        self.packed_bytes = 0
+        self.unpacked_bytes = 0
         self.offset = 0
         self.complete = False
         self._chain = RunningDigest()
@@ -160,7 +178,7 @@ class McapReader:
         self._schemas: dict[int, tuple[str, str, bytes]] = {}
         self._topics: dict[int, str] = {}
         self._session_channels: set[int] = set()
-        # Memory that is left for all messages, and by channel, in bytes.
+        # Memory that may still be used, for all messages and for each channel, in bytes.
         self._memory_left = max(KEPT_BYTES, KEPT_RATIO * self.size) if kept else None
         share = math.inf if self._memory_left is None else CHANNEL_SHARE * self._memory_left
         self._channel_memory_left: defaultdict[int, float] = defaultdict(lambda: share)
@@ -173,14 +191,14 @@ class McapReader:
 
     @property
     def torn(self) -> mcap_records.Damage | None:
-        """The end that was cut off; None in a finished file, and before the end is reached."""
+        """The missing end of the file. None if it is not missing, or was not reached yet."""
         return self.scanner.torn
 
     def messages(self) -> Iterator[McapMessage]:
-        """Yields every message in file order.
+        """Yields every message in the order of the file.
 
         Raises:
-            LogError: the file is not an MCAP file, or unpacks to far too much for its size.
+            LogError: The file is no MCAP file, or unpacks to far too much for its size.
         """
         scanner = self.scanner
         if not scanner.begins and self.watch is None:
@@ -200,9 +218,18 @@ class McapReader:
 
     @property
     def _gave_up(self) -> bool:
+        """True if there were so many damaged parts that no more records are read."""
         return self.watch is not None and len(self.damaged) >= mcap_records.MAX_DAMAGED_PARTS
 
     def _open(self, frame: mcap_records.RecordFrame) -> bytes:
+        """Reads a record of the file, and passes it to `watch`.
+
+        Returns:
+            The messages and definitions in the record, unpacked.
+
+        Raises:
+            UnreadableRecord: The record cannot be read. It is passed to `watch` nevertheless.
+        """
         content = self.scanner.content(frame)
         data = b""
         try:
@@ -214,9 +241,13 @@ class McapReader:
         return data
 
     def _unpack(self, frame: mcap_records.RecordFrame, content: bytes) -> bytes:
-        """Returns the messages, schemas and channels in a record of the file, unpacked.
+        """Returns the messages and definitions in a record of the file, in unpacked form.
 
-        Metadata, attachments and the header are stored, and have no unpacked records.
+        The header, metadata and attachments are stored. They contain no such records, and the
+        result is empty.
+
+        Raises:
+            UnreadableRecord: The record cannot be decoded, or its checksum is wrong.
         """
         match frame.opcode:
             case Opcode.CHUNK:
@@ -247,6 +278,19 @@ class McapReader:
     def _read_records(
         self, data: bytes, frame: mcap_records.RecordFrame
     ) -> Iterator[McapMessage]:
+        """Yields the messages of an unpacked chunk, and stores its schemas and channels.
+
+        Messages and definitions are added to the digests. The local variables make this loop
+        fast, which runs for every message of a file.
+
+        Args:
+            data: The unpacked records.
+            frame: Place of the chunk in the file.
+
+        Raises:
+            UnreadableRecord: A record of the chunk makes no sense.
+            LogError: The messages need too much memory.
+        """
         find_topic = self._topics.get
         session_channels = self._session_channels
         memory_left = self._channel_memory_left
@@ -254,9 +298,10 @@ class McapReader:
         head_bytes = mcap_records.MESSAGE_HEAD.size
         new = tuple.__new__  # twice as fast as calling the class `McapMessage`
         memory = 0
-        chained = 0  # end of the part of `data` that the digest chain includes
         messages = 0
         view = memoryview(data)
+        # Offset up to which `data` has been added to the digest of the messages.
+        digested = 0
         for opcode, begin, end in mcap_records.iterate_records(data):
             if opcode == mcap_records.OP_MESSAGE:
                 length = end - begin
@@ -264,6 +309,8 @@ class McapReader:
                 if length < head_bytes:
                     raise mcap_records.UnreadableRecord("a message is shorter than its head")
                 channel, sequence, log_time_ns, publish_time_ns = parse_head(data, begin)
+
+                # Messages of the session will be decoded, the others will not.
                 if channel in session_channels:
                     cost = _DECODED_BYTES
                     if length > _LONG_BYTES:
@@ -276,34 +323,43 @@ class McapReader:
                     continue
                 memory_left[channel] = remaining - cost
                 memory += cost
+
                 payload = data[begin + head_bytes : end]
                 topic = find_topic(channel, "")
                 yield new(McapMessage, (topic, payload, log_time_ns, publish_time_ns, sequence))
             elif opcode in mcap_records.DEFINITIONS:
-                self._chain.add_records(
-                    view[chained : begin - mcap_records.RECORD_HEAD_BYTES], 0
-                )
-                chained = end
+                # The digest of the messages leaves out the definitions between them.
+                record_start = begin - mcap_records.RECORD_HEAD_BYTES
+                self._chain.add_records(view[digested:record_start], 0)
+                digested = end
                 self._take_memory(_NAME_BYTES + _NAME_RATIO * (end - begin), frame)
                 self._define(opcode, data[begin:end])
-        self._chain.add_records(view[chained:], messages)
+        self._chain.add_records(view[digested:], messages)
         self._take_memory(memory, frame)
 
     def judge_digest(self) -> Integrity:
-        """Returns the agreement of the file, once it has been read, with its digest chain."""
+        """Compares the file with the digests that it states, after it has been read."""
         return self._chain.judge(
             self.metadata, finished=self.complete, damaged=bool(self.damaged)
         )
 
     @property
     def agrees_on_messages(self) -> bool:
-        """True if number and order of the messages read agree with the digest chain."""
+        """True if the messages and their order agree with the digests that the file states."""
         stated = self.metadata.get(DIGESTS, {})
         computed = self._chain.facts()
         return all(stated.get(key) == computed[key] for key in ("messages", "records"))
 
     def _define(self, opcode: int, content: bytes) -> None:
-        """Stores a schema or a channel."""
+        """Stores a schema or a channel. Of repeated definitions, the first one counts.
+
+        Args:
+            opcode: Kind of the definition.
+            content: Content of the definition.
+
+        Raises:
+            UnreadableRecord: The definition cannot be decoded.
+        """
         self._chain.add_entry(opcode, content)
         record = mcap_records.parse_record(opcode, content)
         if opcode == Opcode.SCHEMA:
@@ -324,7 +380,14 @@ class McapReader:
                 self._session_channels.add(record.id)
 
     def _cut_channel(self, channel: int, frame: mcap_records.RecordFrame) -> None:
-        """Ends the reading of a channel whose share of the memory is used up."""
+        """Stops the reading of a channel whose messages take too much memory.
+
+        This is reported once as a damaged part of the file.
+
+        Args:
+            channel: Number of the channel.
+            frame: Place of the record from which on the channel is not read.
+        """
         if self._channel_memory_left[channel] >= 0.0:
             self._channel_memory_left[channel] = -math.inf
             topic = self._topics.get(channel, f"channel {channel}")
@@ -334,10 +397,14 @@ class McapReader:
             self._more_damage.append(mcap_records.Damage(frame.offset, frame.size, text))
 
     def _take_memory(self, amount: int, frame: mcap_records.RecordFrame) -> None:
-        """Subtracts memory from the memory that is left.
+        """Subtracts memory from the memory that may still be used.
+
+        Args:
+            amount: Memory in bytes.
+            frame: Place of the record that needs the memory.
 
         Raises:
-            LogError: the memory does not suffice.
+            LogError: There is not enough memory left.
         """
         if self._memory_left is None:
             return
@@ -352,16 +419,17 @@ class McapReader:
 
 
 _LAST_SIGNED_NS = np.uint64((1 << 63) - 1)
+"""Latest time stamp that fits into a signed number of 64 bits."""
 
 
 @dataclass(slots=True)
 class ChannelMessages:
-    """The messages of one topic, in file order.
+    """Messages of one topic, in the order of the file.
 
     Attributes:
-        payloads: the messages as published.
-        log_ns: arrival of each message, Unix ns.
-        publish_ns: sending time that each message states, Unix ns.
+        payloads: The messages, encoded as published.
+        log_ns: Time of arrival of each message, in Unix time, in ns.
+        publish_ns: Time of sending that each message states, in Unix time, in ns.
     """
 
     payloads: list[bytes] = field(default_factory=list)
@@ -375,29 +443,34 @@ class ChannelMessages:
         self.publish_ns.append(publish_ns)
 
     def times(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Returns the arrival and sending times, shape (K,) each, in Unix ns below 2^63."""
+        """Returns the arrival and sending times as arrays, shape (K,) each, in Unix ns.
+
+        Times of 2^63 ns and later are replaced by the latest time that the arrays can contain.
+        """
         return _clip_times(self.log_ns), _clip_times(self.publish_ns)
 
 
 def _clip_times(times: "array[int]") -> NDArray[np.int64]:
+    """Converts unsigned times to signed ones. Times that are too late are reduced."""
     unsigned = np.array(times, dtype=np.uint64)
     return np.minimum(unsigned, _LAST_SIGNED_NS).astype(np.int64)
 
 
 @dataclass
 class LogContents:
-    """Contents of a log: of one file, or of several parts.
+    """Contents of a log, which may consist of one file or of several parts.
 
     Attributes:
-        sources: names of the files.
-        session: metadata of the session.
-        scenario: text of the scenario.
-        metadata: all metadata, by name.
-        channels: messages, by topic.
-        complete: True if all parts are present, finished, and readable throughout.
+        sources: Names of the files.
+        session: Metadata of the session.
+        scenario: Text of the scenario.
+        metadata: All metadata, by name.
+        channels: The messages, by topic.
+        complete: True if all parts are present and finished, and can be read completely.
         ended: True if the last part was finished.
-        damaged: a sentence for every part that cannot be read.
-        chain: agreement with the digest chain; of several files, the worst.
+        damaged: A sentence for every part of a file that cannot be read.
+        chain: Result of comparing the log with its digests. For several files, the worst
+            result.
     """
 
     sources: tuple[str, ...]
@@ -412,7 +485,7 @@ class LogContents:
 
     @property
     def source(self) -> str:
-        """Name of the log in errors."""
+        """Name of the log for error messages."""
         more = len(self.sources) - 1
         if not more:
             return self.sources[0]
@@ -422,22 +495,23 @@ class LogContents:
 def read_contents(
     stream: BinaryIO, name: str, progress: Progress | None = None, *, trusted: bool = False
 ) -> LogContents:
-    """Returns the contents of a log.
+    """Reads the contents of a log from one file.
 
     Args:
-        stream: the file, opened for reading.
-        name: name of the file in errors.
-        progress: called after every record of the file.
+        stream: The file, opened for reading.
+        name: Name of the file for error messages.
+        progress: Function that is called after every record of the file.
         trusted: True if this program has just written the file. Then the memory of the messages
-            is not limited: however well a run at rest is packed, the file holds no more than
-            the run did.
+            is not limited. A run of arms at rest can be compressed very well, but the file
+            contains no more than this program had in memory before.
 
     Raises:
-        LogError: the file is not an MCAP file, or not a log of trilat-net.
+        LogError: The file is no MCAP file, or no log of trilat-net.
     """
     reader = McapReader(stream, name, progress, kept=not trusted)
     channels: dict[str, ChannelMessages] = {}
-    channel_of_topic: dict[str, ChannelMessages | None] = {}  # None for skipped topics
+    # The channel of each topic that was read. None for topics that are skipped.
+    channel_of_topic: dict[str, ChannelMessages | None] = {}
     for topic, payload, log_ns, publish_ns, _ in reader.messages():
         try:
             channel = channel_of_topic[topic]
@@ -466,10 +540,10 @@ def read_contents(
 
 
 def check_log(stream: BinaryIO, name: str) -> None:
-    """Reads a log once, message by message, without keeping the messages.
+    """Reads a log once without storing its messages, to find out whether it can be opened.
 
     Raises:
-        LogError: no command opens the file; the text states the reason.
+        LogError: The file cannot be opened as a log. The text states the reason.
     """
     reader = McapReader(stream, name)
     deque(reader.messages(), maxlen=0)
@@ -483,8 +557,12 @@ def check_log(stream: BinaryIO, name: str) -> None:
 def _check_head(reader: McapReader, name: str) -> None:
     """Checks that a file that was read describes a session.
 
+    Args:
+        reader: Reader that has read the file.
+        name: Name of the file for the error message.
+
     Raises:
-        LogError: the file lacks the session's metadata or the scenario.
+        LogError: The file lacks the metadata of the session, or the scenario.
     """
     session = reader.metadata.get(SESSION, {})
     missing = [key for key in ("session", "driver") if key not in session]

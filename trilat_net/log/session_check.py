@@ -1,12 +1,12 @@
-"""Check a log: its bytes, its completeness, and its agreement with its scenario and accounts.
+"""Checks a log: its bytes, its completeness, and its agreement with its scenario.
 
-The bytes of any MCAP file are checked. The content is checked only for a trilat-net log: each
-message against its own content, the scenario, and the messages before it. Sites are not
-executed; that is the task of `verify`.
+The bytes of any MCAP file are checked. The content is checked only if the file is a log of
+trilat-net: each message is compared with its own statements, with the scenario, and with the
+earlier messages. The control laws are not executed again. That is the task of `verify`.
 
 Invariant:
-    - Each check has one finding, with the places where the check fails.
-    - Missing messages are listed by ranges.
+    - Each check produces one finding, with the places where the check failed.
+    - Missing messages are listed as ranges of their numbers.
 """
 
 import hashlib
@@ -47,27 +47,28 @@ from .ros2 import cdr
 from .running_digest import DigestState, Integrity
 
 MAX_AHEAD_NS = 10 * NS_PER_S
-"""Largest time by which the stamp of sending may be later than the arrival, for any clocks."""
+"""Largest time by which the sending may be later than the arrival, because of wrong clocks."""
 MAX_BOOTS = 64
-"""Largest number of starts of a member that are distinguished."""
+"""Largest number of starts of a member whose messages are counted separately."""
 _CDR_HEAD = b"\x00\x01"
-"""First bytes of a message in plain CDR, little-endian."""
+"""First bytes of a message in plain CDR, the encoding of ROS 2, in little-endian order."""
 _RATE_TOLERANCE = 0.02
-"""Largest relative difference of a measured rate from the scenario's."""
+"""Largest relative difference between a measured tick rate and that of the scenario."""
 _RATE_SPAN_NS = 2 * NS_PER_S
-"""Shortest time over which a rate is computed."""
+"""Shortest time over which a tick rate is measured, in ns."""
 _ACCOUNTS_SINCE = 3
-"""First schema version whose logs have an account of every channel."""
+"""First schema version whose logs state the message counts of every channel."""
 
 
 @dataclass(frozen=True, repr=False)
 class LogCheckResult(CheckReport):
-    """The result of a check of files.
+    """Result of checking the files of one log.
 
     Attributes:
-        files: names of the files.
-        findings: one finding per check.
-        ours: True if the files are a trilat-net log; else only their bytes were checked.
+        files: Names of the files.
+        findings: One finding for each check.
+        ours: True if the files are a log of trilat-net. Otherwise only their bytes were
+            checked.
     """
 
     files: list[str]
@@ -75,7 +76,7 @@ class LogCheckResult(CheckReport):
     ours: bool
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns plain values, with the keys of `trilat log check --json`."""
+        """Returns the result as plain values, with the keys of `trilat log check --json`."""
         kind = "trilat" if self.ours else "mcap"
         return {
             "files": self.files,
@@ -85,7 +86,7 @@ class LogCheckResult(CheckReport):
         }
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a row per check."""
+        """Returns a row for each check, with its problems."""
         return [
             {
                 "check": finding.check,
@@ -108,11 +109,12 @@ def check_file(*files: str | Path, progress: Progress | None = None) -> LogCheck
     True
 
     Args:
-        files: the file, or the parts of the log.
-        progress: called now and then with the number of bytes read and their total.
+        files: The file, or the parts of the log.
+        progress: Function that is called now and then with the number of bytes read and their
+            total.
 
     Raises:
-        LogError: a file cannot be read, or is of another session than the files before it.
+        LogError: A file cannot be read, or belongs to another session than the previous files.
     """
     check = SessionCheck()
     paths = [Path(file) for file in files]
@@ -132,23 +134,26 @@ def check_file(*files: str | Path, progress: Progress | None = None) -> LogCheck
 
 
 class ChannelCheck:
-    """Checks one channel, message by message: numbers, schema and time stamps.
+    """Checks the messages of one channel: their numbers, schema and time stamps.
 
     Args:
-        key: session, member and channel ("state", "link", "event" or "stats").
-        about: metadata of the session.
-        scenario: the scenario; None if it cannot be read.
-        findings: receives the problems.
-        accounts: the accounts of the session, which count the messages.
+        key: Session, member and channel. A member is a site, which runs one arm, or the
+            recorder.
+        about: Metadata of the session.
+        scenario: Scenario of the session. None if it cannot be read.
+        findings: Receives the problems.
+        accounts: Counts the messages of the session.
 
     Attributes:
-        member: name of the member.
-        kind: the channel: "state", "link", "event" or "stats".
-        rate_hz: tick rate of the member, Hz; 0 for the recorder.
-        received: number of messages; repeated numbers count once.
-        boots: starts of the member.
-        first: number and time of sending of the message with the lowest number.
-        last: number and time of sending of the message with the highest number.
+        member: Name of the member.
+        kind: Name of the channel: "state" (records), "link" (statistics), "event" or "stats".
+        rate_hz: Tick rate of the site, in Hz. It is 0 for the recorder.
+        received: Number of messages, without repetitions.
+        boots: Random numbers that identify the starts of the member.
+        first: Number and sending time of the message with the lowest number. None if there is
+            no message.
+        last: Number and sending time of the message with the highest number. None if there is
+            no message.
     """
 
     def __init__(
@@ -175,17 +180,25 @@ class ChannelCheck:
         self._accounts = accounts
         self._epoch_ns = _parse_number(about, "epoch_unix_ns")
         self._version = _parse_number(about, "schema_version")
-        self._in_file: dict[int, Account] = {}  # by boot
+        # Messages of the present file, by the boot of the member.
+        self._in_file: dict[int, Account] = {}
+        # Name of the present file.
         self._file = ""
+        # Arrival time of the previous message.
         self._log_ns = 0
 
     @property
     def name(self) -> str:
-        """Short name of the channel, as in "m1/state"."""
+        """Short name of the channel for texts, such as "m1/state"."""
         return f"{self.member}/{self.kind}"
 
     def begin(self, file: str, channel: ChannelInfo) -> None:
-        """Starts another file, and checks how the file describes the channel."""
+        """Starts the check of another file, and checks how the file describes the channel.
+
+        Args:
+            file: Name of the file.
+            channel: Description of the channel in the file.
+        """
         self._in_file = defaultdict(Account)
         self._file = file
         self._log_ns = 0
@@ -194,7 +207,7 @@ class ChannelCheck:
             self._add("schema", None, fault)
 
     def _find_schema_fault(self, channel: ChannelInfo) -> str:
-        """Returns the first fault in the description of the channel; "" without a fault."""
+        """Returns the first fault in the description of the channel. Empty if there is none."""
         kind = CHANNEL_TYPES[self.kind]
         if not channel.schema:
             return "has no schema"
@@ -214,48 +227,65 @@ class ChannelCheck:
         return ""
 
     def check_message(self, stored: McapMessage, offset: int) -> None:
-        """Checks a message; `offset` is the byte of the message or of its chunk."""
+        """Checks one message of the file.
+
+        Args:
+            stored: The message, with its times and its sequence number in the file.
+            offset: Offset of the message, or of the chunk that contains it, in the file.
+        """
         kind: Any = CHANNEL_TYPES[self.kind]
         try:
             message = decode(stored.payload, kind, messages.READABLE, self._layout)
         except WireError as error:
             self._add("schema", offset, str(error))
             return
+
         identity = identify_message(message, self.rate_hz)
         number = identity.number
         sequence = identity.sequence
-        if self.kind == topics.STATS:  # statistics of the recorder state no number
+        if self.kind == topics.STATS:
+            # The recorder's statistics contain no number. They are counted instead.
             number = self._in_file[message.boot].expected
             sequence = number
         if message.v != self._version:
             text = f"a message of version {message.v} in a log of version {self._version}"
             self._add("schema", offset, text)
         if identity.sender != self.member:
-            self._add(
-                "schema", offset, f"a message says that it is of {identity.sender[:40]!r}"
-            )
-        if number >= 0:  # events have numbers from version 3 on
+            self._add("schema", offset, f"a message states the sender {identity.sender[:40]!r}")
+
+        if number >= 0:
+            # A file stores the sequence number in 32 bits.
             if stored.sequence != sequence & 0xFFFFFFFF:
                 self._add(
                     "sequence", offset, f"number {sequence} is stored as {stored.sequence}"
                 )
             self._count(message, number, stored.publish_time_ns, offset)
         elif isinstance(message, messages.Event):
+            # Events have no number before version 3 of the schema.
             self._accounts.apply_event(message)
         self._check_times(stored, number, identity.sent_ns, offset)
 
     def _add(self, check: str, offset: int | None, text: str) -> None:
+        """Adds a problem of this channel to the finding of a check."""
         self._findings[check].add(self._file, offset, f"{self.name}: {text}")
 
     def _count(self, message: AnyMessage, number: int, publish_ns: int, offset: int) -> None:
-        """Counts a numbered message, and reports a number that occurs twice in the file."""
+        """Counts a numbered message, and reports a number that occurs twice in the file.
+
+        Args:
+            message: The message.
+            number: Number of the message.
+            publish_ns: Sending time of the message, in Unix time, in ns.
+            offset: Offset of the message in the file.
+        """
         if message.boot not in self.boots and len(self.boots) >= MAX_BOOTS:
             self._add("sequence", offset, f"more than {MAX_BOOTS} starts")
             return
         self.boots.add(message.boot)
-        # two parts may hold the same message, a file may not
+
+        # Two parts of a log may contain the same message, but one file may not.
         if not self._in_file[message.boot].receive(number):
-            self._add("sequence", offset, f"number {number} is there twice")
+            self._add("sequence", offset, f"number {number} occurs twice")
         if isinstance(message, messages.Event):
             is_new = self._accounts.receive_event(self._topic, number, message)
         elif self.kind == topics.STATS:
@@ -263,9 +293,12 @@ class ChannelCheck:
         else:
             is_new = self._accounts.count_message(self._topic, number)
         self.received += is_new
+
+        # The changes in a record state how many ticks the site skipped before it.
         if self.rate_hz and isinstance(message, messages.State) and message.cmd:
             skipped = count_skipped_ticks(message.cmd)
             self._accounts.mark_skipped_ticks(self.member, message.tick, skipped)
+
         numbered_time = (number, publish_ns)
         if self.first is None or numbered_time < self.first:
             self.first = numbered_time
@@ -275,7 +308,18 @@ class ChannelCheck:
     def _check_times(
         self, stored: McapMessage, number: int, stated_ns: int | None, offset: int
     ) -> None:
-        """Checks that arrivals ascend, and that the stamp of sending is that of the message."""
+        """Checks the arrival time and the sending time that the file states for a message.
+
+        Arrival times must not decrease. The sending time must be that of the message itself,
+        and not later than the arrival by more than the clocks can differ.
+
+        Args:
+            stored: The message, with its times in the file.
+            number: Number of the message, for the texts.
+            stated_ns: Sending time that the message states, in ns after the start of the
+                session. None if it states no time.
+            offset: Offset of the message in the file.
+        """
         log_ns = stored.log_time_ns
         publish_ns = stored.publish_time_ns
         if log_ns < self._log_ns:
@@ -297,17 +341,19 @@ class ChannelCheck:
 
 
 def _parse_number(about: Mapping[str, str], key: str) -> int:
-    """Returns a number of the metadata; 0 if it is missing or is not a number."""
+    """Returns a number of the metadata. It is 0 if it is missing or is not a number."""
     text = about.get(key, "")
     return int(text) if re.fullmatch(r"\d{1,19}", text) else 0
 
 
 class SessionCheck:
-    """Checks one session, in one file or in its parts.
+    """Checks one session, in one file or in several parts.
+
+    The caller passes the files to `read`, and calls `findings` at the end.
 
     Attributes:
-        ours: True if a file is a trilat-net log.
-        channels: the checks of the channels, by topic.
+        ours: True if a file is a log of trilat-net.
+        channels: The checks of the channels, by topic.
     """
 
     def __init__(self) -> None:
@@ -317,26 +363,35 @@ class SessionCheck:
         self._counts: Counter[str] = Counter()
         self._scenario: Scenario | None = None
         self._about: dict[str, str] = {}
+        # Counts of the messages that the files contain.
         self._counted = SessionAccounts("", None)
-        self._accounts: dict[str, str] = {}  # accounts that the last file states
-        self._first_part = False  # whether a file begins with the session
-        self._files = 0  # files of the session
-        self._parts = 0  # files that are parts of a log
-        self._views = 0  # messages for viewers
+        # Counts that the recorder states at the end of the last file, by topic.
+        self._accounts: dict[str, str] = {}
+        # True if one of the files contains the beginning of the session.
+        self._first_part = False
+        # Number of files of the session, and of those that are parts of a log.
+        self._files = 0
+        self._parts = 0
+        # Number of messages that were written for viewers.
+        self._views = 0
+        # Version of the schema.
         self._version = 0
+        # Name of the present file.
         self._file = ""
+        # Result of the comparison of the last file with its digests.
         self._chain_text = ""
 
     def read(self, file: str, stream: BinaryIO, progress: Progress | None = None) -> None:
         """Checks every byte of a file, and its messages.
 
         Args:
-            file: name of the file.
-            stream: the file, opened for reading.
-            progress: called now and then with the number of bytes read and their total.
+            file: Name of the file.
+            stream: The file, opened for reading.
+            progress: Function that is called now and then with the number of bytes read and
+                their total.
 
         Raises:
-            LogError: the file is of another session than the files before it.
+            LogError: The file belongs to another session than the previous files.
         """
         reader = McapReader(stream, file, progress, kept=False)
         structure = FileCheck(file, reader.scanner, self._findings)
@@ -347,12 +402,21 @@ class SessionCheck:
         self._counts += structure.counts
 
     def _read_messages(self, file: str, reader: McapReader) -> None:
-        """Checks the messages of a file, and its digest chain."""
+        """Checks the messages of a file, and compares the file with its digests.
+
+        Args:
+            file: Name of the file.
+            reader: Reader of the file.
+
+        Raises:
+            LogError: The file belongs to another session than the previous files.
+        """
         checks: dict[str, ChannelCheck | None] = {}
         self._file = file
         has_begun = False
         for message in reader.messages():
-            if not has_begun:  # the reader has the metadata once it yields a message
+            if not has_begun:
+                # The reader has read the metadata when it yields the first message.
                 has_begun = True
                 self._begin_file(reader)
             topic = message.topic
@@ -369,10 +433,11 @@ class SessionCheck:
                 self._views += 1
                 if message.payload[:2] != _CDR_HEAD:
                     self._findings["schema"].add(
-                        file, reader.offset, f"{topic[:80]}: a message is no CDR"
+                        file, reader.offset, f"{topic[:80]}: a message is not in CDR"
                     )
         if not has_begun:
             self._begin_file(reader)
+
         self._accounts = reader.metadata.get(ACCOUNTS, {})
         chain = reader.judge_digest()
         self._chain_text = chain.text
@@ -380,7 +445,13 @@ class SessionCheck:
             self._findings["chain"].add(file, None, self._chain_text)
 
     def _begin_file(self, reader: McapReader) -> None:
-        """Reads the session of a file, and refuses a file of another session."""
+        """Reads the metadata of a file's session.
+
+        Nothing happens if the file is not a log of trilat-net.
+
+        Raises:
+            LogError: The file belongs to another session than the previous files.
+        """
         about = reader.metadata.get(SESSION, {})
         if not {"session", "driver"} <= about.keys() or SCENARIO not in reader.attachments:
             if self.ours:
@@ -389,7 +460,8 @@ class SessionCheck:
         same = ("session", "epoch_unix_ns", "scenario_sha256")
         if self.ours and any(about.get(key) != self._about.get(key) for key in same):
             raise LogError(f"{self._file}: is of another session; look at it alone")
-        is_new = not self.ours
+
+        is_first_file = not self.ours
         self.ours = True
         self._about = about
         self._version = _parse_number(about, "schema_version")
@@ -397,20 +469,24 @@ class SessionCheck:
         self._parts += PART in reader.metadata
         self._first_part |= reader.metadata.get(PART, {}).get("index", "") in ("", "1")
         self._check_scenario(reader.attachments[SCENARIO])
-        if is_new:
-            continued = not self._first_part
-            self._counted = SessionAccounts(
-                about["session"], self._scenario, continued=continued
-            )
-            # an event may tell of records before the first record
-            for name in self._scenario.names if self._scenario else ():
-                for channel in (topics.STATE, topics.LINK):
-                    self._counted.open_channel(
-                        "/" + topics.key(about["session"], name, channel)
-                    )
+        if is_first_file:
+            self._open_accounts(about["session"])
+
+    def _open_accounts(self, session: str) -> None:
+        """Opens the accounts of the session's sites.
+
+        They are opened before the first record arrives, because an event or statistics may
+        state how many records there are.
+        """
+        continued = not self._first_part
+        self._counted = SessionAccounts(session, self._scenario, continued=continued)
+        names = self._scenario.names if self._scenario else ()
+        for name in names:
+            for channel in (topics.STATE, topics.LINK):
+                self._counted.open_channel("/" + topics.key(session, name, channel))
 
     def _check_scenario(self, text: bytes) -> None:
-        """Checks the text of the scenario against the metadata of the session."""
+        """Checks the text of the scenario, and compares it with the metadata of the session."""
         finding = self._findings["scenario"]
         about = self._about
         digest = hashlib.sha256(text).hexdigest()
@@ -439,31 +515,30 @@ class SessionCheck:
                 )
 
     def _begin_channel(self, channel: ChannelInfo) -> ChannelCheck | None:
-        """Returns the check of a channel in this file; None for channels of other members."""
+        """Returns the check of a channel's messages, and checks the channel's description.
+
+        None for channels that are not a member's, such as those for viewers.
+
+        Args:
+            channel: Description of the channel in the present file.
+        """
         topic = channel.topic
         finding = self._findings["schema"]
-        key = topics.parse_key(topic.removeprefix("/"))
         if topic.startswith(VIZ_ROOT):
-            is_cdr = (channel.encoding, channel.schema_encoding) == (
-                cdr.ENCODING,
-                cdr.SCHEMA_ENCODING,
-            )
-            if not is_cdr or channel.schema_data != cdr.ROS2_SCHEMAS.get(channel.schema):
-                schema = channel.schema[:80] or "no schema"
-                finding.add(
-                    self._file, None, f"{topic[:80]}: {schema} is none of the standard ones"
-                )
+            self._check_view_channel(channel)
             return None
-        session = self._about["session"]
+
+        key = topics.parse_key(topic.removeprefix("/"))
         if (
             key is None
             or key.channel not in CHANNEL_TYPES
-            or key.session != session
+            or key.session != self._about["session"]
             or key.boot
         ):
             if not channel.schema:
                 finding.add(self._file, None, f"{topic[:80]}: has no schema")
             return None
+
         if topic not in self.channels:
             if self._scenario and key.member not in (*self._scenario.sites, topics.RECORDER):
                 finding.add(self._file, None, f"{topic[:80]}: the scenario has no such member")
@@ -478,11 +553,20 @@ class SessionCheck:
         self.channels[topic].begin(self._file, channel)
         return self.channels[topic]
 
+    def _check_view_channel(self, channel: ChannelInfo) -> None:
+        """Checks that a channel for viewers has a standard message type of ROS 2, in CDR."""
+        encodings = (channel.encoding, channel.schema_encoding)
+        is_cdr = encodings == (cdr.ENCODING, cdr.SCHEMA_ENCODING)
+        if not is_cdr or channel.schema_data != cdr.ROS2_SCHEMAS.get(channel.schema):
+            schema = channel.schema[:80] or "no schema"
+            text = f"{channel.topic[:80]}: {schema} is not a standard message type of ROS 2"
+            self._findings["schema"].add(self._file, None, text)
+
     def findings(self) -> Iterator[Finding]:
         """Yields the findings after all files were read.
 
-        For a file without a session the content is not checked, except that its digest chain
-        may show that the session was removed.
+        The content of a file without a session is not checked. Only its digests may show that
+        the session was removed from it.
         """
         counts = self._counts
         findings = self._findings
@@ -491,12 +575,13 @@ class SessionCheck:
         yield findings["whole"].conclude(f"finished, {counts['bytes'] / 1e6:.1f} MB")
         yield findings["checksums"].conclude(f"{counts['crcs']} compared, all agree")
         content = f"{count_nouns(messages, 'message')} in {count_nouns(chunks, 'chunk')}"
-        yield findings["records"].conclude(f"{content}, built as the format says")
-        yield findings["index"].conclude("is what is there")
+        yield findings["records"].conclude(f"{content}, as the format requires")
+        yield findings["index"].conclude("agrees with the data")
         if not self.ours:
             if "chain" in findings:
                 yield findings["chain"].conclude("")
             return
+
         yield self._check_sequence()
         yield self._check_accounts()
         yield findings["chain"].conclude(self._chain_text)
@@ -513,7 +598,10 @@ class SessionCheck:
         yield findings["scenario"].conclude(text)
 
     def _check_sequence(self) -> Finding:
-        """Returns the finding on missing and repeated messages."""
+        """Returns the finding on missing and repeated messages.
+
+        The recorder's statistics are not counted, because they are not numbered.
+        """
         finding = self._findings["sequence"]
         missing = 0
         reordered = 0
@@ -527,6 +615,7 @@ class SessionCheck:
                     f"{check.name} {first}-{last}" if last > first else f"{check.name} {first}"
                 )
             reordered += sum(account.reordered for account in self._counted.list_starts(topic))
+
         received = sum(check.received for check in self.channels.values())
         channels = count_nouns(len(self.channels), "channel")
         text = f"{count_nouns(received, 'message')} of {channels}"
@@ -538,18 +627,19 @@ class SessionCheck:
             text += f"; {finding.summary()}"
         if reordered:
             text += f"; {reordered} came late"
-        if self._takes_events and (silent := self._counted.unknown_ends):
-            text += f"; {describe_unknown_ends(silent)}"
+        if self._needs_end_events and self._counted.unknown_ends:
+            text += f"; {describe_unknown_ends(self._counted.unknown_ends)}"
         for gap in gaps:
             finding.add("", None, f"missing {gap}")
         finding.text = text
         return finding
 
     @property
-    def _takes_events(self) -> bool:
-        """True if the files must have an end event of every site.
+    def _needs_end_events(self) -> bool:
+        """True if the files must contain the "end" event of every site.
 
-        A single part of a log, and a log without events, need not have them.
+        They need not if they are a single part of a log, or if the recorder left out the
+        events.
         """
         session = self._about["session"]
         channel_filter = parse_filter_facts(self._about)
@@ -559,7 +649,11 @@ class SessionCheck:
         return all(map(channel_filter.accepts, keys)) and not is_single_part
 
     def _check_accounts(self) -> Finding:
-        """Returns the finding on the accounts that the file states, against its messages."""
+        """Returns the finding on the message counts that the recorder wrote into the file.
+
+        They are compared with the messages of the file. The comparison is not possible if the
+        counts include messages of parts that were not read, or if several recorders wrote.
+        """
         finding = self._findings["accounts"]
         if not self._accounts:
             return finding.conclude("there are none: the file was not finished")
@@ -568,7 +662,8 @@ class SessionCheck:
             if check.member == topics.RECORDER:
                 recorder_boots |= check.boots
         if not self._first_part or len(recorder_boots) > 1:
-            return finding.conclude("tell of parts that are not here, and were not compared")
+            return finding.conclude("include other parts of the log, and were not compared")
+
         for topic, check in self.channels.items():
             stated = parse_counts(self._accounts.get(topic, ""))
             if check.kind != topics.STATS:
@@ -580,19 +675,19 @@ class SessionCheck:
                         finding.add("", None, f"{account}, {counted[name]} by the file")
             if not stated and self._version >= _ACCOUNTS_SINCE:
                 finding.add("", None, f"{check.name}: has no account")
-        return finding.conclude("agree with what is there")
+        return finding.conclude("agree with the messages")
 
     def _check_rates(self) -> Finding:
-        """Returns the finding on the rates at which the sites sent records."""
+        """Returns the finding on the rates at which the sites sent records.
+
+        The rate is computed from the numbers and sending times of the first and the last
+        record. Short recordings are not judged.
+        """
         finding = self._findings["rates"]
         texts = []
         for check in self.channels.values():
-            if (
-                check.kind != topics.STATE
-                or check.first is None
-                or check.last is None
-                or not check.rate_hz
-            ):
+            is_site_record = check.kind == topics.STATE and bool(check.rate_hz)
+            if not is_site_record or check.first is None or check.last is None:
                 continue
             span_ns = check.last[1] - check.first[1]
             if span_ns < _RATE_SPAN_NS:
@@ -602,17 +697,18 @@ class SessionCheck:
             if abs(rate_hz / check.rate_hz - 1) > _RATE_TOLERANCE:
                 sent = f"{check.member} sent {rate_hz:.1f} records a second"
                 finding.add("", None, f"{sent}, the scenario says {check.rate_hz}")
-        return finding.conclude(", ".join(texts) or "too short to tell")
+        return finding.conclude(", ".join(texts) or "the log is too short to measure them")
 
 
 def judge_integrity(log: Log) -> Integrity:
-    """Returns whether a log is as it was written.
+    """Judges whether a log was changed after it was recorded.
 
-    The digest chain, the accounts and the statistics of the recorder are compared with the
-    records.
+    The log agrees with its digests, or not. In addition, its records are compared with the
+    message counts and the statistics of the recorder, which also reveals changes to a log that
+    was written anew with new digests.
 
     Raises:
-        LogError: a message cannot be read.
+        LogError: A message cannot be decoded.
     """
     if log.chain.passed:
         for site in log.sites:
@@ -623,15 +719,20 @@ def judge_integrity(log: Log) -> Integrity:
 
 
 def _describe_unexplained_gap(log: Log, site: str) -> str:
-    """Returns a description of missing or added records that the log does not explain; else "".
+    """Describes missing or additional records of a site that the log does not explain.
 
-    A gap that neither the accounts nor the recorder's statistics state shows that records were
-    cut out, or that two logs were joined.
+    The recorder states which messages it missed, in the counts at the end of the file and in
+    its statistics. Any other gap shows that records were removed, or that two logs were
+    joined.
+
+    Returns:
+        The description. Empty if the records agree with the statements of the recorder, or if
+        a part of the file cannot be read.
     """
     if log.damaged:
         return ""
     ticks = np.unique(log[site].tick)
-    # the accounts of several files are counted from their records
+    # The counts of several files were computed from their records, and prove nothing.
     stated = parse_counts(log.account(site)) if len(log.sources) == 1 else {}
     counted = {"received": len(ticks), "missing": log.missing(site)}
     if not log.part and stated not in ({}, counted):
@@ -641,6 +742,7 @@ def _describe_unexplained_gap(log: Log, site: str) -> str:
             f"records of {site} were taken out or put in: its account says {stated_text}, "
             f"the file has {counted_text}"
         )
+
     gaps = int(ticks[-1] - ticks[0]) + 1 - len(ticks) if len(ticks) else 0
     gaps -= min(gaps, log.absent_ticks(site))
     if not gaps or log.chain.state is DigestState.INTACT:
