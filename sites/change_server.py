@@ -1,19 +1,22 @@
 """Replies to requests to change something while a site runs.
 
-Users change links, the weights with which a site follows its peers, and the end of the run.
-They stop and enable arms, and mark moments in the log. A site checks each request, replies, and
-applies the accepted changes in its next tick.
+During a run, users can change the network links, change the weights with which a site follows
+its peers, end the run early, stop or enable an arm, and mark a moment in the log. They send
+these requests to the site that runs the arm. Before each tick of its control loop, the site
+checks the requests that have arrived, and replies to each of them.
 
 Invariant:
-    - Every request gets a reply. It is refused with a reason, or accepted by the very next
-      tick, whose record names the change.
-    - An accepted change takes effect `AHEAD_MS` later. It therefore does not alter decisions
-      that were already made, such as the delay of a sample that has been sent.
-    - Within one tick, the order to stop takes precedence over all others. The orders "enable"
-      and "reset" therefore wait for a tick without earlier orders, and the requests behind them
-      wait as well.
-    - A change of weights takes at least `MIN_RAMP_S`, whatever the request states, so that no
-      reference jumps. The record contains the actual duration.
+    - Every request gets a reply: it is accepted, or refused with a reason. An accepted change
+      is part of the log, in the record of the tick that accepts it, so that the run can be
+      reproduced.
+    - A change of a link or of weights takes effect `AHEAD_MS` after it was accepted, because
+      some decisions are made in advance. For example, the delay of a sample that has been sent
+      cannot change any more.
+    - An order to stop an arm is executed at once. The orders "enable" and "reset" are never
+      executed in the same tick as another order, so that they cannot undo a stop. They wait
+      for the next tick, and the requests behind them wait as well.
+    - A change of weights is spread over at least `MIN_RAMP_S`, whatever the request states, so
+      that the reference of the arm does not jump. The log contains the actual duration.
 """
 
 from collections import Counter, deque
@@ -52,7 +55,9 @@ _NEEDED_MODES = {"reset": Mode.FAULT, "enable": Mode.STOPPED}
 
 
 class ChangeServer:
-    """Receives the requests to one site, checks them, and keeps what the site still has to do.
+    """Checks the requests to one site, replies, and keeps the accepted changes for its loop.
+
+    The control loop of the site calls `pop_changes` before each tick.
 
     Args:
         scenario: Scenario of the session.
@@ -64,7 +69,7 @@ class ChangeServer:
         stops: Requests of other members, who may only stop the site. None if there are none.
 
     Attributes:
-        stopped: True once the site has executed the last tick before a requested end.
+        stopped: True if the next tick is the last one before a requested end of the run.
         marks: Marks that are not published yet: pairs of a tick and a text.
         sources: Who requested an accepted change, by the text of the change in the record. The
             entry is removed when the change is published.
@@ -97,7 +102,7 @@ class ChangeServer:
         self.sources: dict[str, str] = {}
 
     def pop_changes(self, k: int) -> Sequence[CoreChange]:
-        """Replies to all waiting requests.
+        """Replies to all waiting requests, and returns the changes for the next tick.
 
         Args:
             k: Next tick.
@@ -105,8 +110,7 @@ class ChangeServer:
         Returns:
             The changes that the site applies in that tick.
         """
-        if self._stop_tick is not None:
-            self.stopped = k + 1 >= self._stop_tick
+        self._update_stopped(k)
 
         changes: list[CoreChange] = []
         has_order = False
@@ -224,20 +228,28 @@ class ChangeServer:
         return to_core_change(self._scenario, change)
 
     def _schedule_stop(self, k: int, stop_s: float) -> tuple[str, int]:
-        """Sets the end of the run, unless an earlier end is set already.
+        """Schedules the end of the run, unless an earlier end is scheduled already.
 
         Args:
-            k: Next tick.
-            stop_s: Requested end, in s since the epoch.
+            k: Next tick. It is executed in any case, so that the run ends after it at the
+                earliest.
+            stop_s: Requested end, in s since the epoch, the common start of the session.
 
         Returns:
-            The text of the reply, and the tick before which the run ends.
+            The text of the reply, and the first tick that is not executed any more.
         """
-        requested = first_tick_at(round(stop_s * 1e9), self._rate_hz)
-        self._stop_tick = min(max(requested, k + 1), self._stop_tick or self._ticks)
-        self.stopped = k + 1 >= self._stop_tick
+        planned_end = self._ticks if self._stop_tick is None else self._stop_tick
+        requested_end = first_tick_at(round(stop_s * 1e9), self._rate_hz)
+        earliest_end = k + 1
+        self._stop_tick = min(max(requested_end, earliest_end), planned_end)
+        self._update_stopped(k)
         text = f"{self._site} ends at t = {self._stop_tick / self._rate_hz:.3f} s"
         return text, self._stop_tick
+
+    def _update_stopped(self, k: int) -> None:
+        """Sets `stopped` if tick `k`, the next one, is the last tick before a requested end."""
+        if self._stop_tick is not None:
+            self.stopped = k + 1 >= self._stop_tick
 
     def _make_change(self, request: ChangeRequest, first: int) -> CoreChange:
         """Returns the requested change of a link or of the weights of the peers.

@@ -1,21 +1,17 @@
 """Limits the computing time of a user's own code: a control law, an operator or a plant.
 
-The site calls such code in its control loop, so that slow code would make ticks late. The code
-may use 75 % (`SHARE`) of the period at which it is called. Additional time adds to its
-overtime, and time that it does not use reduces the overtime again. If the overtime exceeds
-`OVERTIME_LIMIT_NS`, the code is too slow and the run ends. A single call counts for at most
-`HICCUP_NS`, so that one slow call alone is never too slow.
+A site calls such code in its control loop, so that slow code would make the ticks of the loop
+late. Each call may take 75 % (`SHARE`) of the period at which the code is called. If a call
+takes longer, the excess is added to the overtime. If it takes less, the overtime is reduced by
+the unused time. If the overtime exceeds `OVERTIME_LIMIT_NS`, the code is too slow, and the run
+ends with an error. One call counts for at most `HICCUP_NS`, so that a single slow call, for
+example during garbage collection, does not end the run.
 
 If the operating system has interrupted the thread during a call, the computing time of the
-thread counts instead of the elapsed time.
+thread counts instead of the elapsed time. The load of the machine by other programs is thus no
+reason to blame the code.
 
 Code that does not return at all is interrupted by a signal, see `CodeWatchdog`.
-
-Invariant:
-    - The code is judged by its own computing time, and not by the load of the machine.
-    - The measurement does not influence any number of the run.
-    - A single slow call is only counted. Code that is too slow, or that does not return, fails
-      with an error that names the problem.
 """
 
 import signal
@@ -64,7 +60,7 @@ def read_thread_usage() -> tuple[int, int]:
 
 
 class WatchedCode:
-    """A user's own code that is called once per tick, with a record of its computing time.
+    """Calls a user's own code, and measures its computing time.
 
     Args:
         name: Name of the code, as in "the law mylaw:MyLaw".
@@ -179,19 +175,22 @@ class WatchedCode:
         )
 
     def check(self) -> None:
-        """Interrupts the code if it is still in the call that the previous checks saw.
+        """Interrupts the code if the same call has been running for several checks in a row.
 
-        The method is called by a signal handler while the code runs. Checks that are missed
-        because the process was suspended do not count.
+        The method is called by a signal handler every `CHECK_S`, while the code runs. Checks
+        that are missed because the process was suspended do not count. A call is identified by
+        the number of finished calls before it.
 
         Raises:
             Exception: The error of `fail`. It is raised inside of the user's code.
         """
         tick = self._running_tick
-        is_same_call = tick >= 0 and self._calls == self._checked_count
+        is_running = tick >= 0
+        is_same_call = is_running and self._calls == self._checked_count
         self._same_call_checks = self._same_call_checks + 1 if is_same_call else 0
-        self._checked_count = self._calls if tick >= 0 else -1
-        # The first check that sees the call does not count: it may have just begun.
+        self._checked_count = self._calls if is_running else -1
+
+        # The first check that sees a call does not count: the call may have just begun.
         checks = FIRST_CHECKS if tick == self._first_tick else CHECKS
         limit = checks - 1
         if self._same_call_checks >= limit:

@@ -1,21 +1,22 @@
-"""Moves an arm with an input device, and renders the reaction force of the arm on it.
+"""Moves an arm with a haptic input device, and renders the force of the arm on the device.
 
-The person presses a button of the device, the clutch, and moves the device. The target of the
-arm then moves by the same step, rotated and scaled as the scenario says. The force that the arm
-exerts is rendered on the device.
+The operator presses a button of the device, the clutch, and moves the device. The target of the
+arm then moves by the same distance, rotated and scaled by the settings of the scenario. While
+the clutch is not pressed, the operator can bring the device back to its middle position,
+and the target stays where it is. The reaction force of the arm is rendered on the device.
 
 Invariant:
-    - Only changes of the device's position move the target, and only while the clutch is
-      pressed. A state that is not finite, a jump, and a device that connects again move
-      nothing.
-    - The target stays within the reach of the arm, however often the clutch is pressed. A
-      motion of the device out of the reach is lost, and a motion back takes effect at once.
-    - After a release, also after one because the device was silent, the arm is held again only
-      when the clutch is pressed again.
-    - The rendered force is that of the newest record, rotated, scaled and limited as the
-      scenario says. It is zero while the clutch is not pressed, and if the record is old.
-    - Only the states of the device show the site that this program is alive. If the program
-      hangs, the site releases the arm.
+    - The target moves only by changes of the device's position while the clutch is pressed.
+      Positions that are not finite numbers, jumps, and the position of a device that was just
+      connected do not move the target, because they are not motions of the operator.
+    - The target never leaves the region that the arm can reach. A motion of the device that
+      would lead out of it is ignored, so that a motion back moves the arm at once.
+    - If the device sends nothing for some time, the arm is released. After any release, the
+      operator must press the clutch again, so that the arm never starts to move unexpectedly.
+    - The rendered force is zero while the clutch is not pressed, and if no recent record of the
+      arm is available.
+    - Targets are sent to the site only after a new state of the device. If the device or this
+      program stops working, the site receives no targets and releases the arm.
 """
 
 import math
@@ -46,14 +47,16 @@ TRIPS_KEPT = 60_000
 
 
 class DeviceHand:
-    """Operator of an arm that follows an input device.
+    """Moves one arm as its operator, with targets that follow the motion of an input device.
+
+    The process of a live operator creates the object and calls `run`.
 
     Args:
-        hand: Connection to the site, in the role of the operator.
+        hand: Connection to the site that runs the arm, in the role of its operator.
         device: The device.
         settings: How the device moves the arm, and how force is rendered.
         clock: Clock of this machine.
-        reach: Region that the target must not leave.
+        reach: Region that the arm can reach. The target never leaves it.
 
     Attributes:
         states: Number of states that were read.
@@ -82,7 +85,7 @@ class DeviceHand:
         self.jumps = 0
         self.unreadable = 0
         self.trips_ns = deque[int](maxlen=TRIPS_KEPT)
-        # Number and time of each sent target whose force has not been received.
+        # Number and sending time of the targets to which the arm has not responded yet.
         self._sent = deque[tuple[int, int]](maxlen=TRIPS_KEPT)
         self._period_ns = 1_000_000_000 // device.rate_hz
         self._due_ns = 0
@@ -96,8 +99,8 @@ class DeviceHand:
         self._position_m: Vector | None = None
         # A clutch that is still pressed does not count as pressed again.
         self._was_pressed = True
-        # Time at which the clutch was closed; 0 while it is open.
-        self._closed_ns = 0
+        # Time at which the clutch was pressed. None while it is not pressed.
+        self._pressed_since_ns: int | None = None
         self._received_ns = self._clock.monotonic_ns()
         self._sent.clear()
 
@@ -132,29 +135,40 @@ class DeviceHand:
         self._measure_trips()
 
     def _follow(self, state: DeviceState, now_ns: int) -> None:
-        """Applies the buttons of a state, and moves the target if the clutch is pressed.
+        """Applies the buttons of the device, and moves the target if the clutch is pressed.
+
+        The release button releases the arm. When the clutch is pressed for the first time, the
+        target starts at the present pose of the arm. Later it starts where it was left.
 
         Args:
             state: State of the device, with finite numbers.
             now_ns: Present time on the local clock, in ns.
         """
         settings = self._settings
-        previous_m = self._position_m
+        previous_position_m = self._position_m
         elapsed_s = (now_ns - self._received_ns) * 1e-9
         self._position_m = state.position_m
         self._received_ns = now_ns
         is_pressed = state.buttons.get(settings.clutch, False)
-        is_closing = is_pressed and not self._was_pressed
+        was_pressed = self._was_pressed
         self._was_pressed = is_pressed
+
         if state.buttons.get(settings.release, False):
             self.release()
-        elif is_closing:
-            self._target = self._target or list(self._hand.pose)
-            self._closed_ns = now_ns
-        elif not is_pressed:
-            self._closed_ns = 0
-        elif self._closed_ns and previous_m is not None:
-            positions = zip(state.position_m, previous_m, strict=True)
+            return
+        if not is_pressed:
+            self._pressed_since_ns = None
+            return
+        if not was_pressed:
+            self._pressed_since_ns = now_ns
+            if not self._target:
+                self._target = list(self._hand.pose)
+            return
+
+        # After a release of the arm, a clutch that is still pressed moves nothing.
+        is_clutch_active = self._pressed_since_ns is not None
+        if is_clutch_active and previous_position_m is not None:
+            positions = zip(state.position_m, previous_position_m, strict=True)
             step_m = [new - previous for new, previous in positions]
             self._move_target(step_m, elapsed_s)
 
@@ -187,23 +201,28 @@ class DeviceHand:
         Returns:
             The force, in N.
         """
-        is_held = self._closed_ns and self._hand.fresh and self._hand.holds
-        if not is_held:
-            return 0.0, 0.0, 0.0
+        no_force = (0.0, 0.0, 0.0)
+        if self._pressed_since_ns is None:
+            return no_force
+        if not (self._hand.fresh and self._hand.holds):
+            return no_force
+
         settings = self._settings
-        closed_ns = self._clock.monotonic_ns() - self._closed_ns
-        fade = min(1.0, closed_ns / GRIP_NS)
+        pressed_ns = self._clock.monotonic_ns() - self._pressed_since_ns
+        fade = min(1.0, pressed_ns / GRIP_NS)
         force = [-settings.force_scale * fade * component for component in self._hand.force]
-        limited_share = min(1.0, settings.force_limit_n / max(math.hypot(*force), 1e-9))
+        magnitude = max(math.hypot(*force), 1e-9)  # avoids a division by zero
+        reduction = min(1.0, settings.force_limit_n / magnitude)
         device_axes = zip(*self._axes, strict=True)
-        x, y, z = (limited_share * _compute_product(force, axis) for axis in device_axes)
+        x, y, z = (reduction * _compute_product(force, axis) for axis in device_axes)
         return x, y, z
 
     def _measure_trips(self) -> None:
-        """Measures the time from a position of the device to the force that it has caused.
+        """Measures the round trip time from a position of the device to the rendered force.
 
-        Each position was sent with a number. The newest record states which number the site
-        follows.
+        Each target was sent with a number. The newest record of the site states the number of
+        the target that the arm follows. The round trips of this target and of all earlier ones
+        end with the force that was just rendered.
         """
         used_number = self._hand.number
         now_ns = self._clock.monotonic_ns()
@@ -215,7 +234,11 @@ class DeviceHand:
             self.trips_ns.append(now_ns - sent_ns)
 
     def describe(self) -> str:
-        """Returns a line for the user with the numbers of states and the round trip times."""
+        """Returns a line for the user about the states of the device and the round trip times.
+
+        The line contains the numbers of states, of jumps and of unreadable states, and the
+        median and the 99th percentile of the round trip time if any was measured.
+        """
         states = count_nouns(self.states, "state")
         jumps = count_nouns(self.jumps, "jump")
         counts = f"{states} of the device, dropped {jumps}, {self.unreadable} unreadable"

@@ -1,15 +1,16 @@
 """Follows during a run which other members of the session join, leave and end.
 
-A member is a process that takes part in the session: a site or a recorder. Each start of a
-process has a boot, a random number that distinguishes it from earlier and later starts. A site
-learns about the others in two ways: from the liveliness tokens that appear and disappear with a
-process, and from the events that a process publishes.
+A member is a process that takes part in the session: a site, which runs one arm, or a recorder.
+Each start of a process has a boot, a random number that distinguishes it from earlier and later
+starts. A site learns about the others in two ways: from the events that a process publishes,
+and from the Zenoh liveliness token of a process, which disappears when the process ends or its
+connection is lost.
 
 Invariant:
-    - Only the boots with which the session started count as members. If the scenario allows
-      sites to come back (rule `glide`), boots that were admitted later count as well.
-    - Another boot of a site is admitted only after the previous one has disappeared or has
-      published its end. Two processes never act as the same site.
+    - Two processes never act as the same site. The processes with which the session started are
+      members. If the scenario allows sites to leave and come back (rule `glide`), a new process
+      of a site is admitted, but only after the previous one has disappeared or has published
+      its end.
     - A recorder may join at any time.
 """
 
@@ -33,7 +34,7 @@ _INBOX_CAPACITY = 256
 
 
 class PeerMonitor:
-    """The other members of a session, from the view of one site.
+    """Keeps track of the other members of a session for one site.
 
     The site calls `watch` ten times a second, and reads the attributes.
 
@@ -92,7 +93,7 @@ class PeerMonitor:
         return bool(self.stored) and self.recorders <= self.stored
 
     def watch(self, publisher: EventPublisher, t_ns: int) -> None:
-        """Receives events and changes of presence, and publishes who joins and who is lost.
+        """Updates the list of members, and publishes an event for each that joins or is lost.
 
         Args:
             publisher: Publishes the events of this site.
@@ -109,7 +110,7 @@ class PeerMonitor:
     def _update_presence(
         self, member: str, boot: str, publisher: EventPublisher, t_ns: int, *, alive: bool
     ) -> None:
-        """Applies the news that the token of a member has appeared or disappeared.
+        """Updates the attributes after the token of a member has appeared or disappeared.
 
         Args:
             member: Name of the member.
@@ -249,19 +250,20 @@ class PeerMonitor:
         )
 
     def read_stored(self, ticks: int) -> bool:
-        """Receives the recorders' events that they have stored all messages of this site.
+        """Receives the confirmations of recorders that they have stored all data of this site.
 
         Args:
             ticks: Number of ticks of this site.
 
         Returns:
-            True if another recorder has just stored everything.
+            True if at least one further recorder has confirmed since the last call.
         """
-        before = len(self.stored)
+        confirmed_before = len(self.stored)
         for event in read_messages(self._recorder_events, Event):
-            if event.kind == "stored" and event.about == self._site and event.ticks >= ticks:
+            is_about_this_site = event.kind == "stored" and event.about == self._site
+            if is_about_this_site and event.ticks >= ticks:
                 self.stored.add(str(event.boot))
-        return len(self.stored) > before
+        return len(self.stored) > confirmed_before
 
 
 def _set_membership(members: set[T], member: T, is_present: bool) -> None:

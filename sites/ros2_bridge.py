@@ -9,14 +9,15 @@ services. In the other direction, a ROS topic can
 - or be the robot that is the external arm of a site.
 
 Invariant:
-    - ROS is never part of a control loop. A ROS message enters a session only as the goal of an
+    - ROS is never part of a control loop. A ROS message enters a session only as a target of an
       operator, which the site limits and records, or as a measurement of an external arm. A log
       can therefore be verified without ROS.
-    - A topic on which two programs publish moves nothing.
-    - If no target arrives for 200 ms, the arm is released.
-    - A robot without a valid torque receives its safe command repeatedly.
-    - No ROS message ends the bridge. A message that cannot be used is refused and counted by
-      the reason. The first refusal for each reason is printed.
+    - If two programs publish on a topic that commands an arm, the messages of both are refused.
+      The arm would otherwise move back and forth between two targets.
+    - If no target arrives for 200 ms, the arm is released, because the program may have died.
+    - A robot for which no valid torque is available receives its safe command repeatedly.
+    - A message that cannot be used does not end the bridge. It is refused, and counted by the
+      reason. The first refusal for each reason is printed.
 """
 
 import math
@@ -67,10 +68,10 @@ TRIGGER = "std_srvs/srv/Trigger"
 
 
 class SingleSender:
-    """Check that only one program publishes on a topic.
+    """Checks for each message of a topic that only one program publishes on the topic.
 
-    Two programs that command the same arm would move it back and forth. Both are refused until
-    one of them has been silent for `SENDER_TIMEOUT_NS`.
+    Two programs that command the same arm would move it back and forth. The messages of both
+    are refused until one of them has published nothing for `SENDER_TIMEOUT_NS`.
 
     Args:
         clock: Clock of this process.
@@ -118,7 +119,8 @@ class TargetTopic:
 
     Args:
         hand: Connection to the site, in the role of the operator.
-        read: Function that converts a message to a target. It raises ValueError if it cannot.
+        read: Function that converts a message to a target. It raises ValueError if the message
+            is not valid.
         apply: Function that sends a target to the site.
         clock: Clock of this process.
 
@@ -160,8 +162,8 @@ class TargetTopic:
             except ValueError:
                 self._release_hand()
                 raise
-            goal = self._read(data)
-            self._apply(*goal)
+            target = self._read(data)
+            self._apply(*target)
             self._received_ns = self._clock.monotonic_ns()
 
     def watch(self) -> None:
@@ -372,10 +374,12 @@ def _order_joints(
 
 
 def find_joint_indices(joints: Sequence[Sequence[str]], state: cdr.RosJoints) -> list[int]:
-    """Finds the position of each joint in a message.
+    """Finds the index of each joint of an arm in a message with joint states.
+
+    The message may contain further joints, and the joints may have any order.
 
     Args:
-        joints: Names that each joint may have.
+        joints: Names that each joint may have, in the order of the arm.
         state: The message.
 
     Returns:
@@ -424,7 +428,7 @@ def read_joint_target(joints: Sequence[Sequence[str]], data: bytes) -> list[floa
 
 
 def _check_finite(numbers: Sequence[float]) -> list[float]:
-    """Returns the numbers as a list.
+    """Checks that all numbers of a message are finite, and returns them as a list.
 
     Raises:
         ValueError: A number is not finite.
@@ -457,10 +461,10 @@ def read_vector_target(frame: str, axes: int, count: int, data: bytes) -> list[f
 
 
 class Bridge:
-    """The bridge of one running session.
+    """Connects one running session with ROS 2.
 
-    When the object is created, its topics and services exist. `run` then publishes what happens
-    in the session.
+    When the object has been created, ROS programs see its topics and services. `run` then
+    publishes the records, events and statistics of the session.
 
     Args:
         ends: Connections to ROS and to the session.
@@ -543,7 +547,7 @@ class Bridge:
     def run(
         self, rate_hz: float, stopped: Callable[[], bool], say: Callable[[str], None]
     ) -> bool:
-        """Publishes the session until it ends.
+        """Publishes the messages of the session on ROS topics until the session ends.
 
         Args:
             rate_hz: Rate at which the newest records are published, in 1/s.
@@ -668,7 +672,7 @@ def list_joint_names(scenario: Scenario, site: str) -> list[tuple[str, ...]]:
 
 
 def serve_orders(graph: Ros2Graph, running: RunningSession, sites: Sequence[str]) -> None:
-    """Offers the orders of a session as ROS services.
+    """Offers the orders to stop, enable and reset arms, and to end a session, as ROS services.
 
     Their names are `/<session>/stop` for all sites, `/<session>/<site>/stop` for one site, and
     the same for the other orders.
@@ -784,7 +788,7 @@ def serve_ros2(
 def publish_session(
     ends: BridgeEnds, rate_hz: float, stopped: Callable[[], bool], say: Callable[[str], None]
 ) -> bool:
-    """Waits for a session, and bridges it until it ends.
+    """Waits until a session begins, and connects it with ROS 2 until the session ends.
 
     Robots are connected before the session begins, because the session begins only when their
     arms send measurements.
@@ -792,11 +796,13 @@ def publish_session(
     Args:
         ends: Connections to ROS and to the session.
         rate_hz: Rate at which records are published, in 1/s.
-        stopped: Function that returns True to end the call.
+        stopped: Function that is called repeatedly. The connection ends early when it returns
+            True.
         say: Function that prints a line for the user.
 
     Returns:
-        True if another session has begun under the same name.
+        True if the session was replaced by another one of the same name, to which the caller
+        has to connect again. False if the session has ended or `stopped` returned True.
     """
     with ExitStack() as stack:
         robots: dict[str, RobotArm] = {}
@@ -832,23 +838,29 @@ def publish_session(
             send_request = ends.graph.refusals.guard(topic, dominance.send_request)
             stack.enter_context(_repeat_in_thread(REQUEST_PERIOD_S, send_request))
         session_text = f"session {ends.session} is in the graph of ROS 2: /{ends.session}/..."
-        say(session_text + _describe_inputs(ends, bridge, robots))
+        say("; ".join([session_text, *_describe_inputs(ends, bridge, robots)]))
         return bridge.run(rate_hz, stopped, say)
 
 
-def _describe_inputs(ends: BridgeEnds, bridge: Bridge, robots: Iterable[str]) -> str:
-    """Describes the topics that the bridge receives, as the end of a line for the user.
+def _describe_inputs(ends: BridgeEnds, bridge: Bridge, robots: Iterable[str]) -> list[str]:
+    """Describes for the user which ROS topics influence the session, and how.
+
+    A ROS program can publish target positions for an arm, as the operator of that arm. A robot
+    that is the arm of a site publishes its measured joint states.
 
     Args:
         ends: Connections to ROS and to the session.
-        bridge: The bridge of the session.
+        bridge: The bridge of the session, which knows the topics with targets.
         robots: Names of the sites whose arm is a ROS robot.
+
+    Returns:
+        A clause for each topic, such as "/session/s/robot_states measures the arm of s".
     """
-    inputs = [f"; /{topic} holds an arm" for topic in bridge.targets]
+    clauses = [f"/{topic} holds an arm" for topic in bridge.targets]
     for site in robots:
         topic = ends.topic(site, "robot_states")
-        inputs.append(f"; /{topic} measures the arm of {site}")
-    return "".join(inputs)
+        clauses.append(f"/{topic} measures the arm of {site}")
+    return clauses
 
 
 @contextmanager
@@ -887,6 +899,10 @@ def open_robot(
 
 def refuse_other_robots(table: TopicTable, scenario: Scenario) -> None:
     """Checks that each robot in the settings belongs to a site with an external arm.
+
+    Args:
+        table: The user's settings of topics and robots.
+        scenario: Scenario of the session.
 
     Raises:
         UsageError: A robot belongs to another site.

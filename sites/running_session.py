@@ -64,7 +64,12 @@ Sites report their tick every 100 ms, so that the known ticks are slightly out o
 
 
 SOURCE = "the operator"
-"""Name that the sites' events give to the person behind the requests of this module."""
+"""Name of the person who sends the requests of this module, as the log mentions it."""
+
+
+def _never_stopped() -> bool:
+    """Returns False, as the function `stopped` of calls that are ended only by a time limit."""
+    return False
 
 
 class ShareHistory:
@@ -103,9 +108,9 @@ class ShareHistory:
             t_ns: The time, in ns since the epoch (the start of the session). It must not be
                 earlier than in the previous call.
         """
-        started = sorted(ramp for ramp in self._later_ramps if ramp.start_ns <= t_ns)
+        started_ramps = sorted(ramp for ramp in self._later_ramps if ramp.start_ns <= t_ns)
         # A ramp starts from the factors that the previous one had reached by then.
-        for ramp in started:
+        for ramp in started_ramps:
             self._shares_before = self._interpolate(ramp.start_ns)
             self._ramp = ramp
         self._later_ramps = [ramp for ramp in self._later_ramps if ramp.start_ns > t_ns]
@@ -116,9 +121,9 @@ class ShareHistory:
         ramp = self._ramp
         if t_ns >= ramp.end_ns:
             return ramp.alpha
-        part = (t_ns - ramp.start_ns) / (ramp.end_ns - ramp.start_ns)
+        progress = (t_ns - ramp.start_ns) / (ramp.end_ns - ramp.start_ns)
         pairs = zip(self._shares_before, ramp.alpha, strict=True)
-        return tuple(before + part * (after - before) for before, after in pairs)
+        return tuple(before + progress * (after - before) for before, after in pairs)
 
 
 class RunningSession:
@@ -150,33 +155,40 @@ class RunningSession:
     def reach(
         self, member: str = OPERATOR, timeout_s: float = REPLY_TIMEOUT_S
     ) -> Iterator[Bus]:
-        """Opens a connection to the session, as a context manager.
+        """Opens a network connection to the session, as a context manager.
+
+        In a session whose members prove their identities with keys, a request is accepted only
+        from a member that is permitted to send it. Most requests need the keys of the operator.
 
         Args:
-            member: Name of the member whose keys must be available. Empty if the keys of any
-                member suffice.
-            timeout_s: Longest wait for a reply, in s.
+            member: Name of the member under which the requests will be sent. If this object has
+                keys, they must be those of that member. Empty accepts the keys of any member.
+            timeout_s: Longest wait for the reply of a site, in s.
 
         Yields:
-            The connection.
+            The connection. It is closed at the end of the `with` block, unless it was given to
+            this object.
 
         Raises:
-            SessionError: No site replies.
+            SessionError: No site replies in time.
+            UsageError: The keys are those of another member.
         """
         if self._bus is not None:
             yield self._bus
             return
+
         if member:
             self._connection.require(member)
         with connect_to_session(
             self._connection,
             self._clock,
             self.name,
+            # The names of the sites are read from the scenario that a site replies with.
             embedded_names_reader(self.name),
-            stopped=lambda: False,
+            stopped=_never_stopped,
             timeout_s=timeout_s,
         ) as bus:
-            assert bus is not None  # None only if `stopped` returns True
+            assert bus is not None  # it is None only if the call was stopped
             yield bus
 
     @contextmanager
@@ -319,7 +331,11 @@ class RunningSession:
             return [self._send_change(bus, name, request) for name in addressed]
 
     def _send_change(self, bus: Bus, site: str, request: ChangeRequest) -> ChangeReply:
-        """Sends a request to one site, and waits for its reply."""
+        """Sends a request to one site, and returns its reply, accepted or refused.
+
+        Raises:
+            SessionError: The site does not reply in time.
+        """
         return send_change(
             bus=bus, clock=self._clock, session=self.name, site=site, request=request
         )
@@ -368,17 +384,20 @@ class RunningSession:
         clock = self._clock
         infos: dict[str, Info] = {}
         scenario: Scenario | None = None
-        begun_ns = 0
+        first_reply_ns: int | None = None  # time of the first reply of a site
         for info in self._find_members(bus):
             if scenario is None and info.scenario:
                 scenario = parse_embedded(info.scenario, self.name)
-            if scenario is not None and info.member in scenario.sites:
-                infos[info.member] = info
-                begun_ns = begun_ns or clock.monotonic_ns()
-                waited_ns = clock.monotonic_ns() - begun_ns
-                has_waited = scenario.sites_may_return and waited_ns > GATHERING_NS
-                if len(infos) == len(scenario.names) or has_waited:
-                    return scenario, infos
+            if scenario is None or info.member not in scenario.sites:
+                continue
+            infos[info.member] = info
+            if first_reply_ns is None:
+                first_reply_ns = clock.monotonic_ns()
+            waited_ns = clock.monotonic_ns() - first_reply_ns
+            is_complete = len(infos) == len(scenario.names)
+            has_waited = scenario.sites_may_return and waited_ns > GATHERING_NS
+            if is_complete or has_waited:
+                return scenario, infos
         if scenario is None:
             raise SessionError(
                 f"no site of session {self.name!r} answers; "
@@ -387,9 +406,12 @@ class RunningSession:
         return scenario, infos
 
     def _find_members(self, bus: Bus) -> Iterator[Info]:
-        """Yields the replies of the session's members until a time limit."""
+        """Asks all members of the session who they are, and yields their replies.
+
+        A member may reply several times. The replies end after `REPLY_TIMEOUT_S`.
+        """
         return find_members(
-            bus, self._clock, self.name, stopped=lambda: False, timeout_s=REPLY_TIMEOUT_S
+            bus, self._clock, self.name, stopped=_never_stopped, timeout_s=REPLY_TIMEOUT_S
         )
 
     def _find_running(self, bus: Bus, site: str) -> Info:
@@ -498,6 +520,7 @@ class RunningSession:
             ]
 
             def receive() -> list[State]:
+                """Returns the records that have arrived since the last call."""
                 return [record for inbox in inboxes for record in read_records(inbox)]
 
             yield receive
@@ -523,45 +546,54 @@ class RunningSession:
         """
         with self.reach("") as bus:
             inbox = bus.inbox(topics.key(self.name, "*", topics.STATE), STATES_KEPT)
-            kept: dict[str, deque[State]] = {}
-            pictures: dict[str, PictureDelay] = {}
+            latest_records: dict[str, deque[State]] = {}
+            picture_delay: PictureDelay | None = None  # created when the first record arrives
 
             def find() -> dict[str, State]:
+                """Returns one record of each site, the newest or the one that the user sees."""
+                nonlocal picture_delay
                 for record in read_records(inbox):
-                    kept.setdefault(record.site, deque(maxlen=STATES_KEPT)).append(record)
-                newest = {site: records[-1] for site, records in kept.items()}
+                    if record.site not in latest_records:
+                        latest_records[record.site] = deque(maxlen=STATES_KEPT)
+                    latest_records[record.site].append(record)
+                newest = {site: records[-1] for site, records in latest_records.items()}
                 if not as_site:
                     return newest
                 if as_site not in newest:
                     return {}
-                if as_site not in pictures:
+
+                if picture_delay is None:
                     info = self._find_running(bus, as_site)
                     scenario = parse_embedded(info.scenario, self.name)
-                    pictures[as_site] = PictureDelay(scenario, as_site)
+                    picture_delay = PictureDelay(scenario, as_site)
                 local_record = newest[as_site]
-                shown = {as_site: local_record}
-                ticks = pictures[as_site].advance_to(local_record.tick, local_record.used)
-                for peer, tick in ticks.items():
-                    for record in reversed(kept.get(peer, deque())):
+                visible_records = {as_site: local_record}
+                visible_ticks = picture_delay.advance_to(local_record.tick, local_record.used)
+                for peer, tick in visible_ticks.items():
+                    for record in reversed(latest_records.get(peer, deque())):
                         if record.tick == tick:
-                            shown[peer] = record
+                            visible_records[peer] = record
                             break
-                return shown
+                return visible_records
 
             yield find
 
     def mark(self, text: str) -> str:
-        """Marks the present moment in the log with a text.
+        """Stores a text in the log, as a mark of the present moment.
 
-        The mark becomes an event of the first site that replies.
+        The first site of the scenario that is present publishes the mark as an event, which the
+        recorder stores.
+
+        Args:
+            text: The text.
 
         Returns:
             The reply of the site.
         """
         with self.reach() as bus:
             scenario, infos = self._find_sites(bus)
-            first = next(name for name in scenario.names if name in infos)
-            return self._send_change(bus, first, ChangeRequest(mark=text)).text
+            first_present = next(name for name in scenario.names if name in infos)
+            return self._send_change(bus, first_present, ChangeRequest(mark=text)).text
 
     @contextmanager
     def episode(self, name: str) -> Iterator[Callable[[bool], None]]:
@@ -613,6 +645,7 @@ class RunningSession:
                 history.add_change(event.command)
 
             def find() -> dict[str, float]:
+                """Returns the dominance factors at the time of the newest record."""
                 nonlocal now_ns
                 for event in read_messages(events, Event):
                     history.add_change(event.command)
@@ -639,9 +672,9 @@ class RunningSession:
             session=self.name,
             count=count,
             timeout_s=timeout_s,
-            stopped=lambda: False,
+            stopped=_never_stopped,
         )
-        assert report is not None  # None only if `stopped` returns True
+        assert report is not None  # it is None only if the call was stopped
         return report
 
 

@@ -9,14 +9,14 @@ Invariant (rule L1):
     - Tick k is due k periods after the epoch, the common start time of the session. The periods
       are those of the leader, the first site of the scenario. Sites on one machine wake up one
       after another within the period.
-    - A late tick is reported but changes no number: formulas contain the nominal time of a
-      tick, never the measured one. A late loop executes the missed ticks immediately one after
-      another and counts them. With an external arm it skips them, because the arm has moved on
-      in the meantime. The numbers of its ticks then have a gap.
+    - A late tick computes the same numbers as a punctual tick, because formulas contain the
+      nominal time of a tick and never the measured one. A late loop executes the missed ticks
+      immediately one after another. With an external arm it skips them, because the arm has
+      moved in the meantime.
     - A message from the network cannot raise an exception in the loop. It is either a valid
       sample of a peer, or it is dropped and counted by the reason.
-    - A sample is decoded when it arrives, outside the loop. It is stamped with the time of its
-      arrival, not with the time of the tick that reads it.
+    - The arrival time of a sample is measured when it arrives, and not when a tick reads it, so
+      that measured delays do not depend on the period of the loop.
 """
 
 from bisect import bisect_right
@@ -51,26 +51,33 @@ if TYPE_CHECKING:
 
 
 def make_sample_readers(setup: SiteSetup) -> list[Callable[[bytes], PeerSample | WireError]]:
-    """Returns a decoder of samples for each peer of a site, in the order of the links.
+    """Returns, for each peer of a site, a function that decodes the samples of that peer.
 
     The decoders run in network threads, where an exception would be lost. Therefore a decoder
     returns the error instead of raising it.
+
+    Args:
+        setup: Settings of the site. The decoders have the order of its links.
     """
     layouts = [setup.layout._replace(sent=link.channel.record_size) for link in setup.links]
     return [make_reader(PeerSample, layout) for layout in layouts]
 
 
 GLIDE_AHEAD_LIMIT_NS = NS_PER_S
-"""Under `glide`, samples whose stamp is further in the future than this are dropped, in ns."""
+"""Largest time by which a sample may lie in the future under the rule `glide`, in ns.
+
+Under this rule, arms glide back to their peers after an interrupted connection.
+"""
 STEP_MARGIN_RAD = 0.02
 """Tolerance for the distance that a joint moves between two samples, in rad."""
 
 
 class PeerInbox:
-    """Queue of the samples that arrived from the peers of a site, and the checks of a sample.
+    """Receives the samples of the peers of a site, and drops those that fail a check.
 
-    Samples of other boots (starts of a peer's process) are dropped. A site that joins a running
-    session ignores samples from before its own first tick.
+    A boot is a number that identifies one start of a process. For each peer, only samples of
+    one boot are accepted, so that a peer that was started twice does not act twice. A site that
+    joins a running session ignores samples from before its own first tick.
 
     If the scenario lets the arm glide back to its peers after a break, two more kinds of
     samples are dropped: those far in the future, and those that the peer's arm cannot have
@@ -124,21 +131,22 @@ class PeerInbox:
         self._skipped_until[index] = self._last[index]
 
     def find_last_tick_of(self, index: int, boot: int) -> int | None:
-        """Returns the last tick that was received of the boot that a new boot replaces.
+        """Returns the last tick received from a peer before the peer was restarted.
 
         Args:
             index: Index of the peer.
-            boot: The new boot of the peer.
+            boot: Boot of the new process of the peer, whose samples are not accepted yet.
 
         Returns:
-            The tick. None if `boot` is already the accepted boot of the peer, or if no sample
-            of the accepted boot has arrived.
+            The last tick received from the previous process. None if no sample of that process
+            has arrived, or if the samples of `boot` are accepted already.
         """
+        is_accepted_already = boot == self._boots[index]
         last_tick = self._last[index]
         has_received = last_tick > self._skipped_until[index]
-        if boot != self._boots[index] and has_received:
-            return last_tick
-        return None
+        if is_accepted_already or not has_received:
+            return None
+        return last_tick
 
     def drain(self, since_epoch_ns: int) -> list[Arrival]:
         """Removes the samples that have arrived, and returns those that pass all checks.
@@ -180,26 +188,28 @@ class PeerInbox:
         if sample.site != link.peer or sample.boot != self._boots[index]:
             self._dropped["stranger"] += 1
             return None
-        stamp_ns = sample.tick * NS_PER_S // link.rate_hz
-        if stamp_ns < self._from_ns:
-            return None
-        glides = bool(link.speed_limit)
+
+        nominal_ns = sample.tick * NS_PER_S // link.rate_hz  # time of its tick since the epoch
+        if nominal_ns < self._from_ns:
+            return None  # from before the first tick of this site
+        glides = bool(link.speed_limit)  # only links under the rule `glide` have this limit
         ahead_limit_ns = GLIDE_AHEAD_LIMIT_NS if glides else AHEAD_LIMIT_NS
-        if stamp_ns - since_epoch_ns > ahead_limit_ns:
+        if nominal_ns - since_epoch_ns > ahead_limit_ns:
             self._dropped["ahead"] += 1
             return None
         if glides and not self._is_reachable(index, sample):
             self._dropped["implausible"] += 1
             return None
-        # Samples between the last one and this one were lost, or the ring overflowed.
+
+        # Samples between the last one and this one were lost on the network or in a full queue.
         missing = sample.tick - self._last[index] - 1
         if missing > 0:
             self._dropped["missing"] += missing
         self._last[index] = max(self._last[index], sample.tick)
+
         delay_ns = self._monitors[index].receive(sample, arrived_ns)
-        channel: Sequence[
-            float
-        ] = ()  # what the control law of the peer sends to the law of this site
+        # Numbers that the control law of the peer sends to the control law of this site.
+        channel: Sequence[float] = ()
         if sample.ch:
             channel = link.channel.select_for_peer(sample.ch, link.index_at_peer)
         return Arrival(
@@ -213,22 +223,30 @@ class PeerInbox:
         )
 
     def _is_reachable(self, index: int, sample: PeerSample) -> bool:
-        """Returns True if the peer's arm can have moved from its newest sample to this one.
+        """Returns True if a peer's arm can have moved from its newest known state to a sample.
 
-        Each joint speed must be within its limit. Each joint must have moved by at most the
-        limit times the time between the samples, plus `STEP_MARGIN_RAD`. The comparisons are
-        negated so that NaN fails them.
+        Each joint speed must be within the limit of the joint. Each joint must have moved by at
+        most its speed limit times the time between the samples, plus `STEP_MARGIN_RAD`. A
+        sample that contains NaN is not plausible.
+
+        Args:
+            index: Index of the peer.
+            sample: Sample of the peer. If it is plausible and the newest, it is stored.
         """
         link = self._links[index]
         newest = self._newest[index]
-        for speed, limit in zip(sample.qd, link.speed_limit, strict=True):
-            if not abs(speed) <= limit:
+        # Comparisons with NaN are False, so that NaN counts as not within a limit.
+        for speed, speed_limit in zip(sample.qd, link.speed_limit, strict=True):
+            is_within_limit = abs(speed) <= speed_limit
+            if not is_within_limit:
                 return False
         if newest is not None:
             elapsed_s = abs(sample.tick - newest.tick) / link.rate_hz
             joints = zip(sample.q, newest.q, link.speed_limit, strict=True)
-            for angle, newest_angle, limit in joints:
-                if not abs(angle - newest_angle) <= limit * elapsed_s + STEP_MARGIN_RAD:
+            for angle, newest_angle, speed_limit in joints:
+                distance_limit = speed_limit * elapsed_s + STEP_MARGIN_RAD
+                is_within_limit = abs(angle - newest_angle) <= distance_limit
+                if not is_within_limit:
                     return False
         if newest is None or sample.tick > newest.tick:
             self._newest[index] = sample
@@ -244,20 +262,26 @@ MIN_HELD_DELAY_US = 100_000
 
 
 def may_hold_samples(scenario: Scenario, name: str) -> bool:
-    """Returns True if a site may send several samples together without changing the run.
+    """Returns True if a site may send the samples of several ticks together, and thus late.
 
-    This is so if every link from the site delays its samples by at least `MIN_HELD_DELAY_US`:
-    peers do not use a sample before that time. The delay of a link may be shortened during the
-    run. Therefore the site must receive the events of its peers, and stop holding samples when
-    an event reports a change.
+    The run is not changed by this if every link from the site delays its samples by at least
+    `MIN_HELD_DELAY_US`, because no peer uses a sample before that time. The user may shorten
+    the delay of a link during the run. Therefore the site must receive the events of its peers,
+    and must send each sample at once after an event has reported a change.
+
+    Args:
+        scenario: The scenario.
+        name: Name of the site.
     """
     for receiver in scenario.names:
         for link in scenario.setup(receiver).links:
             if link.peer != name:
                 continue
             for model in link.models:
-                constant_us = model.location * (model.kind == DelayKind.CONSTANT)
-                if max(model.playout_us, constant_us) < MIN_HELD_DELAY_US:
+                is_constant = model.kind == DelayKind.CONSTANT
+                constant_us = model.location if is_constant else 0.0
+                smallest_delay_us = max(model.playout_us, constant_us)
+                if smallest_delay_us < MIN_HELD_DELAY_US:
                     return False
     return True
 
@@ -265,8 +289,10 @@ def may_hold_samples(scenario: Scenario, name: str) -> bool:
 class StateBlock:
     """Collects the records of a site's ticks, and sends them to the recorders in blocks.
 
-    Blocks cost less computing time than single messages. A record is always sent after the
-    sample of its tick, because it contains the time at which the sample was sent.
+    A record is the stored result of one tick, and a sample is the part of it that the peers
+    need. Blocks of records cost less computing time than single messages. A record is always
+    sent after the sample of its tick, because it contains the time at which the sample was
+    sent.
 
     Args:
         site: The site in the simulation kernel.
@@ -298,26 +324,37 @@ class StateBlock:
         self._turn = 3 * turn % self._ticks
         self._ticks_per_wake = max(1, site.rate_hz // WAKES_PER_S)
         self.holds_samples = False
+        # Records whose samples are not sent yet, and records that wait for their block. The
+        # fields of an entry are the arguments of `encode_state` after the peers. A record gets
+        # its last two fields, the sending time and the echoes, when its sample is sent.
         self._waiting_records: list[tuple[Any, ...]] = []
         self._records: list[tuple[Any, ...]] = []
-        # Records whose samples are not sent yet, and records that wait for their block. The
-        # fields of an entry are the arguments of `encode_state` after the peers.
 
-    def add(self, output: TickRecord, *facts: Any) -> bool:
-        """Adds the record of a tick, and decides if the block must be sent now.
+    def add(
+        self,
+        output: TickRecord,
+        arrivals: Sequence[Arrival],
+        late_us: int,
+        busy_us: int,
+    ) -> bool:
+        """Adds the record of a tick to the present block, and decides if the block is due.
 
         Args:
             output: The record.
-            facts: The arguments of `encode_state` between the record and the sending time.
+            arrivals: Samples of the peers that the tick has received.
+            late_us: Time by which the tick began late, in us.
+            busy_us: Computing time of the previous tick, in us.
 
         Returns:
-            True if the block is complete, or if somebody holds the arm. The program of that
-            person needs every record at once.
+            True if the block must be sent now: it is complete, or an operator moves the arm at
+            present. The operator's program computes the rendered force from the records, and
+            needs each of them at once.
         """
-        self._waiting_records.append((output, *facts))
-        is_held = bool(output.hand) and HandInForce.read(output.hand).source > 0
+        self._waiting_records.append((output, arrivals, late_us, busy_us))
+        # The source of the operator's commands is 0 if no operator moves the arm.
+        has_operator = bool(output.hand) and HandInForce.read(output.hand).source > 0
         is_block_complete = (output.tick + 1) % self._ticks == self._turn
-        return is_held or is_block_complete
+        return has_operator or is_block_complete
 
     def send_samples(self, k: int, send: Callable[[TickRecord], tuple[Any, ...]]) -> None:
         """Sends the waiting samples to the peers, unless they are held until a later tick.
@@ -325,7 +362,8 @@ class StateBlock:
         Args:
             k: The present tick.
             send: Function that sends the sample of a record. It returns the sending time and
-                the echoes, which become part of the record.
+                the confirmations of received samples ("echoes") that the sample contained.
+                Both become part of the record.
         """
         is_wake_tick = (k + 1 - self._turn) % self._ticks_per_wake == 0
         if not self.holds_samples or is_wake_tick:
@@ -358,11 +396,20 @@ def _publish_sample(
     io: "RunningSite",
     output: TickRecord,
 ) -> tuple[Any, ...]:
-    """Publishes the sample of a tick.
+    """Publishes the sample of a tick to the peers.
+
+    Args:
+        name: Name of this site.
+        boot: Random number that identifies this start of the site.
+        clock: Clock of this process.
+        timing: Stores the time of sending, and provides the echoes.
+        io: Publishes the encoded sample.
+        output: Record of the tick.
 
     Returns:
-        The time of sending on the local clock in ns, and the echoes: which samples of the peers
-        have arrived, and when. The peers compute round trip times from them.
+        The time of sending in ns since the epoch, on the local clock; and the echoes, which
+        confirm the samples of the peers that have arrived, with the times of arrival. The peers
+        compute delays and round trip times from them.
     """
     sent_ns = timing.record_sent(output.tick, clock.monotonic_ns())
     echo = timing.pop_echo()
@@ -384,11 +431,14 @@ def run_loop(
     *,
     catches_up: bool = True,
 ) -> TickRecord | None:
-    """Executes the ticks of a site in real time.
+    """Executes the ticks of a site in real time, until the end of the run or an error.
+
+    Each round waits until a tick is due, receives the samples of the peers, computes the tick,
+    and publishes the results. Work that is not urgent follows in the rest of the period.
 
     Args:
         site: The site in the simulation kernel.
-        boot: Boot of this process.
+        boot: Random number that identifies this start of the site.
         ticks: Number of the tick before which the run ends.
         clock: Clock of this process.
         inbox: Samples of the peers.

@@ -1,14 +1,14 @@
 """Creates the parts of a site, which exist from the start of its process to its end.
 
 A site is a process that runs one arm and its control loop. `SiteParts` creates the site in the
-simulation kernel, the queues for incoming messages, the publishers, the buffer for lost
-messages, and whatever else the scenario requires. `site_process` then joins the session with
-these parts.
+simulation kernel, the queues for incoming messages, the publishers, the buffer from which lost
+messages are sent again, and whatever else the scenario requires. `site_process` then joins the
+session with these parts.
 
 Invariant:
     - When a `SiteParts` object has been created, all subscriptions of the site are declared and
-      its control step is compiled. A site that announces itself is therefore ready for its
-      session.
+      its control step is compiled. A site announces itself only after that, so that it misses
+      no message and its first tick is not late.
 """
 
 from collections.abc import Callable
@@ -170,7 +170,7 @@ class SiteParts:
         warm_up(scenario, name, clock)
 
     def _key(self, channel: str, member: str = "") -> str:
-        """Returns the network key of a channel of this site or of another member.
+        """Returns the network address ("key") of a channel of this site or of another member.
 
         Args:
             channel: Name of the channel, see `topics`.
@@ -179,38 +179,42 @@ class SiteParts:
         return topics.key(self.options.session, member or self.name, channel)
 
     def _make_publishers(self) -> None:
-        """Creates the publishers of samples, records and statistics.
+        """Creates the functions that publish samples, records and statistics.
 
-        Records and statistics are stored in the buffer for recorders that miss them.
+        A sample goes to the peers, a record (the stored result of a tick) and statistics go to
+        the recorder. Records and statistics are also stored in the buffer, so that a recorder
+        that has lost some of them can request them again.
         """
         scenario = self.scenario
         self.publish_sample = self.bus.publisher(self._key(topics.SAMPLE))
-        send_states = self._make_storing_publisher(topics.STATE)
-        send_links = self._make_storing_publisher(topics.LINK)
-        self.publish_link: Callable[[bytes], None] = lambda payload: send_links([payload])
-        # Each record is sent with its tick, so that a site that is killed loses no record.
+        send_records = self._make_storing_publisher(topics.STATE)
+        send_statistics = self._make_storing_publisher(topics.LINK)
+        self.publish_link: Callable[[bytes], None] = lambda payload: send_statistics([payload])
+
+        # Usually the records of several ticks are sent together. They are sent in every tick if
+        # the site has a real arm or may be restarted: if such a site is killed, its last
+        # records must not be lost.
         sends_every_tick = self.arm is not None or scenario.sites_may_return
         self.states = StateBlock(
             site=self.site,
             boot=self.boot,
-            send=send_states,
-            turn=scenario.names.index(self.name),
+            send=send_records,
+            turn=scenario.names.index(self.name),  # sites send in different ticks
             single=sends_every_tick,
         )
-        self.states.holds_samples = not sends_every_tick and may_hold_samples(
-            scenario, self.name
-        )
+        peers_can_wait = may_hold_samples(scenario, self.name)
+        self.states.holds_samples = peers_can_wait and not sends_every_tick
 
     def _watch_code(self, name: str, rate_hz: int) -> Callable[..., Any]:
-        """Returns a function that calls the user's code under the watchdog.
+        """Returns a function that calls a user's code and measures its computing time.
 
         Args:
             name: Name of the code, as in "the plant myplant:MyPlant".
             rate_hz: How often the code is called, in 1/s.
 
         Returns:
-            A function of a tick and a call, see `WatchedCode.run`. It raises TimeoutError if
-            the code is too slow.
+            A function of the number of the tick and the function to call, see
+            `WatchedCode.run`. It raises TimeoutError if the code is too slow.
         """
         code = WatchedCode(name, rate_hz, lambda _, problem: TimeoutError(problem), self.clock)
         self.watchdog.codes.append(code)
@@ -371,7 +375,10 @@ def warm_up(scenario: Scenario, name: str, clock: Clock | None = None) -> None:
 def watch_law(
     scenario: Scenario, site: Site, clock: Clock
 ) -> tuple[CodeWatchdog, Callable[[TickInput], TickRecord]]:
-    """Returns a watchdog for the control law of a site, and the function that computes a tick.
+    """Creates the function that computes a tick, and a watchdog of a user's control law.
+
+    A control law that the user has written in Python may be too slow or never return. The
+    watchdog is a thread that limits its computing time. The built-in laws need no watchdog.
 
     Args:
         scenario: The scenario.
@@ -379,26 +386,31 @@ def watch_law(
         clock: Clock of this process.
 
     Returns:
-        The watchdog and the function. If the law is not the user's own, the watchdog watches
-        nothing, and the function is the step of the kernel.
+        watchdog: The watchdog. It checks only the user's law, and nothing if the law is
+            built-in.
+        step: Function that computes one tick of the site. It raises LawFailed if the user's law
+            fails or is too slow.
     """
     law = scenario.sites[site.name].control
     if not isinstance(law, ImportedLaw):
-        return CodeWatchdog(), site.step
+        idle_watchdog = CodeWatchdog()
+        return idle_watchdog, site.step
 
-    def fail(k: int, problem: str) -> LawFailed:
-        return LawFailed(problem, site=site.name, code=law.code, tick=k)
+    def make_error(tick: int, problem: str) -> LawFailed:
+        return LawFailed(problem, site=site.name, code=law.code, tick=tick)
 
-    code = WatchedCode(f"the law {law.code}", site.rate_hz, fail, clock)
+    watched_law = WatchedCode(f"the law {law.code}", site.rate_hz, make_error, clock)
 
-    def step(inputs: TickInput) -> TickRecord:
-        return code.run(inputs.k, lambda: site.step(inputs))
+    def watched_step(inputs: TickInput) -> TickRecord:
+        return watched_law.run(inputs.k, lambda: site.step(inputs))
 
-    return CodeWatchdog(code), step
+    return CodeWatchdog(watched_law), watched_step
 
 
 def _run_warm_up(setup: SiteSetup, site: Site, step: Callable[[TickInput], TickRecord]) -> None:
-    """Executes ticks with samples of all peers, and encodes and decodes their messages.
+    """Executes ticks of a temporary site, and encodes and decodes the messages of each tick.
+
+    Every tick but the first receives a sample of every peer, so that all code of a tick runs.
 
     Args:
         setup: Settings of the site.

@@ -14,19 +14,16 @@ applies the torque that the site publishes:
 `SwitchClient` reports whether somebody holds the dead-man switch of such an arm. `Hand` lets a
 person or a program move an arm as its operator.
 
+Torques and forces are read from the record that the site publishes in every tick. The recorder
+stores the same records, so that the log contains exactly what was applied to the arm.
+
 Invariant:
-    - The driver may send measurements at any rate. The torque that it applies is part of the
-      record that the site publishes in every tick. The log therefore contains the applied
-      torque.
-    - `ArmClient.torque` returns None if there is no valid torque. The arm must then brake.
-    - A client follows the start of the site (boot) that it saw first. It ignores records of
-      other boots, records that are older than the newest one, and records that are more than
-      `AHEAD_NS` too far in the future.
-    - Messages that cannot be decoded come from other programs and are ignored.
-    - A thread repeats the last message of an operator who does not move. The site can thus
-      detect that the operator's program has died, and then releases the arm.
-    - The force on the arm, and the force that an operator feels, are computed from the site's
-      records. They are the forces in the log.
+    - `ArmClient.torque` returns None if no valid torque is available. The arm must then brake.
+    - A client accepts only records that continue those that it has received: from the same
+      process of the site, newer, and not implausibly far in the future. Otherwise a second
+      process of the same name, or a forged message, could move the arm.
+    - While an operator does not move, a thread repeats the last message. If the messages end,
+      the site knows that the operator's program has died, and releases the arm.
 """
 
 import math
@@ -89,7 +86,7 @@ class SiteSender:
 
     Attributes:
         boot: Random number that identifies this start of the sending program.
-        number: Number of the newest message. It is -1 before the first message.
+        number: Number of the newest message, from 0. It is -1 before the first message.
     """
 
     def __init__(
@@ -117,7 +114,7 @@ class SiteSender:
         return message
 
     def repeat(self, message: R) -> None:
-        """Sends a message again with the same number. Nothing has changed since."""
+        """Sends a message again with the same number, to show that the program still runs."""
         self._publish(encode(message))
 
 
@@ -197,7 +194,11 @@ class SiteClient:
         return is_newer and record.t_ns - last.t_ns <= elapsed_ns + AHEAD_NS
 
     def _read_messages(self) -> None:
-        """Receives records and events, and notes if the run has ended or the site is gone."""
+        """Receives all waiting messages, and updates the newest record and the end of the run.
+
+        The run of the site has ended if the site has published its end, or if its liveliness
+        token, which exists as long as its process is connected, has disappeared.
+        """
         while (message := self._records.poll()) is not None:
             block, received_ns = message
             try:
@@ -385,9 +386,10 @@ def make_hand_sender(bus: Bus, clock: Clock, session: str, site: str) -> SiteSen
 class Hand(SiteClient):
     """Connection of a person or a program that moves an arm as its operator.
 
-    `tn.hand` and the commands of the live page create it. The methods `move`, `turn` and `push`
-    take hold of the arm, and `release` lets it go. The object is a context manager that
-    releases the arm.
+    `tn.hand` and the commands of the live page create it. The first call of `move`, `turn` or
+    `push` starts to move the arm. Which of them is permitted depends on the operator in the
+    scenario: one with a target position, with target angles, or with a force. `release` ends
+    the operator's influence. The object is a context manager that releases the arm at its end.
 
     Args:
         bus: Network connection.
@@ -438,12 +440,10 @@ class Hand(SiteClient):
             self._ended.set()
 
     def move(self, *place_m: float) -> int:
-        """Moves the target of the end effector to x, y (in space also z), in m.
-
-        The first call takes hold of the arm.
+        """Moves the target position, towards which the operator pulls the end effector.
 
         Args:
-            *place_m: Coordinates of the target, in m.
+            *place_m: Coordinates x and y of the target, for an arm in space also z, in m.
 
         Returns:
             The number of the message. Each record states in `hand` which message the site
@@ -456,11 +456,33 @@ class Hand(SiteClient):
         return self._send("move", place_m)
 
     def turn(self, *angles_rad: float) -> int:
-        """Moves the target angles of the joints, in rad. Otherwise it is like `move`."""
+        """Sets target angles of the joints, towards which the operator turns them.
+
+        Args:
+            *angles_rad: Target angle of each joint, in rad.
+
+        Returns:
+            The number of the message, see `move`.
+
+        Raises:
+            UsageError: The scenario's operator is not moved in this way, or a number is not
+                finite.
+        """
         return self._send("turn", angles_rad)
 
     def push(self, *force_n: float) -> int:
-        """Sets the force that acts ON the end effector, in N. Otherwise it is like `move`."""
+        """Sets the force with which the operator pushes the end effector.
+
+        Args:
+            *force_n: Coordinates of the force that acts ON the end effector, in N.
+
+        Returns:
+            The number of the message, see `move`.
+
+        Raises:
+            UsageError: The scenario's operator does not apply forces, or a number is not
+                finite.
+        """
         return self._send("push", force_n)
 
     def release(self) -> None:
@@ -473,15 +495,16 @@ class Hand(SiteClient):
 
     @property
     def holds(self) -> bool:
-        """True if this operator holds the arm according to the newest record."""
+        """True if this program is the operator that moves the arm in the newest record."""
         hand = self.in_force
         return hand is not None and hand.source == self._sender.boot
 
     @property
     def number(self) -> int:
-        """Number of this operator's message that the site followed in the newest record.
+        """Number of the message that the site followed in the newest record.
 
-        It is -1 if this operator does not hold the arm.
+        It is the number that `move`, `turn` or `push` returned. It is -1 if this program does
+        not move the arm at present.
         """
         hand = self.in_force
         if hand is None or hand.source != self._sender.boot:
@@ -490,9 +513,9 @@ class Hand(SiteClient):
 
     @property
     def in_force(self) -> HandInForce | None:
-        """State of the operator who holds the arm, in the newest record.
+        """Operator who moves the arm in the newest record, with the present target or force.
 
-        None before the first record.
+        The operator may be another program. None before the first record.
         """
         record = self.record
         if record is None or not record.hand:

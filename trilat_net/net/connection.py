@@ -81,11 +81,15 @@ def default_endpoints(
 
 @contextmanager
 def reserve_session_endpoints(session: str, sites: Sequence[str]) -> Iterator[list[str]]:
-    """Reserves an endpoint for each site of a session, as a context manager.
+    """Reserves a network endpoint for each site of a session, as a context manager.
 
     The default endpoints are used if they are free, and otherwise any free ports. Inside the
     `with` block, other callers of this function get other endpoints, so that two sessions of
     the same name can run at the same time.
+
+    Args:
+        session: Name of the session.
+        sites: Names of the sites, in the order of the scenario.
 
     Yields:
         The endpoints, in the order of the sites.
@@ -112,24 +116,30 @@ def find_free_endpoints(count: int) -> list[str]:
 
 
 def _bind_ports(stack: ExitStack, ports: Sequence[int], *, shared: bool) -> list[str]:
-    """Binds ports of this machine until the stack is closed.
+    """Reserves ports of this machine for sites that will listen at them.
+
+    A port is reserved by a socket that is bound to it but does not listen. The operating system
+    then gives the port to nobody who asks for any free port.
 
     Args:
-        stack: Closes the sockets.
-        ports: The ports. 0 stands for any free port.
-        shared: True if another program may listen at the ports meanwhile.
+        stack: Closes the sockets, and thereby ends the reservation.
+        ports: Numbers of the ports. 0 stands for any free port.
+        shared: True if the site can listen at its port while the port is still reserved. False
+            reserves the port exclusively.
 
     Returns:
-        The endpoints of the ports.
+        The endpoints of the reserved ports, in the order of the ports.
 
     Raises:
         OSError: A port is in use.
     """
     sockets = [stack.enter_context(socket.socket()) for _ in ports]
-    for probe, port in zip(sockets, ports, strict=True):
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, int(shared))
-        probe.bind(("127.0.0.1", port))
-    return [f"tcp/127.0.0.1:{probe.getsockname()[1]}" for probe in sockets]
+    for reserving_socket, port in zip(sockets, ports, strict=True):
+        reserving_socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, int(shared))
+        reserving_socket.bind(("127.0.0.1", port))
+
+    reserved_ports = [reserving_socket.getsockname()[1] for reserving_socket in sockets]
+    return [f"tcp/127.0.0.1:{port}" for port in reserved_ports]
 
 
 ENDS_SOON = timedelta(days=7)
@@ -164,16 +174,25 @@ class Connection:
     keys_end: datetime | None = None
 
     def reach(self, endpoints: Sequence[Endpoint]) -> list[Endpoint]:
-        """Returns endpoints as this process opens them: if it has keys, TLS replaces TCP."""
+        """Converts endpoints to the form in which this process opens them.
+
+        If the process has keys, its connections are encrypted: TLS replaces TCP.
+
+        Args:
+            endpoints: Endpoints as text, or groups of endpoints from a user's Zenoh file. The
+                groups are not converted.
+        """
         if not self.keys_of:
             return list(endpoints)
-        return [
-            re.sub("^tcp/", "tls/", endpoint) if isinstance(endpoint, str) else endpoint
-            for endpoint in endpoints
-        ]
+
+        encrypted: list[Endpoint] = []
+        for endpoint in endpoints:
+            is_text = isinstance(endpoint, str)
+            encrypted.append(re.sub("^tcp/", "tls/", endpoint) if is_text else endpoint)
+        return encrypted
 
     def open(self) -> ZenohBus:
-        """Opens the connection, and returns the bus.
+        """Opens the connection, and returns the bus through which messages are sent.
 
         Raises:
             UnknownHost: A host name cannot be resolved. This is checked first, because Zenoh
@@ -187,10 +206,10 @@ class Connection:
         return ZenohBus(listen, connect, self.mode, self.settings)
 
     def require_keys_until(self, left_s: float) -> None:
-        """Refuses keys whose validity ends before a session does.
+        """Raises an error if the validity of the keys ends before the planned end of a session.
 
-        A connection that is open outlives the end of its certificate, but no connection can be
-        opened after that. If a cable were unplugged for six seconds, the session would end.
+        An open connection continues after its certificate has expired, but no new connection
+        can be opened. After a short interruption of the network, a member could not return.
 
         Args:
             left_s: Remaining duration of the session, in s.
@@ -209,17 +228,29 @@ class Connection:
             )
 
     def describe_end(self) -> str:
-        """Returns a warning if the validity of the keys ends soon. Empty if it does not."""
+        """Returns a warning for the user if the validity of the keys ends within `ENDS_SOON`.
+
+        Empty if the keys are valid for longer, or if there are no keys.
+        """
         if self.keys_end is None or self.keys_end - datetime.now(UTC) > ENDS_SOON:
             return ""
         remedy = "renew them with trilat keys renew (docs/network.md)"
         return f"the keys of {self.keys_of} end on {self.keys_end:{DATE}}: {remedy}"
 
     def require(self, member: str) -> "Connection":
-        """Checks that the connection may be used in the name of a member, and returns itself.
+        """Checks that this connection has no keys, or the keys of the named member.
+
+        Other members would refuse a process that takes part under one name, but proves its
+        identity with the keys of another name.
+
+        Args:
+            member: Name under which this process will take part in the session.
+
+        Returns:
+            This connection, unchanged, so that the check can be part of an expression.
 
         Raises:
-            UsageError: The connection uses the keys of another member.
+            UsageError: The connection has the keys of another member.
         """
         if self.keys_of not in ("", member):
             raise UsageError(
@@ -459,7 +490,13 @@ def _join_options(
     listen_else: Sequence[str],
     connect_else: Sequence[str] | None,
 ) -> Connection:
-    """Derives the connection of a peer or a router, see `resolve_member_connection`."""
+    """Derives the connection of a peer or a router from the command line and a Zenoh file.
+
+    The arguments are those of `resolve_member_connection`.
+
+    Raises:
+        UsageError: Both the command line and the file name endpoints at which to listen.
+    """
     file_listen = file.endpoints("listen", mode)
     if listen is not None and file_listen is not None:
         raise UsageError(

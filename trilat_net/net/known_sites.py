@@ -1,8 +1,8 @@
 """Remembers which sites run on this machine, so that `trilat stop` reaches them immediately.
 
-A site is a process that runs one arm. Each running site keeps a small file with its endpoints
-in the folder of its user. `trilat stop` reads these files and connects to the sites at once,
-instead of first searching for the session on the network.
+A site is a process that runs one arm. While it runs, it stores its network endpoints in a small
+file, in a folder that belongs to the user who started it. `trilat stop` reads these files and
+connects to the sites at once, instead of first searching for the session on the network.
 
 Invariant:
     - The files are only a shortcut. A site runs without its file, and a file whose process is
@@ -45,7 +45,7 @@ _NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL
 
 
 class KnownSite(msgspec.Struct, frozen=True):
-    """Content of the file of a site that runs on this machine.
+    """Content of the file in which a running site stores how it can be reached.
 
     Attributes:
         session: Name of the session.
@@ -55,7 +55,7 @@ class KnownSite(msgspec.Struct, frozen=True):
         keyed: True if the site encrypts its messages with keys.
         places: Endpoints at which the site, and the members that it connects to, can be
             reached.
-        stop: Payload of the order to stop.
+        stop: The message that stops the arm, encoded.
         pid: Process number of the site.
         machine: Identity of the machine's clock. It changes when the machine is restarted.
     """
@@ -86,10 +86,15 @@ def make_site_known(
     connection: "Connection",
     stop: bytes,
 ) -> Iterator[None]:
-    """Keeps the file of a site while the site runs, as a context manager.
+    """Publishes the endpoints of a site in a file, with which `trilat stop` finds the site.
 
-    There is no file if the site can only be reached with Zenoh settings of its user, which are
-    not part of the file.
+    This is a context manager: the file exists while the site runs, and is removed afterwards.
+    If the file cannot be written, the site runs without it, and `trilat stop` searches the
+    network instead.
+
+    No file is written if the user has configured the network connection with a Zenoh file.
+    Other processes need the same Zenoh file to reach the site, so that the endpoints alone
+    would not help.
 
     Args:
         session: Name of the session.
@@ -98,7 +103,7 @@ def make_site_known(
         boot: Random number that identifies this start of the site. It is part of the file's
             name.
         connection: Network connection of the site.
-        stop: Payload of the order to stop.
+        stop: The message that `trilat stop` sends to stop the arm, encoded.
     """
     endpoints = [*connection.listen, *(connection.connect or ())]
     known = KnownSite(
@@ -112,8 +117,9 @@ def make_site_known(
         pid=os.getpid(),
         machine=SystemClock().identity(),
     )
+    has_users_settings = bool(connection.settings) and not connection.keys_of
     with suppress(OSError, RuntimeError):  # RuntimeError: the user has no home folder
-        if connection.keys_of or not connection.settings:
+        if not has_users_settings:
             _find_folder().mkdir(mode=0o700, parents=True, exist_ok=True)
             descriptor = os.open(_find_folder() / f"{boot:016x}.json", _NEW_FILE, 0o600)
             with os.fdopen(descriptor, "wb") as stream:
@@ -225,16 +231,17 @@ def stop_at_once(arguments: Sequence[str]) -> int | list[str]:
             return 0
 
         # The search continues at the endpoints of the known sites.
-        way = "--router" if known_sites[0].mode == "client" else "--connect"
-        remaining = list(arguments)
+        option = "--router" if known_sites[0].mode == "client" else "--connect"
+        remaining_arguments = list(arguments)
         for endpoint in list_endpoints(known_sites):
-            if isinstance(endpoint, str):
-                remaining += [way, endpoint]
-        return remaining
+            if isinstance(endpoint, str):  # other endpoints cannot be given as an option
+                remaining_arguments += [option, endpoint]
+        return remaining_arguments
     except KeyboardInterrupt:
         return 130
     except Exception:
-        # Whatever the error is: the long way is tried, and reports the error.
+        # An arm must be stopped: after any error, the command continues with the search for
+        # the session, which reports the error if it fails as well.
         return list(arguments)
 
 

@@ -56,13 +56,13 @@ class ModeMeaning(NamedTuple):
 
     Attributes:
         mode: The mode.
-        does: Words that describe the site in the present tense.
-        did: Words that describe the site in the past tense.
-        follows: True if the site follows its peers.
-        rests: True if the arm comes to rest in this mode, under the rule `glide` for
-            interrupted connections. The torque is then not that of the control law alone, and
-            samples of the peers do not influence the reference.
-        halted: True if the site resumes only when a user requests it.
+        does: Words that describe the site in the present tense, as in "m1 follows".
+        did: Words that describe the site in the past tense, as in "m1 followed".
+        follows: True if the arm follows the states of the peers.
+        rests: True if the site brings its arm to rest in this mode, for example because the
+            connection to a peer is interrupted. It then ignores the samples of its peers, and
+            adds a braking torque to the torque of the control law.
+        halted: True if the site leaves this mode only when a user requests it.
     """
 
     mode: Mode

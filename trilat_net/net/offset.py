@@ -24,12 +24,13 @@ Assumptions: the clocks drift apart by less than DRIFT_LIMIT, and their drift de
 mean by less than WANDER over the stored windows.
 
 Invariant:
-    - The time stamps prove each bound, however long the delays are, and however different they
-      are in the two directions.
-    - The offset in use (`SlewedOffset`) never steps. It is continuous and piecewise linear. It
-      reaches each new estimate within SLEW_NS, and then follows the drift of the estimate.
-    - The bound of the offset in use includes the range of the estimate also while the offset
-      moves towards the estimate.
+    - The time stamps prove each error bound, however long the delays are, and however different
+      they are in the two directions. No symmetry of the network is assumed.
+    - Delays are computed with a smoothed offset (`SlewedOffset`) that never steps, because a
+      step would appear as a jump of all delays. The smoothed offset is continuous and piecewise
+      linear. It reaches each new estimate within SLEW_NS, and then follows the estimated drift.
+    - The error bound of the smoothed offset is also valid while the offset still approaches a
+      new estimate.
 """
 
 import math
@@ -147,7 +148,7 @@ class OffsetEstimator:
 
     Attributes:
         broken: Number of times that the limits contradicted each other. The older half of them
-            was then discarded. Such a contradiction shows that a clock has stepped, or has
+            was discarded each time. Such a contradiction shows that a clock has stepped, or has
             drifted by more than DRIFT_LIMIT.
     """
 
@@ -169,31 +170,39 @@ class OffsetEstimator:
             self._floors.append(floor)
 
     def estimate(self, now_ns: int) -> OffsetEstimate | None:
-        """Estimates the offset at present.
+        """Estimates the offset of the other clock at the present time.
 
-        If the stored limits contradict each other, older ones are discarded until the rest
-        agree.
+        The offset is modelled as a straight line over time, below every stored ceiling and
+        above every stored floor. If no such line exists, a clock has stepped, and the older
+        limits belong to the time before the step. The older half of the limits is then
+        discarded, until such a line exists.
 
         Args:
-            now_ns: Present time on the local clock, in ns. No window may end later.
+            now_ns: Present time on the local clock, in ns. It must not be earlier than any of
+                the stored limits.
 
         Returns:
-            The estimate. None if there is no limit in one of the directions.
+            The estimate. None if there is no ceiling or no floor, so that the offset is not
+            limited on both sides.
         """
         while self._ceilings and self._floors:
             lines = _AdmissibleLines(self._ceilings, self._floors, now_ns)
             if lines.exist:
                 return lines.estimate()
+
             self.broken += 1
             kept_limits = max(len(self._ceilings), len(self._floors)) // 2
             for limits in (self._ceilings, self._floors):
                 while len(limits) > kept_limits:
-                    limits.popleft()
+                    limits.popleft()  # the oldest
         return None
 
 
 class _AdmissibleLines:
-    """All straight lines below every ceiling and above every floor.
+    """All straight lines of the offset over time below every ceiling and above every floor.
+
+    The ceilings and floors are the limits of the offset that follow from the time stamps. The
+    set of lines is described by its steepest and its flattest line.
 
     Times are in s relative to the present, and offsets in ns relative to the latest ceiling.
     These small numbers keep the precision that floating-point numbers would lose for 64-bit
@@ -305,19 +314,24 @@ class _AdmissibleLines:
 
 
 SLEW_NS = 1_000_000_000
-"""Time in which the offset in use reaches a new estimate, in ns."""
+"""Time in which the smoothed offset reaches a new estimate, in ns."""
 
 
 class _SlewSegment:
-    """Part of the offset in use: it moves to an estimate within SLEW_NS, and then follows it.
+    """Smoothed offset of another clock from one estimate to the next, as two straight lines.
+
+    The first line leads from the previous value of the offset to the estimate, within SLEW_NS.
+    The second line is the estimate with its drift.
 
     Args:
-        start_ns: Time on the local clock at which the part begins, in ns.
-        offset_ns: Offset in use at that time, in ns.
+        start_ns: Time on the local clock at which the segment begins, in ns.
+        offset_ns: Smoothed offset at that time, in ns.
         estimate: The estimate.
 
     Attributes:
-        bound_ns: Largest error of the offset in use until it has reached the estimate, in ns.
+        start_ns: Time on the local clock at which the segment begins, in ns.
+        estimate: The estimate.
+        bound_ns: Largest error of the smoothed offset until it has reached the estimate, in ns.
     """
 
     def __init__(self, start_ns: int, offset_ns: int, estimate: OffsetEstimate) -> None:
@@ -327,32 +341,39 @@ class _SlewSegment:
         self._joined_offset_ns = estimate.extrapolate_ns(self._joined_ns)
         self._approach_rate = (self._joined_offset_ns - offset_ns) / SLEW_NS
         self._drift_per_ns = estimate.drift / NS_PER_S
-        # The bound is convex over the slew, so the largest bound is at one of the two ends.
+        # The bound is a convex function of time on the first line: it is largest at an end.
         start_bound_ns = estimate.error_bound_ns(start_ns, offset_ns)
         joined_bound_ns = estimate.error_bound_ns(self._joined_ns, self._joined_offset_ns)
         self.bound_ns = max(start_bound_ns, joined_bound_ns)
 
     def evaluate_ns(self, local_ns: int) -> int:
-        """Returns the offset in use at a time of the local clock, in ns."""
+        """Returns the smoothed offset at a time of the local clock, in ns."""
         passed_ns = local_ns - self._joined_ns
         rate = self._approach_rate if passed_ns < 0 else self._drift_per_ns
         return self._joined_offset_ns + int(passed_ns * rate)
 
     def error_bound_ns(self, local_ns: int) -> int:
-        """Returns the largest possible error of the offset in use at a time, in ns."""
+        """Returns the largest possible error of `evaluate_ns` at the same time, in ns.
+
+        On the line towards the estimate, this is the bound for the whole line.
+        """
         if self.start_ns <= local_ns <= self._joined_ns:
             return self.bound_ns
         return self.estimate.error_bound_ns(local_ns, self.evaluate_ns(local_ns))
 
 
 class SlewedOffset:
-    """The offset in use over time: the other clock minus the local clock, without steps.
+    """Smoothed offset over time: the time of another clock minus that of the local clock.
 
-    Delays are computed with this offset and not with the latest estimate, because an estimate
-    may differ from the previous one by a step.
+    Delays are computed with this offset and not directly with the latest estimate. The estimate
+    differs from the previous one by a small step, which would appear as a step of all delays.
+    The smoothed offset instead approaches each estimate along a straight line.
+
+    Two segments are stored, that of the latest estimate and the one before. The offset is
+    therefore defined from the start of the segment before on.
 
     Args:
-        estimate: First estimate, which is used at once.
+        estimate: First estimate. The smoothed offset equals it from the beginning.
     """
 
     def __init__(self, estimate: OffsetEstimate) -> None:
@@ -362,22 +383,22 @@ class SlewedOffset:
 
     @property
     def estimate(self) -> OffsetEstimate:
-        """Estimate to which the offset moves."""
+        """Latest estimate, which the smoothed offset approaches or follows."""
         return self._segment.estimate
 
     @property
     def bound_ns(self) -> int:
-        """Largest error of the offset until it has reached the estimate, in ns.
+        """Largest error of the smoothed offset until it has reached the estimate, in ns.
 
-        Later the error grows.
+        Afterwards the possible error grows with the age of the estimate, see `error_bound_ns`.
         """
         return self._segment.bound_ns
 
     def slew_to(self, local_ns: int, estimate: OffsetEstimate) -> None:
-        """Starts to move to a new estimate.
+        """Makes the smoothed offset approach a new estimate from a given time on.
 
         Args:
-            local_ns: Time on the local clock at which the move starts, in ns.
+            local_ns: Time on the local clock from which on it approaches the estimate, in ns.
             estimate: The estimate.
         """
         segment = _SlewSegment(local_ns, self.evaluate_ns(local_ns), estimate)
@@ -385,21 +406,32 @@ class SlewedOffset:
         self._segment = segment
 
     def evaluate_ns(self, local_ns: int) -> int:
-        """Returns the offset in use at a time of the local clock, in ns.
+        """Returns the smoothed offset between the two clocks at a time.
 
-        The time must not be earlier than the start of the previous move.
+        Args:
+            local_ns: Time on the local clock, in ns. It must not be earlier than the start of
+                the stored segments, which is the start of the approach to the last estimate
+                but one.
+
+        Returns:
+            The other clock minus the local clock, in ns.
         """
         return self._select_segment(local_ns).evaluate_ns(local_ns)
 
     def error_bound_ns(self, local_ns: int) -> int:
-        """Returns the largest possible error of the offset in use at a time, in ns.
+        """Returns the largest possible error of the smoothed offset at a time.
 
-        The time must not be earlier than the start of the previous move.
+        Args:
+            local_ns: Time on the local clock, in ns, with the same condition as for
+                `evaluate_ns`.
+
+        Returns:
+            The largest possible difference between `evaluate_ns` and the true offset, in ns.
         """
         return self._select_segment(local_ns).error_bound_ns(local_ns)
 
     def _select_segment(self, local_ns: int) -> _SlewSegment:
-        """Returns the part of the offset in use to which a time belongs."""
+        """Returns the segment of the smoothed offset that contains a local time."""
         if local_ns >= self._segment.start_ns:
             return self._segment
         return self._previous_segment

@@ -76,7 +76,7 @@ TYPE_HASHES = {
 DISTROS = ("humble", "jazzy", "kilted", "lyrical")
 """Distributions of ROS 2 with which messages can be exchanged."""
 _NO_HASH = "TypeHashNotSupported"
-"""Text that ROS 2 Humble writes in place of a hash."""
+"""Text that ROS 2 Humble writes in place of the hash of a message type."""
 P = ParamSpec("P")
 _ATTACHMENT = struct.Struct("<qqB16s")
 """Layout of an attachment: number, time of sending, length of the identifier, and identifier.
@@ -266,7 +266,11 @@ _SETTINGS = {"timestamping": {"enabled": {"client": True}}}
 Messages need time stamps, which tell late subscribers of a latched topic the last messages.
 """
 SENSOR = QualityOfService(reliable=False, depth=5)
-"""Quality of service of a subscription, to which every publisher is compatible."""
+"""Quality of service of all subscriptions of this program.
+
+It requests unreliable delivery, which every publisher can provide. ROS would not connect a
+subscription that requests reliable delivery with an unreliable publisher.
+"""
 
 
 _MAX_REASONS = 64
@@ -351,9 +355,10 @@ class TopicPublisher:
 
 
 class Ros2Graph:
-    """A node among ROS 2 programs: its publishers, subscriptions and services.
+    """A ROS 2 node of this program, with its publishers, subscriptions and services.
 
-    The object is a context manager that removes the node at its end.
+    The bridge creates one object for each session. The object is a context manager that removes
+    the node at its end.
 
     Args:
         refusals: Counts the messages that are refused.
@@ -452,34 +457,50 @@ class Ros2Graph:
     def subscribe(
         self, topic: str, kind: str, receive: Callable[[bytes, Attachment], None]
     ) -> None:
-        """Subscribes to a topic, visibly for ROS programs.
+        """Subscribes to a topic, and announces the subscription to ROS programs.
 
-        Messages of publishers with another domain, type or definition do not arrive. Such
-        publishers are reported once as refusals, when their token appears.
+        ROS tools such as `ros2 topic info` then list the subscription. Messages of a publisher
+        that uses another ROS domain, another message type or another version of the type do
+        not arrive. The user is told once about each such publisher, see `Refusals`.
 
         Args:
             topic: Name of the topic.
             kind: Name of the message type.
-            receive: Function that receives the payload and the attachment of each message, in a
-                thread of Zenoh. If it raises an error, the message counts as refused.
+            receive: Function that receives the payload and the attachment of each message. It
+                is called in a thread of Zenoh. If it raises an error, the message counts as
+                refused.
         """
         self._declare(EndpointKind.SUBSCRIPTION, topic, kind, SENSOR)
         self._report_mismatches(topic, kind)
-        receive_guarded = self.refusals.guard(topic, receive)
+        receive_or_refuse = self.refusals.guard(topic, receive)
 
         def receive_sample(sample: zenoh.Sample, attachment: Attachment) -> None:
-            receive_guarded(sample.payload.to_bytes(), attachment)
+            receive_or_refuse(sample.payload.to_bytes(), attachment)
 
-        for type_hash in (find_type_hash(kind, "jazzy"), _NO_HASH):
+        # The key of a topic contains the hash of the message type. Publishers of ROS 2 Humble
+        # write a fixed text instead of the hash.
+        newer_hash = find_type_hash(kind, "jazzy")
+        humble_hash = _NO_HASH
+        for type_hash in (newer_hash, humble_hash):
             key = topic_key(self._node.domain, topic, kind, type_hash)
             self._declare_subscriber(key, topic, receive_sample)
 
     def _report_mismatches(self, topic: str, kind: str) -> None:
-        """Reports the publishers of a topic whose messages do not arrive here."""
+        """Reports the publishers of a topic whose messages cannot be received here.
 
-        def check_publisher(sample: zenoh.Sample) -> None:
-            mismatch = describe_mismatch(str(sample.key_expr), self._node.domain, kind)
-            if sample.kind == zenoh.SampleKind.PUT and mismatch:
+        Every publisher of ROS has a liveliness token, a Zenoh key that states its domain, topic
+        and message type. The tokens of all publishers of the topic are observed, including
+        those that exist already.
+
+        Args:
+            topic: Name of the topic.
+            kind: Name of the message type that is subscribed to.
+        """
+
+        def check_publisher(token: zenoh.Sample) -> None:
+            has_appeared = token.kind == zenoh.SampleKind.PUT
+            mismatch = describe_mismatch(str(token.key_expr), self._node.domain, kind)
+            if has_appeared and mismatch:
                 self.refusals.add(f"{topic} is published {mismatch}")
 
         handler = handlers.Callback(check_publisher, indirect=False)
@@ -489,7 +510,9 @@ class Ros2Graph:
         )
 
     def tap(self, topic: str, receive: Callable[[str, Attachment], None]) -> None:
-        """Receives a topic without being visible for ROS programs.
+        """Receives the messages of a topic of any type, without announcing a subscription.
+
+        ROS tools do not list such a subscription.
 
         Args:
             topic: Name of the topic.

@@ -53,11 +53,11 @@ LATE_GATHER_NS = 1_500_000_000
 
 
 class SessionJoin:
-    """Joins one member to a session.
+    """Lets one process join a session, and finds the epoch, the common time of tick 0.
 
-    The member first declares its subscriptions, so that it misses no message of a session that
-    knows the member. It then creates this object, and calls `poll` regularly until the epoch is
-    returned.
+    The process first declares its subscriptions, because the other members may send messages to
+    it as soon as they know it. It then creates this object, which announces the process, and
+    calls `poll` regularly until the epoch is returned.
 
     Args:
         bus: Network connection of this member.
@@ -99,10 +99,11 @@ class SessionJoin:
         self.pinger = Pinger(bus, clock, session)
         self._found_running_ns: int | None = None  # when a running session was found
         answer_pings(bus, clock, session, publisher.info)
-        # The proposal that this member has not agreed to yet, and the one that it has agreed to
-        # or, as the leader, has made. The epoch is on the clock of this member.
-        self._offered: Event | None = None
-        self._announced: Event | None = None
+        # Event `epoch` of the leader that this member has not agreed to yet.
+        self._waiting_proposal: Event | None = None
+        # Event `epoch` that this member has agreed to or, as the leader, has published. Its
+        # epoch on the clock of this member, in ns.
+        self._agreed_proposal: Event | None = None
         self._epoch_ns = 0
         self._attempt = 0
         self._ready_epochs: dict[str, int] = {}  # the epoch on each ready member's clock
@@ -137,7 +138,7 @@ class SessionJoin:
         return self._publisher.info
 
     def poll(self) -> Epoch | None:
-        """Receives messages, replies to them, and takes the next step towards the start.
+        """Receives messages, replies to them, and takes the next step towards the epoch.
 
         A running session is joined if the rules permit it. Otherwise the leader proposes and
         confirms an epoch, and the other members wait for its events.
@@ -151,7 +152,7 @@ class SessionJoin:
         membership = self.membership
         now_ns = self._clock.monotonic_ns()
         self._publisher.answer_queries()
-        may_have_started = self._announced is not None and not membership.is_leader
+        may_have_started = self._agreed_proposal is not None and not membership.is_leader
         membership.poll(may_have_started=may_have_started)
         self.pinger.poll(self._list_other_clocks(membership.boots(), membership.clocks()))
 
@@ -163,7 +164,7 @@ class SessionJoin:
         may_join_running = self._late.may_join_late or not self._sites
         if running and may_join_running:
             # Until the proposed epoch has passed, its confirmation may still arrive.
-            may_start_normally = self._announced is not None and now_ns < self._epoch_ns
+            may_start_normally = self._agreed_proposal is not None and now_ns < self._epoch_ns
             if not may_start_normally:
                 epoch = self._join_late(running, now_ns)
         elif membership.is_leader:
@@ -338,21 +339,21 @@ class SessionJoin:
                 continue
             self._receive_admission(event)
 
-            announced = self._announced
-            if announced is None:
+            agreed = self._agreed_proposal
+            if agreed is None:
                 continue
-            if event.attempt != announced.attempt or event.boots != announced.boots:
+            if event.attempt != agreed.attempt or event.boots != agreed.boots:
                 continue  # the event belongs to another proposal
             if event.kind == "ready":
                 self._ready_epochs[event.member] = event.epoch_mono_ns
-            elif event.kind == "start" and event.boot == announced.boot:
-                includes_all = event.epochs.keys() == announced.boots.keys()
+            elif event.kind == "start" and event.boot == agreed.boot:
+                includes_all = event.epochs.keys() == agreed.boots.keys()
                 if includes_all:
                     return self._make_epoch(event)
         return None
 
     def _receive_admission(self, event: Event) -> None:
-        """Notes if a running site admits or refuses this site, or admits another site.
+        """Stores whether a running site admits this site, refuses it, or admits another site.
 
         Args:
             event: An event of a running site. Events of other kinds are ignored.
@@ -390,49 +391,59 @@ class SessionJoin:
 
         local = self._info
         if event.boots.get(local.member) == local.boot:
-            if not self._is_bound(event):
-                self._offered = event
+            if not self._must_wait_for_other_leader(event):
+                self._waiting_proposal = event
                 self._reply_ready()
         # A proposal with another recorder is no error: of two recorders, one joins late.
         elif local.member in event.boots and self._sites:
             raise SessionError(f"session {self._session!r} goes on with another {local.member}")
 
-    def _is_bound(self, event: Event) -> bool:
-        """Returns True if this member has agreed to a proposal of another leader process.
+    def _must_wait_for_other_leader(self, event: Event) -> bool:
+        """Returns True if this member has agreed to a proposal that may still be confirmed.
 
-        That leader may still confirm its proposal, until its epoch has passed or the leader has
-        disappeared.
+        If the leader was started twice, or was restarted, proposals of two processes arrive.
+        A member that has agreed to one of them must not agree to the other, until the epoch of
+        the first has passed or its process has disappeared.
+
+        Args:
+            event: Proposal of an epoch that has just arrived.
         """
-        announced = self._announced
-        return (
-            announced is not None
-            and announced.boot != event.boot
-            and str(announced.boot) not in self.membership.gone
-            and self._clock.monotonic_ns() < self._epoch_ns
-        )
+        agreed = self._agreed_proposal
+        if agreed is None or agreed.boot == event.boot:
+            return False
+        has_leader_disappeared = str(agreed.boot) in self.membership.gone
+        has_epoch_passed = self._clock.monotonic_ns() >= self._epoch_ns
+        return not (has_leader_disappeared or has_epoch_passed)
 
     def _reply_ready(self) -> None:
-        """Agrees to the waiting proposal once all clocks that this member needs are known.
+        """Agrees to the leader's proposal of an epoch once this member has measured all clocks.
 
-        The reply states the proposed epoch on the clock of this member.
+        Without a waiting proposal, or while the offset of a clock is still unknown, nothing
+        happens, and the caller tries again later. The reply, the event `ready`, states the
+        proposed epoch on the clock of this member.
         """
-        event = self._offered
-        if event is None:
+        proposal = self._waiting_proposal
+        if proposal is None:
             return
-        if not self.pinger.knows_clocks(self._list_other_clocks(event.boots, event.clocks)):
+        other_clocks = self._list_other_clocks(proposal.boots, proposal.clocks)
+        if not self.pinger.knows_clocks(other_clocks):
             return
-        self._offered = None
-        self._announced = event
-        estimate = self.pinger.estimate(event.boot)
-        # The offset is needed at the epoch, but the local time of the epoch depends on the
-        # offset. A rough local time is precise enough, as the clocks drift slowly.
-        rough_epoch_ns = event.epoch_mono_ns - estimate.offset_ns
-        self._epoch_ns = event.epoch_mono_ns - estimate.extrapolate_ns(rough_epoch_ns)
+
+        # Convert the epoch from the leader's clock: local time = leader's time - offset. The
+        # offset drifts with local time, and is needed at the epoch, whose local time is the
+        # result. As the drift is slow, the local time for the present offset is close enough.
+        leader_clock = self.pinger.estimate(proposal.boot)
+        approximate_epoch_ns = proposal.epoch_mono_ns - leader_clock.offset_ns
+        offset_at_epoch_ns = leader_clock.extrapolate_ns(approximate_epoch_ns)
+        self._epoch_ns = proposal.epoch_mono_ns - offset_at_epoch_ns
+
+        self._waiting_proposal = None
+        self._agreed_proposal = proposal
         self._publisher.publish(
             "ready",
             f"{self._info.member} is ready",
-            attempt=event.attempt,
-            boots=event.boots,
+            attempt=proposal.attempt,
+            boots=proposal.boots,
             epoch_mono_ns=self._epoch_ns,
             clock=self._info.clock,
         )
@@ -449,8 +460,8 @@ class SessionJoin:
         """
         now_ns = self._clock.monotonic_ns()
         membership = self.membership
-        announced = self._announced
-        if announced is None:
+        agreed = self._agreed_proposal
+        if agreed is None:
             other_clocks = self._list_other_clocks(membership.boots(), membership.clocks())
             if not membership.list_missing() and self.pinger.knows_clocks(other_clocks):
                 self._announce(now_ns)
@@ -458,16 +469,16 @@ class SessionJoin:
 
         decide_ns = self._epoch_ns - DECIDE_NS - self.pinger.slowest_ns()
         is_too_late = now_ns >= decide_ns
-        have_members_changed = announced.boots != membership.boots()
+        have_members_changed = agreed.boots != membership.boots()
         ready_members = self._ready_epochs.keys() | {self._info.member}
         if is_too_late or have_members_changed or membership.list_missing():
-            self._announced = None
-        elif ready_members >= set(announced.boots):
+            self._agreed_proposal = None
+        elif ready_members >= set(agreed.boots):
             start = self._publisher.publish(
                 "start",
                 "all are ready",
-                attempt=announced.attempt,
-                boots=announced.boots,
+                attempt=agreed.attempt,
+                boots=agreed.boots,
                 epochs={**self._ready_epochs, self._info.member: self._epoch_ns},
             )
             return self._make_epoch(start)
@@ -484,7 +495,7 @@ class SessionJoin:
         self._attempt += 1
         ahead_ns = EPOCH_AHEAD_NS + 2 * self.pinger.slowest_ns()
         self._epoch_ns = now_ns + ahead_ns
-        self._announced = self._publisher.publish(
+        self._agreed_proposal = self._publisher.publish(
             "epoch",
             f"{', '.join(sorted(boots))}: tick 0 is {ahead_ns // 1_000_000} ms from now",
             attempt=self._attempt,
@@ -497,10 +508,10 @@ class SessionJoin:
 
     def _make_epoch(self, start: Event) -> Epoch:
         """Returns the confirmed epoch, given the leader's event `start`."""
-        assert self._announced is not None
+        assert self._agreed_proposal is not None
         return Epoch(
             mono_ns=self._epoch_ns,
-            unix_ns=self._announced.epoch_unix_ns,
+            unix_ns=self._agreed_proposal.epoch_unix_ns,
             boots=start.boots,
             epochs=start.epochs,
         )

@@ -11,7 +11,9 @@ Each site measures the link from each of its peers, with four time stamps:
     t3: the peer sends a sample of its own (the peer's clock)
     t4: this site receives that sample     (this site's clock)
 
-Samples carry t2 and t3, as "echo" and sending time. No message can arrive before it was sent.
+A sample is the state that a site publishes in each tick. It carries t3 as its sending time, and
+t2 as an "echo": the confirmation that a sample of the other site has arrived, with the time of
+its arrival. No message can arrive before it was sent.
 Therefore the offset of the peer's clock (peer minus local) is at most t2 - t1 and at least
 t3 - t4. `offset` computes an estimate from the tightest of these limits.
 
@@ -19,10 +21,10 @@ Invariant:
     - Rule L1: ticks are due on the leader's clock, to the nanosecond. The leader is the first
       site of the scenario.
     - A site on another machine follows the leader's clock by running its own schedule slightly
-      faster or slower, by at most SLEW_LIMIT, and never by a step. While the leader is away,
-      the site continues with the last estimate.
-    - Measurements do not change a run. If a sample seems to arrive before it was sent, it is
-      counted as a fault, but it is used all the same.
+      faster or slower, by at most SLEW_LIMIT, and never by a step, so that no tick is skipped
+      or repeated. If the leader disconnects, the site continues with the last estimate.
+    - Measured delays never decide whether a sample is used. If a sample seems to arrive before
+      it was sent, this is counted as a clock fault, but the sample is used all the same.
 """
 
 from array import array
@@ -56,14 +58,17 @@ It is long compared with the noise of an offset estimate, so that the noise is a
 class TickSchedule:
     """Times at which the ticks of one site are due, on the clock of that site.
 
-    The schedule is linear in k. Its rate can be adjusted, so that it follows the leader's.
+    Tick k is due at a time that grows linearly with k. The rate of growth can be adjusted from
+    any tick on, so that the site keeps the same schedule as the leader, the first site of the
+    scenario, although their clocks differ.
 
     Args:
         epoch_ns: Time of tick 0 on the site's clock, in ns.
         rate_hz: Tick rate of the site.
 
     Attributes:
-        slew: Deviation of the rate: time that the schedule adds to each second, in ns/s.
+        slew: Time by which each second of the schedule is lengthened, in ns/s. Negative if the
+            schedule runs faster than the site's clock.
         error_ns: Lateness compared with the leader's schedule at the last `adjust_rate`, in ns.
     """
 
@@ -169,10 +174,10 @@ class LinkTimingMonitor:
 
     Attributes:
         peer: Clock of the sending peer.
-        offset: Offset of the peer's clock that is in use.
+        offset: Offset of the peer's clock over time, with which delays are computed.
         faults: Number of impossible stamps, and of windows that contradict earlier ones.
-        newest: Newest sample since the last echo: its tick, and its arrival on the local clock
-            in ns. None if no sample has arrived since.
+        newest: Newest sample of the peer whose arrival this site has not confirmed yet: its
+            tick, and its arrival on the local clock in ns. None if all are confirmed.
         worst_ns: Longest time by which a sample seemed to arrive before it was sent, since the
             last event about a fault, in ns. 0 if there was none.
         contradicted: True if a window has contradicted earlier windows since that event.
@@ -188,7 +193,13 @@ class LinkTimingMonitor:
         self.admit(peer)
 
     def admit(self, peer: PeerClock) -> None:
-        """Starts anew for a new process of the peer, which may have another clock."""
+        """Discards all measurements because the peer has been restarted.
+
+        The new process of the peer may run on another machine, and therefore on another clock.
+
+        Args:
+            peer: Clock of the new process.
+        """
         self.peer = peer
         self.offset = SlewedOffset(peer.estimate)
         self.newest: tuple[int, int] | None = None
@@ -218,7 +229,10 @@ class LinkTimingMonitor:
         self._floor: OffsetLimit | None = None
 
     def receive(self, sample: PeerSample, arrived_ns: int) -> int:
-        """Measures the delay of a sample, and evaluates its echoes.
+        """Measures the delay of a sample, and the delays of local samples that it confirms.
+
+        A sample contains echoes: for samples that the peer has received, the time of arrival on
+        the peer's clock. The echo of a local sample gives the delay from this site to the peer.
 
         Args:
             sample: The sample.
@@ -245,7 +259,7 @@ class LinkTimingMonitor:
             self.newest = sample.tick, arrived_ns
         self._received_ns = arrived_ns
 
-        # An echo states when the peer received a sample of this site.
+        # The peer confirms samples of all its peers. `index` says whose sample it is.
         for index, tick, peer_arrival_ns in sample.echo:
             if index != self._index_at_peer:
                 continue
@@ -269,29 +283,37 @@ class LinkTimingMonitor:
         return self._received_ns >= 0 and now_ns - self._received_ns <= UNHEARD_NS
 
     def is_acknowledged(self, now_ns: int) -> bool | None:
-        """Returns True if the peer still receives the samples of this site.
+        """Determines whether the peer still receives the samples of this site.
 
-        The peer does so if it acknowledged a newer sample within UNHEARD_NS before its own last
-        sample.
-
-        Returns:
-            None if the peer has not acknowledged any sample yet, or if no samples of the peer
-            arrive. Then it is not known whether the peer receives this site.
-        """
-        if self._acknowledged_tick < 0 or not self.is_receiving(now_ns):
-            return None
-        return self._received_ns - self._acknowledged_ns <= UNHEARD_NS
-
-    def close_window(self, now_ns: int, slew_ns: int) -> OffsetEstimate | None:
-        """Estimates the offset from the present window, if that is long enough.
-
-        The offset in use then moves gradually to the new estimate, and another window starts.
-        If the window contradicts earlier ones, a clock has stepped: the estimation starts again
-        with wide bounds and short windows.
+        The samples of the peer confirm which samples of this site it has received. If they
+        arrive, but have confirmed nothing new for UNHEARD_NS, the peer does not receive this
+        site.
 
         Args:
             now_ns: Present time on the local clock, in ns.
-            slew_ns: Time from which the offset in use moves, on the local clock, in ns.
+
+        Returns:
+            True if the peer receives this site, and False if it does not. None if this is not
+            known, because the peer has not confirmed any sample yet, or because no samples of
+            the peer arrive.
+        """
+        has_confirmed_any = self._acknowledged_tick >= 0
+        if not has_confirmed_any or not self.is_receiving(now_ns):
+            return None
+        unconfirmed_ns = self._received_ns - self._acknowledged_ns
+        return unconfirmed_ns <= UNHEARD_NS
+
+    def close_window(self, now_ns: int, slew_ns: int) -> OffsetEstimate | None:
+        """Estimates the clock offset from the present window of time stamps, once it is full.
+
+        The offset with which delays are computed is not replaced at once: it approaches the new
+        estimate gradually. Another window starts. If the window contradicts earlier windows, a
+        clock has stepped, and the estimation starts again with wide bounds and short windows.
+
+        Args:
+            now_ns: Present time on the local clock, in ns.
+            slew_ns: Time from which on the offset approaches the estimate, on the local clock,
+                in ns.
 
         Returns:
             The new estimate. None if the window is not long enough yet, or if the peer runs on
@@ -322,10 +344,16 @@ class LinkTimingMonitor:
         return estimate
 
     def pop_measurements(self, now_ns: int) -> dict[str, int]:
-        """Returns the measurements since the last call, and starts new ones.
+        """Returns the offset and the delays of this link, and discards the measured delays.
+
+        The offset and its error bound are those at the present time. The delays are those
+        measured since the last call.
+
+        Args:
+            now_ns: Present time on the local clock, in ns.
 
         Returns:
-            The fields of `LinkStats` about the timing of this link. A value of -1 means that
+            The fields of `LinkStats` about the timing of this link. A delay of -1 means that
             nothing was measured.
         """
         delays = sorted(self._delays)
@@ -435,10 +463,11 @@ class SiteTiming:
     def admit(
         self, index: int, t_ns: int, epoch_ns: int, bound_ns: int | None
     ) -> list[ClockNotice]:
-        """Starts the timing of a peer that joins, or rejoins, a running session.
+        """Starts to measure the link from a peer that joins, or rejoins, a running session.
 
-        The peer states when the epoch was on its own clock, with an error. The first estimate
-        of the offset follows from that, and has wide bounds.
+        The peer states when the epoch was on its own clock, and how accurate this time is. The
+        first estimate of the offset between the clocks is computed from it, and its error bound
+        is wide, because no time stamps have been exchanged yet.
 
         Args:
             index: Index of the peer.
@@ -481,13 +510,16 @@ class SiteTiming:
         return now_ns - self._epoch_ns
 
     def pop_echo(self) -> list[tuple[int, int, int]]:
-        """Returns the echoes for the next sample: the newest arrival from each peer.
+        """Returns the confirmations of received samples that this site sends to its peers.
 
-        Peers of which no sample has arrived since the last call are left out.
+        Every sample that a site publishes contains, for each peer, the tick and the time of
+        arrival of the newest sample received from that peer (an "echo"). From it, the peer
+        computes the delay of the link to this site. Each arrival is confirmed only once.
 
         Returns:
-            For each peer its index, the tick of the sample, and the time of its arrival in ns
-            since the epoch.
+            For each peer from which a sample has arrived since the last call: the index of the
+            peer, the tick in which it sent the sample, and the time of arrival in ns since the
+            epoch.
         """
         echo = []
         for index, monitor in enumerate(self.monitors):
@@ -498,7 +530,9 @@ class SiteTiming:
         return echo
 
     def update_clocks(self, k: int, now_ns: int) -> list[ClockNotice]:
-        """Updates one offset estimate, and adjusts the schedule to that of the leader.
+        """Updates the clock offset of one peer, and adjusts the schedule to the leader's.
+
+        The leader is the first site of the scenario. All sites follow its schedule.
 
         Args:
             k: Next tick. The adjusted schedule applies from this tick on.
@@ -548,20 +582,24 @@ class SiteTiming:
             monitor.worst_ns = 0
             monitor.contradicted = False
 
-        # The reported state is the opposite of the present one, unless the state has changed.
-        is_acknowledged = monitor.is_acknowledged(now_ns)  # None if it is not known
-        has_changed = is_acknowledged is monitor.is_unacknowledged
-        if has_changed:
-            monitor.is_unacknowledged = not monitor.is_unacknowledged
+        is_acknowledged = monitor.is_acknowledged(now_ns)
+        if is_acknowledged is None:  # not known at present
+            return notices
+        was_acknowledged = not monitor.is_unacknowledged  # as reported by the last event
+        if is_acknowledged != was_acknowledged:
+            monitor.is_unacknowledged = not is_acknowledged
             notices.append(_describe_acknowledgement(monitor, k))
         return notices
 
     def pop_measurements(self, now_ns: int) -> dict[str, Any]:
-        """Returns the timing measurements of all links since the last call.
+        """Returns the state of the schedule, and the timing of all links since the last call.
+
+        Args:
+            now_ns: Present time on the local clock, in ns.
 
         Returns:
-            The timing fields of `LinkStats`. The values of a link are in dictionaries by the
-            name of the peer.
+            The timing fields of `LinkStats`: the error and the rate of the schedule, and for
+            each measured quantity of the links a dictionary by the name of the peer.
         """
         stats: dict[str, Any] = {
             "grid_error_us": self.schedule.error_ns // 1000,
@@ -578,7 +616,7 @@ def _describe_estimate(monitor: LinkTimingMonitor, k: int, local_ns: int) -> Clo
 
     Args:
         monitor: Timing of the link from the peer.
-        k: Tick from which on the offset is in use.
+        k: Tick from which on the offset applies.
         local_ns: Time of that tick on the local clock, in ns.
     """
     offset = monitor.offset
@@ -625,18 +663,24 @@ def _describe_fault(monitor: LinkTimingMonitor) -> ClockNotice:
 
 
 def _describe_acknowledgement(monitor: LinkTimingMonitor, k: int) -> ClockNotice:
-    """Returns the event that a peer has stopped, or resumed, to acknowledge samples.
+    """Returns the event that a peer no longer receives this site, or receives it again.
+
+    Samples of the peer arrive in both cases. The event tells users that the connection is
+    interrupted in the other direction only, from this site to the peer.
 
     Args:
         monitor: Timing of the link from the peer.
-        k: Present tick.
+        k: Present tick, which the event states in its field `ticks`.
     """
     name = monitor.peer.name
     if monitor.is_unacknowledged:
         timeout_ms = UNHEARD_NS // 1_000_000
+        kind = "unheard"
         text = f"{name} is heard and does not hear: for {timeout_ms} ms it acknowledged nothing"
-        return {"kind": "unheard", "text": text, "about": name, "ticks": k}
-    return {"kind": "heard", "text": f"{name} hears again", "about": name, "ticks": k}
+    else:
+        kind = "heard"
+        text = f"{name} hears again"
+    return {"kind": kind, "text": text, "about": name, "ticks": k}
 
 
 _LINK_COUNTS = ("accepted", "late", "duplicate", "refused", "lost", "superseded", "copies")
@@ -648,7 +692,7 @@ class LoopStats:
 
     Args:
         site: The site in the simulation kernel, which counts the samples of each link.
-        boot: Boot of this process.
+        boot: Random number that identifies this start of the site's process.
 
     Attributes:
         dropped: Number of messages that were dropped since the start, by reason.
@@ -683,9 +727,10 @@ class LoopStats:
         self.overruns += late_us >= self._period_us
 
     def is_due(self, k: int, skipped: int = 0) -> bool:
-        """Returns True if statistics are published after tick `k`.
+        """Returns True if the site publishes its statistics after tick `k`.
 
-        This is so in regular intervals, also if the tick of the interval itself was skipped.
+        Statistics are published every `ticks_per_stats` ticks. If such a tick was skipped, they
+        are published after the next tick that was executed.
 
         Args:
             k: The tick.

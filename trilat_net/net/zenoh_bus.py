@@ -104,17 +104,24 @@ class _ZenohRing(Generic[T]):
 def _make_sample_handler(receive: Callable[[Any], None]) -> Any:
     """Returns a Zenoh handler that calls a function with every message, in threads of Zenoh.
 
-    CPython keeps a state for each thread. For a thread that it does not know, it creates the
-    state at each call and deletes it afterwards, which costs more than the call itself.
-    Therefore the handler acquires the interpreter once more than it releases it, so that the
-    state of the thread lives as long as the process.
+    The handler also makes these calls cheaper. CPython keeps a data structure for each thread
+    that runs Python code. Zenoh's threads are not created by Python: for them, CPython creates
+    the structure at the beginning of each call and deletes it at the end, which costs more than
+    the call itself. CPython counts how often a thread has entered and left the interpreter, and
+    deletes the structure when the counts are equal. The handler enters once more in each
+    thread, and never leaves again, so that the structure is kept.
+
+    Args:
+        receive: Function that receives each message.
     """
-    thread_states = threading.local()
+    thread_locals = threading.local()
 
     def handle(sample: Any) -> None:
         receive(sample)
-        if not hasattr(thread_states, "state"):
-            thread_states.state = ctypes.pythonapi.PyGILState_Ensure()
+        is_first_call_in_thread = not hasattr(thread_locals, "kept_state")
+        if is_first_call_in_thread:
+            # There is deliberately no matching call of PyGILState_Release.
+            thread_locals.kept_state = ctypes.pythonapi.PyGILState_Ensure()
 
     return handlers.Callback(handle, indirect=False)
 
