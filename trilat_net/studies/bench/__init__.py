@@ -1,6 +1,8 @@
-"""The benchmark suite: control laws on the same tasks, links and seeds.
+"""The benchmark suite: compares control laws in the same tasks, over the same links.
 
-One procedure tunes the gains of all laws.
+Every law is run with the same random seeds, and one procedure tunes the gains of all laws. A
+plan (`plan_bench`) selects the runs, `run_bench` executes them in a folder, and `BenchResults`
+has their tables.
 """
 
 from .bench_plan import BenchPlan, plan_bench

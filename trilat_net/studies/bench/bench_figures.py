@@ -1,9 +1,13 @@
-"""Figures of the suite: a panel per task, a row per law, a column per link.
+"""Draws the results of the benchmark suite as coloured tables.
+
+A figure has a panel per task. In a panel, a row is a control law, a column is a link (a
+connection with a certain delay and loss), and the colour of a cell is the mean of a quantity
+over the runs of that law over that link.
 
 Invariant:
-    - The colour of a cell depends on its mean alone.
+    - The colour of a cell depends only on its mean.
     - A white cross marks a cell with a run that is not stable. A white dot marks a cell without
-      such a run but with a run whose stability is open.
+      such a run, but with a run whose stability is open.
     - Equal results give equal bytes.
 """
 
@@ -29,18 +33,21 @@ FIGURES_OF_BENCH = {
     "effort": ("effort, N m", "effort_nm"),
     "stiffness": ("stiffness at the hand, N/m", "stiffness_n_m"),
 }
-"""For each figure its label and its quantity; "" stands for the share of stable runs."""
+"""For each figure its label and its quantity. The share of stable runs has no quantity."""
 _WIDTH_IN = 7.0
 _ROW_IN = 0.14
 _HEAD_IN = 0.65
 _TEXT_PT = 5.5
 _PALETTE = "cividis"
 _NONE = "#a23b53"
-"""Colour of cells without a number: no contact, no rest, or a run that diverged."""
+"""Colour of cells without a number.
+
+The slave touched no wall, the arms did not come to rest, or a run diverged.
+"""
 
 
 def list_figures_with_values(results: BenchResults) -> list[str]:
-    """Returns the names of the figures for which the results have a number."""
+    """Returns the names of the figures for which the results have at least one number."""
     names = []
     for name in FIGURES_OF_BENCH:
         fields = _collect_fields(results, name).values()
@@ -50,7 +57,15 @@ def list_figures_with_values(results: BenchResults) -> list[str]:
 
 
 def _collect_fields(results: BenchResults, name: str) -> dict[str, Array]:
-    """Returns the numbers of a figure: for each task an array of shape (laws, links)."""
+    """Collects the numbers of a figure.
+
+    Args:
+        results: The results of the suite.
+        name: Name of the figure, a key of `FIGURES_OF_BENCH`.
+
+    Returns:
+        For each task an array of shape (laws, links). A missing number is NaN.
+    """
     _, quantity = FIGURES_OF_BENCH[name]
     tasks = list(results.plan.tasks)
     if quantity == "stiffness_n_m":
@@ -60,13 +75,19 @@ def _collect_fields(results: BenchResults, name: str) -> dict[str, Array]:
 
 
 def draw_bench(results: BenchResults, name: str) -> Figure:
-    """Returns the figure with a name from `list_figures_with_values`."""
+    """Draws a figure of the results.
+
+    Args:
+        results: The results of the suite.
+        name: Name of the figure, from `list_figures_with_values`.
+    """
     label, quantity = FIGURES_OF_BENCH[name]
     links = results.plan.links
     fields = _collect_fields(results, name)
-    scale = _choose_scale(list(fields.values())) if quantity else Normalize(0.0, 1.0)
-    laws_of_panels = [len(field) for field in fields.values()]
-    panels_height = sum(_HEAD_IN / 2 + _ROW_IN * laws for laws in laws_of_panels)
+    is_share = not quantity
+    scale = Normalize(0.0, 1.0) if is_share else _choose_scale(list(fields.values()))
+    law_counts = [len(field) for field in fields.values()]
+    panels_height = sum(_HEAD_IN / 2 + _ROW_IN * count for count in law_counts)
     size = make_print_size(_WIDTH_IN)
     with style.styled_figure(size, panels_height + _HEAD_IN) as figure:
         grid = style.add_panels(
@@ -74,7 +95,7 @@ def draw_bench(results: BenchResults, name: str) -> Figure:
             len(fields),
             1,
             sharex=True,
-            height_ratios=laws_of_panels,
+            height_ratios=law_counts,
         )
         panels = grid[:, 0]
         for axes, (task, field) in zip(panels, fields.items(), strict=True):
@@ -94,21 +115,38 @@ def draw_bench(results: BenchResults, name: str) -> Figure:
 
 
 def _choose_scale(fields: list[Array]) -> Normalize:
-    """Returns a logarithmic scale of colours from the least to the largest number."""
-    known = np.concatenate([field[np.isfinite(field)].ravel() for field in fields])
-    smallest = float(known.min()) if known.size else 0.1
-    largest = float(known.max()) if known.size else 1.0
+    """Returns a logarithmic colour scale from the smallest to the largest number of a figure.
+
+    Args:
+        fields: The numbers of the panels. NaN is ignored.
+    """
+    numbers = np.concatenate([field[np.isfinite(field)].ravel() for field in fields])
+    smallest = float(numbers.min()) if numbers.size else 0.1
+    largest = float(numbers.max()) if numbers.size else 1.0
     # a logarithmic scale needs limits above 0
     return LogNorm(max(smallest, 1e-6), max(largest, 2e-6))
 
 
 def _list_laws(results: BenchResults, task: str) -> list[tuple[str, str]]:
-    """Returns law and form of each row of a task's panel: the laws with results."""
+    """Lists the rows of a task's panel: the laws that have results in the task.
+
+    Returns:
+        Pairs of the name of a law and the form of the suite in which it runs.
+    """
     return [(law, form) for law, form in results.plan.laws if any(results.select(task, law))]
 
 
 def _collect(results: BenchResults, task: str, quantity: str) -> Array:
-    """Returns the numbers of a panel, shape (laws, links); NaN for a missing number."""
+    """Collects the numbers of a panel.
+
+    Args:
+        results: The results of the suite.
+        task: The task of the panel.
+        quantity: The quantity. Empty for the share of stable runs.
+
+    Returns:
+        The numbers, shape (laws, links). A missing number is NaN.
+    """
     laws = _list_laws(results, task)
     links = results.plan.links
     field = np.full((len(laws), len(links)), np.nan)
@@ -122,7 +160,7 @@ def _collect(results: BenchResults, task: str, quantity: str) -> Array:
 
 
 def _label_laws(axes: Axes, results: BenchResults, task: str) -> None:
-    """Writes the laws beside the rows of a panel."""
+    """Writes the names of the laws beside the rows of a task's panel."""
     laws = _list_laws(results, task)
     labels = [name_law(law, form) for law, form in laws]
     axes.set_yticks(range(len(laws)), labels, fontsize=_TEXT_PT)
@@ -131,7 +169,7 @@ def _label_laws(axes: Axes, results: BenchResults, task: str) -> None:
 
 
 def _mark_cells(axes: Axes, results: BenchResults, task: str) -> None:
-    """Marks the cells of a panel that have runs that are open or not stable."""
+    """Marks the cells of a task's panel that have runs that are not stable or open."""
     laws = _list_laws(results, task)
     links = results.plan.links
     for result in results.select(task):
@@ -144,7 +182,16 @@ def _mark_cells(axes: Axes, results: BenchResults, task: str) -> None:
 
 
 def write_bench(results: BenchResults, folder: Path, command: str) -> list[Path]:
-    """Writes the page, the tables and the figures of a suite, and returns their paths."""
+    """Writes the page, the tables and the figures of a suite.
+
+    Args:
+        results: The results of the suite.
+        folder: Folder of the files.
+        command: Command that produces them, which the page shows.
+
+    Returns:
+        The paths of the files.
+    """
     names = list_figures_with_values(results)
     pictures = {f"bench-{name}.png": FIGURES_OF_BENCH[name][0] for name in names}
     texts = {

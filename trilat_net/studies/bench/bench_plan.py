@@ -1,15 +1,21 @@
-"""The plan of the benchmark suite: its tasks, links, laws and cells, and the tuned gains.
+"""The plan of the benchmark suite: which control law runs in which task, over which link.
 
-A task and a link are sets of overrides of a shipped scenario, with a second user or without.
-Every run of the suite is therefore a command of `trilat sim`. A plan is a function of the
-study, the selected part of the study, and the tuned gains.
+The suite compares control laws. It consists of cells. A cell is one law in one task over one
+link (the delay and loss between the sites), and runs once per seed. A task and a link are sets
+of overrides of a scenario that is shipped with the program, so `trilat sim` can reproduce every
+run of the suite.
+
+The gains of all laws are tuned by one procedure, `trilat bench --tune`, and are stored in a
+file. A plan depends only on the study, the part of the study that the user selected, and the
+stored gains.
 
 Invariant:
-    - Gains come from `trilat bench --tune` only, and are stored in a file.
-    - Gains carry a fingerprint of the resolved scenario and of the law's sources. Gains with
-      another fingerprint are reported wherever they are used.
-    - A law has no gains, and no runs, if none of its candidates keeps the stability margin.
-    - Impossible selections are refused before the first run.
+    - Gains are never set by hand. They come from `trilat bench --tune` only.
+    - Gains carry a fingerprint of the scenario and of the source code of the law for which they
+      were tuned. If the fingerprint differs today, the user is told so.
+    - A law without a candidate that stays stable with the margin gets no gains, and does not
+      run.
+    - A selection that cannot run is refused before the first run.
 """
 
 import hashlib
@@ -45,7 +51,10 @@ Settings = Mapping[str, Any]
 """Overrides of a scenario by key."""
 
 BASES = {"three": "_bench_three", "two": "_bench_two", "level": "_bench_two"}
-"""Scenario of each form: three sites, two sites, and two sites whose arms lie in a level plane.
+"""Name of the scenario of each form of the suite.
+
+The form "three" has two masters and a slave, "two" has a master and a slave. The form "level"
+has the same two sites, but the arms lie in a level plane, so gravity does not act on them.
 """
 _OUT = (-0.4557864690179811, 1.3957985827210313)
 """Pose whose end effector is 0.30 m further out than at the start, at the same height."""
@@ -63,15 +72,21 @@ _WALL = {
 _CUT_S = (2.0, 5.0)
 _BURST_SAMPLES = 100.0
 _FIRST = 0.75
-"""Share a of the first user before a handover."""
+"""Parameter a of the dominance factors that lets the first user lead, as before a handover."""
 _SECOND = 0.25
-"""Share a of the first user after a handover."""
+"""Parameter a of the dominance factors that lets the second user lead, as after a handover."""
 
 
 def _build_hand(
     to_rad: Sequence[float], move_start_s: float = 1.0, **keys: Any
 ) -> dict[str, Any]:
-    """Returns the table of a hand that moves to a pose within 2 s, with further keys."""
+    """Returns the scenario table of an operator that moves an arm to a pose within 2 s.
+
+    Args:
+        to_rad: Joint angles of the pose, in rad.
+        move_start_s: Time at which the motion starts, in s.
+        keys: Further keys of the table.
+    """
     return {
         **_HAND,
         "to_rad": list(to_rad),
@@ -82,25 +97,36 @@ def _build_hand(
 
 
 def _build_dominance(a: float) -> dict[str, dict[str, float]]:
-    """Returns the table of dominance, by site and peer, if the first user has the share a."""
+    """Returns the scenario table of the dominance factors of two users and a slave.
+
+    A dominance factor is the weight with which an arm follows another arm.
+
+    Args:
+        a: Dominance factor of the first user over the slave. The second user has 1 - a.
+
+    Returns:
+        The factors other than 0, by the name of the arm and by the name of the arm that it
+        follows.
+    """
     names = ("m1", "m2", "s")
     dominance = {}
     for name, row in zip(names, complementary_shares(a).tolist(), strict=True):
-        shares = zip(names, row, strict=True)
-        dominance[name] = {peer: share for peer, share in shares if share}
+        factors_by_peer = zip(names, row, strict=True)
+        dominance[name] = {peer: factor for peer, factor in factors_by_peer if factor}
     return dominance
 
 
 class BenchTask(NamedTuple):
-    """A task of the suite.
+    """A task of the suite: what the operators do, and what the slave touches.
 
     Attributes:
-        about: description of the task.
-        settings: overrides that turn a form's scenario into the task.
-        users: number of users that the task needs.
-        cut_s: start and end of the outage of all links of the slave, in s; None: no outage.
-        duration_s: time over which errors and efforts are measured, in s. A run lasts at least
-            as long.
+        about: Description of the task for the user.
+        settings: Overrides that turn the scenario of a form into the task.
+        users: Number of users that the task needs.
+        cut_s: Start and end of the outage of all links of the slave, in s. None if no link
+            fails.
+        duration_s: Time from the start over which errors and efforts are measured, in s. A run
+            lasts at least as long.
     """
 
     about: str
@@ -151,7 +177,12 @@ TASKS = {
 
 
 def _build_constant_links() -> dict[str, Settings]:
-    """Returns the links with a constant delay, with and without losses, by name."""
+    """Returns the links with a constant delay, with and without losses.
+
+    Returns:
+        The keys of each link, by a name such as "rtt68-loss50": a round trip of 68 ms, in which
+        half of the samples are lost.
+    """
     links: dict[str, Settings] = {}
     for percent in GRID_LOSSES_PERCENT:
         for rtt_ms in GRID_ROUND_TRIPS_MS:
@@ -171,7 +202,10 @@ LINKS |= {name: {"preset": name} for name in ("4g", "5g", "geo")}
 LINKS["trace"] = {"model": "trace", "file": "busy_machine.csv", "at_end": "loop"}
 
 _MEAN_MS = {"geo": 300.0}
-"""Mean delays, in ms, of presets for which `ROUND_TRIPS` take longer than the tasks."""
+"""Mean one-way delays, in ms, of presets with long delays.
+
+Over these links `ROUND_TRIPS` round trips take longer than the tasks, so the runs are longer.
+"""
 
 SHORTER_REACH: Settings = {"sites.m1.hands": [_build_hand(_LESS_OUT)]}
 """Overrides that give the task `contact` a shorter reach.
@@ -182,24 +216,28 @@ The stiffness at the hand follows from the difference between both reaches.
 _ROLES = ("master", "master", "slave")
 _TUNED_LAWS = {name: law for name, law in BUILT_IN.items() if law.tune}
 LAWS_OF_ANY = tuple(name for name, law in _TUNED_LAWS.items() if not law.explain_misfit(_ROLES))
-"""Laws that fit two users and a slave."""
+"""Names of the tuned laws that fit two users and a slave."""
 LAWS_OF_TWO = tuple(name for name in _TUNED_LAWS if name not in LAWS_OF_ANY)
-"""Laws for two sites only."""
+"""Names of the tuned laws that fit two sites only."""
 TUNED_ROUND_TRIPS_MS = (68, 272, 1088)
 """Round trips at which every law is tuned, in ms."""
 TUNING_TASK = "contact"
-"""The task in which laws are tuned; its twin without the wall is free motion."""
+"""The task in which laws are tuned.
+
+The tuning also runs it without the wall, as free motion.
+"""
 
 
 class BenchStudy(NamedTuple):
-    """A part of the suite.
+    """A named part of the suite.
 
     Attributes:
-        about: purpose of the study.
-        tasks: names of its tasks.
-        laws: names of its laws, by the form in which they run.
-        links: names of its links.
-        seeds: number of seeds of a cell whose link draws random numbers.
+        about: Purpose of the study.
+        tasks: Names of its tasks.
+        laws: Names of its laws, by the form in which they run (a key of `BASES`).
+        links: Names of its links.
+        seeds: Number of runs of a cell whose link draws random delays or losses. Any other cell
+            runs once.
     """
 
     about: str
@@ -241,27 +279,29 @@ STUDIES = {
 
 
 ROUND_TRIPS = 40
-"""A run lasts for at least this number of round trips."""
+"""Least duration of a run, in round trips of its link."""
 
 
 def build_settings(form: str, task: str, link: str, seed: int | None = None) -> dict[str, Any]:
-    """Returns the overrides that turn a form's scenario into a run, apart from the law.
+    """Returns the overrides that turn the scenario of a form into a run, apart from the law.
 
     Args:
-        form: a key of `BASES`.
-        task: a key of `TASKS`.
-        link: a key of `LINKS`.
-        seed: seed of the run; None: that of the scenario.
+        form: A key of `BASES`.
+        task: A key of `TASKS`.
+        link: A key of `LINKS`.
+        seed: Seed of the run. None keeps the seed of the scenario.
     """
     bench_task = TASKS[task]
     link_keys = dict(LINKS[link])
     delay_ms = link_keys.get("delay_ms", _MEAN_MS.get(link, 0.0))
-    trips_s = 2e-3 * ROUND_TRIPS * delay_ms
+    # 2e-3: a round trip is two delays, which are in ms
+    round_trips_s = 2e-3 * ROUND_TRIPS * delay_ms
     settings = {
         **bench_task.settings,
         "link": link_keys,
-        "duration_s": max(bench_task.duration_s, trips_s),
+        "duration_s": max(bench_task.duration_s, round_trips_s),
     }
+
     if bench_task.cut_s is not None:
         link_keys["outages_s"] = [list(bench_task.cut_s)]
         if form == "three":
@@ -276,34 +316,39 @@ def build_settings(form: str, task: str, link: str, seed: int | None = None) -> 
 
 
 GAINS_FILE = Path(str(resources.files("trilat_net.studies.bench") / "bench_gains.json"))
-"""The tuned gains, stored with the program."""
+"""File of the tuned gains, which is part of the program."""
 KNOWLEDGE = ModelInformation()
-"""All laws know gravity exactly."""
+"""What the laws know about the arms: gravity exactly, for all laws."""
 TUNING_BUDGET = 16
-"""Candidates per gain of a law, at each round trip."""
+"""Number of candidates per gain of a law, at each round trip."""
 TUNING_MARGIN = 1.5
-"""Kept gains are stable at the pose with delays longer by this factor, too."""
+"""Factor by which delays may grow without making the selected gains unstable."""
 MARGIN_LENGTHS = 3.0
-"""Factor by which the run with longer delays is longer, so that a slow run does not fail."""
+"""Factor by which the run with longer delays is longer than the tuning run.
+
+Without it, a law that comes to rest slowly would appear to be unstable.
+"""
 
 
 class TunedGains(msgspec.Struct, frozen=True):
-    """The gains of a law in a form of the tasks, tuned at a round trip.
+    """The gains of a law in a form of the suite, tuned at one round trip.
 
-    The procedure keeps the candidate with the least error among those that are stable at the
-    pose with the margin.
+    The procedure tries `tried` candidates. Of those that come to rest at the pose of the task,
+    and still do so when delays grow by `TUNING_MARGIN`, it selects the candidate with the
+    smallest error.
 
     Attributes:
-        form: a key of `BASES`.
-        law: name of the law.
-        round_trip_ms: the round trip, in ms.
-        gains: the kept gains by name; empty if no candidate was stable with the margin.
-        settled: number of candidates that were stable at the pose.
-        tried: number of all candidates.
-        passed: number of stable candidates with a smaller error but without the margin.
-        error_rad: error of the kept candidate, in rad; None if there is none.
-        effort_nm: effort of the kept candidate, in N m; None if there is none.
-        fingerprint: fingerprint of the scenario and the law.
+        form: A key of `BASES`.
+        law: Name of the law.
+        round_trip_ms: The round trip, in ms.
+        gains: The selected gains by name. Empty if no candidate had the margin.
+        settled: Number of candidates that came to rest at the pose.
+        tried: Number of all candidates.
+        passed: Number of candidates that came to rest with a smaller error than the selected
+            candidate, but lack the margin.
+        error_rad: Error of the selected candidate, in rad. None if no candidate was selected.
+        effort_nm: Effort of the selected candidate, in N m. None if no candidate was selected.
+        fingerprint: Fingerprint of the scenario and of the law, see `fingerprint_tuning`.
     """
 
     form: str
@@ -319,7 +364,7 @@ class TunedGains(msgspec.Struct, frozen=True):
 
     @property
     def key(self) -> tuple[str, str, int]:
-        """Form, law and round trip, which identify the gains in the file."""
+        """Form, law and round trip in ms, which identify the gains in the file."""
         return self.form, self.law, self.round_trip_ms
 
     def __str__(self) -> str:
@@ -327,21 +372,28 @@ class TunedGains(msgspec.Struct, frozen=True):
 
 
 def format_settings(settings: Settings) -> list[str]:
-    """Returns overrides as texts KEY=VALUE."""
+    """Returns overrides as texts KEY=VALUE, as the command line accepts them."""
     return [f"{key}={format_toml_value(value)}" for key, value in settings.items()]
 
 
 def load_tuning_task(form: str, round_trip_ms: int) -> TuningScenario:
-    """Returns the experiment in which the laws of a form are tuned."""
+    """Returns the experiment in which the laws of a form are tuned at a round trip in ms."""
     settings = build_settings(form, TUNING_TASK, f"rtt{round_trip_ms}")
     return load_tuning_scenario(BASES[form], format_settings(settings))
 
 
 @cache
 def fingerprint_tuning(form: str, law: str, round_trip_ms: int) -> str:
-    """Returns the fingerprint of a tuning: of its scenario, the law's sources and the ranges.
+    """Returns a digest of everything on which tuned gains depend.
 
-    Gains with another fingerprint were tuned for something else.
+    These are the scenario, the source code of the law, the ranges in which its gains are
+    searched, and the constants of the procedure. If stored gains have another fingerprint, they
+    were tuned for another experiment or another version of the law.
+
+    Args:
+        form: A key of `BASES`.
+        law: Name of the law.
+        round_trip_ms: Round trip of the tuning, in ms.
     """
     space = SEARCH_SPACES[law]
     assert space.kind is not None
@@ -355,7 +407,11 @@ def fingerprint_tuning(form: str, law: str, round_trip_ms: int) -> str:
 
 
 def read_gains(path: Path = GAINS_FILE) -> dict[tuple[str, str, int], TunedGains]:
-    """Returns all tuned gains of a file, by form, law and round trip in ms."""
+    """Reads the tuned gains of a file.
+
+    Returns:
+        The gains by form, law and round trip in ms. Empty if there is no file.
+    """
     if not path.exists():
         return {}
     entries = msgspec.json.decode(path.read_bytes(), type=list[TunedGains])
@@ -363,16 +419,24 @@ def read_gains(path: Path = GAINS_FILE) -> dict[tuple[str, str, int], TunedGains
 
 
 def find_stale(entries: Iterable[TunedGains]) -> list[str]:
-    """Returns the names of gains that were tuned for another scenario or text of the law."""
+    """Lists the gains whose law or scenario has changed since they were tuned.
+
+    Returns:
+        A text for each, such as "wave (three, 68 ms)".
+    """
     return [
         str(gains) for gains in entries if fingerprint_tuning(*gains.key) != gains.fingerprint
     ]
 
 
 def choose_round_trip(mean_ms: float) -> int:
-    """Returns the round trip of the gains for a link: the next tuned one that is not shorter.
+    """Returns the tuned round trip, in ms, whose gains a link with a given round trip uses.
 
-    The longest tuned round trip serves all links that are longer.
+    It is the shortest tuned round trip that is not shorter than that of the link. A link that
+    is longer than all of them uses the longest.
+
+    Args:
+        mean_ms: Mean round trip of the link, in ms.
     """
     for tuned_ms in TUNED_ROUND_TRIPS_MS:
         if tuned_ms >= mean_ms:
@@ -381,23 +445,26 @@ def choose_round_trip(mean_ms: float) -> int:
 
 
 def _has_margin(form: str, round_trip_ms: int, search: CandidateSearch, candidate: int) -> bool:
-    """Returns True if a candidate stays stable at the pose when delays grow by the margin.
+    """Returns True if a candidate comes to rest at the pose even if delays are longer.
+
+    Delays are multiplied by `TUNING_MARGIN`, and the run lasts `MARGIN_LENGTHS` times as long.
 
     Args:
-        form: a key of `BASES`.
-        round_trip_ms: round trip of the tuning, in ms.
-        search: the search.
-        candidate: index of the candidate; its gains are used unchanged.
+        form: A key of `BASES`.
+        round_trip_ms: Round trip of the tuning, in ms.
+        search: The search that tried the candidate.
+        candidate: Index of the candidate in the search. Its gains are used unchanged.
     """
     base = load_tuning_task(form, round_trip_ms)
     controls = search.space.controls(base.scenario, KNOWLEDGE, search.tried[candidate])
-    longer = {
+    longer_delays = {
         "link.delay_ms": 0.5 * TUNING_MARGIN * round_trip_ms,
         "duration_s": MARGIN_LENGTHS * base.scenario.duration_s,
     }
-    overrides = (*base.overrides, *format_settings(longer))
+    overrides = (*base.overrides, *format_settings(longer_delays))
     experiment = load_tuning_scenario(base.source, overrides).with_controls(controls)
-    return measure_candidate(*experiment.texts).outcome is CandidateClass.SETTLED
+    score = measure_candidate(*experiment.texts)
+    return score.outcome is CandidateClass.SETTLED
 
 
 def tune_laws(
@@ -407,14 +474,18 @@ def tune_laws(
     progress: Progress = ignore_progress,
     budget: int = TUNING_BUDGET,
 ) -> list[TunedGains]:
-    """Tunes laws at every round trip of the suite, and returns their gains.
+    """Tunes laws at every round trip of the suite.
 
     Args:
-        laws_by_form: names of the laws, by form.
-        jobs: number of processes, as for `trilat_net.tune`.
-        on: a cluster, as for `trilat_net.tune`.
-        progress: called with the number of finished tunings and of all tunings.
-        budget: number of candidates per gain of a law.
+        laws_by_form: Names of the laws, by form (a key of `BASES`).
+        jobs: Number of processes, as for `trilat_net.tune`.
+        on: Cluster that runs the candidates, as for `trilat_net.tune`.
+        progress: Function that is called with the number of finished tunings and of all
+            tunings.
+        budget: Number of candidates per gain of a law.
+
+    Returns:
+        The gains of every law at every round trip.
     """
     tuned: list[TunedGains] = []
     total = len(TUNED_ROUND_TRIPS_MS) * sum(map(len, laws_by_form.values()))
@@ -437,11 +508,20 @@ def tune_laws(
 
 
 def _select_gains(form: str, round_trip_ms: int, search: CandidateSearch) -> TunedGains:
-    """Returns the gains of the stable candidate with the least error that has the margin."""
+    """Selects the gains of a search: the smallest error among the candidates with the margin.
+
+    Args:
+        form: A key of `BASES`.
+        round_trip_ms: Round trip of the tuning, in ms.
+        search: The finished search of one law.
+    """
     law = search.space.law
     scores = search.scores
     settled = [n for n, score in enumerate(scores) if score.outcome is CandidateClass.SETTLED]
     settled.sort(key=lambda n: scores[n].error_rad or 0.0)
+
+    # The margin costs another run, so it is checked in the order of the errors until a
+    # candidate has it.
     selected = None
     passed = 0
     for candidate in settled:
@@ -449,6 +529,7 @@ def _select_gains(form: str, round_trip_ms: int, search: CandidateSearch) -> Tun
             selected = candidate
             break
         passed += 1
+
     return TunedGains(
         form=form,
         law=law,
@@ -464,7 +545,12 @@ def _select_gains(form: str, round_trip_ms: int, search: CandidateSearch) -> Tun
 
 
 def write_gains(tuned: Sequence[TunedGains], path: Path = GAINS_FILE) -> None:
-    """Writes gains into a file, and replaces those of the same form, law and round trip."""
+    """Writes gains into a file, and keeps the other gains of the file.
+
+    Args:
+        tuned: The gains. They replace those of the same form, law and round trip.
+        path: The file.
+    """
     entries = read_gains(path)
     for gains in tuned:
         entries[gains.key] = gains
@@ -476,15 +562,15 @@ MAX_BENCH_SEEDS = 1000
 
 
 class BenchCell(NamedTuple):
-    """A law in a task over a link, with its gains and seeds.
+    """A cell of the suite: a law in a task over a link, with its gains and seeds.
 
     Attributes:
-        task: a key of `TASKS`.
-        law: name of the law.
-        link: a key of `LINKS`.
-        form: a key of `BASES`.
-        tuned: gains of the law for this link.
-        seeds: seeds of the runs.
+        task: A key of `TASKS`.
+        law: Name of the law.
+        link: A key of `LINKS`.
+        form: A key of `BASES`.
+        tuned: Gains of the law for this link.
+        seeds: Seeds of the runs, one run each.
     """
 
     task: str
@@ -496,12 +582,12 @@ class BenchCell(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Name of the cell in results: task/law/link."""
+        """Name of the cell in results, as in "contact/wave/rtt272"."""
         return f"{self.task}/{self.law}/{self.link}"
 
     @property
     def inputs(self) -> str:
-        """A digest of everything that determines the runs: scenario, task, link and gains."""
+        """Digest of everything that determines the runs: scenario, task, link and gains."""
         parts = (
             _load_base_text(self.form),
             build_settings(self.form, self.task, self.link),
@@ -511,11 +597,15 @@ class BenchCell(NamedTuple):
 
     @property
     def key(self) -> str:
-        """Name of the cell in the journal, as in `BenchRun.cell`; other gains, another name."""
+        """Name of the cell in the journal of finished runs, see `BenchRun.cell`.
+
+        It contains `inputs`, so that runs with other gains are not mistaken for runs of this
+        cell.
+        """
         return f"{self.name} {self.inputs}"
 
     def build(self, seed: int) -> TuningScenario:
-        """Returns the experiment of the run with a seed."""
+        """Returns the experiment of the run with a seed, with the tuned gains."""
         settings = build_settings(self.form, self.task, self.link, seed)
         base = load_tuning_scenario(BASES[self.form], format_settings(settings))
         return base.with_gains(SEARCH_SPACES[self.law], KNOWLEDGE, self.tuned.gains)
@@ -525,10 +615,11 @@ class BenchPlan(NamedTuple):
     """The suite, or a part of it, ready to run.
 
     Attributes:
-        study: name of the study.
-        cells: the cells in the order in which they run.
-        laws: all selected laws with their forms; a law without cells has an empty row.
-        without: tunings of the selected laws that found no gains.
+        study: Name of the study.
+        cells: The cells in the order in which they run.
+        laws: All selected laws, each with its form. In tables, a law without cells has an empty
+            row.
+        without: Tunings of the selected laws that found no gains.
     """
 
     study: str
@@ -538,12 +629,12 @@ class BenchPlan(NamedTuple):
 
     @property
     def tasks(self) -> list[str]:
-        """Tasks of the cells, in order."""
+        """Tasks of the cells, in the order of the cells."""
         return list(dict.fromkeys(cell.task for cell in self.cells))
 
     @property
     def links(self) -> list[str]:
-        """Links of the cells, in order."""
+        """Links of the cells, in the order of the cells."""
         return list(dict.fromkeys(cell.link for cell in self.cells))
 
     @property
@@ -552,10 +643,10 @@ class BenchPlan(NamedTuple):
         return sum(len(cell.seeds) for cell in self.cells)
 
     def cell(self, name: str) -> BenchCell:
-        """Returns the cell with a name, as in contact/wave/rtt272.
+        """Returns the cell with a name, as in "contact/wave/rtt272".
 
         Raises:
-            UsageError: no cell has that name.
+            UsageError: No cell has that name.
         """
         cells = {cell.name: cell for cell in self.cells}
         if name not in cells:
@@ -566,7 +657,7 @@ class BenchPlan(NamedTuple):
 
 @cache
 def _load_base_text(form: str) -> str:
-    """Returns the resolved text of a form's scenario."""
+    """Returns the TOML text of a form's scenario, with all defaults written out."""
     return load_tuning_scenario(BASES[form]).scenario.text
 
 
@@ -578,17 +669,21 @@ def plan_bench(
     links: Sequence[str] = (),
     seeds: int | None = None,
 ) -> BenchPlan:
-    """Returns a study of the suite, or a part of it, checked and ready to run.
+    """Plans a study of the suite, or a part of it.
 
     Args:
-        study: a key of `STUDIES`.
-        tasks: names of the selected tasks; empty: all of the study.
-        laws: names of the selected laws; empty: all of the study.
-        links: names of the selected links, any keys of `LINKS`; empty: all links of the study.
-        seeds: number of seeds; None: that of the study.
+        study: A key of `STUDIES`.
+        tasks: Names of the selected tasks. Empty selects all tasks of the study.
+        laws: Names of the selected laws. Empty selects all laws of the study.
+        links: Names of the selected links, which may be any keys of `LINKS`. Empty selects all
+            links of the study.
+        seeds: Number of seeds. None uses the number of the study.
+
+    Returns:
+        The checked plan, ready to run.
 
     Raises:
-        UsageError: a name is unknown, a law has not been tuned, or no cell remains.
+        UsageError: A name is unknown, a law has not been tuned, or no cell can run.
     """
     bench_study = STUDIES[_check_name("study", study, list(STUDIES))]
     if seeds is None:
@@ -604,9 +699,11 @@ def plan_bench(
         _list_cells(study=bench_study, tasks=tasks, laws=laws, links=links, seeds=seeds)
     )
     cells = [cell for cell in tuned_cells if cell.tuned.gains]
+    # by name, so that gains that several cells share are listed once
     without = {str(cell.tuned): cell.tuned for cell in tuned_cells if not cell.tuned.gains}
     if not cells:
         raise UsageError(_explain_no_cells(tasks, laws, list(without)))
+
     rows = []
     for form, form_laws in bench_study.laws.items():
         rows += [(law, form) for law in form_laws if law in laws]
@@ -614,7 +711,14 @@ def plan_bench(
 
 
 def _explain_no_cells(tasks: Sequence[str], laws: Sequence[str], without: list[str]) -> str:
-    """Returns the error text for a selection without a cell."""
+    """Returns the error text for a selection of which no cell can run.
+
+    Args:
+        tasks: Names of the selected tasks.
+        laws: Names of the selected laws.
+        without: Tunings of these laws that found no gains. Empty if the laws do not fit the
+            tasks.
+    """
     law_names = ", ".join(laws)
     if without:
         return (
@@ -628,12 +732,20 @@ def _explain_no_cells(tasks: Sequence[str], laws: Sequence[str], without: list[s
 
 
 NO_GAINS = "no gains"
+"""Reason for a missing cell: the tuning of the law found no gains."""
 
 
 def explain_no_cell(law: str, form: str, task: str) -> str:
     """Returns the reason why a law does not run in a task, as the tables print it.
 
-    For a law that fits the task the reason is `NO_GAINS`.
+    Args:
+        law: Name of the law.
+        form: Form in which the law runs, a key of `BASES`.
+        task: A key of `TASKS`.
+
+    Returns:
+        "-" if the task needs more users than the form has. "no handover" if the task changes
+        dominance factors, and the law cannot. `NO_GAINS` if the law fits the task.
     """
     bench_task = TASKS[task]
     if bench_task.users > 1 and form != "three":
@@ -650,9 +762,22 @@ def _list_cells(
     links: Sequence[str],
     seeds: int,
 ) -> Iterator[BenchCell]:
-    """Yields the cells of the selected tasks, laws and links, with or without gains."""
+    """Yields the cells of the selected tasks, laws and links, with or without gains.
+
+    Tasks that a law does not fit are left out.
+
+    Args:
+        study: The study.
+        tasks: Names of the selected tasks.
+        laws: Names of the selected laws.
+        links: Names of the selected links.
+        seeds: Number of runs of a cell whose link is random. Any other cell runs once.
+
+    Raises:
+        UsageError: A law has not been tuned for one of the links.
+    """
     gains = read_gains()
-    link_facts = {link: _describe_link(link) for link in links}
+    link_properties = {link: _analyse_link(link) for link in links}
     for form, form_laws in study.laws.items():
         for law in form_laws:
             if law not in laws:
@@ -660,25 +785,31 @@ def _list_cells(
             for task in tasks:
                 if explain_no_cell(law, form, task) != NO_GAINS:
                     continue
-                for link, (random, mean_ms) in link_facts.items():
-                    count = seeds if random else 1
+                for link, (is_random, mean_ms) in link_properties.items():
+                    run_count = seeds if is_random else 1
                     yield BenchCell(
                         task=task,
                         law=law,
                         link=link,
                         form=form,
                         tuned=_find_gains(gains, form, law, mean_ms),
-                        seeds=tuple(range(1, 1 + count)),
+                        seeds=tuple(range(1, 1 + run_count)),
                     )
 
 
 def _find_gains(
     gains: Mapping[tuple[str, str, int], TunedGains], form: str, law: str, delay_ms: float
 ) -> TunedGains:
-    """Returns the gains of a law for a mean delay one way, in ms.
+    """Returns the gains of a law for a link.
+
+    Args:
+        gains: All tuned gains, by form, law and round trip in ms.
+        form: A key of `BASES`.
+        law: Name of the law.
+        delay_ms: Mean one-way delay of the link, in ms.
 
     Raises:
-        UsageError: the law has not been tuned at that delay.
+        UsageError: The law has not been tuned at that delay.
     """
     round_trip_ms = choose_round_trip(2.0 * delay_ms)
     tuned = gains.get((form, law, round_trip_ms))
@@ -690,8 +821,15 @@ def _find_gains(
     return tuned
 
 
-def _describe_link(link: str) -> tuple[bool, float]:
-    """Returns True if a link draws random numbers, and its mean delay one way, in ms."""
+def _analyse_link(link: str) -> tuple[bool, float]:
+    """Determines if a link draws random numbers, and how long its delay is.
+
+    Args:
+        link: A key of `LINKS`.
+
+    Returns:
+        True if its delays or losses are random, and its mean one-way delay in ms.
+    """
     settings = format_settings({"link": dict(LINKS[link])})
     scenario = load_tuning_scenario(BASES["two"], settings).scenario
     first = next(iter(scenario.links.values()))
@@ -705,13 +843,16 @@ def _select_names(
     default: Sequence[str],
     known: Sequence[str] | None = None,
 ) -> list[str]:
-    """Returns the names of an option after a check, or the default if there are no names.
+    """Returns the checked names of an option, or the default if the user gave no names.
 
     Args:
-        option: the option, without its dashes.
-        names: names from the user.
-        default: names in place of an empty selection.
-        known: names that exist; None: those of `default`.
+        option: The option, without its dashes.
+        names: Names from the user.
+        default: Names that replace an empty selection.
+        known: Names that exist. None if these are the names in `default`.
+
+    Raises:
+        UsageError: A name is unknown.
     """
     if known is None:
         known = default
@@ -719,7 +860,11 @@ def _select_names(
 
 
 def _check_name(option: str, name: str, known: Sequence[str]) -> str:
-    """Returns the name from an option if it is known; raises UsageError otherwise."""
+    """Returns the name from an option if it is known.
+
+    Raises:
+        UsageError: The name is unknown. The message suggests a similar name.
+    """
     if name not in known:
         hint = suggest_nearest(name, list(known)) or f"; available: {', '.join(known)}"
         raise UsageError(f"--{option}: no {option} {name!r} is available{hint}")

@@ -1,11 +1,15 @@
 """The results of the benchmark suite by cell, as tables, Markdown, CSV and JSON.
 
+A cell is a control law in a task over a link, see `bench_plan`. It has one run per seed. The
+tables show, for each law, how many links it is stable over, which properties its runs have, and
+the means of the measured quantities.
+
 Invariant:
-    - The output is a function of the runs alone, without a clock: equal results give equal
-      bytes.
-    - A number over seeds has its 95 % interval.
-    - Every run that is not stable is visible.
-    - No law is ranked.
+    - The output depends on the runs alone. It contains no time of day, so equal results give
+      equal bytes.
+    - A mean or share over at least `LEAST_SEEDS` seeds has its 95 % confidence interval.
+    - Every run that is not stable is visible in the tables.
+    - Laws are not ranked.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,56 +27,69 @@ from ..study_folder import encode_csv
 from .bench_plan import STUDIES, TASKS, BenchCell, BenchPlan, TunedGains, explain_no_cell
 
 LEAST_CONTACT_N = 1.0
-"""Least mean force of the wall at the end of a run with contact, in N."""
+"""Smallest mean force of the wall, in N, at which the slave counts as touching it.
+
+The mean is taken over the last quarter of the task.
+"""
 PASSIVE_J = -1e-3
-"""Least energy that hands, friction and wall have put into a passive run at any time, in J."""
+"""Limit of `BenchRun.energy_j`, in J, at or above which a run counts as passive.
+
+It is not 0, because the energy is a numerical integral.
+"""
 LONGEST_S = 100.0
-"""Duration in s of the longest runs, and of those that confirm or refute an unstable run."""
+"""Duration in s of the longest runs, and of the repeated runs of those that are not stable."""
 LEAST_SEEDS = 20
-"""Least number of runs for which there is an interval."""
+"""Smallest number of runs for which an interval is computed."""
 
 
 def name_run(key: str, to_s: float) -> str:
-    """Returns the name of a cell's runs in the journal.
+    """Returns the name of a cell's runs in the journal of finished runs.
 
     Args:
-        key: key of the cell.
-        to_s: duration of a repeated run, in s, which is part of its name; 0 for a first run.
+        key: Key of the cell, see `BenchCell.key`.
+        to_s: Duration in s of runs that are repeated over a longer time, which is part of their
+            name. 0 for the first runs.
     """
     return f"{key} to {to_s:g} s" if to_s else key
 
 
 class BenchRun(msgspec.Struct, frozen=True):
-    """A finished run of the suite.
+    """A finished run of the suite, with its judgement and its measured numbers.
+
+    A worker process creates it, and the journal of the suite stores it. The numbers from
+    `error_rad` on are None if the run diverged.
 
     Attributes:
-        name: name of its cell, task/law/link.
-        inputs: digest of everything that determines the runs of the cell.
-        seed: seed of the run.
+        name: Name of the cell, as in "contact/wave/rtt272".
+        inputs: Digest of everything that determines the runs of the cell.
+        seed: Seed of the run.
         random: True if another seed would give another run.
-        sha256: digest of its scenario.
-        stability: judgement of its end and its twins (docs/definitions.md).
-        behaviour: class of its end.
-        text: explanation of the judgement.
-        length_s: duration of the judged run, in s.
-        to_s: duration in s of a run that was repeated because it was not stable; 0 for a first
-            run.
-        confirmed: True if the repeated run was not stable either, False if it refuted the
-            first run; None without a repeated run.
-        bounded: True if no joint passed `BOUND_RAD_S`, or left its start by more than
-            `THROWN_RAD`.
-        energy_j: least energy that hands, friction and wall had put in at any time, in J.
-        settled_s: time from which all arms stay at their final poses, in s; None if they do
-            not within the run.
-        error_rad: RMS distance of the slave from its users, in rad, undelayed, weighted by
-            dominance, over the time of the task. This and the following numbers are None if
-            the run diverged.
-        effort_nm: RMS of tau - G(q) over sites and joints, in N m.
-        hand_nm: RMS torque of the operators over the joints of sites with an operator, in N m.
-        wall_n: mean force of the wall in the last quarter, in N; None without a wall.
-        force_peak_n: largest force of the wall, in N; None without a wall.
-        stiffness_n_m: stiffness that the user feels, from two reaches, in N/m; None unless the
-            arms come to rest at both.
+        sha256: Digest of the scenario of the run.
+        stability: Judgement of the run by its end and by its twins, which are repeated runs
+            with a small disturbance (docs/definitions.md).
+        behaviour: How the run ended, for example at rest or diverged.
+        text: Explanation of the judgement.
+        length_s: Duration of the judged run, in s.
+        to_s: Requested duration, in s, of a run that was repeated because it was not stable. 0
+            for a first run.
+        confirmed: True if the repeated run was not stable either. False if it was, so that it
+            refuted the first run. None if there is no repeated run.
+        bounded: True if no joint exceeded the velocity `BOUND_RAD_S`, or moved more than
+            `THROWN_RAD` away from its start.
+        energy_j: Smallest value over time of the energy that operators, friction and wall had
+            put into the arms until then, in J.
+        settled_s: Time from which all arms stay at their final poses, in s. None if there is no
+            such time within the run.
+        error_rad: RMS over time and joints of the difference between the slave and the average
+            of the users, weighted with the dominance factors and without delay, in rad.
+        effort_nm: RMS of tau - G(q), the torque without gravity, over sites and joints, in N m.
+        hand_nm: RMS torque of the operators over the joints of the arms that have an operator,
+            in N m.
+        wall_n: Mean force of the wall in the last quarter of the task, in N. None without a
+            wall.
+        force_peak_n: Largest force of the wall, in N. None without a wall.
+        stiffness_n_m: Stiffness that the user feels, in N/m, from two runs with different
+            reaches. None unless the arms come to rest in both.
     """
 
     name: str
@@ -100,22 +117,26 @@ class BenchRun(msgspec.Struct, frozen=True):
     def cell(self) -> str:
         """Name of the run's cell in the journal.
 
-        Cells of the same name with other gains, and repeated runs, have names of their own.
+        It contains the digest of the gains, and the duration of a repeated run, so that such
+        runs are not mistaken for the first runs of the cell.
         """
         return name_run(f"{self.name} {self.inputs}", self.to_s)
 
     @property
     def needs_confirmation(self) -> bool:
-        """True if the run is not stable, did not diverge, and is shorter than `LONGEST_S`."""
+        """True if a longer run could refute that this run is not stable.
+
+        This is not so if the run diverged, or is as long as `LONGEST_S` already.
+        """
         diverged = self.behaviour is EndBehaviour.DIVERGED
         is_short = self.length_s < LONGEST_S
         return self.stability is Stability.NOT_STABLE and not diverged and is_short
 
     @property
     def masked(self) -> bool:
-        """True if the slave was to touch a wall but did not.
+        """True if the slave should touch a wall but did not.
 
-        The numbers of such a run would be those of free motion.
+        The numbers of such a run are those of free motion, and are not shown.
         """
         return self.wall_n is not None and self.wall_n < LEAST_CONTACT_N
 
@@ -128,7 +149,7 @@ QUANTITIES = {
     "stiffness_n_m": "stiffness at the user's hand, by two reaches, N/m",
     "settled_s": "time from which all arms stay at their final poses, s",
 }
-"""Labels of the numbers that are averaged over seeds. A run without contact masks its cell."""
+"""Labels of the quantities that are averaged over the seeds of a cell."""
 _QUANTITIES_OF_ALL = ("error_rad", "effort_nm", "settled_s")
 _QUANTITIES_BY_TASK = {
     "free": ["hand_nm"],
@@ -139,11 +160,11 @@ _JUDGEMENTS = (Stability.STABLE, Stability.OPEN, Stability.NOT_STABLE)
 
 
 class BenchCellResult(NamedTuple):
-    """A cell with the runs of all its seeds.
+    """The results of a cell: one run for each of its seeds.
 
     Attributes:
-        cell: the cell.
-        runs: a run per seed.
+        cell: The cell.
+        runs: The runs, in the order of the seeds.
     """
 
     cell: BenchCell
@@ -151,51 +172,55 @@ class BenchCellResult(NamedTuple):
 
     @property
     def stable(self) -> int:
-        """Number of stable runs."""
+        """Number of runs that are judged stable."""
         return self.count(Stability.STABLE)
 
     def count(self, stability: Stability) -> int:
-        """Returns the number of runs with a judgement."""
+        """Returns the number of runs with a given judgement."""
         return sum(run.stability is stability for run in self.runs)
 
     @property
     def judgement(self) -> Stability:
-        """The worst judgement of the runs: stable only if all runs are."""
+        """The worst judgement of the runs. A cell is stable only if all its runs are."""
         if self.count(Stability.NOT_STABLE):
             return Stability.NOT_STABLE
         return Stability.OPEN if self.count(Stability.OPEN) else Stability.STABLE
 
     @property
     def masked(self) -> bool:
-        """True if the slave was to touch a wall in some run but did not."""
+        """True if the slave should touch a wall but did not in at least one run."""
         return any(run.masked for run in self.runs)
 
     @property
     def is_passive(self) -> bool:
-        """True if no run gave back more energy than it got; False if a run diverged."""
+        """True if no run returned more energy than was put in. False if a run diverged."""
         return self.energy_j is not None and self.energy_j >= PASSIVE_J
 
     @property
     def energy_j(self) -> float | None:
-        """The least energy of the runs, in J; None if a run diverged."""
+        """Smallest value of `BenchRun.energy_j` of the runs, in J. None if a run diverged."""
         values = [run.energy_j for run in self.runs if run.energy_j is not None]
         return min(values) if len(values) == len(self.runs) else None
 
     @property
     def interval(self) -> tuple[float, float] | None:
-        """The 95 % interval of the share of stable runs; None for fewer than `LEAST_SEEDS`."""
+        """95 % confidence interval of the share of stable runs, by Wilson's method.
+
+        None for fewer than `LEAST_SEEDS` runs.
+        """
         if len(self.runs) < LEAST_SEEDS:
             return None
         return wilson_interval(self.stable, len(self.runs))
 
     def compute_mean(self, quantity: str) -> float | MeanInterval | None:
-        """Returns the mean of a quantity over the seeds, with its interval if they suffice.
+        """Computes the mean of a quantity over the seeds.
 
         Args:
-            quantity: a key of `QUANTITIES`.
+            quantity: A key of `QUANTITIES`.
 
         Returns:
-            None if the cell is masked, or if a run has no such number.
+            The mean, with its 95 % confidence interval if there are at least `LEAST_SEEDS`
+            runs. None if the cell is masked, or if a run lacks the quantity.
         """
         values = [getattr(run, quantity) for run in self.runs]
         if None in values or self.masked:
@@ -206,12 +231,12 @@ class BenchCellResult(NamedTuple):
 
 
 class BenchResults(Result):
-    """The results of a suite.
+    """The results of a suite, or of a part of it.
 
     Attributes:
-        plan: plan of the suite.
-        places: all cells with their runs, in the order of the plan.
-        runs: all runs, in that order.
+        plan: Plan of the suite.
+        places: The results of all cells, in the order of the plan.
+        runs: All runs, in the same order.
     """
 
     def __init__(self, plan: BenchPlan, runs: dict[tuple[str, int], BenchRun]) -> None:
@@ -223,7 +248,11 @@ class BenchResults(Result):
         self.runs = [run for result in self.places for run in result.runs]
 
     def blocks(self) -> Iterator[Block]:
-        """Yields verdicts, properties, each quantity of each task, and round trips."""
+        """Yields the parts of the printed text.
+
+        These are a description, the verdicts, the properties of each task, each quantity of
+        each task, and the effects of delay and loss in the study "round-trips".
+        """
         yield from describe_bench(self)
         yield ""
         yield tabulate_verdicts(self)
@@ -238,7 +267,7 @@ class BenchResults(Result):
             yield tabulate_round_trips(self)
 
     def headline(self) -> str:
-        """Returns the study and the numbers of cells and runs."""
+        """Returns the result in one line: the study and the numbers of cells and runs."""
         cells = count_nouns(len(self.places), "cell")
         runs = count_nouns(len(self.runs), "run")
         return f"{self.plan.study}: {cells}, {runs}"
@@ -252,33 +281,42 @@ class BenchResults(Result):
         return {"study": self.plan.study, "gains": entries, "places": self.to_rows()}
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a row per cell."""
+        """Returns the rows of the table: one row per cell."""
         return list(map(_build_row, self.places))
 
     def select(self, task: str, law: str = "", link: str = "") -> Iterator[BenchCellResult]:
-        """Yields the results of a task; of a law and a link only, if these are not ""."""
+        """Yields the results of the cells of a task.
+
+        Args:
+            task: The task.
+            law: The law of the cells. Empty selects all laws.
+            link: The link of the cells. Empty selects all links.
+        """
         for result in self.places:
             cell = result.cell
             if cell.task == task and law in ("", cell.law) and link in ("", cell.link):
                 yield result
 
     def find(self, task: str, law: str, link: str) -> BenchCellResult | None:
-        """Returns the result of a cell; None if the cell did not run."""
+        """Returns the result of a cell. None if the plan does not contain the cell."""
         return next(self.select(task, law, link), None)
 
 
 def _list_used_gains(results: BenchResults) -> list[TunedGains]:
-    """Returns the gains of all cells, each of them once."""
+    """Returns the gains of all cells, without repetitions."""
     return list({str(cell.tuned): cell.tuned for cell in results.plan.cells}.values())
 
 
 def _confirm_run(runs: dict[tuple[str, int], BenchRun], cell: BenchCell, seed: int) -> BenchRun:
     """Returns a run of a cell, with the judgement of its repeated run if there is one.
 
+    A run that is not stable may be repeated over `LONGEST_S`. The longer run decides. A run
+    that lasted that long from the beginning confirms itself.
+
     Args:
-        runs: all runs by cell and seed.
-        cell: the cell.
-        seed: seed of the run.
+        runs: All runs by name of their cell in the journal, and by seed.
+        cell: The cell.
+        seed: Seed of the run.
     """
     run = runs[cell.key, seed]
     if run.stability is not Stability.NOT_STABLE:
@@ -307,13 +345,19 @@ _PRINTED_LINKS = (
     "geo",
     "trace",
 )
-"""Columns of a table if more links ran than fit into it."""
+"""Links that tables show if there are too many links for the width of a page."""
 OPEN_MARK = "?"
+"""Mark of a cell in tables: the stability of at least one run is open."""
 UNSTABLE_MARK = "!"
+"""Mark of a cell in tables: at least one run is not stable."""
 
 
 def list_quantities(results: BenchResults) -> list[tuple[str, str]]:
-    """Returns the tables of quantities: pairs of a task that ran and a key of `QUANTITIES`."""
+    """Lists the tables of quantities that are printed.
+
+    Returns:
+        Pairs of a task that ran and a key of `QUANTITIES`.
+    """
     tasks = results.plan.tasks
     pairs = [(task, quantity) for quantity in _QUANTITIES_OF_ALL for task in tasks]
     for task in tasks:
@@ -322,12 +366,15 @@ def list_quantities(results: BenchResults) -> list[tuple[str, str]]:
 
 
 def name_law(law: str, form: str) -> str:
-    """Returns the name of a law, with the number of its sites unless they are three."""
+    """Returns the name of a law for tables, with a note if it runs with two sites."""
     return law if form == "three" else f"{law} (two sites)"
 
 
 def tabulate_verdicts(results: BenchResults) -> TextTable:
-    """Returns a row per law: for each task, the numbers of links by their verdict."""
+    """Returns a table of verdicts: a row per law, a column per task.
+
+    An entry counts the links over which the law is stable, open and not stable.
+    """
     tasks = results.plan.tasks
     rows = []
     for law, form in results.plan.laws:
@@ -337,7 +384,18 @@ def tabulate_verdicts(results: BenchResults) -> TextTable:
 
 
 def _count_verdicts(results: BenchResults, law: str, form: str, task: str) -> str:
-    """Returns the numbers of stable, open and unstable links, or why the law did not run."""
+    """Returns the numbers of links by verdict as an entry of the table of verdicts.
+
+    Args:
+        results: The results.
+        law: Name of the law.
+        form: Form in which the law runs.
+        task: Name of the task.
+
+    Returns:
+        A text such as "12 / 1 / 3" for stable, open and not stable links. If the law did not
+        run in the task, the reason.
+    """
     verdicts = [result.judgement for result in results.select(task, law)]
     if not verdicts:
         return explain_no_cell(law, form, task)
@@ -345,9 +403,11 @@ def _count_verdicts(results: BenchResults, law: str, form: str, task: str) -> st
 
 
 def tabulate_properties(results: BenchResults, task: str) -> TextTable:
-    """Returns a row per law: for each property, the number of links where all runs have it.
+    """Returns a table of the properties of a task's runs: a row per law, a column per property.
 
-    A further column has the least energy, and the last the number of links without contact.
+    An entry such as 3/12 means that all runs over 3 of the 12 links have the property. Two more
+    columns have the smallest energy, and the number of links over which the slave did not touch
+    the wall.
     """
     headers = (
         task,
@@ -370,7 +430,11 @@ def tabulate_properties(results: BenchResults, task: str) -> TextTable:
 
 
 def _describe_properties(law_results: Sequence[BenchCellResult]) -> list[str]:
-    """Returns the cells of a law's row in the table of properties, without its name."""
+    """Returns the entries of a law's row in the table of properties, without its name.
+
+    Args:
+        law_results: The results of the law in the task, one per link.
+    """
     bounded = 0
     passive = 0
     converged = 0
@@ -382,37 +446,45 @@ def _describe_properties(law_results: Sequence[BenchCellResult]) -> list[str]:
         converged += all(run.settled_s is not None for run in result.runs)
         stable += result.judgement is Stability.STABLE
         masked += result.masked
-    links = len(law_results)
+    link_count = len(law_results)
     return [
-        f"{bounded}/{links}",
-        f"{passive}/{links}",
+        f"{bounded}/{link_count}",
+        f"{passive}/{link_count}",
         _format_least_energy(law_results),
-        f"{converged}/{links}",
-        f"{stable}/{links}",
+        f"{converged}/{link_count}",
+        f"{stable}/{link_count}",
         str(masked),
     ]
 
 
 def _format_least_energy(law_results: Sequence[BenchCellResult]) -> str:
-    """Returns the least energy of the results in J, as a cell of a table."""
+    """Returns the smallest energy of some results in J, as an entry of a table.
+
+    Returns:
+        The energy as text. A dash if all cells have a run that diverged.
+    """
     energies_j = [result.energy_j for result in law_results if result.energy_j is not None]
     if not energies_j:
         return "-"
     least_j = min(energies_j)
-    # rounding of the sum over a run
-    return f"{least_j if least_j < -1e-9 else 0.0:.2g}"
+    if least_j >= -1e-9:
+        # A negative energy this small is a rounding error of the sum over a run.
+        least_j = 0.0
+    return f"{least_j:.2g}"
 
 
 def tabulate_quantity(results: BenchResults, task: str, quantity: str) -> TextTable:
-    """Returns a row per law and a column per link: means over seeds, with marks.
+    """Returns a table of the means of a quantity: a row per law, a column per link.
 
-    The marks tell runs that are open or not stable. A law that does not fit the task has no
-    row.
+    The means are over the seeds of a cell.
+
+    Entries of cells that are open or not stable have a mark. A law that cannot run in the task
+    has no row.
 
     Args:
-        results: the results.
-        task: a task that ran.
-        quantity: a key of `QUANTITIES`.
+        results: The results.
+        task: A task that ran.
+        quantity: A key of `QUANTITIES`.
     """
     links = results.plan.links
     if len(links) > len(_PRINTED_LINKS):
@@ -431,7 +503,12 @@ def tabulate_quantity(results: BenchResults, task: str, quantity: str) -> TextTa
 
 
 def _describe_result(result: BenchCellResult, quantity: str) -> str:
-    """Returns the mean of a quantity as a cell of a table, or why the cell has no number."""
+    """Returns the mean of a quantity as an entry of a table, or the reason why it has no mean.
+
+    Args:
+        result: The result of a cell.
+        quantity: A key of `QUANTITIES`.
+    """
     marks = {Stability.NOT_STABLE: UNSTABLE_MARK, Stability.OPEN: OPEN_MARK}
     mark = marks.get(result.judgement, "")
     if result.masked:
@@ -449,9 +526,12 @@ def _describe_result(result: BenchCellResult, quantity: str) -> str:
 
 
 def tabulate_round_trips(results: BenchResults) -> TextTable:
-    """Returns a row per task and law: how its error grows with delay, and with losses.
+    """Returns a table that shows how the error of each law grows with delay and with losses.
 
-    These are the effects that the published study reports.
+    A row is a task and a law. The columns have the error at the shortest round trip, the ratio
+    of the errors at the longest and the shortest round trip, and the ratio of the errors with
+    and without losses. The published study that this part of the suite repeats reports these
+    effects.
     """
     rows = []
     for task in results.plan.tasks:
@@ -480,21 +560,27 @@ def tabulate_round_trips(results: BenchResults) -> TextTable:
 
 
 def _find_error(results: BenchResults, task: str, law: str, link: str) -> float | None:
-    """Returns the mean error of a cell in rad; None if there is no such number."""
+    """Returns the mean error of a cell, in rad. None if the cell did not run or has no mean."""
     result = results.find(task, law, link)
     mean = None if result is None else result.compute_mean("error_rad")
     return mean.mean if isinstance(mean, MeanInterval) else mean
 
 
 def _format_ratio(numerator: float | None, denominator: float | None) -> str:
-    """Returns a ratio as a cell of a table, or a dash if a number is missing or 0."""
+    """Returns a ratio as an entry of a table.
+
+    The entry is a dash if a number is missing, or if the denominator is 0.
+    """
     if numerator is None or not denominator:
         return "-"
     return f"{numerator / denominator:.3g}"
 
 
 def describe_bench(results: BenchResults) -> Iterator[str]:
-    """Yields the description of a suite in lines: its study, runs, tasks and missing laws."""
+    """Yields lines that describe a suite.
+
+    They name its study, its runs, its tasks, and the laws that did not run.
+    """
     plan = results.plan
     cells = count_nouns(len(plan.cells), "cell")
     runs = count_nouns(len(results.runs), "run")
@@ -519,7 +605,11 @@ def describe_bench(results: BenchResults) -> Iterator[str]:
 
 
 def tabulate_gains(results: BenchResults) -> TextTable:
-    """Returns a row per law, form and round trip: the gains, and how they were selected."""
+    """Returns a table of the gains of each law at each round trip, and their selection.
+
+    The column "stable" has the number of stable candidates and of all candidates. The column
+    "without margin" has the number of candidates with smaller errors that lacked the margin.
+    """
     used = {str(gains): gains for gains in _list_used_gains(results)}
     used |= {str(gains): gains for gains in results.plan.without}
     rows = []
@@ -541,12 +631,12 @@ def tabulate_gains(results: BenchResults) -> TextTable:
 def build_bench_page(
     results: BenchResults, command: str, pictures: Mapping[str, str] = {}
 ) -> str:
-    """Returns the results in Markdown, below the command that writes them.
+    """Builds the page of the results in Markdown.
 
     Args:
-        results: the results.
-        command: the command.
-        pictures: the subject of each picture, by the name of its file beside the page.
+        results: The results.
+        command: The command that writes the page, which is shown at its top.
+        pictures: Subject of each picture, by the name of its file in the folder of the page.
     """
     parts = [
         f"# The suite: {results.plan.study}",
@@ -572,7 +662,7 @@ def build_bench_page(
 
 
 def encode_runs(results: BenchResults) -> str:
-    """Returns a row per run as CSV."""
+    """Returns the runs as CSV: a row per run."""
     cells = {cell.name: cell for cell in results.plan.cells}
     rows = [
         _build_cell_columns(cells[run.name]) | msgspec.to_builtins(run) for run in results.runs
@@ -581,17 +671,20 @@ def encode_runs(results: BenchResults) -> str:
 
 
 _FORMER_KEYS = ("reflected", "reflected_half", "observed", "least_j")
-"""Keys that once had numbers. They stay, as null: no key is removed (docs/json.md)."""
+"""Keys of quantities that are no longer measured.
+
+They stay in the JSON with the value null, because keys are never removed (docs/json.md).
+"""
 _CELL_COLUMNS = ("task", "law", "link", "form")
 
 
 def _build_cell_columns(cell: BenchCell) -> dict[str, Any]:
-    """Returns the columns that identify a cell."""
+    """Returns the columns that identify a cell: task, law, link and form."""
     return {name: getattr(cell, name) for name in _CELL_COLUMNS}
 
 
 def _build_row(result: BenchCellResult) -> dict[str, Any]:
-    """Returns the row of a cell in JSON and CSV, with unknown numbers as None."""
+    """Returns the row of a cell in JSON and CSV. Unknown numbers are None."""
     share_low = None
     share_high = None
     if result.interval is not None:

@@ -1,14 +1,17 @@
-"""Runs the benchmark suite: judges and measures each run, and keeps it in the study's folder.
+"""Executes the runs of the benchmark suite: judges and measures each run, and stores it.
 
-A run is judged by its end and by its twins (`analysis.run_end`, `analysis.twin_growth`). Its
-errors, efforts and forces are those of the log that its command writes, over the time of the
-task. The judgement uses the whole run, which lasts as long as the judgement needs.
+A run is judged by its end (`analysis.run_end`) and by its twins (`analysis.twin_growth`). A
+twin is a repetition of the run with a small disturbance, which shows whether disturbances grow.
+A run is made longer if its judgement needs more time. Its errors, efforts and forces are
+measured over the time of the task only, from the same records that `trilat sim` writes.
 
 Invariant:
-    - The numbers of a run are a function of its scenario. The number of processes, their order
+    - The numbers of a run depend on its scenario alone. The number of processes, their order
       and interruptions have no influence.
-    - A run that is in the journal is never repeated. A run with other gains is another run.
-    - A folder belongs to one version of the program and one arithmetic.
+    - A run that is in the journal of the folder is not executed again. A run with other gains
+      counts as another run.
+    - A folder contains only runs of one version of the program on one kind of arithmetic, see
+      `describe_program`.
 """
 
 import json
@@ -43,28 +46,30 @@ USER = "m1"
 BOUND_RAD_S = 5.0
 """Largest joint velocity of a bounded run, in rad/s.
 
-No joint of such a run leaves its start by more than `THROWN_RAD`.
+In addition, no joint of such a run moves more than `THROWN_RAD` away from its start.
 """
 REST_S = 2.0
-"""Least time in s for which the arms of a converged run stay within `SETTLED_ERROR_RAD` of
-their final poses.
+"""Shortest time, in s, for which the arms of a converged run stay at their final poses.
+
+All joints stay within `SETTLED_ERROR_RAD` of their final angles.
 """
 TWINS = 3
-"""Number of twins of the run with the first seed; the runs with other seeds have one.
+"""Number of twins of the run with the first seed. Runs with other seeds have one twin.
 
-The three are pushed at all joints, at single joints, and in the estimates.
+The disturbances of the three twins are at all joints, at single joints, and in the estimates of
+the adaptive laws.
 """
 TIME_CONSTANTS = 6.0
-"""Least duration of a run in its slowest time constants, up to `LONGEST_S`."""
+"""Shortest duration of a run in units of its slowest time constant, up to `LONGEST_S`."""
 
 
 class BenchRunItem(NamedTuple):
-    """A run to execute, with everything that a worker needs; can be pickled.
+    """A run to execute. It contains everything that a worker process needs, and can be pickled.
 
     Attributes:
-        cell: the cell.
-        seed: the seed.
-        to_s: duration of a repeated run, in s; 0 for a first run.
+        cell: The cell of the suite.
+        seed: Seed of the run.
+        to_s: Duration in s of a repeated run that is longer. 0 for a first run.
     """
 
     cell: BenchCell
@@ -79,12 +84,12 @@ class _JudgedRun(NamedTuple):
     """A run with all of its records, and its judgement.
 
     Attributes:
-        scenario: the scenario, whose duration is that of the run.
-        records: all records by site.
-        end: the end of the run.
-        twins: growth of small pushes.
-        stability: the judgement.
-        text: its explanation.
+        scenario: The scenario. Its duration is that of the run.
+        records: All records of the run, by site.
+        end: Analysis of the end of the run.
+        twins: Growth of the small disturbances of the twins.
+        stability: The judgement.
+        text: Explanation of the judgement.
     """
 
     scenario: Scenario
@@ -96,18 +101,28 @@ class _JudgedRun(NamedTuple):
 
     @property
     def diverged(self) -> bool:
-        """True if a site left its limits."""
+        """True if a site exceeded its limits, which ended the run."""
         return self.end.diverged_at_s is not None
 
 
 def run_bench_task(item: BenchRunItem) -> BenchRun:
-    """Executes, judges and measures a run, in any process."""
+    """Executes, judges and measures a run.
+
+    It may be called in any process, and needs no state but its argument.
+
+    Args:
+        item: The run to execute.
+    """
     cell = item.cell
     scenario = cell.build(item.seed).scenario
     twins = TWINS if item.seed == cell.seeds[0] else 1
-    judged = _judge(scenario, item.to_s or scenario.duration_s, twins)
-    if not item.to_s:
+    is_repeated = item.to_s > 0.0
+    if is_repeated:
+        judged = _judge(scenario, item.to_s, twins)
+    else:
+        judged = _judge(scenario, scenario.duration_s, twins)
         judged = _lengthen(judged, twins)
+
     run = BenchRun(
         name=cell.name,
         inputs=cell.inputs,
@@ -121,7 +136,9 @@ def run_bench_task(item: BenchRunItem) -> BenchRun:
         to_s=item.to_s,
     )
     if judged.diverged:
+        # Errors and efforts of a run that ended early cannot be compared with those of others.
         return run
+
     run = _measure(run, judged, TASKS[cell.task].duration_s)
     if cell.task == "contact" and not run.masked:
         stiffness_n_m = _estimate_stiffness(item, judged)
@@ -130,7 +147,13 @@ def run_bench_task(item: BenchRunItem) -> BenchRun:
 
 
 def _judge(scenario: Scenario, length_s: float, twins: int) -> _JudgedRun:
-    """Runs a scenario for a time in s, with a number of twins, and judges the run."""
+    """Executes a scenario and its twins, and judges the run.
+
+    Args:
+        scenario: The scenario. Its own duration is ignored.
+        length_s: Duration of the run, in s.
+        twins: Number of twins.
+    """
     scenario = msgspec.structs.replace(scenario, duration_s=length_s)
     records, end = run_whole(scenario)
     growth = TwinGrowth("no twins were requested")
@@ -148,55 +171,75 @@ def _judge(scenario: Scenario, length_s: float, twins: int) -> _JudgedRun:
 
 
 def _lengthen(judged: _JudgedRun, twins: int) -> _JudgedRun:
-    """Returns the run, repeated over a longer time if its judgement needs more time.
+    """Repeats a run over a longer time if its judgement needs more time.
 
-    A run has to last for `TIME_CONSTANTS` of its slowest time constants. A run that is not
-    stable is repeated over twice its length, and the longer run is judged.
+    A run must last for `TIME_CONSTANTS` of its slowest time constants, which follow from the
+    rates at which its errors and the disturbances of its twins decay. After that, a run that is
+    not stable is repeated over twice its duration, and the longer run is judged.
+
+    Args:
+        judged: The run.
+        twins: Number of twins of a repeated run.
+
+    Returns:
+        The longer run, or the same run if it is long enough.
     """
     if judged.diverged:
         return judged
     rates = [judged.end.error.rate_per_s, judged.end.speed.rate_per_s]
     rates += [push.rate_per_s for push in judged.twins.pushes if push.factor > 0.0]
-    slowest_s = max((-1.0 / rate for rate in rates if rate < 0.0), default=0.0)
+    # A rate below 0 means decay. Its time constant is the inverse.
+    time_constants_s = [-1.0 / rate for rate in rates if rate < 0.0]
+    slowest_s = max(time_constants_s, default=0.0)
+
     length_s = judged.scenario.duration_s
-    wanted_s = TIME_CONSTANTS * slowest_s
-    # more time than LONGEST_S can only help a run that is still open
-    if judged.stability is Stability.OPEN or wanted_s < LONGEST_S:
-        wanted_s = min(wanted_s, LONGEST_S)
-        if length_s < wanted_s:
-            length_s = float(math.ceil(wanted_s))
+    required_s = TIME_CONSTANTS * slowest_s
+    # If LONGEST_S is too short, repeating the run can only help if its judgement is open.
+    if judged.stability is Stability.OPEN or required_s < LONGEST_S:
+        required_s = min(required_s, LONGEST_S)
+        if length_s < required_s:
+            length_s = float(math.ceil(required_s))
             judged = _judge(judged.scenario, length_s, twins)
+
     if judged.stability is Stability.NOT_STABLE and not judged.diverged:
         return _judge(judged.scenario, 2.0 * length_s, twins)
     return judged
 
 
 def _measure(run: BenchRun, judged: _JudgedRun, duration_s: float) -> BenchRun:
-    """Returns a run with its numbers.
+    """Measures the errors, efforts, forces and energies of a run.
 
     Args:
-        run: the run.
-        judged: the same run with its records.
-        duration_s: time over which errors, efforts and forces are measured, in s.
+        run: The run without these numbers.
+        judged: The same run with its records.
+        duration_s: Time over which errors, efforts and forces are measured, in s.
+
+    Returns:
+        The run with the numbers, see `BenchRun`.
     """
     scenario = judged.scenario
     whole = judged.records
     task_end_ns = round(duration_s * NS_PER_S)
     records = {name: batch.between(0, task_end_ns) for name, batch in whole.items()}
+
     squared_efforts = []
     squared_hand_torques = []
     wall_forces = []
     for name, record in records.items():
         spec = scenario.sites[name]
         arm = build_arm_rows(scenario, name)
+
         effort = record.tau - arm.gravity_torque(record.q)
         squared_efforts.append(np.mean(effort**2))
         if spec.hands:
             hand_torque = _compute_hand_torque(scenario, name, record)
             squared_hand_torques.append(np.mean(hand_torque**2))
+
         tip = arm.place_end_effector(record.q, record.qd)
         t_s = record.t_ns / NS_PER_S
         wall_forces += [wall_force(wall, t_s, tip) for wall in list_walls(spec)]
+
+    # There are no maxima if the task has no wall.
     last_quarters = [force[3 * len(force) // 4 :] for force in wall_forces]
     return msgspec.structs.replace(
         run,
@@ -212,7 +255,12 @@ def _measure(run: BenchRun, judged: _JudgedRun, duration_s: float) -> BenchRun:
 
 
 def _is_bounded(scenario: Scenario, records: dict[str, RecordBatch]) -> bool:
-    """Returns True if all joints stayed below `BOUND_RAD_S` and near their start."""
+    """Returns True if all joints stayed slower than `BOUND_RAD_S` and near their start.
+
+    Args:
+        scenario: The scenario, which has the start angles.
+        records: All records of the run, by site.
+    """
     for name, record in records.items():
         distance_rad = np.abs(record.q - scenario.sites[name].q0_rad)
         speed_rad_s = np.abs(record.qd)
@@ -222,9 +270,19 @@ def _is_bounded(scenario: Scenario, records: dict[str, RecordBatch]) -> bool:
 
 
 def _compute_hand_torque(scenario: Scenario, name: str, record: RecordBatch) -> Array:
-    """Returns the torque of the operators on an arm, shape (K, n), N m.
+    """Computes the torque of the operators on the joints of an arm.
 
-    The friction of the arm's joints is part of the exogenous torque, and is taken out.
+    The records have -tau_x, the sum of all torques from outside. It also contains the viscous
+    friction -D qd of the joints, which is removed by adding D qd. Walls are not removed: the
+    function is meant for arms that touch none.
+
+    Args:
+        scenario: The scenario.
+        name: Name of the arm's site.
+        record: The records of the site.
+
+    Returns:
+        The torque in N m, shape (records, joints).
     """
     torque: Array = -record.tau_x
     for source in scenario.sites[name].environment:
@@ -234,11 +292,15 @@ def _compute_hand_torque(scenario: Scenario, name: str, record: RecordBatch) -> 
 
 
 def find_least_energy(records: dict[str, RecordBatch]) -> float:
-    """Returns the least energy that came from outside until any time, in J.
+    """Computes the smallest energy that the arms had received from outside, in J.
 
-    The energy until t is the integral over 0..t of sum_i -tau_x_i' qd_i, by the trapezoidal
-    rule. All arms begin at rest: a passive network with passive controllers stays at or above
-    zero.
+    The energy received until t is the integral of sum_i -tau_x_i' qd_i from 0 to t, where
+    tau_x_i is the recorded exogenous torque of arm i, computed with the trapezoidal rule. All
+    arms start at rest. If network and controllers are passive, they cannot return more energy
+    than they received, so the energy never falls below 0.
+
+    Args:
+        records: All records of the run, by site.
     """
     power = sum(-np.sum(record.tau_x * record.qd, axis=1) for record in records.values())
     h_s = 1e-9 * np.diff(records[SLAVE].t_ns[:2])[0]
@@ -248,32 +310,38 @@ def find_least_energy(records: dict[str, RecordBatch]) -> float:
 
 
 def _find_settled_s(records: dict[str, RecordBatch]) -> float | None:
-    """Returns the time from which every joint stays at its final angle, in s.
+    """Finds the time from which every joint stays at its final angle.
 
-    Returns None if that time is less than `REST_S` before the end of the run.
+    Args:
+        records: All records of the run, by site.
+
+    Returns:
+        The time in s. None if it is less than `REST_S` before the end of the run, because the
+        arms may then still be moving.
     """
-    last_s = 0.0
+    settled_s = 0.0
     for record in records.values():
         distance_rad = np.abs(record.q - record.q[-1]).max(axis=1)
-        outside = np.flatnonzero(distance_rad > SETTLED_ERROR_RAD)
-        if len(outside):
-            last_s = max(last_s, record.t_ns[outside[-1]] / NS_PER_S)
+        moving = np.flatnonzero(distance_rad > SETTLED_ERROR_RAD)
+        if len(moving):
+            settled_s = max(settled_s, record.t_ns[moving[-1]] / NS_PER_S)
     end_s = records[SLAVE].t_ns[-1] / NS_PER_S
-    return float(last_s) if last_s <= end_s - REST_S else None
+    return float(settled_s) if settled_s <= end_s - REST_S else None
 
 
 def _estimate_stiffness(item: BenchRunItem, far: _JudgedRun) -> float | None:
-    """Returns the stiffness that the user feels along the wall's normal, in N/m.
+    """Estimates the stiffness that the user feels along the normal of the wall.
 
-    The stiffness is the additional force for a longer reach, divided by the additional
-    distance, when both runs are at rest.
+    The same run is executed with a shorter reach of the user. The stiffness is the difference
+    of the forces, divided by the difference of the positions of the user's arm, when both runs
+    are at rest.
 
     Args:
-        item: the run with the longer reach.
-        far: the same run with its records.
+        item: The run with the longer reach.
+        far: The same run with its records.
 
     Returns:
-        None if one of the runs does not come to rest.
+        The stiffness in N/m. None if one of the runs does not come to rest.
     """
     built = item.cell.build(item.seed)
     overrides = (*built.overrides, *format_settings(SHORTER_REACH))
@@ -287,9 +355,17 @@ def _estimate_stiffness(item: BenchRunItem, far: _JudgedRun) -> float | None:
 
 
 def _measure_push(judged: _JudgedRun) -> tuple[float, float]:
-    """Returns the user's mean position in m and force in N along x, over the last second.
+    """Measures how far and how hard the user pushes at the end of a run.
 
-    The force F follows from the torque of the hand, J' F = tau.
+    The force F of the operator on the end effector follows from the torque tau of the operator
+    on the joints: J' F = tau, where J is the Jacobian of the end effector.
+
+    Args:
+        judged: The run.
+
+    Returns:
+        Position of the end effector in m and force in N, both along x and averaged over the
+        last second.
     """
     scenario = judged.scenario
     record = judged.records[USER]
@@ -303,12 +379,20 @@ def _measure_push(judged: _JudgedRun) -> tuple[float, float]:
 
 
 def _measure_error_rad(scenario: Scenario, records: dict[str, RecordBatch]) -> float:
-    """Returns the RMS distance of the slave from its users, weighted by dominance, in rad."""
+    """Computes the RMS difference between the slave and the average of its users, in rad.
+
+    The average is weighted with the dominance factors of the slave, which may change during the
+    run. It uses the joint angles of the users at the same time, without the delay of the links.
+
+    Args:
+        scenario: The scenario.
+        records: Records by site, all over the same times.
+    """
     slave = records[SLAVE]
     t_s = slave.t_ns / NS_PER_S
     period_s = 1.0 / scenario.sites[SLAVE].rate_hz
     start, ramps = list_scripted_ramps(scenario, SLAVE)
-    alpha = evaluate_ramps(start, ramps, t_s, period_s).alpha
+    alpha = evaluate_ramps(start, ramps, t_s, period_s).alpha  # dominance factors
     reference: Array = np.zeros_like(slave.q)
     for index, peer in enumerate(scenario.peers(SLAVE)):
         reference = reference + alpha[:, index, None] * records[peer].q
@@ -326,12 +410,12 @@ def prepare_bench_folder(plan: BenchPlan, path: Path | None = None) -> BenchFold
     """Makes the folder of a suite, or opens an existing folder with its finished runs.
 
     Args:
-        plan: plan of the suite.
-        path: the folder; None: `runs/bench-STUDY`.
+        plan: Plan of the suite.
+        path: The folder. None uses `runs/bench-STUDY`.
 
     Raises:
-        UsageError: the folder has other content, or runs of another version or arithmetic, or
-            cannot be made.
+        UsageError: The folder has other content, or runs of another version of the program or
+            of another arithmetic, or cannot be made.
     """
     if path is None:
         path = Path("runs") / f"bench-{plan.study}"
@@ -359,8 +443,13 @@ def prepare_bench_folder(plan: BenchPlan, path: Path | None = None) -> BenchFold
 def _check_origin(path: Path, folder_origin: str, origin: str) -> None:
     """Refuses a folder whose runs come from another version or arithmetic.
 
+    Args:
+        path: The folder.
+        folder_origin: JSON text that describes the program that made the folder.
+        origin: JSON text that describes this program.
+
     Raises:
-        UsageError: both origins differ.
+        UsageError: The texts differ.
     """
     if folder_origin == origin:
         return
@@ -380,22 +469,27 @@ def run_bench(
     *,
     confirm: bool = False,
 ) -> BenchResults:
-    """Executes the runs of a suite that its journal lacks, and returns all results.
+    """Executes the runs of a suite that are not finished yet.
 
     Args:
-        folder: folder of the suite.
-        jobs: number of processes, as for `trilat_net.bench`.
-        on: a cluster, as for `trilat_net.bench`.
-        progress: called with the number of finished runs and of all runs.
-        confirm: True to repeat runs that are not stable over `LONGEST_S`.
+        folder: Folder of the suite. Its journal has the finished runs.
+        jobs: Number of processes, as for `trilat_net.bench`.
+        on: Cluster that executes the runs, as for `trilat_net.bench`.
+        progress: Function that is called with the number of finished runs and of all runs.
+        confirm: True to repeat the runs that are not stable over `LONGEST_S`.
+
+    Returns:
+        The results of all runs.
 
     Raises:
-        RunFailed: a run ended its workers, or the cluster is gone. Finished runs are kept.
+        RunFailed: A run ended its worker process, or the connection to the cluster is lost.
+            Finished runs are kept in the journal.
     """
     plan = folder.plan
     items = [BenchRunItem(cell, seed) for cell in plan.cells for seed in cell.seeds]
     with folder.journal() as journal:
         _run_pending(journal, items, jobs, on, progress)
+
         if confirm:
             repeated = [
                 item._replace(to_s=LONGEST_S)
@@ -413,7 +507,15 @@ def _run_pending(
     on: Workers,
     progress: Progress,
 ) -> None:
-    """Executes the runs that the journal lacks, and writes each to the journal as it ends."""
+    """Executes the runs that the journal lacks, and adds each to the journal when it ends.
+
+    Args:
+        journal: The finished runs.
+        items: All runs that are needed.
+        jobs: Number of processes.
+        on: Cluster that executes the runs.
+        progress: Function that is called with the number of finished runs and of all runs.
+    """
     pending = []
     for item in items:
         key = name_run(item.cell.key, item.to_s)
