@@ -1,11 +1,12 @@
-"""Output files and folders, input files, and optional packages.
+"""Helpers for output files and folders, input files, and optional packages.
 
 Invariant:
-    - An existing output is replaced only if the caller forces it, and an output gets its name
-      only when it is complete.
-    - No output is written through a symbolic link in place of an output file, or of a folder
-      that the program makes within its output. Otherwise, the author of the link could choose
-      which file is overwritten.
+    - An existing output is replaced only if the caller allows it with `force`.
+    - A file or folder gets its final name only when it is complete. A program that dies while
+      it writes therefore leaves no output that looks complete.
+    - An output is never written through a symbolic link. Otherwise, the author of the link
+      could choose which file is overwritten. The rule also holds for the folders that the
+      program makes within an output folder.
     - An optional package is imported where it is used. If it is missing, the error names the
       command that installs it.
 """
@@ -30,7 +31,7 @@ from typing import Any, BinaryIO
 from .errors import LogError, LogRefused, TrilatError, UsageError
 
 DISK_ERRNOS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
-"""Errors with which a disk refuses data."""
+"""System errors with which a disk refuses data, for example because it is full."""
 STUDY_LIBRARIES = ("loky", "matplotlib", "scipy")
 """Libraries that `trilat-net` installs and `trilat-net-core` does not (pyproject.toml)."""
 
@@ -39,10 +40,10 @@ def require_libraries(*names: str) -> None:
     """Refuses a command before it starts if a library that it needs is missing.
 
     Args:
-        names: the libraries; by default all of `STUDY_LIBRARIES`.
+        names: The libraries. By default all of `STUDY_LIBRARIES`.
 
     Raises:
-        UsageError: a library is not installed.
+        UsageError: A library is not installed. The message has the command that installs it.
     """
     missing = [name for name in names or STUDY_LIBRARIES if find_spec(name) is None]
     if missing:
@@ -53,15 +54,19 @@ def require_libraries(*names: str) -> None:
 
 
 def import_extra(module: str, extra: str, purpose: str) -> Any:
-    """Imports and returns a module of an optional package.
+    """Imports a module of an optional package.
 
     Args:
-        module: the module.
-        extra: the extra of trilat-net that installs the package.
-        purpose: the features that need the package, in the plural.
+        module: Name of the module.
+        extra: Name of the extra of trilat-net that installs the package, as in
+            `trilat-net[extra]`.
+        purpose: The features that need the package, in the plural, for the error.
+
+    Returns:
+        The module.
 
     Raises:
-        UsageError: the package is not installed.
+        UsageError: The package is not installed. The message has the command that installs it.
     """
     try:
         return import_module(module)
@@ -71,24 +76,27 @@ def import_extra(module: str, extra: str, purpose: str) -> Any:
 
 
 def format_extra_install(extra: str) -> str:
-    """Returns the command that installs an extra in the environment of this program.
+    """Returns the shell command that installs an extra in the environment of this program.
 
-    - In the `.venv` of a clone, the command is a target of the clone's Makefile, which installs
-      locked versions.
-    - In another environment that uses a clone, the command is pip with the clone.
-    - Anywhere else, the command is pip with the distribution.
+    - In the `.venv` of a clone of the repository, the command is a target of the clone's
+      Makefile, which installs locked versions.
+    - In another environment that uses a clone, the command is pip with the path of the clone.
+    - Anywhere else, the command is pip with the name of the distribution.
     """
     clone = Path(__file__).resolve().parents[1]
     if not all((clone / name).is_file() for name in ("Makefile", "pyproject.toml")):
         return f"pip install 'trilat-net[{extra}]'"
     if Path(sys.prefix).resolve() != clone / ".venv":
         return shlex.join([sys.executable, "-m", "pip", "install", "-e", f"{clone}[{extra}]"])
-    elsewhere = [] if Path.cwd() == clone else ["-C", str(clone)]
-    return shlex.join(["make", *elsewhere, "extras", f"EXTRAS={extra}"])
+    change_folder = [] if Path.cwd() == clone else ["-C", str(clone)]
+    return shlex.join(["make", *change_folder, "extras", f"EXTRAS={extra}"])
 
 
 def find_version() -> str:
-    """Returns the version of this program, from either of its distributions."""
+    """Returns the version of this program, or "unknown" if it is not installed.
+
+    The program may be installed as the distribution trilat-net or trilat-net-core.
+    """
     for name in ("trilat-net-core", "trilat-net"):
         with suppress(metadata.PackageNotFoundError):
             return metadata.version(name)
@@ -96,7 +104,14 @@ def find_version() -> str:
 
 
 def find_page(name: str) -> Path:
-    """Returns the path of a documentation page, beside the sources or as installed."""
+    """Returns the path of a documentation page.
+
+    In a clone of the repository the page is in its folder docs. Otherwise it is where the
+    installation put it.
+
+    Args:
+        name: File name of the page, as in "json.md".
+    """
     beside_sources = Path(__file__).parents[1] / "docs" / name
     if beside_sources.is_file():
         return beside_sources
@@ -104,16 +119,16 @@ def find_page(name: str) -> Path:
 
 
 def open_regular(path: Path, **options: Any) -> Any:
-    """Opens a regular file for reading, as text if `encoding` is among the options.
+    """Opens a regular file for reading, as text if the options have `encoding`.
 
     Pipes and devices are refused because they may have no end.
 
     Args:
-        path: the file.
-        options: further arguments of `open`.
+        path: The file.
+        options: Further arguments of `open`.
 
     Raises:
-        OSError: the path is a pipe or a device, or cannot be opened.
+        OSError: The path is a pipe or a device, or cannot be opened.
     """
     mode = "r" if "encoding" in options else "rb"
     # Without this flag, opening a pipe that has no writer would block.
@@ -136,35 +151,44 @@ _OTHER_KINDS = {
     b"%PDF": "a PDF document",
     b"SQLite": "an SQLite database",
 }
-"""Kinds of files by their first bytes."""
+"""Kinds of files that are not text, by their first bytes."""
 _ZIPPED_KINDS = {
     b"xl/workbook": "a spreadsheet (.xlsx)",
     b"opendocument.spreadsheet": "a spreadsheet (.ods)",
     b"Index/Tables": "a spreadsheet (.numbers)",
     b"word/document": "a text document (.docx)",
 }
-"""Kinds of ZIP archives by a text that they contain uncompressed."""
+"""Kinds of documents in ZIP archives, by a text that the archive contains uncompressed."""
 
 
 def decode_text(raw: bytes, *, any_code_page: bool = False) -> str:
-    """Returns the text of a file in UTF-8, or in UTF-16 as Windows PowerShell writes it.
+    """Decodes the content of a text file.
+
+    The encoding is UTF-8, or UTF-16 as Windows PowerShell writes it.
 
     Args:
-        raw: the content of the file.
-        any_code_page: True: texts in another encoding are decoded as Latin-1, since programs
-            on Windows print in the code page of their country. Letters beyond ASCII may be
-            wrong then.
+        raw: Content of the file.
+        any_code_page: True to decode a text in another encoding as Latin-1, because programs on
+            Windows print in the code page of their country. Letters beyond ASCII may then be
+            wrong.
+
+    Returns:
+        The text, without a byte order mark.
 
     Raises:
-        ValueError: the content is not text; the message names a spreadsheet as a spreadsheet.
+        ValueError: The content is not text. The message names the kind of file, for example a
+            spreadsheet.
     """
-    if raw[:4] == b"PK\x03\x04":
+    is_zip_archive = raw[:4] == b"PK\x03\x04"
+    if is_zip_archive:
         kinds = [kind for mark, kind in _ZIPPED_KINDS.items() if mark in raw]
         raise ValueError(_describe_kind(kinds[0] if kinds else "a ZIP archive"))
     for mark, kind in _OTHER_KINDS.items():
         if raw.startswith(mark):
             raise ValueError(_describe_kind(kind))
-    if raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
+
+    has_utf16_mark = raw[:2] in (b"\xff\xfe", b"\xfe\xff")
+    if has_utf16_mark:
         return raw.decode("utf-16")
     # UTF-16 without a byte order mark: each pair of bytes of ASCII text has one zero.
     if raw[:2].count(0) == 1:
@@ -180,21 +204,28 @@ def decode_text(raw: bytes, *, any_code_page: bool = False) -> str:
 
 
 def _describe_kind(kind: str) -> str:
-    """Returns the problem of a file that is not text, with advice."""
+    """Returns the problem of a file that is not text, and what the user can do about it.
+
+    Args:
+        kind: The kind of file, with its article, as in "a PDF document".
+    """
     advice = "save its sheet as CSV" if "spreadsheet" in kind else "a text file is needed"
     return f"is {kind}, not text: {advice}"
 
 
 @contextmanager
 def reading(path: Path, kind: type[TrilatError] = LogError) -> Iterator[BinaryIO]:
-    """Opens a regular file for reading as a context.
+    """Opens a regular file for reading, as a context manager.
 
     Args:
-        path: the file.
-        kind: the error class.
+        path: The file.
+        kind: Class of the error to raise.
+
+    Yields:
+        The open file, in binary mode.
 
     Raises:
-        TrilatError: of class `kind`, if the file cannot be read.
+        TrilatError: The file cannot be read. The error is of the class `kind`.
     """
     try:
         with open_regular(path) as stream:
@@ -204,13 +235,13 @@ def reading(path: Path, kind: type[TrilatError] = LogError) -> Iterator[BinaryIO
 
 
 def digest_file(path: Path) -> str:
-    """Returns the SHA-256 of a file's content, in hexadecimal."""
+    """Returns the SHA-256 digest of a file's content, in hexadecimal."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def read_foreign_permissions(path: Path) -> int:
-    """Returns the permission bits of a file for its group and others.
+    """Returns the permission bits that a file grants to its group and to all other users.
 
     The result is 0 on Windows, which has access control lists instead.
     """
@@ -218,10 +249,11 @@ def read_foreign_permissions(path: Path) -> int:
 
 
 def make_folder(folder: Path) -> Path:
-    """Makes a folder and its parents, and returns the folder.
+    """Makes a folder and its parents unless they exist, and returns the folder.
 
     Raises:
-        UsageError: the folder cannot be made.
+        UsageError: The folder cannot be made.
+        LogRefused: The disk is full.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -233,14 +265,14 @@ def make_folder(folder: Path) -> Path:
 
 
 SYSTEM_FOLDERS = ("/dev", "/dev/fd", "/proc/self/fd")
-"""Folders in which the system itself has symbolic links, for instance /dev/stdout."""
+"""Folders in which the system itself makes symbolic links, for example /dev/stdout."""
 
 
 def refuse_link(path: Path) -> None:
-    """Refuses a symbolic link in place of an output.
+    """Refuses an output path that is a symbolic link.
 
     Raises:
-        UsageError: the path is a symbolic link outside of `SYSTEM_FOLDERS`.
+        UsageError: The path is a symbolic link outside of `SYSTEM_FOLDERS`.
     """
     if path.is_symlink() and path.parent.as_posix() not in SYSTEM_FOLDERS:
         problem = "is a symbolic link, and no output is written through one"
@@ -251,18 +283,18 @@ def make_subfolder(folder: Path) -> Path:
     """Makes a folder within an output folder unless it exists, and returns the folder.
 
     Raises:
-        UsageError: the path is a symbolic link, or the folder cannot be made.
+        UsageError: The path is a symbolic link, or the folder cannot be made.
     """
     refuse_link(folder)
     return make_folder(folder)
 
 
 def create_file(path: Path) -> BinaryIO:
-    """Returns a new unbuffered file, after removing an earlier file of that name.
+    """Creates a file for writing without a buffer. An earlier file of that name is deleted.
 
     Raises:
-        UsageError: the path is a symbolic link.
-        OSError: the file cannot be made.
+        UsageError: The path is a symbolic link.
+        OSError: The file cannot be made.
     """
     refuse_link(path)
     path.unlink(missing_ok=True)
@@ -270,14 +302,14 @@ def create_file(path: Path) -> BinaryIO:
 
 
 def extend_file(path: Path) -> BinaryIO:
-    """Returns an unbuffered file for appending, which is created if necessary.
+    """Opens a file for appending without a buffer, and creates it if it does not exist.
 
     Raises:
-        UsageError: the path is a symbolic link.
-        OSError: the file cannot be opened.
+        UsageError: The path is a symbolic link.
+        OSError: The file cannot be opened.
     """
     refuse_link(path)
-    # Windows does not have this flag.
+    # A link that appears after the check is refused by this flag, which Windows lacks.
     no_follow = getattr(os, "O_NOFOLLOW", 0)
 
     def open_without_following(name: str, flags: int) -> int:
@@ -287,15 +319,19 @@ def extend_file(path: Path) -> BinaryIO:
 
 
 def make_results_folder(folder: Path | None, name: str, *, force: bool | None) -> Path:
-    """Makes and returns a folder for results.
+    """Makes a folder for results.
 
     Args:
-        folder: the folder; None chooses the next free `runs/NAME-N`.
-        name: NAME.
-        force: whether the folder may have content; None if the command has no option for it.
+        folder: The folder. None uses the next free folder `runs/NAME-N`.
+        name: NAME of that folder.
+        force: True if the folder may have content. None, like False, refuses content, but the
+            error does not advise --force because the command lacks that option.
+
+    Returns:
+        The folder.
 
     Raises:
-        UsageError: the folder has content and `force` is not set, or it cannot be made.
+        UsageError: The folder has content and `force` is not set, or cannot be made.
     """
     if folder is None:
         return _make_next_folder(name)
@@ -310,7 +346,10 @@ def make_results_folder(folder: Path | None, name: str, *, force: bool | None) -
 
 
 def _make_next_folder(name: str) -> Path:
-    """Makes and returns the next free `runs/NAME-N`; no other process gets the same folder."""
+    """Makes the next free folder `runs/NAME-N`, and returns it.
+
+    No other process gets the same folder, because making an existing folder fails.
+    """
     for n in itertools.count(1):
         folder = Path("runs") / f"{name}-{n:03d}"
         try:
@@ -320,32 +359,38 @@ def _make_next_folder(name: str) -> Path:
         except OSError as error:
             raise describe_write_error(folder, error) from None
         return folder
-    raise AssertionError("there are endless numbers")
+    raise AssertionError("the loop over all numbers does not end")
 
 
 def refuse_existing(
     path: Path, *, force: bool, unfinished: Path | None = None, manifest: str | None = None
 ) -> None:
-    """Refuses an output whose name is taken.
+    """Refuses an output path at which something exists already.
+
+    An empty folder is accepted as the place of an output folder. With `force`, an earlier
+    output of the same kind is accepted too, but never another kind of file or folder.
 
     Args:
-        path: the output.
-        force: whether an earlier output of the same kind may be replaced.
-        unfinished: name of the output while it is written, which must also be free.
-        manifest: file that marks a folder as an earlier output; None if the output is a file.
+        path: Path of the output, which is a file or a folder.
+        force: True if an earlier output of the same kind may be replaced.
+        unfinished: Path of the output while it is being written. It must be free as well. None
+            if the output has no such path.
+        manifest: Name of a file that every output folder of this kind contains, so that it is
+            recognised as an earlier output. None if the output is a file.
 
     Raises:
-        UsageError: the name is taken, or is that of a symbolic link.
+        UsageError: Something exists at the path, or the path is a symbolic link.
     """
     refuse_link(path)
     is_empty_folder = manifest and path.is_dir() and not any(path.iterdir())
     if os.path.lexists(path) and not is_empty_folder:
-        is_replaceable = (path / manifest).is_file() if manifest else path.is_file()
-        if not is_replaceable:
+        is_same_kind = (path / manifest).is_file() if manifest else path.is_file()
+        if not is_same_kind:
             kind = "folder that was exported" if manifest else "file"
             raise UsageError(f"{path}: exists, and is no {kind}; choose another name")
         if not force:
             raise UsageError(f"{path}: exists; choose another name, or replace it with --force")
+
     if unfinished is not None and unfinished.exists() and not force:
         raise UsageError(
             f"{unfinished}: exists: it is being written, or was never finished; make it whole "
@@ -355,10 +400,15 @@ def refuse_existing(
 
 
 def publish_file(unfinished: Path, path: Path, *, force: bool) -> None:
-    """Gives a complete file its name; without `force` an existing file is not replaced.
+    """Gives a complete file its final name.
+
+    Args:
+        unfinished: Path of the complete file, in the same folder.
+        path: The final path.
+        force: True to replace an existing file.
 
     Raises:
-        UsageError: the name is taken.
+        UsageError: Another program has meanwhile created a file at the path.
     """
     if force:
         unfinished.replace(path)
@@ -381,19 +431,20 @@ def write_whole(
 ) -> None:
     """Writes a file so that it exists completely or not at all.
 
-    A device or a pipe is written directly. A symbolic link is refused; a link that appears
-    meanwhile is replaced, not followed.
+    The data is written to a temporary file beside it, which then replaces it. A device or a
+    pipe is written directly. A symbolic link is refused. A link that appears later is replaced,
+    and its target is not changed.
 
     Args:
-        path: the file.
-        data: its content; text is encoded as UTF-8.
-        force: whether it may replace a file.
-        remedy: advice in the error of a full disk.
-        mode: permissions of a new file, before the umask.
+        path: The file.
+        data: Its content. Text is encoded as UTF-8.
+        force: True if an existing file may be replaced.
+        remedy: Advice in the error of a full disk.
+        mode: Permissions of a new file, before the umask.
 
     Raises:
-        UsageError: the file exists, is a symbolic link, or cannot be made.
-        LogRefused: the disk refused the data.
+        UsageError: The file exists, is a symbolic link, or cannot be made.
+        LogRefused: The disk refused the data.
     """
     content = data.encode() if isinstance(data, str) else data
     refuse_link(path)
@@ -421,16 +472,20 @@ def write_whole(
 
 @contextmanager
 def stage_output(path: Path, *, force: bool, manifest: str | None = None) -> Iterator[Path]:
-    """Yields a scratch path, which gets the output's name if the block succeeds.
+    """Yields a temporary path, which gets the name of the output if the block succeeds.
+
+    If the block raises an exception, nothing is left of the output, and an earlier output
+    stays.
 
     Args:
-        path: the output.
-        force: whether an earlier output of the same kind may be replaced.
-        manifest: see `refuse_existing`; with a manifest the scratch path is a folder.
+        path: The output, which is a file or a folder.
+        force: True if an earlier output of the same kind may be replaced.
+        manifest: Name of a file that marks an earlier output folder, see `refuse_existing`. If
+            it is set, the temporary path is a folder. None if the output is a file.
 
     Raises:
-        UsageError: the name is taken, or the path is not writable.
-        LogRefused: the disk refused the data.
+        UsageError: The name is taken, or the path is not writable.
+        LogRefused: The disk refused the data.
     """
     refuse_existing(path, force=force, manifest=manifest)
     remedy = "nothing is left of it. Make room, or take another disk"
@@ -443,7 +498,9 @@ def stage_output(path: Path, *, force: bool, manifest: str | None = None) -> Ite
         if manifest:
             staged.mkdir()
         yield staged
+
         if manifest and path.is_dir():
+            # A folder cannot replace a folder: the earlier one is deleted with the scratch.
             path.rename(scratch / "before")
         staged.replace(path)
     except OSError as error:
@@ -453,7 +510,10 @@ def stage_output(path: Path, *, force: bool, manifest: str | None = None) -> Ite
 
 
 def sync_folder(folder: Path) -> None:
-    """Writes a folder's directory entries to the disk, if the platform supports it."""
+    """Writes the entries of a folder to the disk, so that its files survive a loss of power.
+
+    Nothing happens on platforms that do not support this.
+    """
     with suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)
         try:
@@ -465,12 +525,16 @@ def sync_folder(folder: Path) -> None:
 def describe_write_error(
     path: Path, error: OSError, remedy: str = ""
 ) -> LogRefused | UsageError:
-    """Returns the error of a failed write.
+    """Returns the error of a failed write, for the caller to raise.
 
     Args:
-        path: the file.
-        error: the error of the system.
-        remedy: advice that is added if the disk refused the data (`LogRefused`).
+        path: The file.
+        error: The error of the system.
+        remedy: Advice that is added if the disk refused the data.
+
+    Returns:
+        LogRefused if the disk refused the data, for example because it is full. Otherwise
+        UsageError.
     """
     text = f"{path}: cannot be written: {error.strerror or error}"
     if error.errno in DISK_ERRNOS:

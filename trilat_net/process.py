@@ -1,11 +1,13 @@
-"""Process control: garbage collection, ending signals, shell commands, worker processes.
+"""Controls this process: garbage collection, signals, priority, and worker processes.
 
 Invariant:
-    - Garbage collection pauses only around code whose many objects form no cycles (records,
-      lists of numbers).
-    - A signal does not end the program by itself: a loop polls it and ends in order.
-    - Worker processes leave Ctrl-C to the process that started them. They end when that process
-      ends or fails.
+    - Garbage collection pauses only around code that creates many objects without reference
+      cycles, such as records and lists of numbers. Collecting them would cost time and free
+      nothing.
+    - Ctrl-C or another ending signal does not end the program by itself. A loop polls for the
+      signal, and then ends in an orderly way.
+    - Worker processes ignore Ctrl-C, and leave it to the process that started them. They end
+      when that process ends or fails.
 """
 
 import gc
@@ -27,7 +29,7 @@ from typing import Any
 from .errors import TrilatError
 
 _PARENT_POLL_S = 0.5
-"""Period in which a worker checks that its parent process still exists, s."""
+"""Period in which a worker process checks that its parent process still exists, in s."""
 
 
 @contextmanager
@@ -43,27 +45,32 @@ def pause_gc() -> Iterator[None]:
 
 
 def freeze_gc() -> None:
-    """Collects once, and exempts all existing objects from later collections.
+    """Collects garbage once, and exempts all existing objects from later collections.
 
-    A full collection of all objects that a program has imported takes a quarter of a second.
+    Without this, each full collection traverses all objects of the imported modules, which
+    takes a quarter of a second.
     """
     gc.collect()
     gc.freeze()
 
 
 def disable_gc() -> None:
-    """Exempts all existing objects and stops the collector, for a loop that must not pause."""
+    """Stops the garbage collector for the rest of a process whose loop must not pause.
+
+    Garbage is collected once before.
+    """
     freeze_gc()
     gc.disable()
 
 
 class LinePrinter:
-    """A context that prints lines in a separate thread, so that a loop never waits for it.
+    """Prints lines in a separate thread, so that a control loop never waits for the terminal.
 
-    Up to 256 lines wait to be printed; further lines are lost.
+    It is used as a context manager. Up to 256 lines wait to be printed, and further lines are
+    lost.
 
     Args:
-        print_line: prints a line.
+        print_line: Function that prints a line.
     """
 
     def __init__(self, print_line: Callable[[str], None]) -> None:
@@ -81,11 +88,15 @@ class LinePrinter:
         self._thread.join(1.0)
 
     def put(self, text: str) -> None:
-        """Adds a line to the lines that wait to be printed."""
+        """Adds a line to the lines that wait to be printed.
+
+        The line is lost if too many wait.
+        """
         with suppress(queue.Full):
             self._lines.put_nowait(text)
 
     def _print_lines(self) -> None:
+        """Prints the waiting lines until None arrives, in the thread of the printer."""
         while (text := self._lines.get()) is not None:
             with suppress(OSError):
                 self._print_line(text)
@@ -95,23 +106,29 @@ class LinePrinter:
 _HANG_UP = getattr(signal, "SIGHUP", getattr(signal, "SIGBREAK", None))
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, _HANG_UP)
 ENDING_SIGNALS = tuple(number for number in _SIGNALS if number is not None)
-"""Signals that end a program in order."""
+"""Signals that request the end of the program, such as that of Ctrl-C."""
 _SAME_REQUEST_S = 0.2
-"""Signals within this time count as one request, since a terminal and a parent process may both
-deliver it.
+"""Signals within this time, in s, count as one request.
+
+A terminal and a parent process may both deliver the same signal.
 """
 
 
 class Interrupt:
-    """A context that records the first signal that ends a program, as `number`, else 0.
+    """Records signals that request the end of the program, as a context manager.
 
-    The first signal requests an orderly end, which may take seconds; a second signal requests
-    the end at once (`is_repeated`). A process that ignores the end of its terminal (`nohup`)
-    continues to ignore it.
+    The first signal requests an orderly end, which may take seconds. A second signal requests
+    the end at once, see `is_repeated`. A process that ignores the closing of its terminal, as
+    under `nohup`, continues to ignore it.
 
     Args:
         compiles: True if a signal may end the process at once while the compiler runs, because
-            nothing else has to be ended in order.
+            the process then has nothing else to finish.
+
+    Attributes:
+        number: Number of the first signal. 0 if no signal has arrived.
+        compiles: The argument.
+        raises: True inside `raising`, where a signal raises KeyboardInterrupt.
     """
 
     def __init__(self, *, compiles: bool = False) -> None:
@@ -137,11 +154,13 @@ class Interrupt:
     ) -> None:
         for number, handler in self._before.items():
             signal.signal(number, handler)
+        # An enclosing `Interrupt` learns of the signal that ends this block.
         outer = getattr(self._before.get(signal.SIGINT), "__self__", None)
         if kind is KeyboardInterrupt and isinstance(outer, Interrupt):
             outer.number = outer.number or self.number
 
     def _handle(self, number: int, _frame: FrameType | None) -> None:
+        """Records a signal, and raises KeyboardInterrupt inside `raising`."""
         self.number = self.number or number
         # A terminal that closes and its shell send one SIGHUP each: these are not repetitions.
         if number != _HANG_UP:
@@ -155,10 +174,10 @@ class Interrupt:
 
     @contextmanager
     def raising(self) -> Iterator[None]:
-        """Raises KeyboardInterrupt in the block at a signal, for long work that does not poll.
+        """Makes a signal raise KeyboardInterrupt in the block, for work that does not poll.
 
-        Python ignores an exception that is raised inside a `__del__`; then the block is left at
-        its end.
+        If the signal arrives while Python runs a `__del__`, Python discards the exception. In
+        this case it is raised again at the end of the block.
         """
         self.raises = True
         try:
@@ -169,36 +188,43 @@ class Interrupt:
             raise KeyboardInterrupt
 
     def is_requested(self) -> bool:
-        """True once a signal has arrived."""
+        """Returns True once a signal has requested the end of the program."""
         return self.number != 0
 
     def is_repeated(self) -> bool:
-        """True once a second SIGINT or SIGTERM has arrived that is not a copy of the first."""
+        """Returns True once a second signal has arrived that is not a copy of the first.
+
+        Only SIGINT (Ctrl-C) and SIGTERM count.
+        """
         return self._is_repeated
 
     @property
     def exit_code(self) -> int:
-        """Exit code of a process that the signal has ended, by the shell's convention."""
+        """Exit code of a process that the signal ended: 128 + number, as in shells."""
         return 128 + self.number
 
 
 def end_process_at_signals() -> Callable[[], None]:
-    """Makes signals end the process at once, where they may interrupt its work.
+    """Makes signals end this process at once, if the current `Interrupt` allows it.
 
-    Python handles a signal between two of its instructions, but one call of a compiler takes
-    minutes. The default action of a signal does not end the first process of a container: there
-    a thread ends the process.
+    Python handles a signal only between two of its instructions. A single call of the compiler
+    may take minutes, during which Ctrl-C would have no effect. Therefore the default action of
+    the operating system is restored, which ends the process. The first process of a container
+    (PID 1) has no default action, so a thread ends the process there.
 
     Returns:
-        A function that restores the handlers.
+        A function that restores the handlers of the signals.
     """
     if threading.current_thread() is not threading.main_thread():
+        # Python permits only the main thread to change handlers.
         return lambda: None
+
     replaced = {}
     for number in ENDING_SIGNALS:
         handler = signal.getsignal(number)
         if _may_interrupt(getattr(handler, "__self__", None)):
             replaced[number] = handler
+
     is_first_process = bool(replaced) and os.getpid() == 1
     for number in replaced:
         signal.signal(number, _exit_by_signal if is_first_process else signal.SIG_DFL)
@@ -213,11 +239,16 @@ def end_process_at_signals() -> Callable[[], None]:
 
 
 def _exit_by_signal(number: int, _frame: FrameType | None) -> None:
+    """Ends the process at once with the exit code of a signal."""
     os._exit(128 + number)
 
 
 def _watch_signals() -> Callable[[], None]:
-    """Starts a thread that ends the process at a signal.
+    """Starts a thread that ends the process as soon as an ending signal arrives.
+
+    The part of Python that runs outside of its instructions writes the number of each signal
+    into a pipe (`signal.set_wakeup_fd`). The thread reads the pipe, and therefore works even
+    while the main thread is inside the compiler.
 
     Returns:
         A function that stops the thread.
@@ -243,12 +274,20 @@ def _watch_signals() -> Callable[[], None]:
 
 
 def _may_interrupt(owner: object) -> bool:
-    """True if the owner of a signal's handler allows the signal to interrupt its work."""
+    """Returns True if the owner of a signal's handler allows the signal to interrupt its work.
+
+    Args:
+        owner: Object whose method handles the signal. None if the handler is a plain function.
+    """
     return isinstance(owner, Interrupt) and (owner.raises or owner.compiles)
 
 
 def join_arguments(arguments: Iterable[str]) -> str:
-    """Returns a command as it is typed into a shell of this system."""
+    """Returns a command as a user would type it into a shell of this operating system.
+
+    Args:
+        arguments: Name of the program and its arguments.
+    """
     if os.name != "nt":
         return shlex.join(arguments)
     # Both cmd and PowerShell accept this form.
@@ -261,14 +300,15 @@ def join_arguments(arguments: Iterable[str]) -> str:
 
 
 def raise_priority(nice: int) -> bool:
-    """Raises the priority of this process's threads, except the main thread, if permitted.
+    """Raises the priority of all threads of this process except the main thread, if permitted.
 
     The main thread is excluded because the processes that it starts would inherit the priority.
-    On Linux each thread has its own nice value. On other systems, and without the privilege,
-    nothing changes.
+    If it is the calling thread, its priority is raised too. Only Linux has a nice value for
+    each thread. On other systems, and without the privilege, nothing changes.
 
     Args:
-        nice: below 0 for a priority above normal; -20 is the highest.
+        nice: The nice value. Values below 0 are above the normal priority, and -20 is the
+            highest.
 
     Returns:
         True if the calling thread got the priority.
@@ -276,11 +316,12 @@ def raise_priority(nice: int) -> bool:
     tasks = Path("/proc/self/task")
     if not (sys.platform.startswith("linux") and tasks.is_dir()):
         return False
-    calling = threading.get_native_id()
+    calling_thread = threading.get_native_id()
+    main_thread = os.getpid()  # on Linux the main thread has the number of the process
     all_threads = [int(entry.name) for entry in tasks.iterdir()]
-    others = [thread for thread in all_threads if thread not in (calling, os.getpid())]
+    others = [thread for thread in all_threads if thread not in (calling_thread, main_thread)]
     try:
-        for thread in (calling, *others):
+        for thread in (calling_thread, *others):
             with suppress(ProcessLookupError):  # the thread has ended meanwhile
                 os.setpriority(os.PRIO_PROCESS, thread, nice)
     except OSError:
@@ -297,11 +338,14 @@ def count_cores() -> int:
 
 @contextmanager
 def worker_pool(count: int) -> Iterator[Executor]:
-    """Yields an executor with worker processes, which all have ended when the block ends.
+    """Yields an executor with worker processes, which have all ended when the block ends.
 
-    The processes are started, not forked, so threads and compiled code are safe, and they do
-    not import the caller's script. An exception in the block, Ctrl-C included, kills them in
-    the middle of their work.
+    The processes are started anew, not forked, so that threads and compiled code are safe. They
+    do not import the script of the caller. If the block raises an exception, for example
+    because of Ctrl-C, they are killed in the middle of their work.
+
+    Args:
+        count: Number of processes.
     """
     from loky import ProcessPoolExecutor
 
@@ -325,9 +369,9 @@ def worker_pool(count: int) -> Iterator[Executor]:
 def hold_sigint() -> Iterator[None]:
     """Delays Ctrl-C until the end of the block, and hides it from processes started there.
 
-    The signal mask serves the started processes. It does not delay signals that another thread
-    of this process receives, whose handler Python runs in the main thread. Therefore the
-    handler is replaced as well.
+    The signal mask is inherited by the started processes, which is its purpose. It does not
+    delay Ctrl-C in this process if another thread receives the signal, because Python runs the
+    handler in the main thread anyway. Therefore the handler is replaced as well.
     """
     if sys.platform == "win32" or threading.current_thread() is not threading.main_thread():
         yield
@@ -345,14 +389,24 @@ def hold_sigint() -> Iterator[None]:
 
 
 def _prepare_worker(parent: int, in_command: bool) -> None:
-    """Prepares a worker: it ignores Ctrl-C, and ends after its parent process."""
+    """Prepares a worker process: it ignores Ctrl-C, and ends after its parent process.
+
+    Args:
+        parent: Process number of the parent.
+        in_command: True if the parent runs a command of `trilat`, which changes the wording of
+            errors (`TrilatError.in_command`).
+    """
     TrilatError.in_command = in_command
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_exit_after, args=(parent,), daemon=True).start()
 
 
 def _exit_after(parent: int) -> None:
-    """Ends this process as soon as its parent process has ended."""
+    """Waits until the parent process has ended, and then ends this process.
+
+    Args:
+        parent: Process number of the parent.
+    """
     from multiprocessing import connection, parent_process
 
     sentinel = getattr(parent_process(), "sentinel", None)
