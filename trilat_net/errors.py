@@ -1,13 +1,14 @@
-"""The error classes, and helpers for the wording of messages.
+"""The error classes of the program, and helpers for the wording of messages.
 
-The classes distinguish who has to act: the author of a scenario, the caller, a peer, the owner
-of a file, or the developers.
+The classes distinguish who has to act: the author of a scenario, the caller of a function, the
+operator of another machine, the owner of a file, or the developers of this program.
 
 Invariant:
-    - An error carries its data and one sentence that names the problem, its location and the
+    - An error contains its data and one sentence that names the problem, its location and the
       remedy. The command line prints that sentence and nothing else.
-    - `exit_code` is the exit code of a command that the error ends.
-    - Messages name options of the command line. In Python, they name the arguments instead.
+    - `exit_code` is the exit code of a command that ends with the error.
+    - Messages are written for the command line, and name its options. Outside of a command,
+      the same messages name the arguments of the Python functions instead.
     - Each text that counts things uses `count_nouns`, as in "1 record" and "2 records"
       (`tests/test_wording.py`).
 """
@@ -32,11 +33,18 @@ _ARGUMENTS = {
     "--gravity": "gravity_percent",
     "--at": "at_s",
 }
-"""Arguments in Python whose names differ from their options."""
+"""Python arguments whose names cannot be derived from the names of their options."""
 
 
 def _name_argument(match: re.Match[str]) -> str:
-    """Returns an option as a Python argument; a whole command is not changed."""
+    """Returns the Python argument that corresponds to an option in a message.
+
+    For example, "--min-coverage 0.9" becomes "min_coverage=0.9", and "--force" becomes
+    "force=True". A whole command such as "trilat log recover run.mcap" is not changed.
+
+    Args:
+        match: A match of `_OPTION`.
+    """
     command, option, value = match.groups()
     if command:
         return str(command)
@@ -46,11 +54,14 @@ def _name_argument(match: re.Match[str]) -> str:
 
 
 class TrilatError(Exception):
-    """Base of all errors that a user can act on; a command ends with `exit_code`."""
+    """Base class of all errors that a user can act on.
+
+    A command that ends with the error has the exit code `exit_code`.
+    """
 
     exit_code = 1
     in_command: ClassVar[bool] = False
-    """True in a process that runs a command."""
+    """True in a process that runs a command, so that messages name options, not arguments."""
 
     def __str__(self) -> str:
         # KeyError.__str__ would quote the text.
@@ -59,7 +70,7 @@ class TrilatError(Exception):
 
 
 class UnknownName(TrilatError, KeyError):  # noqa: N818 - it names an outcome
-    """A name that a mapping of results lacks, for instance a site that is not in a log."""
+    """A name that results do not contain, for example a site that is not in a log."""
 
     exit_code = 2
 
@@ -68,9 +79,10 @@ class ScenarioError(TrilatError):
     """An invalid scenario, override or argument, which its author must correct.
 
     Args:
-        problem: the problem and its remedy.
-        path: the dotted key, or "".
-        source: the file or the name of the scenario, or "".
+        problem: The problem and its remedy.
+        path: Dotted path of the wrong key, as in "sites.m1.control.Kd". Empty if no single key
+            is wrong.
+        source: File or name of the scenario. Empty if it is unknown.
     """
 
     exit_code = 2
@@ -83,23 +95,29 @@ class ScenarioError(TrilatError):
 
 
 class CodeWithheld(ScenarioError):  # noqa: N818 - it names an outcome
-    """A law, hand or plant that a log names, but that has not been allowed to run here."""
+    """A user's code that a log names, but that has not been allowed to run on this machine.
+
+    The code is a control law, an operator or a plant.
+    """
 
     exit_code = 4
 
 
 class UsageError(TrilatError):
-    """Arguments that contradict each other or the machine (a busy port, an existing file)."""
+    """Arguments that contradict each other, or that cannot work on this machine.
+
+    Examples are a port that is in use and an output file that exists already.
+    """
 
     exit_code = 2
 
 
 class WireError(TrilatError):
-    """A payload from a peer that is not a message of this program.
+    """A payload from another machine that is not a message of this program.
 
     Args:
-        reason: the category under which such payloads are counted.
-        detail: the problem of this payload.
+        reason: Category under which such payloads are counted.
+        detail: The problem of this payload.
     """
 
     def __init__(self, reason: str, detail: str) -> None:
@@ -108,7 +126,10 @@ class WireError(TrilatError):
 
 
 class SessionError(TrilatError):
-    """A session that cannot start: a missing peer, another scenario, or a running session."""
+    """A session that cannot start.
+
+    For example, a site is missing or has another scenario, or the session is running already.
+    """
 
     exit_code = 2
 
@@ -120,27 +141,33 @@ class LogError(TrilatError):
 
 
 class LogRefused(LogError):  # noqa: N818 - it names an outcome
-    """A log that the machine cannot continue, as on a full disk; earlier records are kept."""
+    """A log that this machine cannot write any further, for example because the disk is full.
+
+    Records that were written before are kept.
+    """
 
     exit_code = 5
 
 
 class NotRepeatable(LogError):  # noqa: N818 - it names an outcome
-    """A run that cannot be executed again from its log; the message says why."""
+    """A run that cannot be executed again from its log. The message gives the reason."""
 
 
 class NothingSaved(LogError):  # noqa: N818 - it names an outcome
-    """A file without anything that could be recovered."""
+    """A damaged file from which nothing could be recovered."""
 
     exit_code = 1
 
 
 class RunFailed(TrilatError):  # noqa: N818 - it names an outcome, as the exit summary does
-    """A run or a comparison that failed: divergence, a dead site, records that differ."""
+    """A run or a comparison that failed.
+
+    For example, an arm diverged, a site died, or records differ that should be equal.
+    """
 
 
 class PeerLeft(RunFailed):
-    """A run that another site left before the end, without rejoining."""
+    """A run that another site left before the end, without joining again."""
 
     exit_code = 3
 
@@ -149,10 +176,11 @@ class CodeFailed(RunFailed):
     """A user's code that raised an exception, was too slow, or returned unusable results.
 
     Args:
-        problem: the failure.
-        site: the site of the code.
-        code: the class, as in "package.module:Law".
-        tick: the tick of the failure; None if the code failed while it was resumed.
+        problem: The failure.
+        site: Name of the site that ran the code.
+        code: The class, as in "package.module:Law".
+        tick: Tick (period of the control loop) in which the code failed. None if the code
+            failed while it was resumed, before a tick.
     """
 
     kind: ClassVar[str] = "code"
@@ -166,25 +194,31 @@ class CodeFailed(RunFailed):
         self.tick = tick
 
     def __reduce__(self) -> tuple[object, ...]:
-        """Returns how to rebuild the error in another process."""
+        """Returns what pickle needs to rebuild the error in another process."""
         rebuild = partial(type(self), site=self.site, code=self.code, tick=self.tick)
         return rebuild, (self.problem,)
 
 
 class LawFailed(CodeFailed):
-    """A user's control law that failed."""
+    """A user's control law that failed.
+
+    It raised an exception, was too slow, or returned unusable results.
+    """
 
     kind = "law"
 
 
 class PlantFailed(CodeFailed):
-    """A user's plant that failed."""
+    """A user's model of an arm (plant) that failed.
+
+    It raised an exception, was too slow, or returned unusable results.
+    """
 
     kind = "plant"
 
 
 class RuntimeFault(TrilatError):  # noqa: N818 - a fault of ours, by its name in docs/design.md
-    """A state that the program must never reach: a bug."""
+    """A state that the program must never reach, which is a bug of the program."""
 
 
 def count_nouns(count: object, singular: str, plural: str = "") -> str:
@@ -196,9 +230,9 @@ def count_nouns(count: object, singular: str, plural: str = "") -> str:
     '1 mark waits'
 
     Args:
-        count: the number, or its text, as in "1,000".
-        singular: the noun, possibly with words before it, as in "late sample".
-        plural: the noun for other numbers; by default `pluralise(singular)`.
+        count: The number, or its text, as in "1,000".
+        singular: The noun, possibly with words before it, as in "late sample".
+        plural: The noun for other numbers. By default `pluralise(singular)`.
     """
     if str(count) == "1":
         return f"{count} {singular}"

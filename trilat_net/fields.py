@@ -1,9 +1,14 @@
-"""The fields of a scenario's types: their base class, ranges of numbers, and checks of tables.
+"""Base class, number types and checks of the tables that a scenario consists of.
+
+A scenario is a TOML file that describes an experiment. Each of its tables becomes an object of
+a subclass of `Frozen`. Annotations such as `Positive` limit the range of a number. Annotations
+such as `Joints` say how many numbers a vector has, for example one per joint of the arm.
 
 Invariant:
-    - An error names the path of the key as the author wrote it, and the nearest valid name.
-    - No quantity of an arm, a gain or a torque exceeds `MAX_QUANTITY`, which keeps arithmetic
-      far from overflow.
+    - An error names the path of the key as the author of the scenario wrote it. For an unknown
+      name it suggests the most similar valid name.
+    - No quantity of an arm, no gain and no torque exceeds `MAX_QUANTITY`. Products of a few of
+      them are therefore far from overflow.
 """
 
 import difflib
@@ -23,36 +28,42 @@ from .errors import ScenarioError, count_nouns
 
 
 class Frozen(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Base of a scenario's types: immutable, and unknown keys are refused."""
+    """Base class of the types of a scenario.
+
+    Its objects are immutable. Unknown keys of a table are refused.
+    """
 
 
 K = TypeVar("K", bound=Frozen)
 
 
 def find_kinds(package: str, base: type[K]) -> Iterator[type[K]]:
-    """Yields the subclasses of `base` with a tag that the files of a package define.
+    """Yields the subclasses of a base class that the files of a package define.
 
-    They are ordered by file and by position in the file.
+    Each subclass is a kind that a scenario can select by the tag of the class, as in
+    `kind = "wall"`. Classes without a tag are only bases of others, and are left out. The order
+    is that of the files, and of the positions in each file.
 
     Args:
-        package: the dotted name of the package.
-        base: the base class.
+        package: Dotted name of the package.
+        base: The base class.
     """
     folders = import_module(package).__path__
     for file in pkgutil.iter_modules(folders):
         name = f"{package}.{file.name}"
         for value in vars(import_module(name)).values():
-            is_kind = isinstance(value, type) and issubclass(value, base)
-            if not is_kind or value.__module__ != name:
+            is_subclass = isinstance(value, type) and issubclass(value, base)
+            if not is_subclass or value.__module__ != name:
                 continue
             tag = value.__struct_config__.tag
-            # Without a tag of its own, a class is only a base of others.
+            # Without a tag of its own, a class is only a base of others. msgspec then uses
+            # the name of the class as its tag.
             if tag is not None and tag != value.__name__:
                 yield value
 
 
 MAX_QUANTITY = 1e9
-"""Largest absolute value of a scenario's quantities."""
+"""Largest absolute value of the quantities of a scenario."""
 
 Positive = Annotated[float, Meta(gt=0.0, le=MAX_QUANTITY)]
 NotNegative = Annotated[float, Meta(ge=0.0, le=MAX_QUANTITY)]
@@ -80,13 +91,14 @@ StructType = type[msgspec.Struct]
 
 
 class VectorCounts(NamedTuple):
-    """Counts of the numbers in the vectors of a site.
+    """How many numbers the vectors of a site have, which depends on its arm.
 
     Attributes:
-        joints: count of a vector with one number per joint.
-        parameters: count of a vector with one number per dynamic parameter.
-        axes: count of a vector with one number per axis of space.
-        shared: count of a vector with one number per coordinate that sites share.
+        joints: Length of a vector with one number per joint.
+        parameters: Length of a vector with one number per dynamic parameter of the arm.
+        axes: Length of a vector with one number per axis of space: 2 in a plane, otherwise 3.
+        shared: Length of a vector with one number per coordinate that the sites exchange, for
+            example per joint or per axis of the end effector.
     """
 
     joints: int = JOINTS
@@ -96,11 +108,12 @@ class VectorCounts(NamedTuple):
 
     @classmethod
     def of_chain(cls, joints: int, shared: int = 0) -> "VectorCounts":
-        """Returns the counts of a chain.
+        """Returns the counts of an arm that is a serial chain in space.
 
         Args:
-            joints: the number of its joints.
-            shared: the number of coordinates that sites share; by default that of the joints.
+            joints: Number of its joints.
+            shared: Number of coordinates that the sites exchange. 0 stands for the number of
+                joints.
         """
         return cls(
             joints=joints,
@@ -111,11 +124,11 @@ class VectorCounts(NamedTuple):
 
 
 class KeyProblem(NamedTuple):
-    """A key with an invalid value.
+    """A key of a table with an invalid value.
 
     Attributes:
-        key: the path of the key below the checked table; "" for the table itself.
-        problem: the problem.
+        key: Path of the key below the checked table. Empty for the table itself.
+        problem: The problem, as the end of a sentence about the key.
     """
 
     key: str
@@ -124,14 +137,15 @@ class KeyProblem(NamedTuple):
 
 @cache
 def _vector_keys(kind: StructType, extra: str) -> Mapping[str, str]:
-    """Returns the vector keys of a type, with the count that each vector has.
+    """Returns the keys of a type that are vectors, with the count that gives each its length.
 
     Args:
-        kind: the type.
-        extra: the annotation: "per" for vectors, "point" for points.
+        kind: The type.
+        extra: "per" for vectors that a single number may stand for. "point" for points in
+            space, which must be written in full.
 
     Returns:
-        Per key the name of a field of `VectorCounts`.
+        For each key the name of a field of `VectorCounts`.
     """
     counts = {}
     for key, hint in get_type_hints(kind, include_extras=True).items():
@@ -143,14 +157,19 @@ def _vector_keys(kind: StructType, extra: str) -> Mapping[str, str]:
 
 
 def expand_vectors(table: TomlTable, kind: StructType, counts: VectorCounts) -> TomlTable:
-    """Returns a table with single numbers and distributions expanded to vectors.
+    """Expands single numbers to vectors of the length that the arm needs.
 
-    A missing vector gets the default of its type, with the length that the arm needs.
+    For example, `Kd = 5` becomes one 5 per joint. The same holds for a distribution such as
+    `{ uniform = [1, 2] }`. A missing vector gets the default of its type, with the right
+    length.
 
     Args:
-        table: the table of a scenario.
-        kind: the type of the table.
-        counts: the counts of the site's vectors.
+        table: A table of a scenario.
+        kind: Type of the table.
+        counts: Lengths of the vectors of the site.
+
+    Returns:
+        The table with these vectors. Other keys are unchanged.
     """
     lengths = {key: getattr(counts, per) for key, per in _vector_keys(kind, "per").items()}
     expanded: TomlTable = {}
@@ -177,12 +196,22 @@ _OWNERS = {
 def find_count_problem(
     table: TomlTable, kind: StructType, counts: VectorCounts
 ) -> KeyProblem | None:
-    """Returns the first vector of a table that has too few or too many numbers, or None."""
+    """Finds the first vector of a table that has too few or too many numbers.
+
+    Args:
+        table: A table of a scenario.
+        kind: Type of the table.
+        counts: Lengths of the vectors of the site.
+
+    Returns:
+        The key and the problem. None if all lengths are right.
+    """
     vectors = {**_vector_keys(kind, "per"), **_vector_keys(kind, "point")}
     for key, per in vectors.items():
         required = getattr(counts, per)
         value = table.get(key)
         if not isinstance(value, list) or len(value) == required:
+            # Values of other types are refused elsewhere.
             continue
         noun = "coordinates" if per == "shared" else per
         numbers = count_nouns(len(value), "number")
@@ -191,23 +220,30 @@ def find_count_problem(
 
 
 def is_number(value: Any) -> TypeGuard[float]:
-    """True for a number in a scenario; true and false do not count as numbers."""
+    """Returns True for a number in a scenario. The values true and false are not numbers."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def is_distribution(value: Any) -> bool:
-    """True for a distribution in place of a number, as { uniform = [...] }."""
+    """Returns True for a distribution in place of a number, as { uniform = [1, 2] }."""
     return isinstance(value, dict) and not value.keys().isdisjoint(("normal", "uniform"))
 
 
 def split_refusal(error: msgspec.ValidationError) -> tuple[str, str]:
-    """Returns the problem of a refused value, and the path of its key below the whole value."""
+    """Splits the message of msgspec for a refused value.
+
+    Args:
+        error: The error, as in "Expected `float` - at `$.sites.m1`".
+
+    Returns:
+        The problem, and the path of the wrong key below the whole value.
+    """
     problem, _, path = str(error).partition(" - at ")
     return problem, path.strip("`$")
 
 
 def reword_problem(problem: str) -> str:
-    """Returns a validation message in the words of a scenario's author."""
+    """Rewords a message of msgspec for the author of a scenario, in terms of TOML."""
     replacements = (("`", ""), ("Expected ", "expected "), ("array", "list"), ("str", "text"))
     for old, new in replacements:
         problem = problem.replace(old, new)
@@ -215,17 +251,24 @@ def reword_problem(problem: str) -> str:
 
 
 MOST_LETTERS = 80
-"""Longest word for which `suggest_nearest` compares."""
+"""Length of the longest word for which `suggest_nearest` compares."""
 MOST_COMPARED = 500
-"""Largest number of words that `suggest_nearest` compares: its time grows by more than the
-product of their number and their length.
+"""Largest number of words that `suggest_nearest` compares.
+
+The time of the comparison grows faster than the product of their number and their length.
 """
 
 
 def suggest_nearest(word: str, valid: Sequence[str]) -> str:
-    """Returns "; did you mean ...?" with the most similar valid word, or "".
+    """Suggests the valid word that is most similar to an unknown word.
 
-    The result is "" if no valid word is similar, or if the word is too long to compare.
+    Args:
+        word: The unknown word.
+        valid: The valid words.
+
+    Returns:
+        The end of an error message, as in "; did you mean 'delay_ms'?". Empty if no valid word
+        is similar, or if the word is too long to compare.
     """
     if len(word) > MOST_LETTERS:
         return ""
@@ -235,15 +278,15 @@ def suggest_nearest(word: str, valid: Sequence[str]) -> str:
 
 
 def check_keys(table: Any, valid: Sequence[str], path: str) -> TomlTable:
-    """Returns a table after checking that its keys are valid.
+    """Checks that a value is a table that contains only valid keys, and returns the table.
 
     Args:
-        table: the value of a scenario.
-        valid: the valid keys.
-        path: the path of the table, for errors.
+        table: A value of a scenario.
+        valid: The valid keys.
+        path: Dotted path of the table, for errors.
 
     Raises:
-        ScenarioError: the value is not a table, or has an unknown key.
+        ScenarioError: The value is not a table, or has an unknown key.
     """
     if not isinstance(table, dict):
         raise ScenarioError("must be a table", path=path)
@@ -257,15 +300,20 @@ def check_keys(table: Any, valid: Sequence[str], path: str) -> TomlTable:
 
 
 def field_names(kind: StructType) -> tuple[str, ...]:
-    """Returns the keys of a type."""
+    """Returns the keys that a table of a type may have."""
     return kind.__struct_encode_fields__
 
 
 def check_choice(word: Any, valid: Sequence[str], path: str) -> None:
     """Refuses a word that is not among the valid ones.
 
+    Args:
+        word: A value of a scenario.
+        valid: The valid words.
+        path: Dotted path of the key, for errors.
+
     Raises:
-        ScenarioError: with the path of the key.
+        ScenarioError: The word is not valid. The message suggests a similar one.
     """
     if word not in valid:
         choices = ", ".join(map(repr, valid))
@@ -274,10 +322,16 @@ def check_choice(word: Any, valid: Sequence[str], path: str) -> None:
 
 
 def check_finite(value: Any, path: str) -> None:
-    """Refuses numbers that are not finite or have more than 64 bits, at any depth.
+    """Refuses numbers that are infinite, NaN, or integers of more than 64 bits.
+
+    Tables and lists are checked with everything that they contain.
+
+    Args:
+        value: A value of a scenario.
+        path: Dotted path of the key, for errors.
 
     Raises:
-        ScenarioError: with the path of the key.
+        ScenarioError: A number is refused. The error has the path of its key.
     """
     if isinstance(value, float) and not math.isfinite(value):
         raise ScenarioError(f"must be a finite number, is {value}", path=path)
@@ -311,20 +365,23 @@ UNITS = {
     "nm_rad": "N m/rad",
     "nm_s_rad": "N m s/rad",
 }
-"""Units by their spelling at the end of names."""
+"""Units by the ending of names, as in delay_ms."""
 
 
 def split_unit(name: str) -> tuple[str, str]:
-    """Returns the words of a name before its unit, and the unit, or "" without a unit.
+    """Splits the name of a quantity into its words and its unit.
 
-    The longest ending that is a unit counts.
+    If several endings of the name are units, the longest one counts.
 
     >>> split_unit("contact_stiffness_n_m")
     ('contact stiffness', 'N/m')
+
+    Returns:
+        The words, separated by spaces, and the unit. The unit is empty if the name has none.
     """
-    parts = name.split("_")
-    for n in range(1, len(parts)):
-        ending = "_".join(parts[n:])
+    words = name.split("_")
+    for word_count in range(1, len(words)):
+        ending = "_".join(words[word_count:])
         if ending in UNITS:
-            return " ".join(parts[:n]), UNITS[ending]
-    return " ".join(parts), ""
+            return " ".join(words[:word_count]), UNITS[ending]
+    return " ".join(words), ""

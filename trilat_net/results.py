@@ -1,9 +1,10 @@
-"""The result of a command as an object: as a line, a text, a table or JSON.
+"""The result of a command as an object, which can become a line, a text, a table or JSON.
 
 Invariant:
-    - A result holds values only. Its text is composed in `reporting`, which is imported when
-      the text is requested, so that modules that compute do not depend on presentation.
-    - JSON has no NaN and no infinity; an unknown quantity is null.
+    - A result contains only values. Its text is composed by the package `reporting`, which is
+      imported when the text is requested. Modules that compute therefore do not depend on
+      modules that format.
+    - JSON contains no NaN and no infinity. An unknown quantity is null.
 """
 
 import math
@@ -20,18 +21,18 @@ _REPR_LENGTH = 200
 
 
 class Result:
-    """The result of a command.
+    """Base class of the results of all commands and of the corresponding Python functions.
 
-    A subclass overrides `to_dict` if its keys differ from its fields, and `to_rows` if its
+    A subclass overrides `to_dict` if its JSON keys differ from its fields, and `to_rows` if its
     table has several rows.
     """
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns plain values, with the keys of the command's --json."""
+        """Returns plain values, with the keys that the command prints with --json."""
         return dict(vars(self))
 
     def to_rows(self) -> Sequence[Mapping[str, Any]]:
-        """Returns the rows of the table of `to_frame`."""
+        """Returns the rows of the table of `to_frame`: by default a row of all plain values."""
         values = self.to_dict().items()
         row = {key: value for key, value in values if not isinstance(value, dict | list)}
         return [row]
@@ -41,7 +42,7 @@ class Result:
         return str(_texts().summarize(self))
 
     def to_frame(self) -> "pandas.DataFrame":
-        """Returns a pandas data frame.
+        """Returns the result as a pandas data frame.
 
         Raises:
             UsageError: pandas is not installed.
@@ -50,7 +51,7 @@ class Result:
         return pandas.DataFrame(list(self.to_rows()))
 
     def headline(self) -> str:
-        """Returns the result in one line."""
+        """Returns the result in one line: by default the first line of its text."""
         for line in self.summary().splitlines():
             if line.strip():
                 return line.strip()
@@ -66,7 +67,7 @@ class Result:
 
 
 def _texts() -> Any:
-    """Returns the module that composes the texts of results, imported when needed."""
+    """Imports the module that composes the texts of results, and returns it."""
     return import_module(f"{__package__}.reporting.result_text")
 
 
@@ -74,5 +75,5 @@ JsonObject = dict[str, Any]
 
 
 def finite_or_none(value: float) -> float | None:
-    """Returns the number for JSON, or None for NaN and infinity."""
+    """Returns a number as JSON can contain it: None for NaN and infinity."""
     return value if math.isfinite(value) else None
