@@ -884,8 +884,8 @@ def _add_hands(feed: ReplayedInputs, log: Log, ticks: int) -> ReplayedInputs:
 def _write_actions(feed_actions: Array, k: int, actions: Array) -> None:
     """Writes actions of an operator into a feed.
 
-    An action contains a target and its rate of change per tick. The feed contains the target
-    and the next target, between which the kernel interpolates.
+    An action contains a target and its velocity. A feed contains the target, and the sum of
+    target and velocity: the position that the target would reach after one second.
 
     Args:
         feed_actions: Actions of one site in a `ReplayedInputs`, shape (K, 1 + 2 size).

@@ -1,16 +1,16 @@
-"""The arms of a scenario: the planar two-link arm, or a chain of joints from a URDF.
+"""Defines the arms of a scenario: the planar two-link arm, and chains from URDF files.
 
-`Arm` and `Task` are the tables of a scenario, and `build_arm` turns them into an `ArmModel`,
-which has the parameters and the geometry that computations need. `compute_rest_gains` and
-`bound_estimates` derive from the model how an arm comes to rest, and a box for the estimates of
-an adaptive law.
+`Arm` and `Task` are tables of a scenario. `build_arm` converts them to an `ArmModel`, which has
+the parameters and the geometry that computations need. `compute_rest_gains` and
+`bound_estimates` derive controller parameters from the model: gains with which the arm comes to
+rest, and bounds for the parameters that an adaptive law estimates.
 
 Invariant:
-    - If one arm of a scenario is a chain, all arms are, so that live, virtual and swept runs
-      compute with the same leaves. The planar arm is then a chain of two joints in the x-y
-      plane.
-    - Times that follow from linear algebra are rounded up to a millisecond, so that they are
-      the same numbers on every machine.
+    - If one arm of a scenario is a chain, all arms are. The planar arm is then modelled as a
+      chain of two joints in the x-y plane. Therefore all sites of a scenario are computed by
+      the same functions, in live sessions, in virtual time and in parameter studies.
+    - Times that are computed with eigenvalues are rounded up to a millisecond. Eigenvalues
+      differ between machines in the last bits, and the rounded times do not.
 """
 
 import math
@@ -42,19 +42,20 @@ from .link_inertia import LinkInertia, TensorEntries, ThreeReals
 from .urdf import UrdfChain, UrdfJoint, UrdfPayload, read_urdf
 
 TASK_AXES = ("x", "y", "z", "rx", "ry", "rz")
+"""Names of the axes of a task: three translations and three rotations."""
 STOP_REACH_RAD = 0.05
-"""Depth in a stop at which the stop pushes with the joint's effort limit, rad or m."""
+"""Depth in a stop at which the stop pushes with the effort limit of the joint, in rad or m."""
 START_MARGIN_RAD = 0.15
 START_MARGIN_M = 0.02
-"""Largest distance of a start pose beyond a stop or a limit of position.
+"""Largest distance of a start pose beyond a stop or a position limit.
 
-That is 8.6 degrees, or 2 cm of a sliding joint. Encoders are set to zero by hand, and arms are
-parked on stops that lie beyond those in their files.
+The margin is 8.6 degrees, or 2 cm for a sliding joint. It is needed because encoders are set to
+zero by hand, and arms are parked on stops that lie beyond those in their URDF files.
 """
 STOP_EFFORT_NM = 100.0
-"""The effort limit for which stops are made if a file states none."""
+"""Effort limit from which the stiffness of a stop is computed if the file states none."""
 STOP_DAMPING_S = 0.01
-"""Damping of a stop over its stiffness, s."""
+"""Ratio of the damping of a stop to its stiffness, in s."""
 PLANAR_UNITS = ("kg m^2", "kg m^2", "kg m^2", "kg m", "kg m")
 """Units of the five parameters of Eq. (24)."""
 BODY_UNITS = {
@@ -62,43 +63,48 @@ BODY_UNITS = {
     **dict.fromkeys(("mc_x", "mc_y", "mc_z"), "kg m"),
     **dict.fromkeys(("Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz"), "kg m^2"),
 }
-"""The ten parameters of a link of a chain, about its joint's frame, with their units."""
+"""Units of the ten inertial parameters of a link of a chain, by name.
+
+m is the mass, mc the mass times the centre of mass, and I the inertia about the joint's frame.
+"""
 _SLIDING_UNITS = {"rad": "m", "rad/s": "m/s", "N m": "N"}
-"""Units of a joint that slides, by the unit of a joint that turns."""
+"""Units of a sliding joint, by the unit of the same quantity of a rotating joint."""
 _IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 class Arm(fields.Frozen, frozen=True):
-    """An arm: a chain of joints from a URDF, or the planar arm of two links.
+    """Table of an arm: the planar arm of two links, or a chain of joints from a URDF file.
 
-    The defaults of the planar arm are the paper's: point masses at the ends of the links. The
-    keys of one kind of arm have no meaning for the other.
+    The defaults of the planar arm are those of the paper, with point masses at the ends of the
+    links. Each key belongs to one of the two kinds of arm, or to both.
 
     Attributes:
-        l1_m: this and the keys down to I2_kg_m2 are those of `ArmLinks`.
-        g_m_s2: gravitational acceleration, m/s^2.
-        known: false: the masses and inertias are unknown, as of a real arm that was not
-            identified, and enter no formula. Only for an arm outside of the program.
-        dead_man: true: the arm moves only while somebody holds its dead-man switch
-            (`docs/external-arm.md`). Only for an arm outside of the program.
-        urdf: name of the URDF that describes the arm, in `Scenario.urdf`; "": the arm is the
-            planar arm.
-        base_xyz_m: position of the base in the frame that the sites share, in which walls and
-            operators are given as well.
-        base_rpy_rad: orientation of the base in that frame: rotations about the fixed axes x, y
-            and z, in this order.
-        base: the base link; "": the root of the file.
-        tip: the end link; "": the only link on which no other link hangs.
-        down: direction of gravity in the base's frame; its length does not matter.
-        payload_kg: mass fixed to the end link. If it is 0, the next two keys have no meaning.
-        payload_com_m: centre of mass of the payload in the end link's frame.
+        l1_m: This key and the following ones up to I2_kg_m2 are those of `ArmLinks`.
+        g_m_s2: Gravitational acceleration, in m/s^2.
+        known: False if the masses and inertias are unknown, as those of a robot that has not
+            been identified. They then enter no formula. Only for a real robot.
+        dead_man: True if the arm moves only while somebody holds its dead-man switch
+            (`docs/external-arm.md`). Only for a real robot.
+        urdf: Name of the URDF file of the arm, in `Scenario.urdf`. Empty for the planar arm.
+        base_xyz_m: Position of the base in the frame that all sites share, in m. Walls and
+            operators are described in this frame as well.
+        base_rpy_rad: Orientation of the base in that frame, in rad: rotations about the fixed
+            axes x, y and z, in this order.
+        base: Name of the link that does not move. By default, the root of the file.
+        tip: Name of the link at the end of the arm. By default, the only link that carries no
+            other link.
+        down: Direction of gravity in the frame of the base. Its length does not matter.
+        payload_kg: Mass that is fixed to the tip, in kg. If it is 0, the next two keys have no
+            effect.
+        payload_com_m: Centre of mass of the payload in the frame of the tip, in m.
         payload_inertia_kg_m2: Ixx, Ixy, Iyy, Ixz, Iyz, Izz of the payload about its centre of
             mass.
-        armature_kg_m2: inertia of each drive as seen at its joint; kg for a prismatic joint.
-        stops: true: the joint limits of the file are springs that the arm may run into.
-        balance_inertia: true: an inertia of the file that no body can have is replaced by the
-            nearest inertia of a body.
-        links: masses and inertias that replace those of the file, by the name of the link.
+        armature_kg_m2: Inertia of each drive as seen at its joint, in kg m^2, or in kg for a
+            prismatic joint.
+        stops: True if the joint limits of the file are mechanical stops, modelled as springs.
+        balance_inertia: True if an impossible inertia in the file is replaced by the nearest
+            possible one. False if it is refused.
+        links: Masses and inertias that replace those of the file, by the name of the link.
     """
 
     l1_m: fields.Positive = 1.0
@@ -133,29 +139,29 @@ class Arm(fields.Frozen, frozen=True):
 
 
 def start_margin(joint: ChainJoint) -> float:
-    """Returns how far beyond its stops and limits a joint may start, rad or m."""
+    """Returns how far beyond its stops and limits a joint may start, in rad or m."""
     return START_MARGIN_M if joint.prismatic else START_MARGIN_RAD
 
 
 BASE_KEYS = ("base_xyz_m", "base_rpy_rad")
-"""The keys of an arm that place its base in space."""
+"""Keys of an arm that place its base in space."""
 CHAIN_KEYS = fields.field_names(Arm)[fields.field_names(Arm).index("base") :]
-"""The keys of an arm that only a chain has."""
+"""Keys of an arm that only a chain has."""
 
 
 class Task(fields.Frozen, frozen=True, omit_defaults=True):
-    """The coordinates that the sites share: joint angles, or end effectors' poses.
+    """Table of a task: the coordinates that the sites share.
 
     Attributes:
-        space: "joints": the joint angles; "position": the positions of the end effectors;
-            "pose": their positions and orientations.
-        axes: the axes along which the site follows, of x, y, z, rx, ry, rz; left out: all axes.
-        scale: metres in the shared coordinates per metre of this arm.
-        posture_rad: joint angles near which the arm stays as far as the task leaves it free;
-            left out: its start pose.
-        posture_rate_1_s: rate at which the arm returns to that posture, 1/s: the share of the
-            deviation per second.
-        singular_value: singular value of the Jacobian below which its inverse is damped.
+        space: "joints": The sites share joint angles. "position": They share the positions of
+            their end effectors. "pose": They share positions and orientations.
+        axes: Axes along which the site follows its peers, out of x, y, z, rx, ry and rz. By
+            default, all axes.
+        scale: Number of metres in the shared coordinates per metre of this arm.
+        posture_rad: Joint angles that the arm tends to, as far as the task leaves it free. By
+            default, its start pose.
+        posture_rate_1_s: Rate at which the arm returns to that posture, in 1/s.
+        singular_value: Singular value of the Jacobian below which its inverse is damped.
     """
 
     space: Literal["joints", "position", "pose"] = "joints"
@@ -167,11 +173,15 @@ class Task(fields.Frozen, frozen=True, omit_defaults=True):
 
     @property
     def shared(self) -> int:
-        """The number of coordinates that the sites share; 0: one per joint."""
+        """Number of shared coordinates in task space, 0 if the sites share joint angles."""
         return {"joints": 0, "position": 3, "pose": 6}[self.space]
 
     def find_idle_key(self, written: Mapping[str, object]) -> fields.KeyProblem | None:
-        """Returns a key of the written table that has no effect, or None."""
+        """Returns a key that the author wrote although it has no effect, or None.
+
+        Args:
+            written: Table as its author wrote it.
+        """
         if not self.shared:
             for key in written:
                 if key != "space":
@@ -193,7 +203,10 @@ class Task(fields.Frozen, frozen=True, omit_defaults=True):
 
     @property
     def setup(self) -> TaskSetup | None:
-        """The task in the form of the core; None if the sites share joint angles."""
+        """Task in the form that the simulation kernel uses.
+
+        None if the sites share joint angles.
+        """
         if not self.shared:
             return None
         shared_axes = TASK_AXES[: self.shared]
@@ -209,19 +222,20 @@ class Task(fields.Frozen, frozen=True, omit_defaults=True):
 
 
 class ArmModel(NamedTuple):
-    """The parameters and the geometry of an arm.
+    """Parameters and geometry of an arm with n joints.
 
     Attributes:
-        theta: the true parameters: Eq. (24) for the planar arm, ten per link for a chain.
-        counts: the lengths of the arm's vectors.
-        joint_names: the names of the joints, from the base on.
-        link_names: the names of the links that the joints move.
-        efforts: the largest effort that the file states for each joint, N m or N; inf if it
-            states none.
-        speeds: the largest speed that the file states for each joint, rad/s or m/s; inf if it
-            states none.
-        lengths_m: the lengths of the two links of the planar arm; (0, 0) for a chain.
-        chain: the chain in the form of the core; None for the planar arm.
+        theta: True inertial parameters: the five of Eq. (24) for the planar arm, ten per link
+            for a chain.
+        counts: Lengths of the arm's vectors.
+        joint_names: Names of the joints, starting at the base.
+        link_names: Names of the links that the joints move.
+        efforts: Largest effort of each joint according to the file, in N m or N. inf if the
+            file does not state it.
+        speeds: Largest speed of each joint according to the file, in rad/s or m/s. inf if the
+            file does not state it.
+        lengths_m: Lengths of the two links of the planar arm. (0, 0) for a chain.
+        chain: Chain in the form that the simulation kernel uses. None for the planar arm.
     """
 
     theta: Array
@@ -244,14 +258,14 @@ class ArmModel(NamedTuple):
         return parameters
 
     def widen_stops(self, q0: Vector) -> "ArmModel":
-        """Returns the arm with stops moved to its start pose, where it starts beyond them.
+        """Returns the arm with stops moved outward, so that the start pose touches none.
 
-        A stop is moved if the start pose lies beyond it by at most the margin, see
-        `start_margin`. An arm that stands at rest beyond a nominal stop does not touch its real
-        stop, so that no spring may push there. The other stops stay.
+        A stop is moved to the start pose if the joint starts beyond it by at most the margin,
+        see `start_margin`. An arm that stands at rest beyond the nominal position of a stop
+        does not touch the real stop, so that the spring of the stop must not push.
 
         Args:
-            q0: start pose, rad or m, shape (n,).
+            q0: Start pose, in rad or m, shape (n,).
         """
         if self.chain is None:
             return self
@@ -266,7 +280,11 @@ class ArmModel(NamedTuple):
         return self._replace(chain=self.chain._replace(joints=tuple(joints)))
 
     def joint_units(self, unit: str) -> list[str]:
-        """Returns the unit of a quantity at each joint; `unit`: at a joint that turns."""
+        """Returns the unit of a quantity for each joint.
+
+        Args:
+            unit: Unit of the quantity for a rotating joint.
+        """
         if self.chain is None:
             return [unit] * self.counts.joints
         return [
@@ -275,10 +293,9 @@ class ArmModel(NamedTuple):
         ]
 
     def end_effector(self, q: Vector) -> list[float]:
-        """Returns the position of the end effector in the pose `q`, m.
+        """Returns the position of the end effector in the pose `q`, in m.
 
-        The list has one number per axis of the arm's space: two for the planar arm, three for a
-        chain.
+        It has two coordinates for the planar arm and three for a chain.
         """
         if self.chain is None:
             l1, l2 = self.lengths_m
@@ -290,29 +307,29 @@ class ArmModel(NamedTuple):
         return list(place_end_effector(self._place_links(q), np.array(self.chain.tip_m)))
 
     def _place_links(self, q: Vector | Array) -> RowArray:
-        """Returns the rows of the core's chain, with the links placed in the pose `q`."""
+        """Returns the kernel's rows of a chain, with all links placed in the pose `q`."""
         assert self.chain is not None
         rows = build_chain(self.chain.joints)
         place_joints(rows, np.asarray(q, dtype=np.float64))
         return rows
 
     def end_effector_orientation(self, q: Vector) -> tuple[float, float, float]:
-        """Returns the end effector's orientation in the pose `q`, a rotation vector, rad."""
+        """Returns the end effector's orientation in the pose `q`, a rotation vector in rad."""
         if self.chain is None:
             return 0.0, 0.0, q[0] + q[1]
         rows = self._place_links(q)
-        # Fills R_base, which turns base axes into those of each link.
+        # This call computes R_base, the rotation from the base to each link.
         place_end_effector(rows, np.array(self.chain.tip_m))
         return relative_rotation(rows[-1]["R_base"], np.array(self.chain.tip_rotation).T)
 
     @property
     def reach(self) -> HandReach:
-        """A bound of the positions of the end effector; exact for the planar arm.
+        """Range of the distance of the end effector from the first joint.
 
-        Every joint, and the end effector, lies at a fixed distance from the joint before, and a
-        sliding joint at most its travel farther. The end effector is therefore at most as far
-        from the first joint as the sum of all distances. Without sliding joints it is at least
-        as far as the longest distance minus the sum of the others.
+        It is exact for the planar arm, and a bound for a chain. Each joint, and the end
+        effector, has a fixed distance from the previous joint, plus the travel of a sliding
+        joint. The largest distance is the sum of all of these. Without sliding joints, the
+        smallest distance is at least the longest link minus the sum of the other links.
         """
         if self.chain is None:
             l1, l2 = self.lengths_m
@@ -330,7 +347,11 @@ class ArmModel(NamedTuple):
         return HandReach(joints[0].origin_m, inner_m, outer_m)
 
     def find_joint_reach(self, limits: MotionLimits) -> HandReach:
-        """Returns the range of each joint between its stops and its limits of position."""
+        """Returns the range of each joint that its stops and position limits permit.
+
+        Args:
+            limits: Position limits of the site.
+        """
         joints = self.counts.joints
         low = np.broadcast_to(np.array(limits.q_min, dtype=np.float64), joints)
         high = np.broadcast_to(np.array(limits.q_max, dtype=np.float64), joints)
@@ -341,20 +362,23 @@ class ArmModel(NamedTuple):
 
     @property
     def shares_pose(self) -> bool:
-        """True if the site follows with its end effector, in task space."""
+        """True if the sites share the position or pose of their end effectors."""
         return self.chain is not None and self.chain.task is not None
 
     @property
     def axes(self) -> tuple[float, ...]:
-        """1 for each task coordinate that the site follows, else 0; () in joint space."""
+        """For each task coordinate, 1 if the site follows it and 0 if not.
+
+        Empty in joint space.
+        """
         task = None if self.chain is None else self.chain.task
         return () if task is None else task.axes
 
     def shared_pose(self, q: Vector) -> tuple[float, ...]:
         """Returns the coordinates that a site shares in the pose `q`.
 
-        These are the joint angles, or the position of the end effector times the task's scale,
-        followed by its orientation if the sites share poses.
+        These are the joint angles, or the scaled position of the end effector. If the sites
+        share poses, the orientation as a rotation vector follows.
         """
         if self.chain is None or self.chain.task is None:
             return tuple(q)
@@ -373,17 +397,20 @@ class ArmModel(NamedTuple):
         return J[: self.counts.shared]
 
     def largest_gravity(self, g_m_s2: float) -> tuple[float, ...]:
-        """Returns the largest gravity torques of the planar arm, N m; () for a chain."""
+        """Returns upper bounds of the gravity torques of the planar arm, in N m.
+
+        Empty for a chain.
+        """
         if self.chain is not None:
             return ()
         upper_nm, lower_nm = (abs(float(moment)) * g_m_s2 for moment in self.theta[3:5])
         return upper_nm + lower_nm, lower_nm
 
     def inertia(self, q: Array) -> Array:
-        """Returns the inertia matrix M(q) of a chain with its drives, shape (n, n)."""
+        """Returns the inertia matrix M(q) of a chain including its drives, shape (n, n)."""
         rows = self._place_links(q)
         mass_matrix(rows, self.theta)
-        # The core computes the lower triangle only.
+        # The kernel computes only the lower triangle of the symmetric matrix.
         lower = np.tril(rows["M"])
         M: Array = lower + np.tril(lower, -1).T
         return M
@@ -393,14 +420,14 @@ def build_arm(arm: Arm, task: Task, urdf_texts: Mapping[str, str], chains: bool)
     """Returns the model of an arm.
 
     Args:
-        arm: the arm's table.
-        task: the task of its site.
-        urdf_texts: the texts of URDF files, by name.
-        chains: True if all arms of the scenario are chains, the planar arm included.
+        arm: Table of the arm.
+        task: Task of its site.
+        urdf_texts: Texts of the URDF files, by name.
+        chains: True if all arms of the scenario are chains, including the planar arm.
 
     Raises:
-        ScenarioError: the arm's file cannot be used, or the planar arm has a singular inertia
-            matrix. The path is that of a key below the arm's.
+        ScenarioError: The file of the arm cannot be used, or the planar arm has a singular
+            inertia matrix. The error contains the path of a key below that of the arm.
     """
     if arm.urdf:
         return _build_chain_model(arm, task, read_arm(arm, urdf_texts))
@@ -431,10 +458,11 @@ def build_arm(arm: Arm, task: Task, urdf_texts: Mapping[str, str], chains: bool)
 
 
 def _list_planar_bodies(arm: Arm) -> Array:
-    """Returns the parameters of the planar arm's links as a chain has them, shape (20,).
+    """Returns the planar arm's inertial parameters in the form of a chain, shape (20,).
 
-    A link with its centre of mass at (c, 0, 0) and moment of inertia I about the axis z
-    through it has m c as first moment along x, and Iyy = Izz = m c^2 + I about its joint.
+    A link has the mass m, its centre of mass at (c, 0, 0), and the moment of inertia I about
+    the z axis through the centre of mass. About its joint, the first moment along x is m c, and
+    Iyy = Izz = m c^2 + I.
     """
     links = (
         (arm.m1_kg, arm.lc1_m, arm.I1_kg_m2),
@@ -448,7 +476,10 @@ def _list_planar_bodies(arm: Arm) -> Array:
 
 
 def _build_planar_chain(arm: Arm, task: Task) -> ChainSetup:
-    """Returns the planar arm as a chain: its joints turn about z, gravity acts along -y."""
+    """Returns the planar arm as a chain.
+
+    Its joints rotate about z, and gravity acts along -y.
+    """
     shoulder = ChainJoint(
         prismatic=False, axis=(0.0, 0.0, 1.0), rotation=_IDENTITY, origin_m=(0.0, 0.0, 0.0)
     )
@@ -458,11 +489,11 @@ def _build_planar_chain(arm: Arm, task: Task) -> ChainSetup:
 
 
 def read_arm(arm: Arm, urdf_texts: Mapping[str, str]) -> UrdfChain:
-    """Returns the chain that an arm's file describes between its base and its end link.
+    """Reads the chain of joints between the base and the tip of an arm from its URDF file.
 
     Raises:
-        ScenarioError: there is no such file, or it cannot be used. The path is that of a key
-            below the arm's.
+        ScenarioError: There is no such file, or it cannot be used. The error contains the path
+            of a key below that of the arm.
     """
     if arm.urdf not in urdf_texts:
         raise ScenarioError(f"names no file of the scenario: {arm.urdf!r}", path="urdf")
@@ -482,6 +513,7 @@ def read_arm(arm: Arm, urdf_texts: Mapping[str, str]) -> UrdfChain:
     except ScenarioError as error:
         if error.path:
             raise
+        # The message of `read_urdf` begins with its subject, for example "tip: ...".
         subject, _, problem = error.problem.partition(": ")
         if subject in _KEYS_OF_SUBJECTS:
             raise ScenarioError(problem, path=_KEYS_OF_SUBJECTS[subject]) from None
@@ -489,9 +521,9 @@ def read_arm(arm: Arm, urdf_texts: Mapping[str, str]) -> UrdfChain:
 
 
 _KEYS_OF_SUBJECTS = {"base": "base", "tip": "tip", "payload": "payload_inertia_kg_m2"}
-"""Keys of the arm by the subject of a problem that `read_urdf` reports.
+"""Key of the arm for each subject of an error message of `read_urdf`.
 
-Problems with another subject are those of the file.
+Errors with another subject concern the file.
 """
 
 
@@ -505,7 +537,10 @@ def _read_cached(
     *,
     balance: bool,
 ) -> UrdfChain:
-    """Returns the chain of a URDF, see `read_urdf`; equal arguments are read once."""
+    """Returns the chain of a URDF file, see `read_urdf`.
+
+    Repeated calls do not read it again.
+    """
     return read_urdf(
         text=text,
         base=base,
@@ -519,9 +554,15 @@ def _read_cached(
 def _place_base(
     arm: Arm, joints: tuple[ChainJoint, ...], gravity: Three
 ) -> tuple[tuple[ChainJoint, ...], Three]:
-    """Returns the joints of a chain, and gravity, in the frame that the sites share.
+    """Expresses the joints of a chain, and gravity, in the frame that all sites share.
 
-    The rotation of the base is R_z(yaw) R_y(pitch) R_x(roll).
+    The rotation of the base is R_z(yaw) R_y(pitch) R_x(roll). Only the first joint changes,
+    because the others are expressed in the frame of the joint before them.
+
+    Args:
+        arm: Table of the arm.
+        joints: Joints in the frame of the base.
+        gravity: Gravitational acceleration in the frame of the base.
     """
     if not (any(arm.base_xyz_m) or any(arm.base_rpy_rad)):
         return joints, gravity
@@ -541,7 +582,11 @@ def _place_base(
 
 
 def _build_chain_model(arm: Arm, task: Task, urdf_chain: UrdfChain) -> ArmModel:
-    """Returns the model of an arm from the chain that was read from its file."""
+    """Returns the model of an arm whose chain has been read from its file.
+
+    Raises:
+        ScenarioError: The number of drive inertias differs from that of the joints.
+    """
     joint_count = len(urdf_chain.joints)
     if len(arm.armature_kg_m2) not in (1, joint_count):
         problem = (
@@ -576,10 +621,15 @@ def _build_chain_model(arm: Arm, task: Task, urdf_chain: UrdfChain) -> ArmModel:
 
 
 def _build_joint(joint: UrdfJoint, armature_kg_m2: float, *, has_stops: bool) -> ChainJoint:
-    """Returns a joint in the form of the core.
+    """Returns a joint in the form that the simulation kernel uses.
 
-    Stops are springs that push with the joint's effort limit at the depth `STOP_REACH_RAD`, and
-    dampers of `STOP_DAMPING_S` times the stiffness.
+    A stop is a spring that pushes with the effort limit of the joint at the depth
+    `STOP_REACH_RAD`, and a damper with `STOP_DAMPING_S` times the stiffness.
+
+    Args:
+        joint: Joint from the file.
+        armature_kg_m2: Inertia of the drive.
+        has_stops: Whether the joint limits of the file are stops.
     """
     chain_joint = ChainJoint(
         prismatic=joint.kind == "prismatic",
@@ -603,13 +653,13 @@ def _build_joint(joint: UrdfJoint, armature_kg_m2: float, *, has_stops: bool) ->
 
 
 BRAKE_S = 0.03
-"""Least time constant with which damping alone brings a joint to rest."""
+"""Smallest time constant with which damping brings a joint to rest, in s."""
 BRAKE_TICKS = 4
-"""Least time constant, in ticks, that damping gives to any motion of the arm."""
+"""Smallest time constant that the damping may give to any motion of the arm, in ticks."""
 UNKNOWN_BRAKE_S = 0.1
-"""The time constant for an arm whose inertia is not known."""
+"""Time constant for an arm whose inertia is not known, in s."""
 BRAKE_TORQUE_SHARE = 0.5
-"""The share of the largest torque that decelerates the reference."""
+"""Fraction of the largest torque that is used to decelerate the reference."""
 
 
 def compute_rest_gains(
@@ -621,20 +671,21 @@ def compute_rest_gains(
     *,
     known: bool,
 ) -> RestGains:
-    """Returns the gains with which an arm comes to rest.
+    """Computes the gains with which an arm comes to rest by damping.
 
-    A joint of inertia M_ii gets the damping B = M_ii / T. The fastest motion of all joints
-    together then decays with the largest eigenvalue of diag(M) M^-1 / T, and T is chosen so
-    that the time constant of this motion is `BRAKE_TICKS` ticks or more. If the inertia of the
-    arm is not known, B is the damping of its law wherever that is positive.
+    A joint with the inertia M_ii gets the damping B = M_ii / T. Because the joints are coupled,
+    the fastest motion of the arm decays with the rate lambda / T, where lambda is the largest
+    eigenvalue of diag(M) M^-1. T is chosen so that the time constant T / lambda is at least
+    `BRAKE_TICKS` ticks. If the inertia of the arm is not known, B is the damping of the control
+    law, for joints for which it is positive.
 
     Args:
-        arm: the arm.
-        q0: start pose, in which the inertia of a chain counts. For the planar arm the stretched
-            pose counts.
-        law_damping: the damping of the law per joint, N m s/rad, shape (n,).
-        limit_nm: the largest torque, N m; one number or one per joint.
-        rate_hz: the tick rate, Hz.
+        arm: Model of the arm.
+        q0: Start pose, for which the inertia of a chain is computed. The inertia of the planar
+            arm is that of the stretched pose.
+        law_damping: Damping of the control law for each joint, in N m s/rad, shape (n,).
+        limit_nm: Largest torque, in N m, as one number or one per joint.
+        rate_hz: Tick rate of the site, in Hz.
         known: False if the parameters of the model are not those of the arm.
     """
     if arm.chain is None:
@@ -643,6 +694,7 @@ def compute_rest_gains(
     else:
         M = arm.inertia(np.array(q0))
     inertia = np.diag(M)
+
     # diag(M) M^-1 has the eigenvalues of the symmetric diag(M)^(1/2) M^-1 diag(M)^(1/2).
     root = np.sqrt(inertia)
     symmetric = root * np.linalg.inv(M) * root[:, None]
@@ -660,20 +712,25 @@ def compute_rest_gains(
 
 
 def bound_estimates(gains: Gains, arm: ArmModel, limit_nm: Vector, g_m_s2: float) -> Gains:
-    """Returns the gains of an adaptive law with a box for its estimates.
+    """Returns the gains of an adaptive law with bounds for the parameters that it estimates.
 
-    The motors of an arm can hold it against gravity. With the largest torque T of the joints,
-    the gravitational acceleration g and the length l of a link (of a chain: the reach of the
-    arm), a first moment is therefore at most T / g, a second moment at most l T / g, and the
-    mass of a link at most T / g over the mean length of the links. Masses, and second moments
-    about an axis, are not negative. The first estimate is always in the box. Gains that have a
-    box already, and those of other laws, are returned as they are.
+    The motors of the arm can hold it against gravity, which bounds the parameters. With the
+    largest torque T of a joint, the gravitational acceleration g and the length l of a link
+    (for a chain, the reach of the arm):
+
+    - a first moment (mass times distance) is at most T / g;
+    - a second moment (moment of inertia) is at most l T / g;
+    - the mass of a link is at most T / g divided by the mean length of the links;
+    - masses, and second moments about an axis, are not negative.
+
+    The bounds are widened so that they include the first estimate. Gains that have bounds
+    already, and gains of other laws, are returned unchanged.
 
     Args:
-        gains: the gains of the law.
-        arm: the arm.
-        limit_nm: the largest torque, N m; one number or one per joint.
-        g_m_s2: gravitational acceleration; 0: no box follows.
+        gains: Gains of the law.
+        arm: Model of the arm.
+        limit_nm: Largest torque, in N m, as one number or one per joint.
+        g_m_s2: Gravitational acceleration, in m/s^2. Without gravity, no bounds follow.
     """
     has_box = np.isfinite(gains.low).any()
     if gains.law is not Law.ADAPTIVE or has_box or g_m_s2 == 0.0:
@@ -705,7 +762,7 @@ def _bound_planar_parameters(
 def _bound_chain_parameters(
     arm: ArmModel, chain: ChainSetup, limit_nm: float, g_m_s2: float
 ) -> tuple[Array, Array]:
-    """Returns lower and upper bounds of ten parameters per link, shape (10 n,) each."""
+    """Returns lower and upper bounds of the ten parameters of each link, shape (10 n,) each."""
     joints = arm.counts.joints
     reach_m = sum(float(np.linalg.norm(joint.origin_m)) for joint in chain.joints)
     reach_m += float(np.linalg.norm(chain.tip_m))

@@ -1,9 +1,12 @@
-"""Descriptions of scenarios in lines of text, and differences between scenarios.
+"""Describes scenarios in lines of text, and lists the differences between scenarios.
+
+The descriptions include facts that follow from a scenario, for example whether the condition of
+a control law for stability holds, and how long an arm needs to come to rest.
 
 Invariant:
-    - A difference that several sites or links share is one entry. A law of another kind is one
-      entry as a whole, and so is a link.
-    - Names, titles and expectations describe an experiment and do not count as differences.
+    - A difference that several sites or links have in common is listed once. If two sites have
+      control laws of different kinds, the laws are compared as a whole. So are links.
+    - Names, titles and expectations only describe an experiment, and are not compared.
 """
 
 import math
@@ -30,6 +33,7 @@ from .scenario_reader import load_scenario
 from .scenario_types import Scenario
 from .urdf import UrdfJoint
 
+# Notes on the matrix of dominance factors, the weights with which sites follow their peers.
 COUPLED_OPERATORS = (
     "beta differs between sites: it weighs the operators of single sites, and does not cover "
     "hands that are coupled to one another (one user at two handles)"
@@ -42,10 +46,11 @@ IRREVERSIBLE_SHARES = (
 
 
 def lacks_detailed_balance(scenario: Scenario) -> bool:
-    """Returns True if no diagonal D > 0 makes D (I - alpha) symmetric.
+    """True if no diagonal matrix D > 0 exists for which D (I - alpha) is symmetric.
 
-    The result is False if some law exchanges more than positions, or does not compensate
-    gravity.
+    alpha is the matrix of dominance factors. Without such a D, the factors are called
+    irreversible. The result is False if a control law exchanges more than positions or does not
+    compensate gravity, because the condition does not apply then.
     """
     laws = [spec.control for spec in scenario.sites.values()]
     if not all(law.exchanges_positions() for law in laws):
@@ -54,9 +59,13 @@ def lacks_detailed_balance(scenario: Scenario) -> bool:
 
 
 def _find_link_delays(links: Mapping[str, LinkBase], rates_hz: Mapping[str, int]) -> Array:
-    """Returns the delay of every link in the form of `LawSituation.delay_s`.
+    """Returns the delay of every link in s, in the form of `LawSituation.delay_s`.
 
-    A constant delay is rounded up to a tick of the receiver; other delays are NaN.
+    A constant delay is rounded up to whole ticks of the receiver. The other delays are NaN.
+
+    Args:
+        links: Links by name.
+        rates_hz: Tick rates of the sites, by name.
     """
     names = list(rates_hz)
     delay_s = np.zeros((len(names), len(names)))
@@ -69,15 +78,16 @@ def _find_link_delays(links: Mapping[str, LinkBase], rates_hz: Mapping[str, int]
             continue
         rate_hz = rates_hz[receiver]
         delay_us = max(round(model.location), model.playout_us)
+        # rounded up; without a delay, a sample is used from the next tick on
         ticks = max(1, -(-delay_us * rate_hz // 1_000_000))
         delay_s[index] = ticks / rate_hz
     return delay_s
 
 
 def _find_hold_time(scenario: Scenario) -> float:
-    """Returns the time in s for which a torque is held; NaN if the tick rates differ.
+    """Returns the time for which a torque is held, in s.
 
-    The time is 0 in a scheme that is not digital.
+    The time is 0 if the scheme is not digital, and NaN if the tick rates of the sites differ.
     """
     if scenario.scheme != "digital":
         return 0.0
@@ -86,7 +96,7 @@ def _find_hold_time(scenario: Scenario) -> float:
 
 
 def _list_situations(scenario: Scenario) -> Iterator[tuple[str, LawSettings, LawSituation]]:
-    """Yields each site with its law and the situation on which the law's stability rests."""
+    """Yields each site, its control law, and the facts on which its stability depends."""
     rates_hz = {name: site.rate_hz for name, site in scenario.sites.items()}
     delay_s = _find_link_delays(scenario.links, rates_hz)
     hold_s = _find_hold_time(scenario)
@@ -106,9 +116,9 @@ def _list_situations(scenario: Scenario) -> Iterator[tuple[str, LawSettings, Law
 
 
 def describe_law_conditions(scenario: Scenario) -> list[str]:
-    """Returns the conditions on which the stability of the laws rests, as lines.
+    """Returns lines that say whether the stability conditions of the control laws hold.
 
-    Sites of one law whose condition is the same share a line.
+    Sites with the same law and the same condition share a line.
     """
     owners: dict[tuple[str, StabilityCondition], list[str]] = {}
     for name, law, situation in _list_situations(scenario):
@@ -124,7 +134,10 @@ def describe_law_conditions(scenario: Scenario) -> list[str]:
 
 
 def _describe_idle_shares(scenario: Scenario) -> list[str]:
-    """Returns lines on sites whose dominance factors have no effect."""
+    """Returns lines about sites whose dominance factors have no effect.
+
+    Some control laws determine themselves how the sites share authority.
+    """
     ramped_sites = {change.dominance for change in scenario.timeline}
     owners: dict[str, list[str]] = {}
     for name, law, situation in _list_situations(scenario):
@@ -142,10 +155,16 @@ def _describe_idle_shares(scenario: Scenario) -> list[str]:
 
 
 def describe_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> list[str]:
-    """Returns the facts of a valid scenario as lines, as `trilat scenario check` prints them.
+    """Describes a valid scenario in lines of text, as `trilat scenario check` prints them.
 
     >>> len(tn.describe_scenario("paper")) > 5
     True
+
+    Args:
+        scenario: Scenario, or any source that `load_scenario` accepts.
+
+    Raises:
+        ScenarioError: The scenario is not valid.
     """
     scenario = load_scenario(scenario)
     names = ", ".join(scenario.names)
@@ -174,7 +193,10 @@ def describe_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> li
 
 
 def _describe_links(scenario: Scenario) -> list[str]:
-    """Returns a line for each link, or one line if all links are alike; then the views."""
+    """Returns a line for each link, or one line if all links are equal.
+
+    Lines about views follow.
+    """
     descriptions = {name: link.describe() for name, link in scenario.links.items()}
     if len(set(descriptions.values())) > 1:
         lines = [f"link {name}: {text}" for name, text in descriptions.items()]
@@ -187,7 +209,7 @@ def _describe_links(scenario: Scenario) -> list[str]:
 
 
 def _describe_shares(scenario: Scenario) -> list[str]:
-    """Returns lines on the weights that follow from the dominance matrix."""
+    """Returns lines about the weights that follow from the matrix of dominance factors."""
     beta = scenario.beta
     weights = "none: alpha is reducible, some site's weight is zero"
     if beta is not None:
@@ -205,7 +227,7 @@ def _describe_shares(scenario: Scenario) -> list[str]:
 
 
 def _describe_arms(scenario: Scenario) -> list[str]:
-    """Returns lines on every different arm of a URDF: its joints, limits and notes."""
+    """Returns lines about each different arm with a URDF file: its joints, limits and notes."""
     lines: list[str] = []
     for arm, owners in _group_chains(scenario):
         chain = read_arm(arm, scenario.urdf)
@@ -224,24 +246,24 @@ def _describe_arms(scenario: Scenario) -> list[str]:
 
 
 def _describe_joint(joint: UrdfJoint, drive: ChainJoint) -> str:
-    """Returns a line on a joint: its link, its limits and the inertia of its drive."""
+    """Returns a line about a joint: its link, its limits and the inertia of its drive."""
     unit = "m" if drive.prismatic else "rad"
     effort_unit = "N" if drive.prismatic else "N m"
     inertia_unit = "kg" if drive.prismatic else "kg m^2"
-    facts = [f"  {joint.name} moves {joint.link}, {joint.inertia[0]:.4g} kg"]
+    parts = [f"  {joint.name} moves {joint.link}, {joint.inertia[0]:.4g} kg"]
     if joint.lower > -math.inf:
-        facts.append(f"{joint.lower:.4g} to {joint.upper:.4g} {unit}")
+        parts.append(f"{joint.lower:.4g} to {joint.upper:.4g} {unit}")
     if joint.effort_limit < math.inf:
-        facts.append(f"{joint.effort_limit:.4g} {effort_unit}")
+        parts.append(f"{joint.effort_limit:.4g} {effort_unit}")
     if joint.velocity_limit < math.inf:
-        facts.append(f"{joint.velocity_limit:.4g} {unit}/s")
+        parts.append(f"{joint.velocity_limit:.4g} {unit}/s")
     if drive.armature_kg_m2 > 0.0:
-        facts.append(f"drive {drive.armature_kg_m2:.4g} {inertia_unit}")
-    return "; ".join(facts)
+        parts.append(f"drive {drive.armature_kg_m2:.4g} {inertia_unit}")
+    return "; ".join(parts)
 
 
 def _group_chains(scenario: Scenario) -> list[tuple[Arm, list[str]]]:
-    """Returns every different arm of a URDF, with the sites that have it."""
+    """Returns each different arm with a URDF file, and the names of the sites that have it."""
     groups: list[tuple[Arm, list[str]]] = []
     for name, spec in scenario.sites.items():
         if not spec.arm.urdf:
@@ -255,7 +277,7 @@ def _group_chains(scenario: Scenario) -> list[tuple[Arm, list[str]]]:
 
 
 def list_arm_notes(scenario: Scenario) -> list[str]:
-    """Returns sentences on how the arms of a run differ from their files, with the sites."""
+    """Returns sentences about differences between the arms of a run and their URDF files."""
     notes = []
     for arm, owners in _group_chains(scenario):
         subject = f"arm of {', '.join(owners)}"
@@ -264,7 +286,7 @@ def list_arm_notes(scenario: Scenario) -> list[str]:
 
 
 def _list_start_notes(scenario: Scenario) -> list[str]:
-    """Returns sentences on joints that start beyond a stop or a limit of position."""
+    """Returns sentences about joints that start beyond a stop or a position limit."""
     notes: list[str] = []
     for name, spec in scenario.sites.items():
         if spec.arm.urdf and spec.arm.stops:
@@ -274,7 +296,7 @@ def _list_start_notes(scenario: Scenario) -> list[str]:
 
 
 def _list_stop_notes(scenario: Scenario, name: str) -> list[str]:
-    """Returns sentences on the joints of a site that start beyond a stop of their file."""
+    """Returns sentences about the joints of a site that start beyond a stop in their file."""
     spec = scenario.sites[name]
     units = scenario.arms[name].joint_units("rad")
     joints = read_arm(spec.arm, scenario.urdf).joints
@@ -290,7 +312,7 @@ def _list_stop_notes(scenario: Scenario, name: str) -> list[str]:
 
 
 def _list_limit_notes(scenario: Scenario, name: str) -> list[str]:
-    """Returns sentences on the joints of a site that start beyond a limit of position."""
+    """Returns sentences about the joints of a site that start beyond a position limit."""
     spec = scenario.sites[name]
     model = scenario.arms[name]
     units = model.joint_units("rad")
@@ -314,7 +336,7 @@ def _list_limit_notes(scenario: Scenario, name: str) -> list[str]:
 
 
 def _describe_tasks(scenario: Scenario) -> list[str]:
-    """Returns lines on the sites that follow with their end effectors."""
+    """Returns lines about the sites that share the position or pose of their end effectors."""
     lines = []
     for name, model in scenario.arms.items():
         if not model.shares_pose:
@@ -335,9 +357,10 @@ def _describe_tasks(scenario: Scenario) -> list[str]:
 
 
 def _describe_silences(scenario: Scenario) -> list[str]:
-    """Returns lines on how often sites with the stale rule `glide` will hold.
+    """Returns lines about how often sites will have to wait for late samples of their peers.
 
-    The holds are counted in the samples that the links draw.
+    This concerns sites with the stale rule "glide". The number of waits is computed with the
+    delays and losses that the links will draw in the run.
     """
     lines = []
     for name, spec in scenario.sites.items():
@@ -370,7 +393,7 @@ def _describe_silences(scenario: Scenario) -> list[str]:
 
 
 def _describe_stops(scenario: Scenario) -> list[str]:
-    """Returns lines on how arms with the stale rule `glide` come to rest.
+    """Returns lines about how arms with the stale rule "glide" come to rest.
 
     Sites with the same text share a line.
     """
@@ -384,7 +407,10 @@ def _describe_stops(scenario: Scenario) -> list[str]:
 
 
 def _describe_stop(scenario: Scenario, name: str) -> list[str]:
-    """Returns predicates on a site's arm: when it comes to rest, and what its motors bear."""
+    """Returns the facts about the stop of a site's arm, as predicates for a sentence.
+
+    They say when the arm comes to rest, and whether its motors are strong enough.
+    """
     spec = scenario.sites[name]
     if not spec.arm.known:
         return ["have no stated time to rest: their inertia is not known (arm.known)"]
@@ -406,17 +432,19 @@ def _describe_stop(scenario: Scenario, name: str) -> list[str]:
 
 
 _NOT_COMPARED = ("name", "title", "about", "assumed", "expect", "drawn", "sites", "links")
+"""Keys that describe an experiment, or that are compared separately."""
 _MAX_VALUE_LENGTH = 80
 """Largest length of the text of a value."""
 
 
 class ScenarioDifference(NamedTuple):
-    """A difference between experiments.
+    """Difference between experiments.
 
     Attributes:
-        key: the dotted path of the key; below `sites.NAME` without that prefix.
-        owners: the sites that have the difference; () for a key of the whole experiment.
-        values: the value in each experiment, as text; "none" if it has no such key.
+        key: Dotted path of the key, without `sites.NAME` for a key of a site.
+        owners: Names of the sites that have the difference. Empty for a key of the whole
+            experiment.
+        values: Value in each experiment as a text. "none" if the experiment lacks the key.
     """
 
     key: str
@@ -424,6 +452,7 @@ class ScenarioDifference(NamedTuple):
     values: tuple[str, ...]
 
     def __str__(self) -> str:
+        """Returns the key and the sites."""
         return f"{self.key} of {', '.join(self.owners)}" if self.owners else self.key
 
 
@@ -436,6 +465,8 @@ def compare_scenarios(scenarios: Sequence[Scenario]) -> list[ScenarioDifference]
     tables: list[dict[str, Any]] = [msgspec.to_builtins(scenario) for scenario in scenarios]
     common_tables = [_omit_keys(table, _NOT_COMPARED) for table in tables]
     differences += _compare_tables(common_tables)
+
+    # Sites with the same difference are collected in one entry.
     owners: dict[tuple[str, tuple[str, ...]], list[str]] = {}
     for site in scenarios[0].names:
         if not all(site in other.sites for other in scenarios):
@@ -454,7 +485,10 @@ def _omit_keys(table: Mapping[str, Any], keys: Sequence[str]) -> dict[str, Any]:
 
 
 def _compare_tables(tables: Sequence[Mapping[str, Any]]) -> list[ScenarioDifference]:
-    """Returns the differences between tables of one kind; laws of several kinds as a whole."""
+    """Returns the differences between tables with the same keys.
+
+    If they contain control laws of different kinds, the laws are compared as a whole.
+    """
     laws = {table.get("control", {}).get("law") for table in tables}
     if len(laws) > 1:
         descriptions = tuple(describe_law(table["control"]) for table in tables)
@@ -472,7 +506,7 @@ def _compare_tables(tables: Sequence[Mapping[str, Any]]) -> list[ScenarioDiffere
 
 
 def _compare_links(scenarios: Sequence[Scenario]) -> list[ScenarioDifference]:
-    """Returns the differences between links; links that differ alike are one entry."""
+    """Returns the differences between links. Links with the same difference share an entry."""
     names_by_values: dict[tuple[str, ...], list[str]] = {}
     common_names = list(scenarios[0].links)
     for other in scenarios[1:]:
@@ -490,7 +524,12 @@ def _compare_links(scenarios: Sequence[Scenario]) -> list[ScenarioDifference]:
 
 
 def flatten_table(table: Mapping[str, Any], path: str = "") -> list[tuple[str, Any]]:
-    """Returns the values of a table and of the tables in it, with dotted keys."""
+    """Returns the values of a table and of all tables in it, with dotted keys.
+
+    Args:
+        table: The table.
+        path: Dotted key of the table itself.
+    """
     pairs: list[tuple[str, Any]] = []
     for key, value in table.items():
         key_path = f"{path}.{key}" if path else key
@@ -502,7 +541,11 @@ def flatten_table(table: Mapping[str, Any], path: str = "") -> list[tuple[str, A
 
 
 def describe_law(control: Mapping[str, Any]) -> str:
-    """Returns a short text on a law and its gains, from its table."""
+    """Returns a short text about a control law and its gains.
+
+    Args:
+        control: Table of the law.
+    """
     # The gains of a user's law are its settings; the hash of its file is left out.
     if "code" in control:
         name = str(control["code"])
@@ -515,7 +558,7 @@ def describe_law(control: Mapping[str, Any]) -> str:
 
 
 def describe_value(value: Any) -> str:
-    """Returns the text of a value; a list of equal numbers as one number."""
+    """Returns a value as a short text. A list of equal numbers is written as one number."""
     if value is None or value == [] or value == ():
         return "none"
     if isinstance(value, dict):

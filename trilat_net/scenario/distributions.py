@@ -1,9 +1,15 @@
-"""Distributions in place of numbers: a seed draws start poses, masses and gains.
+"""Draws numbers of a scenario that are given as probability distributions.
+
+An author may write `{ normal = [mean, deviation] }` or `{ uniform = [low, high] }` in place of
+a number, for example a start pose, a mass or a gain. The seed of the scenario determines the
+number.
 
 Invariant (L4):
-    - A draw is a function of the seed and of the number's dotted key, rounded to nine digits.
-    - A resolved scenario holds the number that was drawn and, under `drawn`, its distribution:
-      another seed draws it again. A number that an override replaced stays as it is.
+    - A drawn number is a function of the seed and of the dotted key of the number. It is
+      rounded to nine digits.
+    - A resolved scenario contains the drawn number, and its distribution in the table `drawn`,
+      so that another seed draws the number again. A number that an override has replaced is not
+      drawn again.
 """
 
 import re
@@ -19,18 +25,19 @@ from ..errors import ScenarioError
 from ..fields import Frozen, NotNegative, Real, TomlTable, is_distribution, is_number
 
 _MAX_LIST_LENGTH = 64
-"""Longer lists are recorded tables, in which nothing is drawn."""
+"""Longest list in which numbers are drawn. Longer lists are recorded tables."""
 
 
 class Distribution(Frozen, frozen=True, omit_defaults=True, kw_only=True):
-    """The origin of a number: a normal or a uniform distribution.
+    """Distribution from which a number was drawn, together with the number.
 
-    A pose that follows a drawn start pose has neither distribution.
+    The pose of an operator may have been copied from a drawn start pose. Such a pose has
+    neither of the two distributions.
 
     Attributes:
-        normal: mean and standard deviation.
-        uniform: lower and upper end.
-        value: the number that was drawn, or the pose.
+        normal: Mean and standard deviation of a normal distribution.
+        uniform: Lower and upper end of a uniform distribution.
+        value: The drawn number, or the copied pose.
     """
 
     normal: tuple[Real, NotNegative] | None = None
@@ -38,7 +45,11 @@ class Distribution(Frozen, frozen=True, omit_defaults=True, kw_only=True):
     value: float | Annotated[list[float], Meta(max_length=MAX_JOINTS)]
 
     def draw(self, seed: int, key: str) -> float:
-        """Returns the number that a seed draws for a dotted key."""
+        """Returns the number that belongs to a seed and a dotted key.
+
+        A hash of the seed and the key gives a uniform random number, which the inverse
+        distribution function converts.
+        """
         # Few scenarios need this import, which takes some milliseconds.
         from statistics import NormalDist
 
@@ -54,7 +65,7 @@ class Distribution(Frozen, frozen=True, omit_defaults=True, kw_only=True):
         return float(f"{number:.9g}")
 
     def describe(self) -> str:
-        """Returns the distribution as text."""
+        """Returns the distribution as a text."""
         if self.normal is not None:
             mean, deviation = self.normal
             return f"normal, {mean:g} with a deviation of {deviation:g}"
@@ -65,7 +76,7 @@ class Distribution(Frozen, frozen=True, omit_defaults=True, kw_only=True):
 
 
 def dotted_key(path: str) -> str:
-    """Returns a path such as hands[0].peak_nm as an override writes it: hands.0.peak_nm."""
+    """Converts a path such as hands[0].peak_nm to the form of an override, hands.0.peak_nm."""
     return re.sub(r"\[(\d+)\]", r".\1", path)
 
 
@@ -73,11 +84,12 @@ class Draws:
     """Draws the numbers of one scenario.
 
     Args:
-        seed: the seed of the scenario. An invalid seed is refused later, at its own key.
-        known: the table `drawn` of a scenario that was resolved before.
+        seed: Seed of the scenario. If it is not an integer, 0 is used here; it is refused later
+            with the path of its key.
+        known: Table `drawn` of a scenario that was resolved before. Empty for a new scenario.
 
     Attributes:
-        drawn: the distribution of every number drawn so far, by its dotted key.
+        drawn: Distribution of every number drawn so far, by its dotted key.
     """
 
     def __init__(self, seed: Any, known: Any) -> None:
@@ -89,13 +101,19 @@ class Draws:
         self.drawn: dict[str, Distribution] = {}
 
     def draw_numbers(self, table: TomlTable, path: str) -> TomlTable:
-        """Returns a table with a number in place of each distribution, also in its lists."""
+        """Returns a table with numbers in place of distributions, also in its lists.
+
+        Args:
+            table: The table.
+            path: Path of the table.
+        """
         return {key: self._draw_entry(value, f"{path}.{key}") for key, value in table.items()}
 
     def _draw_entry(self, value: Any, path: str) -> Any:
-        """Returns the number of a distribution, or of a number that was drawn before.
+        """Returns the number in place of a distribution.
 
-        Other values are returned as they are.
+        A number that was drawn from a distribution before is drawn again, because the seed may
+        have changed. Other values are returned unchanged.
         """
         if isinstance(value, list) and len(value) <= _MAX_LIST_LENGTH:
             entries = []
@@ -103,6 +121,7 @@ class Draws:
                 is_nested = isinstance(entry, list)
                 entries.append(entry if is_nested else self._draw_entry(entry, f"{path}[{n}]"))
             return entries
+
         key = dotted_key(path)
         known = self._known.get(key)
         if is_distribution(value):
@@ -118,21 +137,23 @@ class Draws:
     def follow_start(
         self, table: TomlTable, key: str, pose: Sequence[float], path: str
     ) -> None:
-        """Writes the start pose into a table, in place, unless the key has another pose.
+        """Sets a pose of an operator to the arm's start pose, unless the author wrote another.
 
-        A pose that followed an earlier draw of the start pose is replaced.
+        A pose that was copied from an earlier draw of the start pose is replaced.
 
         Args:
-            table: the table of an operator.
-            key: the key of the pose.
-            pose: the start pose.
-            path: the path of the table.
+            table: Table of the operator. It is changed.
+            key: Key of the pose.
+            pose: Start pose.
+            path: Path of the table.
         """
         pose_key = dotted_key(f"{path}.{key}")
         known = self._known.get(pose_key)
         if key in table and (known is None or table[key] != known.value):
             return
         table[key] = pose
+
+        # If the start pose was drawn, another seed must change the copy as well.
         site = pose_key.partition(".hands.")[0]
         start_keys = (f"{site}.q0_rad", f"{site}.arm.l")
         if any(drawn_key.startswith(start_keys) for drawn_key in self.drawn):
@@ -140,7 +161,11 @@ class Draws:
 
 
 def _read_distribution(table: TomlTable, path: str) -> Distribution:
-    """Returns the distribution of a table; refuses a table that is not one."""
+    """Returns the distribution that a table states.
+
+    Raises:
+        ScenarioError: The table does not state a distribution.
+    """
     try:
         origin = msgspec.convert({**table, "value": 0.0}, Distribution)
     except msgspec.ValidationError:

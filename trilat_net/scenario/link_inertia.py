@@ -1,13 +1,13 @@
-"""Masses and inertias that a scenario sets for the links of a URDF, and their balancing.
+"""Defines masses and inertias that a scenario states for links, and balances impossible ones.
 
-Some files state inertias that no body can have. Balancing replaces such an inertia by the
-nearest possible one.
+Some URDF files contain inertias that no body can have. Balancing replaces such an inertia by
+the nearest possible one.
 
 Invariant:
-    - A key in the scenario replaces the file's value. Without the key, the file's value stays.
-    - Balancing uses sums, products, quotients and square roots in a fixed order, so that a
-      balanced tensor has the same bits on every machine.
-    - Balancing does not change a tensor that a body can have.
+    - A key in the scenario replaces the value in the file. Without the key, the file applies.
+    - Balancing uses only sums, products, quotients and square roots in a fixed order, so that
+      the result has the same bits on every machine.
+    - Balancing does not change a possible inertia.
 """
 
 import math
@@ -20,9 +20,9 @@ from .. import fields
 from ..core.chain import Matrix
 
 JACOBI_SWEEPS = 12
-"""Sweeps of Jacobi's method.
+"""Number of sweeps of Jacobi's method.
 
-A symmetric 3 x 3 matrix is diagonal to rounding after six or seven sweeps.
+A symmetric 3 x 3 matrix is diagonal up to rounding errors after six or seven sweeps.
 """
 
 ThreeReals = Annotated[tuple[fields.Real, ...], Meta(min_length=3, max_length=3)]
@@ -30,15 +30,15 @@ TensorEntries = Annotated[tuple[fields.Real, ...], Meta(min_length=6, max_length
 
 
 class LinkInertia(fields.Frozen, frozen=True, omit_defaults=True):
-    """The mass and inertia of a link, in place of the values in its file.
+    """Mass and inertia of a link that replace the values in its file.
 
     Attributes:
-        mass_kg: the mass; 0 removes the body of the link. Left out: as in the file.
-        com_m: the centre of mass in the link's frame. Left out: as in the file, or the origin
-            of the link's frame if the file does not state it.
-        inertia_kg_m2: Ixx, Ixy, Iyy, Ixz, Iyz, Izz about the centre of mass in the axes of the
-            link's frame. Left out: as in the file, or zero, the inertia of a point, if the file
-            does not state it.
+        mass_kg: Mass, in kg. 0 removes the body of the link. By default, as in the file.
+        com_m: Centre of mass in the frame of the link, in m. By default as in the file, or the
+            origin of the frame if the file does not state it.
+        inertia_kg_m2: Ixx, Ixy, Iyy, Ixz, Iyz, Izz about the centre of mass, in the axes of the
+            link's frame. By default as in the file, or zero (a point of mass) if the file does
+            not state it.
     """
 
     mass_kg: fields.NotNegative | None = None
@@ -46,7 +46,7 @@ class LinkInertia(fields.Frozen, frozen=True, omit_defaults=True):
     inertia_kg_m2: TensorEntries | None = None
 
     def list_given_keys(self) -> list[str]:
-        """Returns the keys that the scenario gives."""
+        """Returns the names of the keys that the scenario states."""
         keys = fields.field_names(LinkInertia)
         return [key for key in keys if getattr(self, key) is not None]
 
@@ -58,23 +58,24 @@ def fill_tensor(entries: Sequence[float]) -> Matrix:
 
 
 def balance_tensor(tensor: Matrix) -> Matrix:
-    """Returns the inertia tensor of the nearest mass distribution that a body can have.
+    """Returns the nearest inertia tensor that a body can have.
 
-    With the principal moments I_1, I_2, I_3, the second moments of the mass along the principal
-    axes are
+    Let I_1, I_2 and I_3 be the principal moments of inertia. The second moments of the mass
+    along the principal axes are
 
         s_k = (I_1 + I_2 + I_3) / 2 - I_k.
 
-    A body can have the tensor if no s_k is negative. Negative s_k are set to zero, which is the
-    projection onto the cone of possible distributions, and the moments are composed again:
+    A body can have the tensor if no s_k is negative. Otherwise the negative s_k are set to
+    zero. This is the projection onto the set of possible mass distributions. The moments are
+    then composed again:
 
         I_k = s_1 + s_2 + s_3 - s_k.
 
-    The principal axes do not change. If only the triangle inequality failed, the largest moment
-    does not change either, and the two smaller moments grow equally.
+    The principal axes do not change. If only the triangle inequality was violated, the largest
+    moment does not change either, and the two smaller ones grow by the same amount.
 
     Args:
-        tensor: symmetric, kg m^2.
+        tensor: Symmetric inertia tensor about the centre of mass, in kg m^2.
     """
     moments, axes = _diagonalise(tensor)
     half_sum = 0.5 * (moments[0] + moments[1] + moments[2])
@@ -98,8 +99,8 @@ def balance_tensor(tensor: Matrix) -> Matrix:
 def _diagonalise(tensor: Matrix) -> tuple[list[float], list[list[float]]]:
     """Returns the principal moments of a symmetric tensor, and the principal axes as columns.
 
-    This is Jacobi's method in plain arithmetic, because LAPACK's routines differ in the last
-    bit between machines.
+    The method is Jacobi's, in plain Python arithmetic. The routines of LAPACK differ between
+    machines in the last bits.
     """
     a = [list(row) for row in tensor]
     axes = [[float(i == j) for j in range(3)] for i in range(3)]
@@ -107,7 +108,7 @@ def _diagonalise(tensor: Matrix) -> tuple[list[float], list[list[float]]]:
         for p, q in ((0, 1), (0, 2), (1, 2)):
             if a[p][q] == 0.0:
                 continue
-            # The rotation by which a[p][q] becomes zero; the smaller of the two angles.
+            # The rotation that makes a[p][q] zero, with the smaller of the two possible angles.
             theta = (a[q][q] - a[p][p]) / (2.0 * a[p][q])
             root = math.sqrt(theta * theta + 1.0)
             tangent = math.copysign(1.0, theta) / (abs(theta) + root)

@@ -1,10 +1,14 @@
-"""Overrides KEY=VALUE of an author's tables or of a resolved scenario.
+"""Applies overrides KEY=VALUE, which change single keys of a scenario.
+
+Overrides apply to the tables of a scenario file, or to a resolved scenario, in which every key
+of every site and link is written out.
 
 Invariant:
-    - In a resolved scenario, as a log holds it, a key of a group (`control.Kd`,
-      `link.delay_ms`, `rate_hz`) applies to every site or link that can have it.
-    - A key of a single site or link (`sites.s.control.Kd`) takes precedence, in any order.
-    - A key that no built-in law has is a setting of a user's law.
+    - In a resolved scenario, a key of a group (`control.Kd`, `link.delay_ms`, `rate_hz`)
+      applies to every site or link that can have it.
+    - A key of a single site or link (`sites.s.control.Kd`) has priority, regardless of the
+      order.
+    - A key of `control` that no built-in law has is an argument of a user's law.
 """
 
 import tomllib
@@ -20,20 +24,26 @@ from .resolve import PRESETS, TRACE_KEYS
 from .scenario_types import SITE_GROUPS, Scenario
 
 _KIND_KEYS = {"control": ("law",), "link": ("model", "preset")}
-"""Groups whose keys depend on a kind, and the keys that name the kind."""
+"""Groups in which other keys depend on a kind, and the keys that name this kind."""
 _USER_LAW = "own"
+"""Kind of all control laws that users wrote."""
 
 Override = tuple[str, Any]
-"""A dotted key and its value."""
+"""Dotted key and its new value."""
 
 
 def expand_overrides(scenario: Scenario, pairs: Sequence[Override]) -> dict[str, Any]:
-    """Returns overrides of a resolved scenario with the keys of groups written out.
+    """Returns overrides of a resolved scenario in which the keys of groups are written out.
 
     A key of a group becomes a key of each site or link that can have it.
 
+    Args:
+        scenario: The resolved scenario.
+        pairs: The overrides.
+
     Raises:
-        ScenarioError: a group has no such key, or nothing in the scenario can have it.
+        ScenarioError: The group has no such key, or no site or link of the scenario can have
+            it.
     """
     flat_pairs = _flatten_groups(pairs)
     overridden = dict(flat_pairs)
@@ -57,7 +67,7 @@ def expand_overrides(scenario: Scenario, pairs: Sequence[Override]) -> dict[str,
 
 
 def _flatten_groups(pairs: Sequence[Override]) -> list[Override]:
-    """Returns overrides in which the table of a whole group is written key by key."""
+    """Returns overrides in which a table for a whole group is replaced by its single keys."""
     flat_pairs: list[Override] = []
     for key, value in pairs:
         is_group = key in SITE_GROUPS or key in _KIND_KEYS
@@ -69,7 +79,10 @@ def _flatten_groups(pairs: Sequence[Override]) -> list[Override]:
 
 
 def _expand_single(scenario: Scenario, key: str, overridden: Mapping[str, Any]) -> str:
-    """Returns a key that is not of a group; a setting of a user's law gets its full path."""
+    """Returns the path of a key that does not belong to a group.
+
+    A key of a user's law is an argument of its class, and gets the path of this argument.
+    """
     group, _, rest = key.partition(".")
     site, _, name = rest.partition(".control.")
     is_control_key = group == "sites" and site in scenario.sites and bool(name)
@@ -79,7 +92,7 @@ def _expand_single(scenario: Scenario, key: str, overridden: Mapping[str, Any]) 
 
 
 def _user_law_key(path: str, name: str) -> str:
-    """Returns the path of a key of a user's law; keys that are not its fields are settings."""
+    """Returns the path of a key of a user's law. Keys that are not its fields are arguments."""
     is_field = name.split(".")[0] in ("law", *field_names(ImportedLaw))
     return f"{path}.{name}" if is_field else f"{path}.settings.{name}"
 
@@ -87,19 +100,23 @@ def _user_law_key(path: str, name: str) -> str:
 def _expand_group(
     scenario: Scenario, group: str, name: str, overridden: Mapping[str, Any]
 ) -> list[str]:
-    """Returns the paths of a key of a group, for each law or link that can have it.
+    """Returns the paths of a key of a group, one for each law or link that can have the key.
 
-    The kind of a law or link is that after the overrides.
+    Whether a law or link can have it depends on its kind after the overrides.
 
     Args:
-        scenario: the scenario.
+        scenario: The scenario.
         group: "control" or "link".
-        name: the key in the group.
-        overridden: all overrides, by key.
+        name: Key in the group.
+        overridden: All overrides, by key.
+
+    Raises:
+        ScenarioError: No law or link can have the key.
     """
     kinds, keys_by_kind = _list_group_kinds(scenario, group, overridden)
     if name in _KIND_KEYS[group]:
         return [f"{path}.{name}" for path in kinds]
+
     valid_keys = sorted({key for keys in keys_by_kind.values() for key in keys})
     vector, _ = _split_entry(name)
     members = []
@@ -112,9 +129,13 @@ def _expand_group(
         elif vector in keys_by_kind.get(kind, valid_keys):
             # An unknown kind is refused when the tables are resolved.
             members.append(f"{path}.{name}")
-    # A key that no built-in law of the scenario has is a setting of the users' laws.
-    if members or user_law_members:
-        return members or user_law_members
+
+    # A key that no built-in law of the scenario has is an argument of the users' laws.
+    if members:
+        return members
+    if user_law_members:
+        return user_law_members
+
     if vector not in valid_keys:
         hint = suggest_nearest(vector, [*_KIND_KEYS[group], *valid_keys])
         hint = hint or f"; valid are {', '.join(valid_keys)}"
@@ -132,7 +153,11 @@ def _expand_group(
 def _list_group_kinds(
     scenario: Scenario, group: str, overridden: Mapping[str, Any]
 ) -> tuple[dict[str, str], dict[str, tuple[str, ...]]]:
-    """Returns the kind of each law or link by its path, and the keys of each built-in kind."""
+    """Returns the kind of each law or link after the overrides, and the keys of each kind.
+
+    Returns:
+        Kinds by the path of the law or link, and keys by the built-in kind.
+    """
     if group == "control":
         laws = {}
         for site in scenario.names:
@@ -148,10 +173,11 @@ def _list_group_kinds(
 
 
 def _split_entry(key: str) -> tuple[str, str]:
-    """Splits the key of an entry, as in "q0_rad.1", into that of its list and its number.
+    """Splits the key of an entry of a list, such as "q0_rad.1".
 
     Returns:
-        Key of the list and number of the entry; for other keys the key itself and "".
+        Key of the list, and number of the entry as a text. For other keys, the key itself and
+        an empty text.
     """
     vector, _, entry = key.rpartition(".")
     if vector and entry.isdecimal():
@@ -162,11 +188,18 @@ def _split_entry(key: str) -> tuple[str, str]:
 def split_entries(
     tables: TomlTable, pairs: Sequence[Override]
 ) -> tuple[dict[str, Any], list[Override]]:
-    """Returns overrides that apply to an author's tables, and overrides that must wait.
+    """Separates the overrides that apply to the tables of a file from those that must wait.
 
-    An override of an entry of a vector waits if the tables do not write the vector out. The
-    vector may be a single number, or the value of a group; only the resolved scenario has its
+    An override of an entry of a list must wait if the tables do not contain the list. It may be
+    written as a single number, or for all sites; only the resolved scenario contains its
     entries.
+
+    Args:
+        tables: Tables of the scenario file.
+        pairs: The overrides.
+
+    Returns:
+        The overrides that apply to the tables, and those that must wait.
     """
     applicable = {}
     waiting = []
@@ -180,7 +213,10 @@ def split_entries(
 
 
 def _find_value(tables: TomlTable, key: str) -> Any:
-    """Returns the value at a dotted key, in which a number is an entry of a list; or None."""
+    """Returns the value at a dotted key, in which a number is an index.
+
+    None if there is none.
+    """
     value: Any = tables
     for name in key.split("."):
         if isinstance(value, dict):
@@ -193,7 +229,7 @@ def _find_value(tables: TomlTable, key: str) -> Any:
 
 
 def _find_law(scenario: Scenario, site: str, overridden: Mapping[str, Any]) -> Any:
-    """Returns the name of a site's law after the overrides."""
+    """Returns the name of a site's control law after the overrides."""
     for path in (f"sites.{site}.control.law", "control.law"):
         if path in overridden:
             return overridden[path]
@@ -201,9 +237,9 @@ def _find_law(scenario: Scenario, site: str, overridden: Mapping[str, Any]) -> A
 
 
 def _find_model(scenario: Scenario, link: str, overridden: Mapping[str, Any]) -> Any:
-    """Returns the name of a link's model after the overrides.
+    """Returns the name of a link's delay model after the overrides.
 
-    An unknown model or preset is refused when the tables are resolved.
+    An unknown model or preset is refused later, when the tables are resolved.
     """
     for path in (f"links.{link}", "link"):
         if f"{path}.model" in overridden:
@@ -215,18 +251,19 @@ def _find_model(scenario: Scenario, link: str, overridden: Mapping[str, Any]) ->
 
 
 def apply_overrides(tables: TomlTable, overrides: Mapping[str, Any] | Sequence[str]) -> None:
-    """Writes overrides into the tables of a scenario as read from TOML, in place.
+    """Writes overrides into the tables of a scenario file, in place.
 
-    A number in a key is an entry of a list, counted from 0, as in
-    sites.s.environment.0.stiffness_n_m. A key that names a kind (a link's model or preset, a
-    law, an arm's urdf) removes the other keys of its table, which belong to another kind.
+    A number in a key is the index of an entry of a list, counted from 0, as in
+    sites.s.environment.0.stiffness_n_m. A key that names a kind (the model or preset of a link,
+    a law, the URDF file of an arm) removes the other keys of its table, because they belong to
+    the previous kind.
 
     Args:
-        tables: the tables.
-        overrides: a mapping, or texts KEY=VALUE.
+        tables: The tables.
+        overrides: Overrides by key, or texts KEY=VALUE.
 
     Raises:
-        ScenarioError: an override has no such form, or its key does not exist.
+        ScenarioError: An override does not have this form, or its key does not exist.
     """
     pairs = parse_overrides(overrides)
     overridden_keys = {key for key, _ in pairs}
@@ -245,14 +282,24 @@ def apply_overrides(tables: TomlTable, overrides: Mapping[str, Any] | Sequence[s
 
 
 def _list_kind_keys(parents: Sequence[str]) -> list[str]:
-    """Returns the keys that name a kind, in the table at the keys `parents`."""
+    """Returns the keys that name a kind, for the table at a path.
+
+    Args:
+        parents: Keys of the path.
+    """
     if parents and parents[-1] == "arm":
         return ["urdf"]
     return [key for keys in _KIND_KEYS.values() for key in keys]
 
 
 def _check_site_exists(tables: TomlTable, parents: Sequence[str], key: str) -> None:
-    """Refuses a key of a site that the tables do not have."""
+    """Refuses the key of a site that does not exist.
+
+    Args:
+        tables: Tables of the scenario.
+        parents: Keys of the path, without the last one.
+        key: The complete key, for the error message.
+    """
     sites = tables.get("sites")
     if len(parents) < 2 or parents[0] != "sites" or not isinstance(sites, dict):
         return
@@ -263,12 +310,15 @@ def _check_site_exists(tables: TomlTable, parents: Sequence[str], key: str) -> N
 
 
 def _reach_table(tables: TomlTable, parents: Sequence[str], last: str) -> TomlTable | list[Any]:
-    """Returns the table or list at the keys `parents`; tables that are missing are added.
+    """Returns the table or list at a path. Missing tables and lists are added.
 
     Args:
-        tables: the tables of the scenario.
-        parents: the keys of the table, one after the other.
-        last: the key in that table. If it is a number, a missing table is a list.
+        tables: Tables of the scenario.
+        parents: Keys of the path.
+        last: Key in the table or list. If it is a number, a missing container is a list.
+
+    Raises:
+        ScenarioError: There is a value in place of a table, or no such entry of a list.
     """
     container: Any = tables
     for depth, name in enumerate(parents):
@@ -285,7 +335,16 @@ def _reach_table(tables: TomlTable, parents: Sequence[str], last: str) -> TomlTa
 
 
 def _list_index(entries: list[Any], name: str, path: str) -> int:
-    """Returns the number of an entry of a list; refuses an entry that does not exist."""
+    """Returns the index of an entry of a list.
+
+    Args:
+        entries: The list.
+        name: Index as a text.
+        path: Path of the entry, for the error message.
+
+    Raises:
+        ScenarioError: There is no such entry.
+    """
     if not name.isdecimal() or int(name) >= len(entries):
         counted = f"it has {len(entries)}, counted from 0" if entries else "the list is empty"
         raise ScenarioError(f"no such entry: {counted}", path=path)
@@ -293,13 +352,14 @@ def _list_index(entries: list[Any], name: str, path: str) -> int:
 
 
 def parse_overrides(overrides: Mapping[str, Any] | Sequence[str]) -> list[Override]:
-    """Returns overrides as keys and values.
+    """Returns overrides as pairs of a key and a value.
 
     Args:
-        overrides: a mapping, or texts KEY=VALUE whose values are TOML or bare words.
+        overrides: Overrides by key, or texts KEY=VALUE. The value of a text is TOML or a bare
+            word.
 
     Raises:
-        ScenarioError: a text is not of that form.
+        ScenarioError: A text does not have this form.
     """
     if isinstance(overrides, Mapping):
         return list(name_law_classes(overrides).items())
@@ -315,9 +375,9 @@ def parse_overrides(overrides: Mapping[str, Any] | Sequence[str]) -> list[Overri
 
 
 def split_assignment(text: str) -> Override | None:
-    """Returns the key and the value of a text KEY=VALUE; None if it is not of that form.
+    """Splits a text KEY=VALUE into its key and its value. None if it does not have this form.
 
-    The value is TOML, or else a bare word.
+    A value that is not TOML is a bare word, and is returned as a text.
     """
     key, equals, value = text.partition("=")
     if not equals or not key.strip():

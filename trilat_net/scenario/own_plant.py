@@ -1,11 +1,13 @@
-"""A user's own plant: a class that moves an arm and the bodies of its scene.
+"""Runs a user's plant: a class that computes the motion of an arm and of other bodies.
+
+In a scenario, the plant of a site is named by its class:
 
     plant = "my_plant:Scene"            # or a table: { class = "my_plant:Scene", mass_kg = 2 }
 
 Invariant:
-    - The state that a plant returns is a measurement: it becomes q, qd and tau_x of the next
-      tick's record, as the motion of an arm outside of the program does. A log therefore
-      executes the control again exactly, without the plant, and does not judge the plant.
+    - The state that a plant returns is treated as a measurement, like that of a real robot. It
+      becomes q, qd and tau_x of the next record. Therefore the control can be executed again
+      from a log without the plant, and the motion of the plant is not judged.
 """
 
 import math
@@ -30,12 +32,15 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 _BODY_NAME = re.compile(r"[a-z][a-z0-9_]{0,29}")
 _MAX_BODIES = 32
+"""Largest number of bodies that a plant moves in addition to its arm."""
 _MAX_SIZE_M = 100.0
+"""Largest extent of a body, in m."""
 _POSE_NUMBERS = 7
+"""Number of values of a pose: three for the position, four for the quaternion."""
 
 
 class PlantContext(NamedTuple):
-    """The facts that the class of a user's own plant receives.
+    """Facts that a user's plant receives when it is created.
 
     >>> class Scene:
     ...     def __init__(self, facts: tn.PlantContext) -> None:
@@ -45,14 +50,14 @@ class PlantContext(NamedTuple):
     ...         return self.arm.q, self.arm.qd
 
     Attributes:
-        site: the site whose arm the plant moves.
-        scenario: the experiment: its arms, start poses and tick rates.
-        q0_rad: the arm's start pose, rad, shape (n,).
-        h_s: the period of a tick, s.
-        seed: seed for random numbers of the plant, derived from the scenario's seed and the
+        site: Name of the site whose arm the plant moves.
+        scenario: The experiment, with its arms, start poses and tick rates.
+        q0_rad: Start pose of the arm, in rad, shape (n,).
+        h_s: Duration of a tick, in s.
+        seed: Seed for random numbers of the plant. It depends on the scenario's seed and the
             site.
-        bodies_m: the bodies that the plant moves besides the arm, by name: their sizes along
-            their own axes x, y and z, m.
+        bodies_m: Extents of the bodies that the plant moves in addition to the arm, by name,
+            along their own axes x, y and z, in m.
     """
 
     site: str
@@ -64,42 +69,46 @@ class PlantContext(NamedTuple):
 
 
 class PlantProgram(Protocol):
-    """A user's own plant. Its class is called with `PlantContext` and its settings, by name."""
+    """Interface of a user's plant.
+
+    The class is called with a `PlantContext` as its first argument, and with its settings by
+    name.
+    """
 
     def step(self, tau: Array, h_s: float) -> Sequence[Sequence[float]]:
-        """Advances the plant by a period under the control torque ON the joints.
+        """Advances the plant by one period under a constant control torque.
 
         Args:
-            tau: the control torque, N m, shape (n,).
-            h_s: the period, s.
+            tau: Control torque ON the joints, in N m, shape (n,).
+            h_s: Duration of the period, in s.
 
         Returns:
-            q, rad, and qd, rad/s, at the end of the period. A plant that knows the torque of
-            contacts returns tau_x, N m, as well, in the sign of Eq. (8): the negative of the
+            q in rad and qd in rad/s at the end of the period. A plant that knows the torque of
+            contacts also returns tau_x in N m, with the sign of Eq. (8): the negative of the
             torque ON the arm.
         """
 
     def poses(self) -> Sequence[Sequence[float]]:
-        """Returns the poses of the bodies now, in the order of `PlantContext.bodies_m`.
+        """Returns the current poses of the bodies, in the order of `PlantContext.bodies_m`.
 
-        The method is called only if the plant has bodies.
+        This method is called only if the plant has bodies.
 
         Returns:
-            Seven numbers per body: x, y, z of its centre in the arm's base frame, m, and the
-            quaternion w, x, y, z.
+            Seven numbers per body: x, y and z of its centre in the frame of the arm's base, in
+            m, and the quaternion w, x, y, z.
         """
 
 
 class OwnPlant(Frozen, frozen=True, rename={"code": "class"}, omit_defaults=True):
-    """The plant of a site in a scenario.
+    """Table of a user's plant in a scenario.
 
     Attributes:
-        code: the class of the plant, as in "my_plant:Scene".
-        source_sha256: hash of the file of the class.
-        bodies: the bodies that the plant moves besides the arm, by name: the sizes of a box
-            around the body along its own axes x, y and z, m. Their poses are recorded and
-            drawn.
-        settings: the arguments of the class, by name.
+        code: Class of the plant, for example "my_plant:Scene".
+        source_sha256: SHA-256 hash of the file of the class.
+        bodies: Bodies that the plant moves in addition to the arm. For each name, the extents
+            along the body's own axes x, y and z of a box around it, in m. Their poses are
+            recorded and drawn.
+        settings: Arguments of the class, by name.
     """
 
     method: ClassVar[str] = "step"
@@ -111,9 +120,16 @@ class OwnPlant(Frozen, frozen=True, rename={"code": "class"}, omit_defaults=True
 
 
 def resolve_plant(written: Any, path: str) -> Any:
-    """Returns a site's plant complete: a class gets the hash of its file.
+    """Returns the complete table of a site's plant, with the hash of the file of its class.
 
-    A text such as "external", and a value of a wrong type, is returned as it is.
+    A text such as "external", and a value of a wrong type, are returned unchanged.
+
+    Args:
+        written: Plant as its author wrote it.
+        path: Path of the key, for error messages.
+
+    Raises:
+        ScenarioError: The class is missing, its file cannot be read, or a body is not valid.
     """
     table = written
     if isinstance(written, str) and ":" in written:
@@ -126,8 +142,10 @@ def resolve_plant(written: Any, path: str) -> Any:
     bodies = {}
     if "bodies" in table:
         bodies["bodies"] = _check_bodies(table["bodies"], f"{path}.bodies")
+    # A table with a hash has been resolved before.
     if "source_sha256" in table:
         return {**table, **bodies}
+
     settings = {key: value for key, value in table.items() if key not in ("class", "bodies")}
     return {
         "class": code,
@@ -138,7 +156,11 @@ def resolve_plant(written: Any, path: str) -> Any:
 
 
 def _check_bodies(written: Any, path: str) -> Any:
-    """Returns the table of bodies if their names and sizes are valid."""
+    """Returns the table of bodies unchanged if their names and extents are valid.
+
+    Raises:
+        ScenarioError: There are too many bodies, or a name or extent is not valid.
+    """
     if not isinstance(written, Mapping) or len(written) > _MAX_BODIES:
         example = "{ box = [0.2, 0.2, 0.1] }"
         raise ScenarioError(
@@ -158,28 +180,28 @@ def _check_bodies(written: Any, path: str) -> Any:
 
 
 def _is_box_size(size: Any) -> bool:
-    """Returns True for a list of three lengths in m that a body may have."""
+    """True for a list of three lengths in m that a body may have."""
     if not isinstance(size, list | tuple) or len(size) != 3:
         return False
     return all(is_number(length) and 0.0 < length <= _MAX_SIZE_M for length in size)
 
 
 class PlantPlayer:
-    """Runs a user's own plant at its site, tick by tick.
+    """Runs a user's plant at its site, tick by tick.
 
     Args:
-        scenario: the scenario.
-        site: name of the site.
-        plant: the plant of the site.
-        watch: calls the code of the plant.
+        scenario: The scenario.
+        site: Name of the site.
+        plant: Table of the plant.
+        watch: Function that calls the code of the plant, for example with a time limit.
 
     Attributes:
-        state: the state of the arm at the next tick.
-        rate_hz: the tick rate of the site, Hz.
+        state: State of the arm and the bodies in the next tick.
+        rate_hz: Tick rate of the site, in Hz.
 
     Raises:
-        ScenarioError: the class cannot be used, or lacks a method.
-        PlantFailed: the first poses of the bodies are wrong.
+        ScenarioError: The class cannot be used, or lacks a method.
+        PlantFailed: The first poses of the bodies are not valid.
     """
 
     def __init__(
@@ -216,12 +238,12 @@ class PlantPlayer:
         """Advances the plant from a tick to the next one.
 
         Args:
-            tick: the tick.
-            tau: its control torque, N m, shape (n,).
+            tick: The tick.
+            tau: Control torque of this tick, in N m, shape (n,).
 
         Raises:
-            PlantFailed: the plant raised an error, or returned a state that is not a finite
-                motion of the arm.
+            PlantFailed: The plant raised an error, or returned a state with wrong lengths or
+                numbers that are not finite.
         """
         vectors = self._call(tick, lambda: self._step(tau))
         for name, vector in zip(("q", "qd", "tau_x"), vectors, strict=False):
@@ -233,19 +255,25 @@ class PlantPlayer:
                 )
             if not all(map(math.isfinite, vector)):
                 raise self._make_error(tick, f"{name} is {vector}, which is not finite")
+
         bodies = self._call(tick, self._read_poses)
         q, qd, *contact_torques = vectors
         tau_x = contact_torques[0] if contact_torques else ()
         self.state = PlantState(q, qd, tau_x, bodies)
 
     def _step(self, tau: Sequence[float]) -> list[list[float]]:
-        """Returns q, qd and, if the plant knows it, tau_x after a period."""
+        """Returns q, qd and, if the plant returns it, tau_x after one period."""
         q, qd, *others = self._program.step(np.array(tau), 1.0 / self.rate_hz)
         vectors = [q, qd, *others[:1]]
         return [[float(number) for number in vector] for vector in vectors]
 
     def _read_poses(self) -> list[float]:
-        """Returns the poses of all bodies, one after the other, seven numbers each."""
+        """Returns the poses of all bodies as one list, with seven numbers per body.
+
+        Raises:
+            ValueError: The plant returned another number of poses, or numbers that are not
+                finite.
+        """
         if not self._body_count:
             return []
         poses = [[float(number) for number in pose] for pose in self._program.poses()]
@@ -260,10 +288,14 @@ class PlantPlayer:
         return numbers
 
     def _call(self, tick: int, function: Callable[[], T]) -> T:
-        """Returns the result of the plant's code at a tick.
+        """Calls the code of the plant, and returns the result.
+
+        Args:
+            tick: Tick, for the error message.
+            function: The call.
 
         Raises:
-            PlantFailed: the code raised an error.
+            PlantFailed: The code raised an error.
         """
         try:
             result: T = self._watch(tick, function)
@@ -273,16 +305,16 @@ class PlantPlayer:
             raise self._make_error(tick, f"{type(error).__name__}: {error}") from error
 
     def _make_error(self, tick: int, problem: str) -> PlantFailed:
-        """Returns the error for a problem of the plant at a tick."""
+        """Returns the error that reports a problem of the plant in a tick."""
         return PlantFailed(problem, site=self._site, code=self._code, tick=tick)
 
 
 def make_plant_players(scenario: "Scenario") -> dict[str, PlantPlayer]:
-    """Returns the players of all users' own plants, by site.
+    """Returns a player for each site with a user's plant, by the name of the site.
 
     Raises:
-        CodeWithheld: a class may not run.
-        ScenarioError: a plant cannot be made.
+        CodeWithheld: A class may not run.
+        ScenarioError: A plant cannot be created.
     """
     return {
         name: PlantPlayer(scenario, name, spec.plant)

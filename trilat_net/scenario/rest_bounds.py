@@ -1,11 +1,11 @@
-"""Bounds of a stop: how long it takes, how fast joints may get, and what motors bear.
+"""Bounds how an arm comes to rest: the time, the largest speeds, and the load of the motors.
 
-The bounds follow from the model of the arm, the limits of its torques, and the rule by which
-the arm comes to rest (`core.resting`). docs/links.md derives them; comments give the numbers of
-its equations.
+If a site must stop, damping brings its arm to rest (`core.resting`). The bounds follow from the
+model of the arm, the limits of its torques, and this rule. docs/links.md derives them; the
+numbers in comments are those of its equations.
 
 Invariant:
-    - The same scenario has the same bounds: poses are drawn with a fixed seed.
+    - The bounds of a scenario are always the same, because poses are drawn with a fixed seed.
 """
 
 import math
@@ -23,26 +23,28 @@ from .arms import Arm, ArmModel
 from .scenario_types import Scenario
 
 AT_REST_RAD_S = 0.05
-"""Speed of the joints below which an arm is at rest."""
+"""Speed of the joints below which an arm counts as at rest, in rad/s."""
 SETTLE_TIMES = 10.0
-"""Time constants `RestGains.time_s` within which the torque at rest forgets its start."""
+"""Number of time constants `RestGains.time_s` after which the initial torque has decayed."""
 _POSES = 100
+"""Number of poses in which the dynamics of an arm are computed."""
 _LEAST_NM = 1e-300
-"""Keeps a divisor above zero."""
+"""Smallest divisor, which avoids a division by zero."""
 _MAX_PATTERNS = 64
 """Largest number of combinations of the joints' directions that are examined."""
 
 
 class RestBounds(NamedTuple):
-    """Bounds of a stop from a speed of the joints.
+    """Bounds of a stop that begins with a certain speed of the joints.
 
     Attributes:
-        rest_s: the time within which the arm is at rest; inf: its motors cannot hold it.
-        bearable_share: the share of the speed up to which the motors can hold the Coriolis
-            torques between joints.
-        kinetic_j: the largest kinetic energy at that speed, J.
-        blend_j: the largest energy that the last torques before the stop add, J.
-        peak_rad_s: the largest speed of each joint that the energy allows, shape (n,).
+        rest_s: Time within which the arm is at rest, in s. Infinite if its motors cannot hold
+            it against gravity.
+        bearable_share: Fraction of the speed up to which the motors can balance the Coriolis
+            torques between the joints. It may exceed 1.
+        kinetic_j: Largest kinetic energy at the speed, in J.
+        blend_j: Largest energy that the last torques before the stop add, in J.
+        peak_rad_s: Largest speed of each joint that the energy permits, in rad/s, shape (n,).
     """
 
     rest_s: float
@@ -53,13 +55,13 @@ class RestBounds(NamedTuple):
 
 
 class _ArmSamples(NamedTuple):
-    """The dynamics of an arm in many poses.
+    """Dynamics of an arm in many poses.
 
     Attributes:
-        M: inertia matrix, shape (poses, n, n).
-        G: absolute torque of gravity, N m, shape (poses, n).
-        coriolis: largest absolute Coriolis torque over all directions of the joints, N m, shape
-            (poses, n).
+        M: Inertia matrix in each pose, shape (poses, n, n).
+        G: Absolute gravity torque in each pose, in N m, shape (poses, n).
+        coriolis: Largest absolute Coriolis torque over all directions in which the joints may
+            move, in N m, shape (poses, n).
     """
 
     M: Array
@@ -68,12 +70,13 @@ class _ArmSamples(NamedTuple):
 
 
 def find_rest_bounds(scenario: Scenario, site: str, qd: Array | None = None) -> RestBounds:
-    """Returns the bounds of a stop from a speed of the joints.
+    """Computes the bounds of a stop.
 
     Args:
-        scenario: the scenario; the site has the rule `glide`.
-        site: the site.
-        qd: speed of each joint, rad/s, shape (n,); None: the limits of the speeds.
+        scenario: The scenario. The site has the stale rule "glide".
+        site: Name of the site.
+        qd: Speed of each joint at the beginning, in rad/s, shape (n,). By default, the speed
+            limits.
     """
     spec = scenario.sites[site]
     setup = scenario.setup(site)
@@ -85,6 +88,7 @@ def find_rest_bounds(scenario: Scenario, site: str, qd: Array | None = None) -> 
         samples = _sample_chain(scenario.arms[site], np.array(spec.q0_rad), speed)
     else:
         samples = _sample_planar_arm(spec.arm, speed)
+
     beyond_gravity_nm = np.maximum(limit_nm - samples.G, 0.0)
     shares = beyond_gravity_nm / np.maximum(samples.coriolis, _LEAST_NM)
     velocities = speed * _list_patterns(joints)
@@ -113,14 +117,17 @@ def find_rest_bounds(scenario: Scenario, site: str, qd: Array | None = None) -> 
 def _bound_rest_time(
     setup: SiteSetup, speed: Array, limit_nm: Array, samples: _ArmSamples, energy_j: float
 ) -> float:
-    """Returns the time of Eq. (8), s; inf if the motors cannot hold the arm.
+    """Computes the time within which the arm is at rest, Eq. (8), in s.
 
     Args:
-        setup: the setup of the site.
-        speed: speed of each joint at the beginning, rad/s, shape (n,).
-        limit_nm: largest torque of each joint, N m, shape (n,).
-        samples: the dynamics of the arm.
-        energy_j: the largest energy at the beginning, J.
+        setup: Setup of the site.
+        speed: Speed of each joint at the beginning, in rad/s, shape (n,).
+        limit_nm: Largest torque of each joint, in N m, shape (n,).
+        samples: Dynamics of the arm.
+        energy_j: Largest energy at the beginning, in J.
+
+    Returns:
+        The time. Infinite if the motors cannot hold the arm against gravity.
     """
     gravity_nm = samples.G.max(axis=0)
     available_nm = limit_nm - gravity_nm
@@ -148,10 +155,13 @@ def _bound_rest_time(
 
 
 def _list_patterns(joints: int) -> Array:
-    """Returns directions of the joints, 1 or -1 each, shape (patterns, joints).
+    """Returns combinations of directions of the joints, with entries 1 or -1.
 
-    The first joint's direction is always 1, because the opposite pattern has the same energy
-    and the same Coriolis torques.
+    The first joint always has the direction 1, because the opposite combination has the same
+    kinetic energy and the same Coriolis torques.
+
+    Returns:
+        Array of shape (patterns, joints), with at most `_MAX_PATTERNS` rows.
     """
     all_patterns = product((1.0, -1.0), repeat=joints - 1)
     patterns = islice(all_patterns, _MAX_PATTERNS)
@@ -159,7 +169,10 @@ def _list_patterns(joints: int) -> Array:
 
 
 def _draw_poses(model: ArmModel, q0: Array) -> Array:
-    """Returns the start pose and poses between the stops of the joints, shape (poses, n)."""
+    """Returns the start pose, and random poses between the joints' stops, shape (poses, n).
+
+    A joint without a stop is drawn between -pi and pi.
+    """
     assert model.chain is not None
     low = []
     high = []
@@ -172,10 +185,14 @@ def _draw_poses(model: ArmModel, q0: Array) -> Array:
 
 
 def _sample_planar_arm(arm: Arm, speed: Array) -> _ArmSamples:
-    """Returns the dynamics of the planar arm for all angles of its elbow.
+    """Computes the dynamics of the planar arm for all angles of its elbow.
 
-    The equations are the paper's Eq. (2) to (5) and (24). The inertia and the Coriolis torques
-    do not depend on the shoulder, and gravity is bounded over all poses.
+    The equations are (2) to (5) and (24) of the paper. Inertia and Coriolis torques do not
+    depend on the angle of the shoulder. The gravity torques are upper bounds over all poses.
+
+    Args:
+        arm: Table of the arm.
+        speed: Speed of each joint, in rad/s, shape (2,).
     """
     a, b, c, first, second = theta_from_links(arm.planar_links())
     elbow = np.linspace(-math.pi, math.pi, _POSES + 1)
@@ -196,9 +213,14 @@ def _sample_planar_arm(arm: Arm, speed: Array) -> _ArmSamples:
 
 
 def _sample_chain(model: ArmModel, q0: Array, speed: Array) -> _ArmSamples:
-    """Returns the dynamics of a chain in its start pose and in drawn poses.
+    """Computes the dynamics of a chain in its start pose and in random poses.
 
-    Friction is left out: it only dissipates energy.
+    Friction is left out, because it only dissipates energy.
+
+    Args:
+        model: Model of the arm.
+        q0: Start pose, shape (n,).
+        speed: Speed of each joint, in rad/s, shape (n,).
     """
     assert model.chain is not None
     gravity = np.array(model.chain.gravity_m_s2)

@@ -1,12 +1,12 @@
-"""Samples of its peers that a site uses, and samples that its user sees.
+"""Computes in advance which samples of its peers a site uses, and which samples its user sees.
 
-Delays and losses are drawn as a run draws them, so that a forecast before a run holds in the
-run.
+A sample is the state that a site publishes in one tick. Its delay and loss are random, but they
+are a function of the scenario and its seed. Therefore the same draws can be made without a run.
 
 Invariant:
-    - The draws are those of the link's key.
-    - The samples that a user sees are a function of scenario, seed and ticks. A log
-      therefore need not record them.
+    - The random draws are those of the link's key, as in a run.
+    - The samples that a user sees are a function of the scenario, the seed and the tick.
+      Therefore logs need not contain them.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -25,21 +25,23 @@ from .delay_models import LinkBase
 from .scenario_types import Scenario
 
 _BLOCK = 8192
-"""Samples that are scheduled at once."""
+"""Number of samples that are scheduled at once."""
 
 
 class LinkSchedule:
-    """The due times of the samples of a link, computed with a row of the core's link.
+    """Computes when the samples of a link are due at the receiver.
 
-    The row has all models and outages from the start. A model applies from its first stamp on.
+    The kernel's own function computes the times. It works on a row that describes the link,
+    with all its models and outages. A model applies to samples that are sent at its first stamp
+    or later.
 
     Args:
-        setup: the link.
-        changed_models: models that changes of the run bring into force later.
+        setup: Setup of the link.
+        changed_models: Models that the link gets by changes during the run.
 
     Attributes:
-        models: the models of the link, in the order of their first stamps.
-        row: the state of the link in the core.
+        models: All models of the link, in the order of their first stamps.
+        row: Row of the link in the form that the kernel uses.
     """
 
     def __init__(self, setup: LinkSetup, changed_models: Sequence[LinkModel] = ()) -> None:
@@ -52,10 +54,11 @@ class LinkSchedule:
                     points.append((int(t_us), int(delay_us)))
             models.append(model)
         models += changed_models
-        # The sort is stable: of two models with one first stamp, the changed model applies.
+        # The sort is stable: of two models with the same first stamp, the changed one applies.
         models.sort(key=lambda model: model.from_ns)
         self.models = np.array(models, LINK_MODEL_DTYPE)
         self._points = np.array([*points, *setup.outages], dtype=np.int64).reshape(-1, 2)
+
         row: Row = np.zeros(1, link_dtype(0))[0]
         row.rate_hz = setup.rate_hz
         row.key = setup.key
@@ -68,9 +71,15 @@ class LinkSchedule:
         self._block = np.empty(_BLOCK, dtype=np.int64)
 
     def draw(self, end: int) -> IntArray:
-        """Returns the due times of the samples before `end`, in ns; LOST for a lost sample.
+        """Computes when the next samples are due.
 
-        The first of these samples is the sample after the last sample of the previous call.
+        The first of these samples is the one after the last sample of the previous call.
+
+        Args:
+            end: Number of the sample after the last one.
+
+        Returns:
+            Due times in ns after the epoch. LOST for a sample that is lost.
         """
         first = int(self.row.scheduled) + 1
         due_ns = np.empty(max(0, end - first), dtype=np.int64)
@@ -88,26 +97,29 @@ class LinkSchedule:
         return due_ns
 
     def draw_releases(self, end: int, receiver_hz: int) -> tuple[IntArray, IntArray]:
-        """Returns the next samples that are not lost, and the ticks of their release.
+        """Computes in which ticks of the receiver the next samples come into use.
+
+        Samples that are lost are left out.
 
         Args:
-            end: the sample after the last one to draw.
-            receiver_hz: the tick rate of the receiving site, Hz.
+            end: Number of the sample after the last one.
+            receiver_hz: Tick rate of the receiver, in Hz.
 
         Returns:
-            Numbers of samples, and the receiver's first tick at or after each due time.
+            Numbers of the samples, and for each the receiver's first tick at or after its due
+            time.
         """
         samples = np.arange(int(self.row.scheduled) + 1, end)
         due_ns = self.draw(end)
         stamp_ns = samples * NS_PER_S // int(self.row.rate_hz)
-        # A sample is never released at its own stamp.
+        # A sample never comes into use at the time of its own stamp.
         ticks = first_ticks(np.maximum(due_ns, stamp_ns + 1), receiver_hz)
         is_delivered = due_ns != LOST
         return samples[is_delivered], ticks[is_delivered]
 
 
 def first_ticks(due_ns: IntArray, rate_hz: int) -> IntArray:
-    """Returns the first ticks at or after times in ns, as `core.ticks.first_tick_at` does."""
+    """Returns the first ticks at or after some times in ns, like `core.ticks.first_tick_at`."""
     return -(-due_ns * rate_hz // NS_PER_S)
 
 
@@ -115,17 +127,17 @@ def first_ticks(due_ns: IntArray, rate_hz: int) -> IntArray:
 def draw_used_samples(
     link: LinkBase, key: int, receiver_hz: int, sender_hz: int, duration_s: float
 ) -> IntArray:
-    """Returns the sample in use at every tick of a site that has only this link.
+    """Computes which sample a site uses in every tick, if it has only one link.
 
     Args:
-        link: the link.
-        key: the key of its random draws.
-        receiver_hz: the tick rate of the site, Hz.
-        sender_hz: the tick rate of the peer, Hz.
-        duration_s: the duration of the run, s.
+        link: The link.
+        key: Key of the link's random draws.
+        receiver_hz: Tick rate of the site, in Hz.
+        sender_hz: Tick rate of the peer, in Hz.
+        duration_s: Duration of the run, in s.
 
     Returns:
-        Numbers of samples, shape (ticks,); -1 before the first sample is in use.
+        Number of the sample in every tick, shape (ticks,). -1 before the first sample.
     """
     setup = LinkSetup(
         peer="peer",
@@ -145,7 +157,16 @@ def draw_used_samples(
 
 
 def _list_newest(samples: IntArray, releases: IntArray, ticks: int) -> IntArray:
-    """Returns the newest sample released at or before each tick, -1 before the first."""
+    """Returns the newest sample that is in use in each tick.
+
+    Args:
+        samples: Numbers of the samples.
+        releases: Tick in which each sample comes into use.
+        ticks: Number of ticks.
+
+    Returns:
+        Numbers of samples, shape (ticks,). -1 before the first sample.
+    """
     newest = np.full(ticks, -1, dtype=np.int64)
     is_within = releases < ticks
     np.maximum.at(newest, releases[is_within], samples[is_within])
@@ -153,35 +174,36 @@ def _list_newest(samples: IntArray, releases: IntArray, ticks: int) -> IntArray:
 
 
 def count_silences(used: IntArray, receiver_hz: int, silence_ns: int) -> int:
-    """Returns how often no new sample came into use for longer than `silence_ns`.
+    """Counts how often no new sample came into use for longer than a limit.
 
     The time before the first sample does not count.
 
     Args:
-        used: the sample in use at every tick, -1 before the first.
-        receiver_hz: the tick rate of the site, Hz.
-        silence_ns: the longest time that is not a silence, ns.
+        used: Number of the sample in use in every tick. -1 before the first sample.
+        receiver_hz: Tick rate of the site, in Hz.
+        silence_ns: The limit, in ns.
     """
     new_sample_ticks = np.flatnonzero(np.diff(used, prepend=-1) > 0)
     if not len(new_sample_ticks):
         return 0
     gap_ticks = np.diff(new_sample_ticks, append=len(used))
     gaps_ns = gap_ticks * NS_PER_S // receiver_hz
+    # Without a silence, the distance between new samples is one period.
     period_ns = NS_PER_S // receiver_hz
     return int(np.count_nonzero(gaps_ns - period_ns > silence_ns))
 
 
 class PictureDelay:
-    """The delay of the picture in which a site's user sees its peers: `[sites.NAME.view]`.
+    """Delay of the picture in which the user of a site sees the other arms.
 
-    The picture has a link of its own beside the haptic link, with random draws of its own (L4).
-    The user sees a peer's sample from the site's first tick at or after the arrival of the
-    sample over that link (L2), until a newer sample is shown. Without a view, the user sees the
-    samples in use.
+    The picture is transmitted over a link of its own, with random draws of its own (L4). The
+    user sees a sample from the site's first tick at or after its arrival over that link (L2),
+    until a newer one is shown. Without a view in the scenario, the user sees the samples that
+    the controller uses.
 
     Args:
-        scenario: the scenario.
-        site: name of the site.
+        scenario: The scenario.
+        site: Name of the site.
     """
 
     def __init__(self, scenario: Scenario, site: str) -> None:
@@ -206,19 +228,19 @@ class PictureDelay:
                 outages=tuple(outages),
             )
             self._links[peer] = (rate_hz, LinkSchedule(setup))
-        # Samples and their release ticks after the tick of the last call, shape (2, samples).
+        # Samples that are not shown yet, and the ticks in which they will be shown.
         self._waiting = {peer: np.empty((2, 0), dtype=np.int64) for peer in self._links}
         self._shown = dict.fromkeys(self._links, -1)
 
     def advance_to(self, tick: int, used: Mapping[str, int]) -> Mapping[str, int]:
-        """Returns the sample of each peer that is shown at a tick of the site.
+        """Returns the sample of each peer that is shown in a tick of the site.
 
         Args:
-            tick: the tick; never before that of the last call.
-            used: the sample in use of each peer at that tick.
+            tick: The tick. It must not be before that of the previous call.
+            used: For each peer, the sample that the controller uses in this tick.
 
         Returns:
-            Ticks of the peers; -1 before the first.
+            Number of the shown sample of each peer. -1 before the first sample.
         """
         for peer, releases in self._draw_until(tick):
             samples, ticks = np.concatenate((self._waiting[peer], releases), axis=1)
@@ -230,10 +252,14 @@ class PictureDelay:
         return {**used, **self._shown}
 
     def list_shown_samples(self, ticks: int) -> dict[str, IntArray]:
-        """Returns the samples that are shown at the first ticks of a run.
+        """Returns the samples that are shown in the first ticks of a run.
+
+        Args:
+            ticks: Number of ticks.
 
         Returns:
-            For each peer an array of shape (ticks,), -1 before the first; {} without a view.
+            For each peer, an array of shape (ticks,), with -1 before the first sample. Empty
+            without a view.
         """
         return {
             peer: _list_newest(samples, releases, ticks)
@@ -241,8 +267,12 @@ class PictureDelay:
         }
 
     def _draw_until(self, tick: int) -> Iterator[tuple[str, tuple[IntArray, IntArray]]]:
-        """Yields each peer with the samples that it sent before `tick`, and their releases."""
+        """Yields the samples that each peer sent before a tick, and when they are shown.
+
+        Args:
+            tick: Tick of the site.
+        """
         for peer, (rate_hz, schedule) in self._links.items():
-            # A sample that is stamped at the tick itself is not shown yet.
+            # A sample that is sent at the time of the tick itself is not shown yet.
             end = -(-tick * rate_hz // self._receiver_hz)
             yield peer, schedule.draw_releases(end, self._receiver_hz)

@@ -1,9 +1,9 @@
-"""Skeletons of users' code: a working law, hand or plant, and its test.
+"""Writes skeletons of code for users: a working law, operator or plant, and a test of it.
 
 Invariant:
-    - A skeleton is a file of this package, such as `scenarios/_law.txt`. The file mylaw.py gets
-      the class MyLaw.
-    - The written code runs as it is, and its test passes.
+    - The skeletons are files of this package, such as `scenarios/_law.txt`. The class gets its
+      name from the file: mylaw.py contains the class MyLaw.
+    - The written code runs unchanged, and its test passes.
 """
 
 import keyword
@@ -17,28 +17,29 @@ from .resolve import SHIPPED_FOLDER
 
 
 def new_law(path: str | Path, *, force: bool = False) -> list[Path]:
-    """Writes the skeleton of a law and its test; the command is `trilat new law`.
+    """Writes the skeleton of a control law and its test. The command is `trilat new law`.
 
     >>> [path.name for path in tn.new_law("mylaw.py")]
     ['mylaw.py', 'test_mylaw.py']
 
     Args:
-        path: the file, which becomes a module; mylaw.py has the class MyLaw.
-        force: True if existing files of these names may be replaced.
+        path: File to write, which is a Python module. mylaw.py contains the class MyLaw.
+        force: If True, existing files of these names are replaced.
 
     Returns:
-        The files that were written.
+        The written files.
 
     Raises:
-        UsageError: a file exists, or Python would find another module by that name.
+        UsageError: A file exists, or Python has another module of that name.
     """
     return _write_skeleton("law", Path(path), force=force)
 
 
 def new_hand(path: str | Path, *, force: bool = False) -> list[Path]:
-    """Writes the skeleton of a hand and its test; the command is `trilat new hand`.
+    """Writes the skeleton of an operator and its test. The command is `trilat new hand`.
 
-    A hand is a program that acts as a user. The arguments are those of `new_law`.
+    The operator is a program that moves an arm in place of a person. The arguments are those of
+    `new_law`.
 
     >>> [path.name for path in tn.new_hand("myhand.py")]
     ['myhand.py', 'test_myhand.py']
@@ -47,9 +48,10 @@ def new_hand(path: str | Path, *, force: bool = False) -> list[Path]:
 
 
 def new_plant(path: str | Path, *, force: bool = False) -> list[Path]:
-    """Writes the skeleton of a plant and its test; the command is `trilat new plant`.
+    """Writes the skeleton of a plant and its test. The command is `trilat new plant`.
 
-    A plant moves an arm. The arguments are those of `new_law`.
+    A plant is a program that computes the motion of an arm. The arguments are those of
+    `new_law`.
 
     >>> [path.name for path in tn.new_plant("myplant.py")]
     ['myplant.py', 'test_myplant.py']
@@ -58,7 +60,17 @@ def new_plant(path: str | Path, *, force: bool = False) -> list[Path]:
 
 
 def _write_skeleton(kind: str, file: Path, *, force: bool) -> list[Path]:
-    """Writes the skeleton of a law, hand or plant and its test; returns the two files."""
+    """Writes a skeleton and its test, and returns the two files.
+
+    Args:
+        kind: "law", "hand" or "plant".
+        file: File of the skeleton.
+        force: If True, existing files are replaced.
+
+    Raises:
+        UsageError: A file exists, its name is not that of a module, or Python has another
+            module of that name.
+    """
     module = file.stem
     is_module_name = module.isidentifier() and not keyword.iskeyword(module)
     if file.suffix != ".py" or not is_module_name:
@@ -83,7 +95,7 @@ def _write_skeleton(kind: str, file: Path, *, force: bool) -> list[Path]:
 
 
 def _is_other_module(module: str, file: Path) -> bool:
-    """Returns True if Python finds a module of this name in another file."""
+    """True if Python finds a module of this name in another file."""
     spec = find_spec(module)
     if spec is None:
         return False
@@ -93,6 +105,13 @@ def _is_other_module(module: str, file: Path) -> bool:
 
 
 def name_skeleton_class(module: str, kind: str = "law") -> str:
-    """Returns the class of a module's skeleton: MyLaw of mylaw and my_law, Spring of spring."""
+    """Returns the name of the class in a skeleton.
+
+    The modules mylaw and my_law contain the class MyLaw, and spring contains Spring.
+
+    Args:
+        module: Name of the module.
+        kind: "law", "hand" or "plant".
+    """
     parts = re.sub(rf"(?<=[a-z0-9]){kind}$", f"_{kind}", module).split("_")
     return "".join(part[:1].upper() + part[1:] for part in parts) or kind.title()
