@@ -194,7 +194,7 @@ def count_silences(used: IntArray, receiver_hz: int, silence_ns: int) -> int:
 
 
 class PictureDelay:
-    """Delay of the picture in which the user of a site sees the other arms.
+    """Delay of the picture `[sites.NAME.view]` in which a user sees the other arms.
 
     The picture is transmitted over a link of its own, with random draws of its own (L4). The
     user sees a sample from the site's first tick at or after its arrival over that link (L2),
