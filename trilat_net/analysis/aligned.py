@@ -1,12 +1,17 @@
-"""Aligns a site's records on its tick grid, and shows its peers as the site sees them.
+"""Aligns the records of a site on its ticks, and shows its peers as the site sees them.
+
+Analyses need a row for every tick, also if the log lacks some records. They also need the
+motion of a peer at times between its ticks, for example at the time at which a delayed sample
+was sent.
 
 Invariant:
     - A gap in the records is filled by interpolation, so that sums have all their terms and
       rows keep their times. Filled rows are not `known`, and no metric uses them.
-    - Between two records a peer moves along a cubic through angles and velocities. Before its
-      first record it rests (L7).
-    - Between two ticks a stamp moves at rate one, as under the constant delay of the theorem.
-      The difference from the stamp of the sample in use at the next tick is a jump of the link.
+    - Between two records a peer moves along a cubic polynomial through angles and velocities.
+      Before its first record it rests (rule L7 of docs/design.md).
+    - Within a tick period the sample in use is assumed to grow no older, as under the constant
+      delay of the stability theorem. The difference from the sample in use at the next tick is
+      treated as a jump at the end of the period.
 """
 
 from collections.abc import Sequence
@@ -32,39 +37,43 @@ RECORD_COLUMNS = ("q", "qd", "q_des", "qd_des", "tau", "tau_x", "theta_hat")
 _NO_COLUMNS: Array = np.zeros((0, 0))
 _NO_ROWS: Bools = np.zeros(0, dtype=np.bool_)
 RESUMING_S = 2.0 * BLEND_S
-"""Time after one of the `RESTING_MODES` in which the torque may not be the law's alone, s."""
+"""Time after a resting mode in which the torque may differ from that of the law, in s."""
 _TICK_TOLERANCE = 1e-5
-"""Times that differ from a tick by less than this share of a period are at the tick."""
+"""Largest difference from a tick of a time that counts as the tick, as a share of a period."""
 
 
 class AlignedRecords(NamedTuple):
     """A site's records on every tick from its first to its last: K rows, one per tick.
 
-    In task space the shared coordinates are those of the end effector, of length m.
+    In task space the shared coordinates are the m coordinates of the end effector.
 
     Attributes:
-        site: name of the site.
-        rate_hz: tick rate, in Hz.
-        first: tick of row 0.
+        site: Name of the site.
+        rate_hz: Tick rate, in Hz.
+        first: Tick of row 0.
         known: True if the tick has a record, shape (K,).
         follows: True if the site followed its peers, shape (K,): it did not hold, brake or
             return, and its reference was slower than its limit.
-        q: joint angles, shape (K, n), rad.
-        qd: joint velocities, shape (K, n), rad/s.
-        q_des: reference of the shared coordinates, shape (K, n) or (K, m).
-        qd_des: its derivative.
-        tau: control torque, shape (K, n), N m.
-        tau_x: exogenous torque in the sign of Eq. (8), shape (K, n), N m.
-        theta_hat: parameter estimates, shape (K, P).
-        used: for each peer, the tick of the sample in use, shape (K,); -1 before the first
+        q: Joint angles, shape (K, n), in rad.
+        qd: Joint velocities, shape (K, n), in rad/s.
+        q_des: Reference of the shared coordinates, shape (K, n) or (K, m).
+        qd_des: Derivative of the reference.
+        tau: Control torque, shape (K, n), in N m.
+        tau_x: External torque in the sign of Eq. (8), which is the negative of the torque on
+            the arm, shape (K, n), in N m.
+        theta_hat: Parameter estimates, shape (K, P).
+        used: For each peer, the tick of the sample in use, shape (K,). -1 before the first
             sample.
-        x: position or pose of the end effector in task space, shape (K, m); else empty.
-        xd: its derivative.
-        wrench: the force at the end effector that tau_x amounts to, shape (K, m); else empty.
-        axes: see `SiteLog`.
-        hand: action of a live hand, shape (K, h), see `HandInForce`; else empty.
-        rests: True in one of the `RESTING_MODES`, and for `RESUMING_S` afterwards, shape (K,);
-            empty if the site never rests.
+        x: Position or pose of the end effector in task space, shape (K, m). Empty in joint
+            space.
+        xd: Derivative of x.
+        wrench: Force at the end effector that corresponds to tau_x, shape (K, m). Empty in
+            joint space.
+        axes: See `SiteLog`.
+        hand: Action of an operator who acts live, shape (K, h), see `HandInForce`. Empty if
+            there is none.
+        rests: True in one of the `RESTING_MODES`, and for `RESUMING_S` afterwards, shape (K,).
+            Empty if the site never rests.
     """
 
     site: str
@@ -99,39 +108,39 @@ class AlignedRecords(NamedTuple):
 
     @property
     def h_s(self) -> float:
-        """The period, in s."""
+        """The tick period, in s."""
         return 1.0 / self.rate_hz
 
     @property
     def t_s(self) -> Array:
-        """Nominal time of every row, shape (K,), s."""
+        """Nominal time of every row, shape (K,), in s."""
         return self._ticks / self.rate_hz
 
     @property
     def _ticks(self) -> Ints:
-        """The tick of every row, shape (K,)."""
+        """Tick of every row, shape (K,)."""
         end = self.first + len(self.known)
         return np.arange(self.first, end, dtype=np.int64)
 
     @property
     def nominal_s(self) -> Array:
-        """Nominal time of every row in whole nanoseconds, shape (K,), s.
+        """Nominal time of every row, rounded down to whole nanoseconds, shape (K,), in s.
 
-        The core compares these times with the start and end of an exogenous torque.
+        The simulation kernel compares these times with the start and end of an external torque.
         """
         time_ns = self._ticks * NS_PER_S // self.rate_hz
         return time_ns.astype(np.float64) * 1e-9
 
     @property
     def e(self) -> Array:
-        """Position error, Eq. (9), shape (K, n), rad; in task space (K, m), see `SiteLog.e`."""
+        """Position error, Eq. (9), shape (K, n), in rad, or in task space (K, m)."""
         if self.x.size:
             return compute_task_errors(self.x, self.q_des, self.axes)
         return self.q - self.q_des
 
     @property
     def ed(self) -> Array:
-        """Velocity error, shape (K, n), rad/s; in task space (K, m)."""
+        """Velocity error, shape (K, n), in rad/s. In task space (K, m)."""
         return self.shared_rate - self.qd_des
 
     @property
@@ -140,7 +149,7 @@ class AlignedRecords(NamedTuple):
         return self.known[:-1] & self.known[1:]
 
     def known_at_end(self, length_s: float) -> Bools:
-        """Returns the recorded rows of the last `length_s` seconds, shape (K,)."""
+        """Returns True for the recorded rows of the last `length_s` seconds, shape (K,)."""
         t_s = self.t_s
         start_s = t_s[-1] - length_s
         rows: Bools = self.known & (t_s > start_s)
@@ -148,13 +157,16 @@ class AlignedRecords(NamedTuple):
 
 
 def hold_torque(tau: Array, limit_nm: Array | float, *, digital: bool) -> Array:
-    """Returns the torque that a controller holds over every period, shape (K, n), N m.
+    """Returns the torque that a controller holds during every tick period.
 
     Args:
-        tau: the recorded torque, shape (K, n), N m.
-        limit_nm: limit of the torque.
-        digital: True for the scheme `digital`, which holds tau_k; False for `second_order`,
+        tau: Recorded torque, shape (K, n), in N m.
+        limit_nm: Limit of the torque.
+        digital: True for the scheme `digital`, which holds tau_k. False for `second_order`,
             which extrapolates it to 1.5 tau_k - 0.5 tau_{k-1} within the limit.
+
+    Returns:
+        Torque, shape (K, n), in N m.
     """
     held = tau.copy()
     if not digital:
@@ -166,21 +178,22 @@ def hold_torque(tau: Array, limit_nm: Array | float, *, digital: bool) -> Array:
 def align_records(log: Log, *, common: bool = False) -> dict[str, AlignedRecords]:
     """Returns the aligned records of all sites that have records, in scenario order.
 
-    A record with the mode "diverged" is left out: it may hold zeros in place of numbers that
+    A record with the mode "diverged" is left out: it may contain zeros in place of numbers that
     are not finite.
 
     Args:
-        log: the log of a run.
-        common: end all sites where the first site ends, as sums over all sites require.
+        log: The log of the run.
+        common: True to end all sites where the first site ends, as sums over all sites require.
 
     Returns:
-        The records by site; with `common` {} unless every site has two ticks.
+        The records, by site. With `common` it is empty unless every site has two ticks.
     """
     rows_by_site: dict[str, Ints] = {}
     for site in log.sites:
         _, first_of_tick = np.unique(log[site].tick, return_index=True)
         modes = log[site].mode[first_of_tick]
         rows_by_site[site] = first_of_tick[modes != "diverged"]
+
     aligned = {}
     if not common:
         for site, rows in rows_by_site.items():
@@ -189,6 +202,7 @@ def align_records(log: Log, *, common: bool = False) -> dict[str, AlignedRecords
         return aligned
     if min(map(len, rows_by_site.values())) < 2:
         return {}
+
     first_times_s = []
     last_times_s = []
     for site, rows in rows_by_site.items():
@@ -208,11 +222,11 @@ def align_records(log: Log, *, common: bool = False) -> dict[str, AlignedRecords
 
 
 def find_unlimited_rows(limits: Limits, qd_des: Array) -> Bools:
-    """Returns the rows in which every coordinate of a reference is slower than its limit.
+    """Finds the rows in which every coordinate of a reference is slower than its limit.
 
     Args:
-        limits: limits of the site.
-        qd_des: reference velocities, shape (K, n) or (n,).
+        limits: Limits of the site.
+        qd_des: Velocities of the reference, shape (K, n) or (n,).
 
     Returns:
         True for such rows, shape (K,) or ().
@@ -222,7 +236,13 @@ def find_unlimited_rows(limits: Limits, qd_des: Array) -> Bools:
 
 
 def _find_resting_rows(modes: NDArray[Any], tick: Ints, rate_hz: int) -> Bools:
-    """Returns the records in one of the `RESTING_MODES`, or within `RESUMING_S` after one."""
+    """Finds the records in one of the `RESTING_MODES`, or within `RESUMING_S` after one.
+
+    Args:
+        modes: Mode of each record.
+        tick: Tick of each record.
+        rate_hz: Tick rate of the site.
+    """
     rests = np.isin(modes, RESTING_MODES)
     if not rests.any():
         return rests
@@ -238,13 +258,13 @@ def _fill_tick_grid(
     rows: Ints,
     last: int | None = None,
 ) -> AlignedRecords:
-    """Returns a site's records on every tick; missing records are interpolated.
+    """Returns a site's records on every tick. Missing records are interpolated.
 
     Args:
-        scenario: scenario of the run.
-        part: the site's part of the log.
-        rows: rows of the records to use, one per tick, by rising tick.
-        last: last tick; by default that of the last record.
+        scenario: Scenario of the run.
+        part: The site's part of the log.
+        rows: Rows of the records to use, one per tick, by rising tick.
+        last: Last tick. By default that of the last record.
     """
     names = [*RECORD_COLUMNS]
     if part.layout.task:
@@ -252,6 +272,7 @@ def _fill_tick_grid(
     if part.layout.hand:
         names.append("hand")
     part.prepare(*names)
+
     tick = part.tick[rows]
     first = int(tick[0])
     end = int(tick[-1])
@@ -261,6 +282,7 @@ def _fill_tick_grid(
     # index of the last record at or before each tick
     previous = np.searchsorted(tick, grid, side="right") - 1
     known: Bools = tick[previous] == grid
+
     spec = scenario.sites[part.name]
     modes = part.mode[rows]
     runs = modes == "run"
@@ -272,6 +294,7 @@ def _fill_tick_grid(
         resting_in_grid = resting[previous]
         if resting_in_grid.any():
             rests = resting_in_grid
+
     columns = {}
     for name in names:
         values = getattr(part, name)[rows]
@@ -280,6 +303,7 @@ def _fill_tick_grid(
         else:
             interpolated = [np.interp(grid, tick, column) for column in values.T]
             columns[name] = np.stack(interpolated, axis=1)
+
     used = {}
     for peer in part.peers:
         recorded = part.used[peer][rows]
@@ -301,9 +325,9 @@ class PeerMotion(NamedTuple):
     """Motion of a peer at K times: of its joints, or in task space of its end effector.
 
     Attributes:
-        q: shared coordinates, shape (K, n), rad; in task space (K, m), m.
-        qd: their derivatives, shape (K, n), rad/s; in task space (K, m), m/s.
-        squares: integral of qd squared since row 0, per coordinate, shape (K, n), rad^2/s.
+        q: Shared coordinates, shape (K, n), in rad. In task space (K, m), in m.
+        qd: Their derivatives, shape (K, n), in rad/s. In task space (K, m), in m/s.
+        squares: Integral of qd squared since row 0, per coordinate, shape (K, n), in rad^2/s.
         known: True if the motion follows from records, shape (K,).
     """
 
@@ -314,12 +338,12 @@ class PeerMotion(NamedTuple):
 
 
 class PeerTrajectory:
-    """A site's motion as a function of time.
+    """The motion of a site as a function of time, through its records.
 
     The motion is a polynomial between two records, and rest before the first record (L7).
 
     Args:
-        records: the site's records.
+        records: Records of the site.
     """
 
     def __init__(self, records: AlignedRecords) -> None:
@@ -332,13 +356,13 @@ class PeerTrajectory:
         self._squares: Array = np.vstack([start, running_sums])
 
     def evaluate(self, t_s: Array) -> PeerMotion:
-        """Returns the site's motion at some times; on its ticks this equals its records.
+        """Returns the site's motion at some times. At its ticks this equals its records.
 
         q is the cubic Hermite polynomial through angles and velocities, and qd is linear
-        between two records. The integral of qd squared is the exact one of the trapezoid rule.
+        between two records. The integral of qd squared is that of the trapezoid rule.
 
         Args:
-            t_s: times since the epoch, shape (K,), s.
+            t_s: Times after the start of the session, shape (K,), in s.
         """
         records = self.records
         h = records.h_s
@@ -350,6 +374,7 @@ class PeerTrajectory:
         period = np.floor(position)
         row = np.clip(period, 0, last_period).astype(np.int64)
         x = np.clip(position - row, 0.0, 1.0)[:, np.newaxis]
+
         qa = records.shared[row]
         qb = records.shared[row + 1].copy()
         va = records.shared_rate[row]
@@ -357,6 +382,7 @@ class PeerTrajectory:
         # rotation vectors of different branches must not be interpolated
         if records.x.shape[1] == POSE:
             qb[:, POSITION:] = choose_nearest_vectors(qb[:, POSITION:], qa[:, POSITION:])
+
         quadratic = 3 * (qb - qa) - h * (2 * va + vb)
         cubic = 2 * (qa - qb) + h * (va + vb)
         q = qa + x * (h * va + x * (quadratic + x * cubic))
@@ -365,10 +391,12 @@ class PeerTrajectory:
         squared_b = vb**2
         mean_square = squared_a + 0.5 * x * (squared_b - squared_a)
         squares = self._squares[row] + h * x * mean_square
+
         fraction = x[:, 0]
         known_a = records.known[row] | (fraction == 1.0)
         known_b = records.known[row + 1] | (fraction == 0.0)
         known = known_a & known_b & ((position >= 0.0) | (records.first == 0))
+
         q = np.where(x == 1.0, qb, q)  # exactly the record, which the polynomial rounds
         is_before = position < 0.0
         qd[is_before] = 0.0
@@ -377,14 +405,15 @@ class PeerTrajectory:
 
 
 class DelayedPeer(NamedTuple):
-    """A peer as a site sees it through its link.
+    """Motion of a peer as a site sees it through its link.
 
     Attributes:
-        now: the peer at the site's ticks, K rows.
-        delayed: the peer at the stamps of the samples in use, K rows.
-        delayed_end: the peer at the end of every period, if the stamp moves at rate one, K - 1
-            rows.
-        stamp_s: stamp of the sample in use, shape (K,), s; NaN before the first sample.
+        now: Motion of the peer at the site's ticks, K rows.
+        delayed: Its motion at the times at which the samples in use were sent, K rows.
+        delayed_end: Its motion at the end of every period, if the sample in use grew no older
+            within the period, K - 1 rows.
+        stamp_s: Time at which the sample in use was sent, shape (K,), in s. NaN before the
+            first sample.
     """
 
     now: PeerMotion
@@ -394,7 +423,7 @@ class DelayedPeer(NamedTuple):
 
     @property
     def known(self) -> Bools:
-        """True if the whole period follows from records, shape (K - 1,)."""
+        """True if the motion over the whole period follows from records, shape (K - 1,)."""
         now = self.now.known
         delayed = self.delayed.known
         now_known = now[:-1] & now[1:]
@@ -404,15 +433,15 @@ class DelayedPeer(NamedTuple):
 
 
 _BEFORE_EPOCH_S = -1.0
-"""Any time before the epoch, at which a peer is at rest in its start pose (L7)."""
+"""A time before the start of the session, at which a peer rests in its start pose (L7)."""
 
 
 def view_delayed_peer(records: AlignedRecords, past: PeerTrajectory) -> DelayedPeer:
-    """Returns a peer as a site sees it.
+    """Returns the motion of a peer as a site sees it through its link.
 
     Args:
-        records: the site's records.
-        past: the peer's motion.
+        records: Records of the site.
+        past: Motion of the peer.
     """
     used = records.used[past.records.site]
     has_sample = used >= 0
@@ -429,11 +458,15 @@ def view_delayed_peer(records: AlignedRecords, past: PeerTrajectory) -> DelayedP
 
 
 def find_latest_rows(records: AlignedRecords, t_s: Array) -> tuple[Ints, Bools]:
-    """Returns the rows of a site's latest ticks at some times, shape (K,) each.
+    """Finds the rows of a site's latest ticks at some times.
+
+    Args:
+        records: Records of the site.
+        t_s: Times, shape (K,), in s.
 
     Returns:
-        The rows.
-        True for each tick that is recorded.
+        The rows, shape (K,).
+        True for each of these ticks that is recorded, shape (K,).
     """
     tick = np.floor(t_s * records.rate_hz + 1e-6).astype(np.int64)
     row = tick - records.first
@@ -445,7 +478,10 @@ def find_latest_rows(records: AlignedRecords, t_s: Array) -> tuple[Ints, Bools]:
 
 
 def find_common_rows(sites: Sequence[AlignedRecords]) -> tuple[list[Ints], Bools]:
-    """Returns the rows of every site's latest ticks at the ticks of the first site.
+    """Finds the rows of every site's latest ticks at the ticks of the first site.
+
+    Args:
+        sites: Records of the sites.
 
     Returns:
         The rows by site, shape (K,) each.

@@ -1,4 +1,4 @@
-"""Signs of the quaternions of a plant's bodies in a stream of frames, chosen without jumps."""
+"""Chooses the signs of the quaternions of moving bodies, so that they do not jump."""
 
 from collections.abc import Sequence
 
@@ -12,8 +12,9 @@ from ..log.orientations import QUATERNION_AXES, QuaternionSigns
 class BodyTurns:
     """Chooses the signs of the quaternions of a plant's bodies in one stream of frames.
 
-    Two quaternions of opposite sign describe the same orientation. The quaternion that is
-    nearer to the quaternion of the frame before is chosen.
+    A plant is a simulated environment with bodies, whose poses are published in frames. Two
+    quaternions of opposite sign describe the same orientation. Of both, the one nearer to the
+    quaternion of the frame before is chosen, so that a plot or an interpolation sees no jump.
     """
 
     def __init__(self) -> None:
@@ -23,7 +24,8 @@ class BodyTurns:
         """Returns the poses of a frame with chosen signs, shape (7 b,).
 
         Args:
-            bodies: pose of each body: position x, y, z in m, and unit quaternion w, x, y, z.
+            bodies: Pose of each of the b bodies: position x, y, z in m, and unit quaternion w,
+                x, y, z.
         """
         pose_length = POSITION + len(QUATERNION_AXES)
         numbers = np.array(bodies, dtype=np.float64)

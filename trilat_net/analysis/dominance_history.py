@@ -1,12 +1,16 @@
-"""Dominance of sites over time, alpha of Eq. (6), and the Lyapunov weights that belong to it.
+"""Traces the dominance factors of the sites over time, and computes the weights of the proof.
 
-The weights of the sites' functionals are beta_i = pi_i / c_i, where pi is the left Perron
-vector of alpha, and c_i the scalar in Kd_i = c_i Kbar. Both conditions are necessary: beta'
-Upsilon <= 0 together with Upsilon 1 = 0 forces equality, so that there is no slack. pi as the
-weight of a delayed consensus is a known result (docs/errata.md). The paper uses weights of 1.
+The dominance factor alpha_ij of Eq. (6) is the weight with which site i follows site j. The
+energy function V of the stability proof is a weighted sum over the sites. Their Lyapunov
+weights are beta_i = pi_i / c_i, where pi is the left Perron vector of alpha (pi' alpha = pi'),
+and c_i the scalar in Kd_i = c_i Kbar, with a gain Kbar that all sites share. Both conditions
+are
+necessary: beta' Upsilon <= 0 together with Upsilon 1 = 0 forces equality, so that there is no
+slack. pi as the weight of a delayed consensus is a known result (docs/errata.md). The paper
+uses weights of 1.
 
 Invariant:
-    - alpha is a function of time and of the applied changes alone.
+    - alpha depends only on time and on the applied changes.
     - A ramp starts from the value that the ramp before it has at that time.
 """
 
@@ -25,16 +29,17 @@ from ..log.record_columns import Ints
 from ..scenario import Scenario
 
 RAMP_TIME_TOLERANCE_S = 5e-10
-"""Half of the nanosecond to which ramps start and end, s."""
+"""Half of the nanosecond to which the starts and ends of ramps are rounded, in s."""
 
 
 class DominanceHistory(NamedTuple):
-    """Dominance factors of a site for its P peers, in scenario order.
+    """Dominance factors with which a site follows its P peers, in scenario order, over time.
 
     Attributes:
-        alpha: factors at every row, shape (K, P).
-        rate: their derivatives as the controller takes them into account, shape (K, P), 1/s.
-        before: factors at the end of every period, before a step there, shape (K - 1, P).
+        alpha: Factors at every row, shape (K, P).
+        rate: Their time derivatives as the controller takes them into account, shape (K, P), in
+            1/s.
+        before: Factors at the end of every period, before a step there, shape (K - 1, P).
     """
 
     alpha: Array
@@ -52,15 +57,16 @@ class DominanceHistory(NamedTuple):
 def trace_dominance(log: Log, site: str, t_s: Array) -> DominanceHistory:
     """Returns the dominance factors of a site at successive ticks.
 
-    A site that goes on without a peer rescales the factors of the others to the sum 1.
+    If the site lost a peer and continues without it, the factors of the others are scaled to
+    the sum 1.
 
     Args:
-        log: the log of a run.
-        site: name of the site.
-        t_s: times of the ticks, shape (K,), s.
+        log: The log of the run.
+        site: Name of the site.
+        t_s: Times of the ticks, shape (K,), in s.
 
     Raises:
-        LogError: a record names a change that is not valid.
+        LogError: A record names a change that is not valid.
     """
     start, ramps = list_ramps(log, site)
     h_s = 1.0 / log.scenario.sites[site].rate_hz
@@ -68,6 +74,7 @@ def trace_dominance(log: Log, site: str, t_s: Array) -> DominanceHistory:
     present = ~find_lost_peers(log, site, t_s)
     if present.all():
         return planned
+
     alpha = planned.alpha * present
     rate = planned.rate * present
     before = planned.before * present[:-1]
@@ -84,12 +91,16 @@ def trace_dominance(log: Log, site: str, t_s: Array) -> DominanceHistory:
 
 
 def list_ramps(log: Log, site: str) -> tuple[Array, list[DominanceRamp]]:
-    """Returns the factors of a site at the epoch, shape (P,), and all its ramps.
+    """Returns the dominance factors of a site at the start, and all of their later changes.
 
-    The ramps are those of the scenario and those of the recorded commands.
+    The changes are ramps: those of the scenario and those of the recorded commands.
+
+    Returns:
+        The factors at the start, shape (P,).
+        The ramps.
 
     Raises:
-        LogError: a record names a change that is not valid.
+        LogError: A record names a change that is not valid.
     """
     start, ramps = list_scripted_ramps(log.scenario, site)
     ramps = list(ramps)
@@ -99,7 +110,12 @@ def list_ramps(log: Log, site: str) -> tuple[Array, list[DominanceRamp]]:
 
 
 def find_users(scenario: Scenario) -> tuple[str, list[str]]:
-    """Returns the first slave ("" if there is none) and its users, which are all masters."""
+    """Finds the shared slave of a scenario and its users.
+
+    Returns:
+        Name of the first slave. Empty if there is none.
+        Names of all masters, at which the users are.
+    """
     slaves = []
     masters = []
     for site, spec in scenario.sites.items():
@@ -112,15 +128,15 @@ def find_users(scenario: Scenario) -> tuple[str, list[str]]:
 
 
 class UserShares(NamedTuple):
-    """Shares of the users of a slave, over K times.
+    """Dominance factors of the users of a slave, over K times.
 
     A program holds the arm of one user. While another user leads, somebody intervenes.
 
     Attributes:
-        shares: the slave's dominance factors for its U users, shape (K, U).
-        leader: index of the user with the largest share, shape (K,); the program's user if no
-            share is larger.
-        program: index of the user whose arm a program holds.
+        shares: The slave's dominance factors for its U users, shape (K, U).
+        leader: Index of the user with the largest factor, shape (K,). It is the program's user
+            if no factor is larger.
+        program: Index of the user whose arm the program holds.
     """
 
     shares: Array
@@ -129,23 +145,25 @@ class UserShares(NamedTuple):
 
 
 def find_user_shares(scenario: Scenario, alpha: Array, program: str = "") -> UserShares:
-    """Returns the shares of the users in the slave of `find_users`.
+    """Returns the dominance factors of the users in the slave of `find_users`, and who leads.
 
     Args:
-        scenario: scenario of the run.
-        alpha: dominance factors of the slave, shape (K, P).
-        program: the user whose arm a program holds; by default the last user.
+        scenario: Scenario of the run.
+        alpha: Dominance factors of the slave, shape (K, P).
+        program: Name of the user whose arm a program holds. By default the last user.
 
     Raises:
-        UsageError: there is no such user.
+        UsageError: There is no such user.
     """
     slave, users = find_users(scenario)
     program = program or users[-1]
     if program not in users:
         raise UsageError(f"the program holds one of {', '.join(users)}, not {program!r}")
+
     peers = scenario.peers(slave)
     columns = [peers.index(user) for user in users]
     shares = alpha[:, columns]
+
     program_index = users.index(program)
     program_share = shares[:, program_index]
     program_leads = program_share >= shares.max(axis=1)
@@ -155,12 +173,12 @@ def find_user_shares(scenario: Scenario, alpha: Array, program: str = "") -> Use
 
 
 def find_lost_peers(log: Log, site: str, t_s: Array) -> NDArray[np.bool_]:
-    """Returns the peers without which a site continues, over time; see `core.lost_peers`.
+    """Finds the times at which a site continued without a peer, see `core.lost_peers`.
 
     Args:
-        log: the log of a run.
-        site: name of the site.
-        t_s: times, shape (K,), s.
+        log: The log of the run.
+        site: Name of the site.
+        t_s: Times, shape (K,), in s.
 
     Returns:
         True for each lost peer, shape (K, P).
@@ -170,6 +188,7 @@ def find_lost_peers(log: Log, site: str, t_s: Array) -> NDArray[np.bool_]:
     lost = np.zeros((len(t_s), peer_count), dtype=bool)
     if not log.scenario.sites[site].on_stale.rule.degrades or not len(part):
         return lost
+
     first = part.layout.count_life_memory(peer_count)
     is_lost = part.memory(first, peer_count) != 0.0
     # the newest record at each time
@@ -181,7 +200,7 @@ def find_lost_peers(log: Log, site: str, t_s: Array) -> NDArray[np.bool_]:
 
 
 def list_losses(log: Log) -> list[str]:
-    """Returns a sentence for each time in which a site continued without a peer."""
+    """Returns a sentence for each span of time in which a site continued without a peer."""
     sentences = []
     for site in log.sites:
         part = log[site]
@@ -202,7 +221,12 @@ def list_losses(log: Log) -> list[str]:
 
 
 def list_scripted_ramps(scenario: Scenario, site: str) -> tuple[Array, list[DominanceRamp]]:
-    """Returns the factors of a site at the epoch, shape (P,), and the scenario's ramps."""
+    """Returns the dominance factors of a site at the start, and their changes in the scenario.
+
+    Returns:
+        The factors at the start, shape (P,).
+        The ramps.
+    """
     factors = scenario.dominance[site]
     peers = scenario.peers(site)
     start = np.array([factors.get(peer, 0.0) for peer in peers])
@@ -214,19 +238,25 @@ def drop_finished_ramps(
     ramps: Sequence[DominanceRamp],
     from_s: float,
 ) -> tuple[Array, list[DominanceRamp]]:
-    """Returns a start and ramps that have the same history from a time on.
+    """Returns fewer ramps with which the factors are the same from a time on.
 
-    Ramps that have finished before this time are left out.
+    Ramps that have finished before this time are left out, and the start factors are changed
+    accordingly.
 
     Args:
-        start: factors at the epoch, shape (P,).
-        ramps: all ramps.
-        from_s: time from which the history must be the same, in s.
+        start: Factors at the start of the session, shape (P,).
+        ramps: All ramps.
+        from_s: Time from which the factors must be the same, in s.
+
+    Returns:
+        The new start factors.
+        The remaining ramps.
     """
     sorted_ramps = sorted(ramps, key=lambda ramp: ramp.start_ns)
     started = sum(ramp.start_ns * 1e-9 <= from_s for ramp in sorted_ramps)
     if started < 2:
         return start, sorted_ramps
+
     # the last ramp that has started may still be in progress
     finished = sorted_ramps[: started - 1]
     remaining = sorted_ramps[started - 1 :]
@@ -244,10 +274,10 @@ def evaluate_ramps(
     """Returns the dominance factors over time.
 
     Args:
-        start: factors at the epoch, shape (P,).
-        ramps: ramps of the factors.
-        t_s: ascending times, one period apart, shape (K,), s.
-        h_s: the period, in s.
+        start: Factors at the start of the session, shape (P,).
+        ramps: Ramps of the factors.
+        t_s: Ascending times, one period apart, shape (K,), in s.
+        h_s: The period, in s.
     """
     alpha = np.tile(start, (len(t_s), 1))
     rate = np.zeros((len(t_s), len(start)))
@@ -267,6 +297,7 @@ def evaluate_ramps(
         after = np.array(ramp.alpha)
         start_s = next_start_s
         end_s = ramp.end_ns * 1e-9
+
         has_started = t_s >= start_s - RAMP_TIME_TOLERANCE_S
         has_not_ended = t_s < end_s - RAMP_TIME_TOLERANCE_S
         is_climbing = has_started & has_not_ended
@@ -278,24 +309,25 @@ def evaluate_ramps(
             since_start_s = t_s[is_climbing, np.newaxis] - start_s
             alpha[is_climbing] = before + slope * since_start_s
             rate[is_climbing] = slope
+
     at_period_ends = alpha[:-1] + h_s * rate[:-1]
     return DominanceHistory(alpha, rate, at_period_ends)
 
 
 KD_SHAPE_TOLERANCE = 1e-9
-"""Relative difference up to which two gains count as equal."""
+"""Largest relative difference of two gains that count as equal."""
 
 
 class LyapunovWeights(NamedTuple):
-    """Lyapunov weights beta, as far as they exist.
+    """The weights beta of the sites in the energy function V, as far as they exist.
 
     Attributes:
-        beta: weight of each site, shape (N,). The weights have the sum N: with equal shares
-            each weight is 1, as in the paper.
-        groups: the closed groups of sites, as tuples of indices: no site of a group follows a
+        beta: Weight of each site, shape (N,), with the sum N. With equal dominance factors each
+            weight is 1, as in the paper.
+        groups: The closed groups of sites, as tuples of indices: no site of a group follows a
             site outside. If there is a single group, pi is unique, though some of its entries
             may be 0.
-        scales: c_i of Kd_i = c_i Kbar, with 1 for the first site, shape (N,); None if the Kd
+        scales: c_i of Kd_i = c_i Kbar, with 1 for the first site, shape (N,). None if the Kd
             differ in shape.
     """
 
@@ -305,10 +337,13 @@ class LyapunovWeights(NamedTuple):
 
 
 def find_closed_groups(alpha: Array) -> tuple[tuple[int, ...], ...]:
-    """Returns the groups of sites that reach each other along shares, and no other site.
+    """Finds the groups of sites that follow each other, and no site outside the group.
 
     Args:
-        alpha: the dominance matrix, shape (N, N).
+        alpha: Matrix of the dominance factors, shape (N, N).
+
+    Returns:
+        Indices of the sites of each group.
     """
     reach = find_reach(alpha)
     groups = []
@@ -324,10 +359,13 @@ def find_closed_groups(alpha: Array) -> tuple[tuple[int, ...], ...]:
 
 
 def left_perron_vector(alpha: Array) -> Array:
-    """Returns pi >= 0 with pi' alpha = pi' and sum 1, shape (N,).
+    """Returns the vector pi >= 0 with pi' alpha = pi' and the sum 1, shape (N,).
 
     pi is 0 for sites outside closed groups. With several closed groups pi is not unique: each
     group then counts by its number of sites.
+
+    Args:
+        alpha: Matrix of the dominance factors, shape (N, N).
     """
     pi = np.zeros(len(alpha))
     groups = find_closed_groups(alpha)
@@ -340,12 +378,15 @@ def left_perron_vector(alpha: Array) -> Array:
 
 
 def find_kd_scales(Kd: Array) -> Array | None:
-    """Returns c_i of Kd_i = c_i Kbar with c_1 = 1; None if there are no such scalars.
+    """Returns the scalars c_i of Kd_i = c_i Kbar with c_1 = 1.
 
-    If all Kd are zero, nothing couples the sites, and any scales are right: the scales are 1.
+    If all Kd are zero, nothing couples the sites, and any scalars are right: they are 1.
 
     Args:
-        Kd: gains, shape (N, n); NaN along an axis that a site does not follow.
+        Kd: Gains, shape (N, n). NaN along an axis that a site does not follow.
+
+    Returns:
+        The scalars, shape (N,). None if there are none.
     """
     if not np.nan_to_num(Kd).any():
         return np.ones(len(Kd))
@@ -353,6 +394,7 @@ def find_kd_scales(Kd: Array) -> Array | None:
     sizes = Kd[:, is_common_axis].sum(axis=1)
     if not sizes.all():
         return None
+
     shapes = Kd / sizes[:, np.newaxis]
     # fmax and fmin ignore NaN
     largest = np.fmax.reduce(shapes)
@@ -365,13 +407,13 @@ def find_kd_scales(Kd: Array) -> Array | None:
 
 
 def compute_lyapunov_weights(alpha: Array, Kd: Array) -> LyapunovWeights:
-    """Returns the weights beta_i = pi_i / c_i.
+    """Computes the weights beta_i = pi_i / c_i of the sites in the energy function.
 
-    If the Kd differ in shape, pi alone is returned as beta, which lets V rise.
+    If the Kd differ in shape, pi alone is returned as beta. V may then rise.
 
     Args:
-        alpha: the dominance matrix, shape (N, N).
-        Kd: gains, shape (N, n).
+        alpha: Matrix of the dominance factors, shape (N, N).
+        Kd: Gains, shape (N, n).
     """
     pi = left_perron_vector(alpha)
     scales = find_kd_scales(Kd)

@@ -1,6 +1,8 @@
-"""Classifies the trend of an envelope over the second half of a record.
+"""Classifies the trend of an envelope over the second half of a run: it grows, decays or stays.
 
-A class describes the record and predicts nothing; see docs/definitions.md, "Stable".
+An envelope is the largest size of a signal in short intervals of time, such as the largest
+error |e| in each twentieth of a second. A class describes the record and predicts nothing (see
+docs/definitions.md, "Stable").
 
 The half is divided into n equal windows, with n = 16 and, if these do not decide, n = 8. A
 window counts with its largest value, at least `FLOOR_RAD`. A straight line is fitted to the
@@ -59,7 +61,7 @@ _LARGEST_RISE_FROM_ZERO = math.log(8.0 / 5.0)
 
 
 class EnvelopeTrend(StrEnum):
-    """Trend of an envelope at the end of a run; the value is the text for people."""
+    """Trend of an envelope at the end of a run. The value is the text for people."""
 
     DECAYS = "decays"
     HARDLY = "hardly decays"
@@ -69,12 +71,12 @@ class EnvelopeTrend(StrEnum):
 
 
 class EnvelopeFit(NamedTuple):
-    """Trend of an envelope over the second half of a run.
+    """Trend of an envelope over the second half of a run, computed by `fit_envelopes`.
 
     Attributes:
-        trend: class of the trend.
-        rate_per_s: slope of the logarithm of the maxima, 1/s: the envelope goes as exp(rate t);
-            NaN if there are too few points.
+        trend: Class of the trend.
+        rate_per_s: Slope of the logarithm of the maxima, in 1/s: the envelope is proportional
+            to exp(rate t). NaN if there are too few points.
         calm: True if two conditions hold: the envelope falls, or the upper bound excludes a
             rise by a quarter within the half; and the last quarter's maximum is at most 1.5
             times the maximum of the quarter before.
@@ -93,7 +95,7 @@ class EnvelopeFit(NamedTuple):
 
     @property
     def rate_text(self) -> str:
-        """The rate of an envelope that grows or decays; otherwise the trend as a verb."""
+        """The rate of an envelope that grows or decays, otherwise the trend as a verb."""
         if self.trend in (EnvelopeTrend.STEADY, EnvelopeTrend.UNDECIDED):
             return self.text
         return f"{self.rate_per_s:+.3g}/s"
@@ -106,14 +108,17 @@ def fit_envelopes(
     *,
     falls_first: bool = False,
 ) -> list[EnvelopeFit]:
-    """Returns the trends of several envelopes, as the module's docstring defines them.
+    """Determines the trends of several envelopes, as the module's docstring defines them.
 
     Args:
-        t_s: ascending times, shape (K,), s.
-        values: the largest |e| since the time before, shape (K, C).
-        floor: floor of the envelopes, in place of `FLOOR_RAD`.
-        falls_first: an envelope that rises after a fall counts as growing too, because other
-            modes are known to cause the fall.
+        t_s: Ascending times, shape (K,), in s.
+        values: The envelopes, for example the largest |e| since the time before, shape (K, C).
+        floor: Floor of the envelopes, in place of `FLOOR_RAD`.
+        falls_first: True if an envelope that rises after a fall counts as growing too, because
+            other modes are known to cause the fall.
+
+    Returns:
+        The trend of each envelope.
     """
     envelopes = values.shape[1]
     no_fit = EnvelopeFit(EnvelopeTrend.UNDECIDED, math.nan)
@@ -154,13 +159,14 @@ def _find_window_maxima(
 ) -> Array | None:
     """Returns the maxima of equal windows of the second half, shape (windows, C).
 
-    Returns None if some window has fewer than two points.
-
     Args:
-        t_s: ascending times, shape (K,), s.
-        values: the envelopes, shape (K, C).
-        windows: number of windows.
-        floor: least maximum.
+        t_s: Ascending times, shape (K,), in s.
+        values: The envelopes, shape (K, C).
+        windows: Number of windows.
+        floor: Least maximum.
+
+    Returns:
+        The maxima. None if some window has fewer than two points.
     """
     if not len(t_s):
         return None
@@ -176,12 +182,12 @@ def _find_window_maxima(
 
 
 def _fit_maxima(maxima: Array, window_s: float, log_floor: float) -> list[EnvelopeFit]:
-    """Returns the trends of envelopes, by least-squares lines through their log maxima.
+    """Determines the trends of envelopes by least-squares lines through their log maxima.
 
     Args:
-        maxima: maxima of n equal windows, shape (n, C).
-        window_s: length of a window, in s.
-        log_floor: logarithm of the floor; an envelope below it is at rest.
+        maxima: Maxima of n equal windows, shape (n, C).
+        window_s: Length of a window, in s.
+        log_floor: Logarithm of the floor. An envelope below it is at rest.
     """
     n = len(maxima)
     log_maxima = np.log(maxima)
@@ -221,12 +227,12 @@ def _classify_trend(
     *,
     dead: bool,
 ) -> EnvelopeTrend:
-    """Returns the trend of an envelope.
+    """Returns the class of the trend of an envelope, as the module's docstring defines it.
 
     Args:
-        change: change of its logarithm over the half, by the line.
-        bound: bound of the error of this change.
-        steps: steps of the log maxima from quarter to quarter of the half, shape (3,).
+        change: Change of the envelope's logarithm over the half, according to the line.
+        bound: Bound of the error of this change.
+        steps: Steps of the log maxima from quarter to quarter of the half, shape (3,).
         dead: True if the last quarter is at the floor.
     """
     if dead:

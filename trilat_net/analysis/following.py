@@ -1,11 +1,15 @@
-"""Maps errors of the reference to motion and torque of the joints, over rows.
+"""Maps errors of the reference to motion and torque of the joints, for all records at once.
 
-A site follows joint by joint, or in task space with its end effector.
+A site follows its peers joint by joint, or in task space with its end effector. In task space
+an error of the end effector must be translated to the joints with the inverse of the Jacobian
+J, which is damped near singular poses. `JointFollowing` and `TaskFollowing` have the same
+methods for both cases.
 
 Invariant:
     - All maps are written with NumPy from the equations of `docs/laws.md`, independently of the
-      core.
-    - Axes that are not followed have no effect: only the other axes' rows of J and J' count.
+      simulation kernel.
+    - Axes that are not followed have no effect: only the rows of J and J' of the other axes
+      count.
     - With the reference of `find_task_reference`, J v = -Lambda e - damping y. Near a singular
       pose the end effector therefore lacks the velocity damping y.
 """
@@ -23,7 +27,7 @@ from .arm_rows import ArmRows, Numbers, PlanarArmRows, multiply_columns
 
 Rows = slice | Ints
 _LEAST_EIGENVALUE = 1e-12
-"""Smallest eigenvalue of J J' of an axis along which the end effector can move at all."""
+"""Lower bound of the eigenvalues of J J', so that the inverse stays finite."""
 
 
 def find_task_reference(
@@ -33,17 +37,20 @@ def find_task_reference(
     posture: tuple[Numbers, Numbers],
     error: tuple[Numbers, Numbers],
 ) -> tuple[Numbers, Numbers]:
-    """Returns the reference velocity v of the joints and its derivative a, shape (n, ...).
+    """Returns the reference velocity v of the joints and its derivative a, shape (n, ...) each.
 
         v = psi + J' y,               A y  = -Lambda e - J psi
         a = psi' + Jd' y + J' y',     A y' = -Lambda ed - Jd v - J (psi' + Jd' y)
 
+    psi is a velocity towards a preferred posture, e the error of the end effector and ed its
+    derivative. A' in the first line of each formula stands for the transposed matrix.
+
     Args:
         J: Jacobian of the followed axes, shape (m, n, ...).
-        Jd: its derivative.
-        solve: solves A y = b for y, shape (m, ...), with A = J J' + damping, plus 1 for each
-            axis that is not followed.
-        posture: psi and psi', shape (n, ...).
+        Jd: Time derivative of the Jacobian.
+        solve: Function that solves A y = b for y, shape (m, ...), with A = J J' + damping, plus
+            1 for each axis that is not followed.
+        posture: psi and its derivative, shape (n, ...).
         error: Lambda e and Lambda ed, shape (m, ...).
     """
     psi, psi_rate = posture
@@ -62,7 +69,11 @@ def find_task_reference(
 
 
 class JointFollowing(NamedTuple):
-    """The maps of a site that follows joint by joint; `TaskFollowing` has the same methods."""
+    """The maps of a site that follows joint by joint. `TaskFollowing` has the same methods.
+
+    Attributes:
+        Lambda: Gain of the error, shape (n,), in 1/s.
+    """
 
     Lambda: Array
 
@@ -102,16 +113,16 @@ class TaskFollowing:
     """The maps of a site that follows with its end effector, over K rows.
 
     Attributes:
-        Lambda: gain of the error, 0 along an axis that the site does not follow, shape (m,).
+        Lambda: Gain of the error, 0 along an axis that the site does not follow, shape (m,).
         J: Jacobian of the followed axes, shape (K, m, n).
-        Jd: its derivative, shape (K, m, n).
-        psi: velocity towards the posture, shape (K, n), rad/s.
-        psi_rate: its derivative, shape (K, n).
-        inverse: inverse of J J' with its damping, shape (K, m, m).
-        damping: damping, shape (K,), m^2.
-        damping_rate: its derivative, shape (K,), m^2/s.
-        least: lower bound of the least singular value, from which the damping is computed,
-            shape (K,), m.
+        Jd: Time derivative of the Jacobian, shape (K, m, n).
+        psi: Velocity towards the preferred posture, shape (K, n), in rad/s.
+        psi_rate: Derivative of psi, shape (K, n).
+        inverse: Inverse of J J' with its damping, shape (K, m, m).
+        damping: Damping near singular poses, shape (K,), in m^2.
+        damping_rate: Derivative of the damping, shape (K,), in m^2/s.
+        least: Lower bound of the least singular value of J, from which the damping is computed,
+            shape (K,), in m.
     """
 
     Lambda: Array
@@ -157,17 +168,24 @@ class TaskFollowing:
         return torque
 
     def project_torque(self, torque: Array) -> Array:
-        """Returns the force at the end effector of a joint torque, shape (K, m), N."""
+        """Returns the force at the end effector that corresponds to a joint torque, in N.
+
+        Args:
+            torque: Joint torque, shape (K, n), in N m.
+
+        Returns:
+            Force along the followed axes, shape (K, m).
+        """
         along_axes = np.einsum("kij,kj->ki", self.J, torque)
         return self._solve(slice(None), along_axes)
 
     def without_posture(self) -> "TaskFollowing":
-        """Returns the same maps without the motion towards the posture: linear in e and ed."""
+        """Returns the same maps without the motion to the posture: linear in e and ed."""
         still = np.zeros_like(self.psi)
         return replace(self, psi=still, psi_rate=still)
 
     def compute_damping_deviation(self, rows: Rows, e: Array) -> tuple[Array, Array]:
-        """Returns the effect of the damping near singular poses, which is zero elsewhere.
+        """Returns the effect of the damping near singular poses. It is zero elsewhere.
 
         Returns:
             J r - x' - Lambda e, shape (K, m).
@@ -199,17 +217,18 @@ def build_following(
     qd: Array,
     Lambda: Array,
 ) -> Following:
-    """Returns the maps of a site over rows of its joint motion.
+    """Returns the maps of a site over its joint motion.
 
     Args:
-        arm: arm of the site.
-        q: joint angles, shape (K, n), rad.
-        qd: joint velocities, shape (K, n), rad/s.
-        Lambda: gain of the error, 0 along axes that are not followed, shape (n,) or (m,).
+        arm: Arm of the site.
+        q: Joint angles, shape (K, n), in rad.
+        qd: Joint velocities, shape (K, n), in rad/s.
+        Lambda: Gain of the error, 0 along axes that are not followed, shape (n,) or (m,).
     """
     task = arm.task
     if isinstance(arm, PlanarArmRows) or task is None:
         return JointFollowing(Lambda)
+
     end_effector = arm.place_end_effector(q, qd)
     axes = np.array(task.axes)[:, np.newaxis]
     scale = axes * task.scale
@@ -226,6 +245,7 @@ def build_following(
     # 1 / trace(A^-1) is a smooth lower bound of the least eigenvalue of A
     trace = np.trace(axes * inverse, axis1=1, axis2=2)
     least_eigenvalue = 1.0 / trace
+
     damping = np.maximum(task.singular_value**2 - least_eigenvalue, 0.0)
     half_A_rate = J @ _transpose(Jd)
     A_rate = half_A_rate + _transpose(half_A_rate)
@@ -236,6 +256,7 @@ def build_following(
     if damping.any():
         damping_matrix = damping[:, np.newaxis, np.newaxis] * np.eye(len(axes))
         inverse = np.linalg.inv(A + damping_matrix)
+
     from_posture = np.array(task.posture) - q
     return TaskFollowing(
         Lambda=Lambda,

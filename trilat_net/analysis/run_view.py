@@ -1,7 +1,8 @@
-"""One view of a recorded run, from which all metrics are computed.
+"""Provides one view of a recorded run, from which all metrics are computed.
 
-The view holds the aligned records of the sites, the torques by source, the dominance factors,
-the links and the walls.
+The view contains the records of the sites, the torques by source, the dominance factors (the
+weights with which sites follow each other), the links and the walls. Metrics ask the view for
+what they need, so that nothing is computed twice.
 
 Invariant:
     - Each quantity is derived from the log only once, by `RunView.compute_once` or by a cached
@@ -33,9 +34,9 @@ class SiteRun(NamedTuple):
     """A site of a recorded run.
 
     Attributes:
-        records: aligned records of the site.
-        torque: torque ON the site's arm, by source.
-        dominance: dominance factors of the site for its peers.
+        records: Records of the site, one for every tick.
+        torque: External torque on the site's arm, by source.
+        dominance: Dominance factors with which the site follows its peers.
     """
 
     records: AlignedRecords
@@ -44,14 +45,14 @@ class SiteRun(NamedTuple):
 
 
 class RunView:
-    """A recorded run as metrics see it.
+    """A recorded run as the metrics see it.
 
     Args:
-        log: the log of the run.
+        log: The log of the run.
 
     Attributes:
-        log: the log of the run.
-        scenario: the scenario of the run.
+        log: The log of the run.
+        scenario: The scenario of the run.
     """
 
     def __init__(self, log: Log) -> None:
@@ -67,7 +68,7 @@ class RunView:
 
     @cached_property
     def sites(self) -> dict[str, SiteRun]:
-        """The sites with records."""
+        """The sites with records, by name."""
         runs = {}
         for site, records in align_records(self.log).items():
             runs[site] = SiteRun(
@@ -91,17 +92,17 @@ class RunView:
 
     @cached_property
     def absent(self) -> list[str]:
-        """The sites without records."""
+        """Names of the sites without records."""
         return [site for site in self.log.sites if site not in self.sites]
 
     @cached_property
     def links(self) -> dict[str, LinkSummary]:
-        """The links by name, "j->i"."""
+        """Summaries of the links by name, "j->i"."""
         return {link.name: link for link in summarise_links(self.log)}
 
     @cached_property
     def walls(self) -> dict[str, tuple[str, TorqueSource]]:
-        """The walls by name, each with its site; "s/1" is the first wall of site s."""
+        """The walls by name, each with its site. "s/1" is the first wall of site s."""
         walls = {}
         for site in self.log.sites:
             for number, wall in enumerate(list_walls(self.scenario.sites[site]), 1):
@@ -109,10 +110,11 @@ class RunView:
         return walls
 
     def list_subjects(self, kind: str) -> Iterable[str]:
-        """Returns the names of the subjects of a kind.
+        """Lists the names of what a kind of metric describes.
 
         Args:
-            kind: "run" (a single subject named ""), "site", "link" or "wall".
+            kind: "site", "link", "wall", or "run". The run is a single subject with an empty
+                name.
         """
         if kind == "run":
             return [""]
@@ -127,8 +129,8 @@ class RunView:
 def _view_shared(scenario: Scenario, run: SiteRun) -> SiteRun:
     """Returns a site's run in the coordinates that sites share.
 
-    An operator's script is turned into forces with the Jacobian of the first pose, so that a
-    constant script stays constant.
+    The plan of an operator is turned into forces with the Jacobian of the first pose, so that a
+    constant plan stays constant.
     """
     records = run.records
     torque = run.torque
@@ -148,6 +150,7 @@ def _view_shared(scenario: Scenario, run: SiteRun) -> SiteRun:
         environment_held=following.project_torque(torque.environment_held),
         script=script,
     )
+
     x = records.x
     if x.shape[1] == POSE:
         # metrics compare poses of different times, so rotation vectors must not change branch

@@ -1,14 +1,15 @@
-"""Signals of a site as columns over its records, and the site's settling time.
+"""Defines the signals of a site, its settling time, and how signals are reduced for plots.
 
-For plots, columns are decimated: each bucket of records keeps the minimum and the maximum of
-each column, so that a spike of one tick at 1 kHz stays visible. A gap in the records that is
-wider than a bucket becomes a row of NaN.
+A signal is an array with a row for each record of a site, such as the errors of the joints. For
+plots, the rows are reduced: each bucket of records keeps the minimum and the maximum of each
+column, so that a spike of a single tick at 1 kHz stays visible. A gap in the records that is
+wider than a bucket becomes a row of NaN, so that no line is drawn across it.
 
 Invariant:
-    - Each signal has one definition, for figures, page, summary and metrics.
-    - Torques of operators and environment are those ON the arm, the negative of the record's
-      tau_x of Eq. (8).
-    - Empty logs give empty columns.
+    - Each signal has one definition, for figures, pages, summaries and metrics.
+    - Torques of operators and environment are those on the arm, which are the negative of the
+      recorded tau_x of Eq. (8).
+    - Empty logs give empty arrays.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,26 +24,25 @@ from ..log.record_columns import Ints
 from ..log.site_log import SiteLog
 
 SETTLED_ERROR_RAD = 1e-2
-"""A site has settled when all errors of joints (rad) or along axes (m) stay below this."""
-
+"""Largest error of a settled site, in rad for joints and in m for axes of end effectors."""
 
 Signal = Callable[[SiteLog], Array]
-"""A column over the K records of a site."""
+"""Function that returns a signal of a site, with a row for each of its K records."""
 joint_angles: Signal = attrgetter("q")
-"""q, shape (K, n), rad."""
+"""Joint angles q, shape (K, n), in rad."""
 joint_errors: Signal = attrgetter("e")
-"""e = q - q_des, Eq. (9), shape (K, n), rad."""
+"""Errors e = q - q_des, Eq. (9), shape (K, n), in rad."""
 controller_torques: Signal = attrgetter("tau")
-"""tau, Eq. (13), shape (K, n), N m."""
+"""Control torques tau, Eq. (13), shape (K, n), in N m."""
 parameter_estimates: Signal = attrgetter("theta_hat")
-"""theta_hat, Eq. (15), shape (K, P), kg m^2 and kg m.
+"""Parameter estimates theta_hat, Eq. (15), shape (K, P), in kg m^2 and kg m.
 
 P is 5 for the planar arm and 10 n for a chain.
 """
 
 
 def reference_angles(part: SiteLog) -> Array:
-    """Returns q_des, Eq. (6), shape (K, n), rad.
+    """Returns the references q_des of the joints, Eq. (6), shape (K, n), in rad.
 
     In task space the joints have no reference, and q is returned.
     """
@@ -50,13 +50,13 @@ def reference_angles(part: SiteLog) -> Array:
 
 
 def follows_in_task_space(log: Log) -> bool:
-    """True if sites follow with their end effectors: their errors are those along axes."""
+    """Returns True if sites follow with their end effectors, so that errors are along axes."""
     arms = log.scenario.arms.values()
     return any(arm.shares_pose for arm in arms)
 
 
 def joint_error_rates(part: SiteLog) -> Array:
-    """Returns qd - qd_des, Eq. (18), shape (K, n), rad/s.
+    """Returns the velocity errors qd - qd_des, Eq. (18), shape (K, n), in rad/s.
 
     In task space xd - xd_des is returned, shape (K, m).
     """
@@ -79,14 +79,19 @@ def shared_unit(log: Log) -> str:
 
 
 def external_torques(part: SiteLog) -> Array:
-    """Returns -tau_x, the torque of operator and environment ON the arm, shape (K, n), N m."""
+    """Returns the torque of operator and environment on the arm, shape (K, n), in N m."""
     return 0.0 - part.tau_x  # 0 - 0 is 0, but -0 would be printed as -0
 
 
 def sample_ages_ms(log: Log, site: str) -> Array:
-    """Returns the age of each peer's sample in use, one column per peer, ms.
+    """Returns the age of each peer's sample in use, in ms.
 
-    Its shape is (K, N - 1). Ages before a peer's first sample are NaN.
+    Args:
+        log: The log of the run.
+        site: Name of the site.
+
+    Returns:
+        Ages, shape (K, N - 1), with a column for each peer. NaN before a peer's first sample.
     """
     part = log[site]
     columns = []
@@ -98,7 +103,7 @@ def sample_ages_ms(log: Log, site: str) -> Array:
 
 
 def sites_with_operator(log: Log) -> list[str]:
-    """Returns the sites that have hands in the scenario, or external torques in the records."""
+    """Lists the sites with operators in the scenario, or with recorded external torques."""
     sites = []
     for site in log.sites:
         has_hands = bool(log.scenario.sites[site].hands)
@@ -115,7 +120,7 @@ def largest_magnitude(values: Array) -> Array:
 
 
 def largest_remaining_error(part: SiteLog) -> Array:
-    """Returns the largest error of any joint from each record to the last, shape (K,), rad."""
+    """Returns the largest error of any joint from each record to the last, shape (K,)."""
     largest = largest_magnitude(joint_errors(part))
     from_the_end = np.maximum.accumulate(largest[::-1])
     return from_the_end[::-1]
@@ -124,8 +129,9 @@ def largest_remaining_error(part: SiteLog) -> Array:
 def settling_time_s(part: SiteLog) -> float | None:
     """Returns the last time at which an error exceeded `SETTLED_ERROR_RAD`, in s.
 
-    Returns 0 if no error ever exceeded the bound, and None if an error of the last record
-    exceeds it.
+    Returns:
+        The time. 0 if no error ever exceeded the bound. None if the last record has an error
+        that exceeds it, or if there are no records.
     """
     if not len(part):
         return None
@@ -140,7 +146,7 @@ def settling_time_s(part: SiteLog) -> float | None:
 
 
 def settling_time_of_all_s(times_s: Sequence[float | None]) -> float | None:
-    """Returns the time at which the last site has settled, in s; None if some site has not."""
+    """Returns the time at which the last site has settled, in s. None if some site has not."""
     settled_s = [time_s for time_s in times_s if time_s is not None]
     if len(settled_s) < len(times_s):
         return None
@@ -148,17 +154,17 @@ def settling_time_of_all_s(times_s: Sequence[float | None]) -> float | None:
 
 
 def operator_displacement(log: Log, twin: Log, site: str) -> tuple[Ints, Array, Array]:
-    """Returns how far a site is displaced from a twin of the run without operators.
+    """Returns how far operators displaced a site, compared with a run without operators.
 
     Args:
-        log: the log of the run.
-        twin: the log of its twin.
-        site: name of the site.
+        log: The log of the run.
+        twin: The log of the same run without operators.
+        site: Name of the site.
 
     Returns:
         The ticks that both logs have, shape (K,).
-        Their times, shape (K,), s.
-        q of the log minus q of the twin, shape (K, n), rad.
+        Their times, shape (K,), in s.
+        q of the log minus q of the twin, shape (K, n), in rad.
     """
     part = log[site]
     twin_part = twin[site]
@@ -171,12 +177,12 @@ def operator_displacement(log: Log, twin: Log, site: str) -> tuple[Ints, Array, 
 
 
 class DecimatedTrace(NamedTuple):
-    """C columns over P ticks, ready to be drawn; each visible gap is a row of NaN.
+    """Signals reduced to P points, ready to be drawn. Each visible gap is a row of NaN.
 
     Attributes:
-        tick: ticks, shape (P,).
-        t_s: their times, shape (P,), s.
-        values: the columns, shape (P, C).
+        tick: Ticks of the points, shape (P,).
+        t_s: Their times, shape (P,), in s.
+        values: Values of the C columns, shape (P, C).
     """
 
     tick: Ints
@@ -187,23 +193,25 @@ class DecimatedTrace(NamedTuple):
 def extreme_rows(values: Array, buckets: int) -> Ints:
     """Returns the rows to keep: the first, the last, and each bucket's extremes per column.
 
-    Buckets have equal numbers of rows. NaN is never an extreme; a bucket in which a column is
+    Buckets have equal numbers of rows. NaN is never an extreme. A bucket in which a column is
     NaN throughout keeps its first row.
 
     Args:
-        values: the columns, shape (K, C).
-        buckets: number of buckets.
+        values: The columns, shape (K, C).
+        buckets: Number of buckets.
     """
     rows, columns = values.shape
     if rows <= 2 * buckets or not columns:
         return np.arange(rows)
-    # quotients are rounded up
+
+    # The negated floor division rounds up.
     size = -(-rows // buckets)
     filled_buckets = -(-rows // size)
     # the last bucket is filled up with its last row, which changes no extreme
     filled_rows = np.arange(filled_buckets * size)
     index = np.minimum(filled_rows, rows - 1).reshape(-1, size)
     bucket = np.arange(filled_buckets)
+
     ends = np.array([0, rows - 1])
     keep = [ends]
     for column in range(columns):
@@ -222,18 +230,19 @@ def decimate(
     values: Array,
     buckets: int,
 ) -> DecimatedTrace:
-    """Returns a trace of at most 2 C + 3 points per bucket, C being the number of columns.
+    """Reduces signals to at most 2 C + 3 points per bucket, C being the number of columns.
 
-    One bucket per pixel is enough.
+    One bucket per pixel of a plot is enough.
 
     Args:
-        tick: ascending ticks, shape (K,).
-        t_s: their nominal times, shape (K,), s.
-        values: the columns, shape (K, C).
-        buckets: number of buckets.
+        tick: Ascending ticks, shape (K,).
+        t_s: Their nominal times, shape (K,), in s.
+        values: The columns, shape (K, C).
+        buckets: Number of buckets.
     """
     if not len(tick):
         return DecimatedTrace(tick, t_s, values)
+
     # narrower gaps are narrower than a pixel, and there may be thousands of them
     ticks = tick[-1] - tick[0]
     bucket_ticks = max(1.0, ticks / buckets)

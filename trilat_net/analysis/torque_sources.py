@@ -190,7 +190,7 @@ def compute_live_torque(
 
     Args:
         source: The operator.
-        hand: Recorded action of the operator, see `HandInForce`, shape (K, h): the strength of
+        hand: Recorded action of the operator, see `HandInForce`, shape (K, h): the firmness of
             the grip from 0 to 1, two further values, the target and the target's velocity.
         q: Joint angles, shape (K, n), in rad.
         qd: Joint velocities, shape (K, n), in rad/s.

@@ -1,4 +1,7 @@
-"""Equilibria of the loop: at the end of a run, nearest to a pose, or predicted.
+"""Finds equilibria of the control loop: poses in which all arms and estimates rest.
+
+An equilibrium is needed to linearise the loop. It may be the one at the end of a run, the one
+nearest to a given pose, or the one that the linear loop predicts from the start poses.
 
 Equilibria are not isolated: any pose on which the sites agree may be an equilibrium. Every
 result is therefore the equilibrium nearest to a stated pose. The simulation supplies starting
@@ -61,10 +64,14 @@ Its direction leads to further equilibria.
 
 
 def extend_scenario(scenario: Scenario, duration_s: float) -> Scenario:
-    """Returns the experiment with a longer duration, s, in which nothing new begins.
+    """Returns the experiment with a longer duration, in which nothing new begins.
 
-    Hands and environments that are present at the original end stay; chirps and multisines are
-    removed.
+    Operators and environments that are present at the original end stay. Chirps and multisines
+    are removed.
+
+    Args:
+        scenario: The experiment.
+        duration_s: The longer duration, in s.
     """
     end_s = scenario.duration_s
 
@@ -97,10 +104,10 @@ def extend_scenario(scenario: Scenario, duration_s: float) -> Scenario:
 
 
 def compute_equilibrium_residual(conditions: OperatingConditions, rest: Equilibrium) -> Array:
-    """Returns the rates at a pose in the order of the loop's states, shape (states,).
+    """Returns the rates of the loop's states at a pose, shape (states,).
 
-    The rates of the angles are zero. The others are the accelerations and the rates of the
-    estimates.
+    They are zero at an equilibrium. The rates of the angles are zero by definition, because all
+    arms are at rest. The others are the accelerations and the rates of the estimates.
     """
     arguments = linear_loop.gather_site_arguments(conditions, rest)
     states = []
@@ -119,10 +126,14 @@ def _select_loop_states(conditions: OperatingConditions, states: Sequence[Array]
 
 @limit_blas_threads()
 def find_nearest_equilibrium(conditions: OperatingConditions, rest: Equilibrium) -> Equilibrium:
-    """Returns the equilibrium nearest to a pose, by Gauss-Newton steps of least norm.
+    """Finds the equilibrium nearest to a pose, by Gauss-Newton steps of least norm.
+
+    Args:
+        conditions: The numbers of the loop.
+        rest: The pose, with estimates.
 
     Raises:
-        ScenarioError: a site in task space is in a singular pose.
+        ScenarioError: A site in task space is in a singular pose.
     """
     _refuse_singular_poses(conditions, rest)
     if conditions.has_forms:
@@ -183,7 +194,7 @@ def _shift_equilibrium(
     rest: Equilibrium,
     step: Array,
 ) -> Equilibrium:
-    """Returns an equilibrium shifted by a step of the loop's states; velocities are ignored."""
+    """Returns an equilibrium shifted by a step of the loop's states. Velocities are ignored."""
     masks = linear_loop.mask_loop_states(conditions)
     counts = [np.count_nonzero(mask) for mask in masks]
     ends = np.cumsum(counts)
@@ -224,7 +235,7 @@ def _refuse_singular_poses(conditions: OperatingConditions, rest: Equilibrium) -
 
 
 def predict_from_start(conditions: OperatingConditions, scenario: Scenario) -> Equilibrium:
-    """Returns the equilibrium that the loop reaches from the start poses.
+    """Predicts the equilibrium that the loop reaches from the start poses.
 
     The prediction assumes that all modes decay except those at zero. A loop with roots at zero
     keeps part of its history. With the null vectors W' S = 0 and S V = 0 of S = A + sum_k A_k,
@@ -232,8 +243,8 @@ def predict_from_start(conditions: OperatingConditions, scenario: Scenario) -> E
 
         V (W' D V)^-1 W' (x(0) + sum_k A_k int_{-T_k}^0 x)
 
-    Hale and Verduyn Lunel, "Introduction to Functional Differential Equations" (1993),
-    chapter 7.
+    where A_k is the matrix of the terms with the delay T_k. Hale and Verduyn Lunel,
+    "Introduction to Functional Differential Equations" (1993), chapter 7.
     """
     q = pad_rows([spec.q0_rad for spec in scenario.sites.values()])
     start = Equilibrium(q, _complete_estimates(conditions), "", 0.0)
@@ -282,7 +293,8 @@ def _compute_deviation(
 def _project_on_zero_roots(loop: linear_loop.LinearLoop, deviation: Array) -> Array | None:
     """Returns the part of a constant deviation that remains for ever, shape (states,).
 
-    Returns None if the roots at zero have too few vectors.
+    Returns:
+        The part. None if the roots at zero have too few vectors.
     """
     left, values, right = np.linalg.svd(loop.static_matrix)
     is_zero = values <= _FLAT * values[0]
@@ -303,17 +315,18 @@ def _project_on_zero_roots(loop: linear_loop.LinearLoop, deviation: Array) -> Ar
 
 
 def find_equilibrium(scenario: Scenario, pose: tuple[float, ...] | None = None) -> Equilibrium:
-    """Returns the equilibrium of a scenario at the end of a run, or at a pose.
+    """Finds the equilibrium of a scenario at the end of a run, or at a pose.
 
     Args:
-        scenario: the experiment.
-        pose: shared pose of all sites: an angle per joint in rad, or in task space the pose of
-            the end effectors. Estimates are then the true parameters. None: the end of a run.
+        scenario: The experiment.
+        pose: Shared pose of all sites: an angle per joint in rad, or in task space the pose of
+            the end effectors. Estimates are then the true parameters. None for the end of a
+            run.
 
     Raises:
-        ScenarioError: the scenario has no linear loop, or no equilibrium near the end of its
+        ScenarioError: The scenario has no linear loop, or no equilibrium near the end of its
             run.
-        UsageError: the pose does not consist of as many finite numbers as expected.
+        UsageError: The pose does not consist of as many finite numbers as expected.
     """
     conditions = derive_operating_conditions(scenario)
     if pose is None:
@@ -327,7 +340,7 @@ def predict_equilibrium(scenario: Scenario) -> Equilibrium:
     """Returns the equilibrium that the linear loop predicts from the start poses.
 
     Raises:
-        ScenarioError: the scenario has no linear loop, or no equilibrium there.
+        ScenarioError: The scenario has no linear loop, or no equilibrium near the prediction.
     """
     conditions = derive_operating_conditions(scenario)
     return _require_equilibrium(scenario, predict_from_start(conditions, scenario))
@@ -336,10 +349,15 @@ def predict_equilibrium(scenario: Scenario) -> Equilibrium:
 def follow_equilibrium(scenario: Scenario, rest: Equilibrium) -> Equilibrium:
     """Returns the equilibrium of a scenario nearest to the equilibrium of another scenario.
 
-    `rest` itself, with completed estimates, is returned if it is an equilibrium here too.
+    If the other equilibrium is one of this scenario too, it is returned with completed
+    estimates.
+
+    Args:
+        scenario: The experiment.
+        rest: Equilibrium of a similar scenario.
 
     Raises:
-        ScenarioError: the scenario has no linear loop, or no equilibrium there.
+        ScenarioError: The scenario has no linear loop, or no equilibrium near `rest`.
     """
     conditions = derive_operating_conditions(scenario)
     start = rest._replace(theta_hat=_complete_estimates(conditions, rest.theta_hat))
@@ -353,13 +371,13 @@ def follow_equilibrium(scenario: Scenario, rest: Equilibrium) -> Equilibrium:
 
 
 def choose_equilibrium(scenario: Scenario) -> Equilibrium:
-    """Returns the equilibrium of a scenario: predicted where possible, else the end of a run.
+    """Returns the equilibrium of a scenario: predicted if possible, else at the end of a run.
 
-    Prediction is possible if any shared pose is an equilibrium: no site has estimates, and no
+    A prediction is possible if any shared pose is an equilibrium: no site has estimates, and no
     operator or environment acts.
 
     Raises:
-        ScenarioError: the scenario has no linear loop, or no equilibrium there.
+        ScenarioError: The scenario has no linear loop, or no such equilibrium.
     """
     sites = derive_operating_conditions(scenario).sites
     if any(site.gains.law is Law.ADAPTIVE or site.actors for site in sites):
@@ -378,9 +396,10 @@ def _complete_estimates(
     """Returns the estimates of all sites, shape (N, P), padded with zeros.
 
     Args:
-        conditions: the numbers of the loop.
-        theta_hat: known estimates, shape (N, P). None: the true parameters, and for an imported
-            law its initial memory. Laws that learn nothing have their assumed parameters.
+        conditions: The numbers of the loop.
+        theta_hat: Known estimates, shape (N, P). None for the true parameters, and for an
+            imported law its initial memory. Laws that learn nothing have their assumed
+            parameters.
     """
     rows = []
     for n, site in enumerate(conditions.sites):
@@ -416,8 +435,8 @@ def _build_at_pose(pose: tuple[float, ...], conditions: OperatingConditions) -> 
     """Returns the pose that the user requests, with true estimates and its residual.
 
     Raises:
-        ScenarioError: an end effector does not reach the pose, or the pose is singular.
-        UsageError: the pose does not consist of as many finite numbers as expected.
+        ScenarioError: An end effector does not reach the pose, or the pose is singular.
+        UsageError: The pose does not consist of as many finite numbers as expected.
     """
     first_site = conditions.sites[0]
     coordinates = lay_out_arguments(first_site).coordinates
@@ -453,16 +472,16 @@ def _describe_pose(coordinates: int, *, task: bool) -> str:
 
 
 def reach_pose(site: SiteSetup, pose: Array) -> Array:
-    """Returns the joint angles at which a site's end effector has a pose, rad, shape (n,).
+    """Returns joint angles at which a site's end effector has a pose, in rad, shape (n,).
 
     Gauss-Newton steps from the start pose find the nearest such angles.
 
     Args:
-        site: setup of a site that follows in task space.
-        pose: the shared pose, shape (m,).
+        site: Setup of a site that follows in task space.
+        pose: The shared pose, shape (m,).
 
     Raises:
-        ScenarioError: the end effector does not reach the pose along the followed axes.
+        ScenarioError: The end effector does not reach the pose along the followed axes.
     """
     layout = lay_out_arguments(site)
     q = np.array(site.q0, dtype=np.float64)
@@ -548,7 +567,11 @@ def _find_at_run_end(scenario: Scenario, conditions: OperatingConditions) -> Equ
 
 
 def _require_equilibrium(scenario: Scenario, rest: Equilibrium) -> Equilibrium:
-    """Returns an equilibrium, or raises ScenarioError if its residual is too large."""
+    """Returns an equilibrium unchanged, if it is one.
+
+    Raises:
+        ScenarioError: The residual is too large.
+    """
     if not rest.residual <= MAX_EQUILIBRIUM_RESIDUAL:
         raise ScenarioError(
             "the loop has no equilibrium near the end of its run "

@@ -1,10 +1,13 @@
-"""Roots of the sampled loop by Floquet theory, over the period of tick rates and delays.
+"""Computes the characteristic roots of the sampled loop, by Floquet theory.
 
-Each site is linearised over one tick of its own rate:
+The sampled loop is the loop as it is executed: the controllers compute in ticks, and the arms
+move continuously. Tick rates and delays may differ between sites and links, and repeat after a
+period T. Each site is linearised over one tick of its own rate:
 
     X_i[k + 1] = P_i X_i[k] + sum_j P_ij X_j[m_ij(k)]
 
-with m_ij(k) the sample of site j that site i uses at its tick k. The multipliers mu of the map
+with the state X_i of site i and the sample m_ij(k) of site j that site i uses at its tick k.
+The multipliers mu of the map
 M over a period T, M v = mu v, give the roots s = ln(mu) / T. They are Ritz values of a block
 Krylov space (block Arnoldi): Saad, "Numerical Methods for Large Eigenvalue Problems", second
 edition (2011), chapter 6.
@@ -60,17 +63,17 @@ from .operating_point import Equilibrium, OperatingConditions
 
 
 def discretise_zero_order_hold(A: Array, B: Array, h_s: float) -> tuple[Array, Array]:
-    """Returns the matrices Phi and Gamma of x' = A x + B u over a period with u held.
+    """Returns the matrices Phi and Gamma of x' = A x + B u over a period in which u is held.
 
-    The state after a period is Phi x + Gamma u, with Phi = exp(A h) and
+    The state after the period is Phi x + Gamma u, with Phi = exp(A h) and
     Gamma = int_0^h exp(A s) ds B. Both are computed as one matrix exponential: Van Loan,
     "Computing integrals involving the matrix exponential", IEEE Trans. Automatic Control 23
     (1978).
 
     Args:
-        A: shape (n, n).
-        B: shape (n, m).
-        h_s: the period, s.
+        A: Matrix of the states, shape (n, n).
+        B: Matrix of the inputs, shape (n, m).
+        h_s: The period h, in s.
     """
     n, m = B.shape
     augmented = np.zeros((n + m, n + m))
@@ -81,14 +84,15 @@ def discretise_zero_order_hold(A: Array, B: Array, h_s: float) -> tuple[Array, A
 
 
 class SiteTickMap(NamedTuple):
-    """One site over a tick: X' = P X + Q w with the inputs w from its peers.
+    """One site over a tick: X' = P X + Q w, with the inputs w from its peers.
 
     Attributes:
-        P: shape (n, n); X holds q, qd, the state eta of the estimate, and, for the scheme
-            `second_order`, the torque of the previous tick.
-        Q: shape (n, inputs).
-        output: the samples for the peers by X, shape (3 m, n), see `SiteJacobian.output`.
-        names: names of the states.
+        P: Matrix of the state, shape (n, n). X contains q, qd, the state eta of the estimate,
+            and, for the scheme `second_order`, the torque of the previous tick.
+        Q: Matrix of the inputs, shape (n, inputs).
+        output: Samples for the peers as a function of X, shape (3 m, n), see
+            `SiteJacobian.output`.
+        names: Names of the states.
     """
 
     P: Array
@@ -101,8 +105,8 @@ def linearise_site_tick(site: SiteSetup, jacobian: SiteJacobian) -> SiteTickMap:
     """Returns one site over a tick, from the derivatives of its rates.
 
     Args:
-        site: setup of the site.
-        jacobian: derivatives of its rates, see `differentiate_rates`.
+        site: Setup of the site.
+        jacobian: Derivatives of its rates, see `differentiate_rates`.
     """
     layout = jacobian.layout
     rates = jacobian.rates
@@ -150,11 +154,11 @@ def linearise_site_tick(site: SiteSetup, jacobian: SiteJacobian) -> SiteTickMap:
 
 
 def _discretise_arm(jacobian: SiteJacobian, h_s: float) -> tuple[Array, Array]:
-    """Returns the matrices of an arm over a tick under a held torque.
+    """Returns the matrices of an arm over a tick in which the torque is held.
 
     Args:
-        jacobian: derivatives of the site's rates.
-        h_s: length of a tick, s.
+        jacobian: Derivatives of the site's rates.
+        h_s: Length of a tick, in s.
     """
     layout = jacobian.layout
     rates = jacobian.rates
@@ -179,11 +183,11 @@ class CoupledTicks(NamedTuple):
     """The sites over one tick each, and the effects of their states on their peers.
 
     Attributes:
-        S: block diagonal of the sites' own maps, shape (n, n).
-        effects: effect of site j on site i, where there is one, shape (n, n) each, by (i, j).
-        names: names of the states.
-        owners: index of the site to which each state belongs, shape (n,).
-        constant: number of omitted states that are constant or without effect.
+        S: Block diagonal matrix of the sites' own maps, shape (n, n).
+        effects: Effect of site j on site i, if there is one, shape (n, n) each, by (i, j).
+        names: Names of the states.
+        owners: Index of the site to which each state belongs, shape (n,).
+        constant: Number of omitted states that are constant or without effect.
     """
 
     S: Array
@@ -194,7 +198,7 @@ class CoupledTicks(NamedTuple):
 
 
 def couple_ticks(conditions: OperatingConditions, rest: Equilibrium) -> CoupledTicks:
-    """Returns the sites over a tick, and their effects, without constant states."""
+    """Returns the sites over a tick, and their effects on each other, without constant states."""
     jacobians = differentiate_rates(conditions, rest)
     maps = []
     for site, jacobian in zip(conditions.sites, jacobians, strict=True):
@@ -264,14 +268,14 @@ _SAME_ROOT = 1e-6
 
 
 class SamplesInUse(NamedTuple):
-    """The samples that sites use over a span that begins with a tick of every site.
+    """The samples that sites use over a span of time that begins with a tick of every site.
 
     Attributes:
-        span_s: length of the span, s.
-        used: by (i, j) the number of the sample of site j that site i uses at each of its
+        span_s: Length of the span, in s.
+        used: By (i, j) the number of the sample of site j that site i uses at each of its
             ticks, counted from the sample at the beginning of the span.
-        period_s: period of delays and tick rates, which divides the span, s; None: they do not
-            repeat.
+        period_s: Period of delays and tick rates, which divides the span, in s. None if they do
+            not repeat.
     """
 
     span_s: float
@@ -280,7 +284,7 @@ class SamplesInUse(NamedTuple):
 
 
 def _find_cycle_s(link: LinkBase) -> float:
-    """Returns the period of a link's delay, s; 0 if it is constant or does not repeat."""
+    """Returns the period of a link's delay, in s. 0 if it is constant or does not repeat."""
     model = link.to_core_model()
     points = link.points
     if points is not None and model.kind == DelayKind.TRACE and len(points) > 1:
@@ -294,17 +298,20 @@ def _find_cycle_s(link: LinkBase) -> float:
 
 
 def _is_ending_trace(link: LinkBase) -> bool:
-    """True if a link plays a trace that does not repeat."""
+    """Returns True if a link plays a delay trace that does not repeat."""
     model = link.to_core_model()
     return model.kind == DelayKind.TRACE and model.at_end == TraceEnd.HOLD
 
 
 def _find_period_s(links: Sequence[LinkBase], rates_hz: Sequence[int]) -> float | None:
-    """Returns the period after which tick rates and delays repeat, s; None if they do not.
+    """Returns the period after which tick rates and delays repeat, in s.
 
     Args:
-        links: the links whose delays vary.
-        rates_hz: tick rate of each site.
+        links: The links whose delays vary.
+        rates_hz: Tick rate of each site.
+
+    Returns:
+        The period. None if they do not repeat.
     """
     common_hz = math.gcd(*rates_hz)
     span_count = round(MAX_PERIOD_S * common_hz)
@@ -329,7 +336,10 @@ def _find_period_s(links: Sequence[LinkBase], rates_hz: Sequence[int]) -> float 
 
 
 def find_samples_in_use(conditions: OperatingConditions) -> SamplesInUse:
-    """Returns the samples in use over the period of delays and rates, or over a drawn span."""
+    """Returns the samples that the sites use over the period of delays and tick rates.
+
+    If delays are drawn at random, a span with drawn delays takes the place of the period.
+    """
     rates_hz = [site.rate_hz for site in conditions.sites]
     common_hz = math.gcd(*rates_hz)
     links: list[LinkBase] = []
@@ -381,8 +391,8 @@ class _SpanPart(NamedTuple):
     """A part of a span, after which columns are scaled.
 
     Attributes:
-        runs: ticks in an order in which every sample is known before its use.
-        stops: the tick of each site after the part.
+        runs: Ticks in an order in which every sample is known before its use.
+        stops: Tick of each site after the part.
     """
 
     runs: list[_TickRun]
@@ -397,9 +407,9 @@ def _plan_parts(
     """Returns an order of all ticks of a span, in parts.
 
     Args:
-        ticks: number of ticks of each site.
-        used: by (i, j) the sample of site j at each tick of site i.
-        count: number of parts.
+        ticks: Number of ticks of each site.
+        used: By (i, j) the sample of site j at each tick of site i.
+        count: Number of parts.
     """
     # entry n: number of ticks of site i that depend on samples of site j up to n only
     computable = {}
@@ -433,9 +443,9 @@ class _PeerEffect(NamedTuple):
     """The effect of one peer on a site.
 
     Attributes:
-        peer: index of the peer.
-        rows: row of the peer's track that each tick of the site uses.
-        effect: effect of the peer's state on the site's next state, shape (n_i, n_j).
+        peer: Index of the peer.
+        rows: Row of the peer's track that each tick of the site uses.
+        effect: Effect of the peer's state on the site's next state, shape (n_i, n_j).
     """
 
     peer: int
@@ -444,13 +454,14 @@ class _PeerEffect(NamedTuple):
 
 
 class _SpanMap:
-    """The linear loop over a span, as an operator on columns.
+    """The linear loop over a span of time, as an operator on columns.
 
-    A column holds the states of each site at its last ticks, as far back as a peer uses them.
+    A column contains the states of each site at its last ticks, as far back as a peer uses
+    them.
 
     Attributes:
-        neutral: constant motions, orthonormal, shape (size, zeros).
-        scales: factors by which columns are multiplied after each part. The first application
+        neutral: Constant motions, orthonormal, shape (size, zeros).
+        scales: Factors by which columns are multiplied after each part. The first application
             chooses them so that its columns have size 1.
     """
 
@@ -504,9 +515,13 @@ class _SpanMap:
         return V - constant_part
 
     def _build_tracks(self, V: Array) -> list[Array]:
-        """Returns the track of each site: past states by the columns V, and room for the span.
+        """Returns the track of each site: its past states, and room for the states of the span.
 
-        A track has the shape (rows + ticks, n_i, columns).
+        Args:
+            V: Columns with the past states.
+
+        Returns:
+            Tracks of shape (rows + ticks, n_i, columns).
         """
         columns = V.shape[1]
         tracks = []
@@ -529,13 +544,15 @@ class _SpanMap:
         """Returns columns after the span, and the track of each site.
 
         Args:
-            V: columns, shape (size, columns).
-            divided: divide out constant motions and scale the columns after each part.
-            sizes: list to which the norm of each column after each part is appended.
+            V: Columns, shape (size, columns).
+            divided: True to divide out constant motions, and to scale the columns after each
+                part.
+            sizes: List to which the norm of each column after each part is appended.
 
         Returns:
-            The columns after the span, and the states of each site from the start of the span
-            on, shape (ticks + 1, n_i, columns) each.
+            The columns after the span.
+            The states of each site from the start of the span on, shape (ticks + 1, n_i,
+            columns) each.
         """
         columns = V.shape[1]
         tracks = self._build_tracks(V)
@@ -595,13 +612,14 @@ def _find_multipliers(
     """Returns the largest multipliers of a span map, by the block Arnoldi method.
 
     Args:
-        span: the map.
-        n: number of states of the loop.
-        wanted: number of distinct moduli; fewer result if the others are too close to zero.
+        span: The map.
+        n: Number of states of the loop.
+        wanted: Number of distinct moduli. Fewer result if the others are too close to zero.
 
     Returns:
-        The multipliers by falling modulus, their vectors as columns, and which multipliers are
-        exact to `_RESIDUAL`.
+        The multipliers, by falling modulus.
+        Their vectors, as columns.
+        True for each multiplier that is exact to `_RESIDUAL`.
     """
     random = np.random.default_rng(0)
     start_states = random.standard_normal((n, min(n, _COLUMNS)))
@@ -649,8 +667,8 @@ def _order_multipliers(mu: Complex, wanted: int) -> NDArray[np.int64]:
     """Returns the indices of the largest multipliers, by falling modulus.
 
     Args:
-        mu: the multipliers.
-        wanted: number of distinct moduli.
+        mu: The multipliers.
+        wanted: Number of distinct moduli.
     """
     order = np.argsort(-np.abs(mu), kind="stable")
     moduli = np.abs(mu[order])
@@ -668,16 +686,16 @@ def compute_sampled_spectrum(
     wanted: int = 6,
     uses: SamplesInUse | None = None,
 ) -> Spectrum | None:
-    """Returns the rightmost roots of the sampled loop.
+    """Computes the rightmost roots of the sampled loop.
 
     Args:
-        conditions: the numbers of the loop.
-        rest: the equilibrium.
-        wanted: number of roots; fewer result if the others are too close to -infinity.
-        uses: the samples in use; None: those of the scenario's links.
+        conditions: The numbers of the loop.
+        rest: The equilibrium.
+        wanted: Number of roots. Fewer result if the others are too close to -infinity.
+        uses: The samples in use. None for those of the scenario's links.
 
     Returns:
-        The roots; None if a law has states or waves of its own, because such a law is
+        The roots. None if a law has states or waves of its own, because such a law is
         linearised in continuous time only.
     """
     if conditions.has_forms:
@@ -732,15 +750,15 @@ def compute_sampled_spectrum(
 
 
 def _estimate_deviation(span: _SpanMap, mode: Array, span_s: float) -> float:
-    """Returns the standard deviation of a root over the parts of a span, 1/s.
+    """Estimates the standard deviation of a root over the parts of a span, in 1/s.
 
-    The logarithm of the mode's size over the parts is taken as a random walk. The mean variance
-    of the walk's Brownian bridge is a twelfth of the variance of the walk's end.
+    The logarithm of the mode's size over the parts is treated as a random walk. The mean
+    variance of the walk's Brownian bridge is a twelfth of the variance of the walk's end.
 
     Args:
-        span: the map.
-        mode: real and imaginary part of the mode as columns, shape (size, 2).
-        span_s: length of the span, s.
+        span: The map.
+        mode: Real and imaginary part of the mode as columns, shape (size, 2).
+        span_s: Length of the span, in s.
     """
     sizes: list[Array] = []
     span.apply(mode, sizes=sizes)
@@ -761,15 +779,15 @@ def _describe_modes(
 ) -> list[CharacteristicRoot]:
     """Returns the roots of modes, with their frequencies and their fastest joints.
 
-    A multiplier determines a frequency up to multiples of 2 pi / T only. The multiple is that
+    A multiplier determines a frequency only up to multiples of 2 pi / T. The multiple is that
     of the strongest line in the spectrum of the mode's fastest joint.
 
     Args:
-        s: principal values of the roots, shape (K,), 1/s.
-        tracks: states of each site from the start of the span on, with K columns of real parts
+        s: Principal values of the roots, shape (K,), in 1/s.
+        tracks: States of each site from the start of the span on, with K columns of real parts
             and then K of imaginary parts.
-        loop: the loop.
-        rates_hz: tick rate of each site.
+        loop: The loop.
+        rates_hz: Tick rate of each site.
     """
     count = len(s)
     roots: list[CharacteristicRoot] = []
@@ -808,12 +826,12 @@ def _describe_modes(
 
 
 def _find_strongest_offset(velocity: Complex, principal: complex, hz: int) -> float:
-    """Returns the difference of a mode's strongest frequency from its principal value, rad/s.
+    """Returns how far a mode's strongest frequency is from its principal value, in rad/s.
 
     Args:
-        velocity: velocity of a joint in the mode, one value per tick.
-        principal: principal value of the root, 1/s.
-        hz: tick rate of the joint's site.
+        velocity: Velocity of a joint in the mode, with one value per tick.
+        principal: Principal value of the root, in 1/s.
+        hz: Tick rate of the joint's site.
     """
     # beyond fifteen time constants the track consists of rounding errors
     usable = 2 + int(15.0 * hz / max(1e-9, abs(principal.real)))
@@ -826,7 +844,7 @@ def _find_strongest_offset(velocity: Complex, principal: complex, hz: int) -> fl
 
 
 def _find_root(roots: Sequence[CharacteristicRoot], s: complex) -> int | None:
-    """Returns the index of the first root equal to s within `_SAME_ROOT`, or None."""
+    """Returns the index of the first root that equals s within `_SAME_ROOT`, or None."""
     for index, known in enumerate(roots):
         if abs(known.s - s) <= _SAME_ROOT * (1.0 + abs(s)):
             return index

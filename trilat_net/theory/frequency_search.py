@@ -1,11 +1,13 @@
-"""Adaptive frequency grids, minima of curves over frequency, and bands below a level.
+"""Finds minima of curves over frequency, and the bands in which a curve is below a level.
 
-A grid is refined where the response changes by more than a tenth between two points, and around
-minima until the neighbours of each minimum lie less than 1 % above it.
+Curves such as eigenvalues of a frequency response can be evaluated only at discrete
+frequencies. A grid of frequencies is refined where the response changes by more than a tenth
+between two points, and around minima until the neighbours of each minimum lie less than 1 %
+above it.
 
 Invariant:
-    - Values on a grid are evidence but no proof: features that are narrower than the grid's
-      steps stay hidden.
+    - Values on a grid are evidence but no proof: features that are narrower than the steps of
+      the grid stay hidden.
 """
 
 from collections.abc import Callable
@@ -43,7 +45,7 @@ _SETTLED = 0.01
 
 
 class FrequencyBand(NamedTuple):
-    """A range of frequencies, Hz."""
+    """A range of frequencies, in Hz."""
 
     from_hz: float
     to_hz: float
@@ -53,9 +55,9 @@ class Minima(NamedTuple):
     """A curve over frequency with resolved minima.
 
     Attributes:
-        w_rad_s: frequencies, shape (F,), rad/s.
-        values: values of the curve, shape (F,).
-        below: the bands in which the curve lies below its level.
+        w_rad_s: Frequencies, shape (F,), in rad/s.
+        values: Values of the curve, shape (F,).
+        below: Bands in which the curve is below its level.
     """
 
     w_rad_s: Array
@@ -64,27 +66,27 @@ class Minima(NamedTuple):
 
     @property
     def least(self) -> float:
-        """The least value."""
+        """The least value of the curve."""
         return float(self.values.min())
 
     @property
     def least_hz(self) -> float:
-        """The frequency of the least value, Hz."""
+        """The frequency of the least value, in Hz."""
         w_rad_s = self.w_rad_s[self.values.argmin()]
         return float(w_rad_s / (2.0 * np.pi))
 
 
 def build_frequency_grid(low_hz: float, high_hz: float, delay_s: float) -> Array:
-    """Returns frequencies that resolve the phase of a delay, rad/s, shape (F,).
+    """Returns frequencies that resolve the phase of a delay, in rad/s, shape (F,).
 
     The frequencies are evenly spaced on a logarithmic axis. Further frequencies are evenly
     spaced on a linear axis, because a round trip over the longest delay T turns the phase once
     in pi / T rad/s.
 
     Args:
-        low_hz: lower end of the band, Hz.
-        high_hz: upper end of the band, Hz.
-        delay_s: the longest delay T, s.
+        low_hz: Lower end of the band, in Hz.
+        high_hz: Upper end of the band, in Hz.
+        delay_s: The longest delay T, in s.
     """
     low = 2.0 * np.pi * low_hz
     high = 2.0 * np.pi * high_hz
@@ -101,9 +103,14 @@ def build_frequency_grid(low_hz: float, high_hz: float, delay_s: float) -> Array
 
 
 def find_resolved_hz(low_hz: float, high_hz: float, delay_s: float) -> float:
-    """Returns the frequency up to which the grid resolves the phase of a delay, Hz.
+    """Returns the frequency up to which the grid resolves the phase of a delay, in Hz.
 
     Up to this frequency the grid has at least four points per turn of a round trip.
+
+    Args:
+        low_hz: Lower end of the band, in Hz.
+        high_hz: Upper end of the band, in Hz.
+        delay_s: The longest delay, in s.
     """
     step_hz = (high_hz - low_hz) / _MAX_POINTS
     if 8.0 * step_hz * delay_s <= 1.0:
@@ -116,12 +123,12 @@ def find_resolved_hz(low_hz: float, high_hz: float, delay_s: float) -> float:
 def refine_frequencies(response: PortResponse, w_rad_s: Array) -> Array:
     """Returns a grid on which the response changes by at most a tenth from point to point.
 
-    The number of points is limited. At a pole on the axis refinement stops when two points
-    differ by a millionth.
+    The number of points is limited. At a pole on the imaginary axis, refinement stops when two
+    points differ by a millionth.
 
     Args:
-        response: the response.
-        w_rad_s: first frequencies, rising, shape (F,), rad/s.
+        response: The response.
+        w_rad_s: First frequencies, rising, shape (F,), in rad/s.
     """
 
     def find_large_changes(Y: Complex) -> NDArray[np.bool_]:
@@ -142,12 +149,13 @@ def _refine(
     w_rad_s: Array,
     find_coarse: Callable[[NDArray[Any]], NDArray[np.bool_]],
 ) -> tuple[Array, NDArray[Any]]:
-    """Returns a refined grid and the function's values on it.
+    """Refines a grid of frequencies, and returns it with the function's values.
 
     Args:
-        function: values, shape (F, ...), by frequencies, shape (F,).
-        w_rad_s: first frequencies, rising, shape (F,).
-        find_coarse: returns the steps of the grid to be halved, shape (F - 1,), by the values.
+        function: Function that returns values, shape (F, ...), for frequencies, shape (F,).
+        w_rad_s: First frequencies, rising, shape (F,).
+        find_coarse: Function that returns the steps of the grid to halve, shape (F - 1,), for
+            the values.
     """
     values = function(w_rad_s)
     for _ in range(_ROUNDS):
@@ -183,11 +191,11 @@ def find_minima(
     """Returns a curve with its minima resolved, and the bands in which it is below a level.
 
     Args:
-        curve: the curve.
-        w_rad_s: first frequencies, rising, shape (F,), rad/s.
-        level: the level.
-        tolerance: rounding error of the curve. The curve must be below the level by more than
-            this error, and so must a minimum be below its neighbours. None: zero.
+        curve: The curve.
+        w_rad_s: First frequencies, rising, shape (F,), in rad/s.
+        level: The level.
+        tolerance: Rounding error of the curve. The curve must be below the level by more than
+            this error, and so must a minimum be below its neighbours. None for zero.
     """
 
     def find_rounding(w: Array) -> Array:
@@ -213,7 +221,7 @@ def _find_steps_at_minima(curve_and_rounding: Array) -> NDArray[np.bool_]:
     more than 1 % of the minimum's depth, and by more than 1 % of the least value.
 
     Args:
-        curve_and_rounding: values of the curve and their rounding errors, shape (F, 2).
+        curve_and_rounding: Values of the curve and their rounding errors, shape (F, 2).
     """
     values, rounding = curve_and_rounding.T
     middle = values[1:-1]
@@ -236,13 +244,13 @@ def _find_bands_below(
     values: Array,
     level: float,
 ) -> tuple[FrequencyBand, ...]:
-    """Returns the bands in which a curve is below a level; bisection finds all edges together.
+    """Returns the bands in which a curve is below a level. Bisection locates all edges.
 
     Args:
-        curve: the curve.
-        w_rad_s: frequencies, rising, shape (F,), rad/s.
-        values: values of the curve, shape (F,).
-        level: the level.
+        curve: The curve.
+        w_rad_s: Frequencies, rising, shape (F,), in rad/s.
+        values: Values of the curve, shape (F,).
+        level: The level.
     """
     is_below = values < level
     edge_steps = np.flatnonzero(is_below[1:] != is_below[:-1])

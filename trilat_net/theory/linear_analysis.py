@@ -1,13 +1,17 @@
-"""Linear analysis of a scenario, or of a run's end: equilibrium, roots, margin, verdict.
+"""Analyses the linear loop of a scenario, or of the end of a recorded run.
+
+The analysis answers whether small motions about an equilibrium die away. It contains the
+equilibrium, the characteristic roots of the continuous and the sampled loop, the delay margin,
+and, if requested, the edges of stability and the haptic ports.
 
 At the end of a recorded run, the roots belong to the log's last pose and estimates, under the
-conditions at the log's end. If delays are drawn or measured, the roots are computed over the
-samples that the last quarter of the records uses. For laws that are linearised in continuous
-time only, mean ages replace these samples. Nothing is executed but twins.
+conditions at the log's end. If delays are drawn at random or measured, the roots are computed
+with the samples that the last quarter of the records uses. For laws that can be linearised in
+continuous time only, mean ages replace these samples. Nothing is executed again but twins.
 
 Invariant:
-    - The verdict is the sampled loop's, at any tick rates and delays. If a law is linearised in
-      continuous time only, the verdict is the continuous loop's.
+    - The verdict is that of the sampled loop, at any tick rates and delays. If a law can be
+      linearised in continuous time only, the verdict is that of the continuous loop.
     - The verdict holds for small motions about the equilibrium only.
 """
 
@@ -54,24 +58,24 @@ DEFAULT_ROOTS = 6
 MAX_ROOTS = 60
 """Largest number of roots that can be requested."""
 SAMPLED_ROOT_DIFFERENCE = 0.01
-"""Continuous and sampled roots that differ by more than this share of abs(s) are both shown."""
+"""Largest difference of continuous and sampled roots that is not shown, as a share of abs(s)."""
 
 
 @dataclass(frozen=True, repr=False)
 class LinearAnalysis(Result):
-    """The linear analysis of a scenario.
+    """The linear analysis of a scenario, see `analyse_linear_loop`.
 
     Attributes:
-        scenario: the experiment.
-        conditions: the numbers of the loop: dominance factors, ages, actors in force.
-        rest: the equilibrium.
-        loop: the loop linearised at the equilibrium.
-        continuous: roots of the delay-differential equation.
-        sampled: roots of the sampled loop; None if a law is linearised in continuous time
+        scenario: The experiment.
+        conditions: The numbers of the loop: dominance factors, delays, operators in force.
+        rest: The equilibrium.
+        loop: The loop linearised at the equilibrium.
+        continuous: Roots of the continuous loop, a delay-differential equation.
+        sampled: Roots of the sampled loop. None if a law can be linearised in continuous time
             only.
-        margin: the common delays for which the continuous loop is stable.
-        scans: edges of stability along the requested keys.
-        ports: analysis of the operators' haptic ports; None if it was not requested.
+        margin: The common delays for which the continuous loop is stable.
+        scans: Edges of stability along the requested keys.
+        ports: Analysis of the haptic ports of the operators. None if it was not requested.
     """
 
     scenario: Scenario
@@ -86,7 +90,7 @@ class LinearAnalysis(Result):
 
     @property
     def end_effectors(self) -> tuple[Array, ...]:
-        """The pose that each site shares at the equilibrium; empty arrays in joint space."""
+        """The pose that each site shares at the equilibrium. Empty arrays in joint space."""
         sites = self.conditions.sites
         if not sites[0].layout.task:
             return (np.zeros(0),) * len(sites)
@@ -104,7 +108,7 @@ class LinearAnalysis(Result):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Remarks on conditions, equilibrium and roots."""
+        """Remarks on the conditions, the equilibrium and the roots."""
         notes = [*self.conditions.notes, *self.rest.notes]
         if self.sampled is not None and self.sampled.verdict != self.continuous.verdict:
             decides = "ticks and delays decide"
@@ -124,11 +128,11 @@ class LinearAnalysis(Result):
         return (*notes, *describe_law_conditions(self.scenario))
 
     def headline(self) -> str:
-        """Returns the verdict in one line."""
+        """Returns the verdict and the delay margin in one line."""
         return f"{self.scenario.name}: {self.verdict}; delay margin {self.margin.description}"
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns plain values, with the keys of `trilat linear --json`."""
+        """Returns the analysis as plain values, with the keys of `trilat linear --json`."""
         sampled = None
         if self.sampled is not None:
             sampled = _spectrum_to_json(self.sampled)
@@ -153,7 +157,7 @@ class LinearAnalysis(Result):
         }
 
     def _rest_to_json(self) -> dict[str, Any]:
-        """Returns the equilibrium as plain values, without padding."""
+        """Returns the equilibrium as plain values, without the zeros that pad its arrays."""
         rest = self.rest
         q = {}
         theta_hat = {}
@@ -175,7 +179,7 @@ class LinearAnalysis(Result):
         return values
 
     def _delays_to_json(self) -> dict[str, float]:
-        """Returns the age of the samples in use, ms, by link."""
+        """Returns the age of the samples in use, in ms, by link."""
         conditions = self.conditions
         names = self.scenario.names
         receivers, senders = np.nonzero(conditions.alpha)
@@ -186,7 +190,7 @@ class LinearAnalysis(Result):
         return delays_ms
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a row for each root: of the continuous loop, and as computed by ticks."""
+        """Returns a row for each root of the continuous and of the sampled loop."""
         spectra = {"continuous": self.continuous, "as computed": self.sampled}
         rows: list[dict[str, Any]] = []
         for loop, spectrum in spectra.items():
@@ -199,9 +203,13 @@ class LinearAnalysis(Result):
         return rows
 
     def find_sampled_root(self, root: CharacteristicRoot) -> CharacteristicRoot | None:
-        """Returns the sampled root nearest to a continuous root, if they differ by over 1 %.
+        """Returns the sampled root nearest to a continuous root, if both differ by over 1 %.
 
-        Returns None if they differ by less, or if there is no sampled root.
+        Args:
+            root: A root of the continuous loop.
+
+        Returns:
+            The sampled root. None if both differ by less, or if there is no sampled root.
         """
         if self.sampled is None or not self.sampled.roots:
             return None
@@ -222,28 +230,31 @@ def analyse_linear_loop(
     ports: bool = False,
     hands: Sequence[HandMatrices] = (),
 ) -> LinearAnalysis:
-    """Returns the linear analysis of a scenario, see `trilat_net.linear`.
+    """Analyses the linear loop of a scenario, see `trilat_net.linear`.
 
     Args:
-        source: a scenario, its file, or the name of a shipped scenario.
-        overrides: changed keys of the scenario.
-        pose: shared pose of all sites, rad; None: the end of a run.
-        roots: number of roots.
-        over: ranges of keys along which edges of stability are searched, as "control.d=0.1:3".
-        ports: analyse the operators' haptic ports.
-        hands: measured operators, any of whom may hold any master.
+        source: A scenario, its file, or the name of a shipped scenario.
+        overrides: Changed keys of the scenario.
+        pose: Shared pose of all sites, in rad. None for the pose at the end of a run.
+        roots: Number of roots to compute.
+        over: Ranges of keys along which edges of stability are searched, such as
+            "control.d=0.1:3".
+        ports: True to analyse the haptic ports of the operators.
+        hands: Measured impedances of operators, any of whom may hold any master.
 
     Raises:
-        ScenarioError: the scenario is not valid, or has no linear loop.
-        UsageError: another argument is not valid.
+        ScenarioError: The scenario is not valid, or has no linear loop.
+        UsageError: Another argument is not valid.
     """
     ranges = [parse_edge_range(text) for text in over]
     if not 1 <= roots <= MAX_ROOTS:
         raise UsageError(f"--roots is a number of roots, 1 to {MAX_ROOTS}, not {roots}")
+
     scenario = load_scenario(source, overrides)
     conditions = derive_operating_conditions(scenario)
     rest = find_equilibrium(scenario, pose)
     loop = linearise_loop(conditions, rest)
+
     analysis = LinearAnalysis(
         scenario=scenario,
         conditions=conditions,
@@ -253,6 +264,7 @@ def analyse_linear_loop(
         sampled=compute_sampled_spectrum(conditions, rest, roots),
         margin=find_delay_margin(loop),
     )
+
     scans = []
     for key, low, high in ranges:
         edges = iterate_linear_edges(scenario, key, low=low, high=high, rest=rest)
@@ -279,7 +291,7 @@ def _margin_to_json(margin: DelayMargin) -> dict[str, Any]:
 
 
 def _spectrum_to_json(spectrum: Spectrum) -> dict[str, Any]:
-    """Returns a spectrum as plain values."""
+    """Returns the roots of a loop as plain values."""
     roots = []
     for root in spectrum.roots:
         values = {
@@ -313,16 +325,18 @@ def certify_run(
     own_laws: bool = False,
     twins: int = TWINS,
 ) -> Certificate:
-    """Returns the certificate of a log, with the roots of the loop at the end of the run.
+    """Issues the certificate of a log, with the roots at its end and with twins.
+
+    A twin is a repeated execution of the run with a small push.
 
     Args:
-        log: the log.
-        min_coverage: least share of records that a site must have, see `certify`.
-        own_laws: the code of imported laws may be executed.
-        twins: number of twins that are executed; 0: none.
+        log: The log.
+        min_coverage: Least share of the ticks of a site that must be recorded, see `certify`.
+        own_laws: True if the code of imported laws may be executed.
+        twins: Number of twins that are executed. 0 for none.
 
     Raises:
-        LogError: a record cannot be read, or names a change that does not exist.
+        LogError: A record cannot be read, or names a change that does not exist.
     """
     certificate = certify(log, min_coverage=min_coverage, own_laws=own_laws)
     growth = None
@@ -332,7 +346,14 @@ def certify_run(
 
 
 def find_end_pose_roots(log: Log) -> EndPoseRoots:
-    """Returns the roots of the loop at the end of a run, or the reason why there are none."""
+    """Returns the roots of the loop at the end of a recorded run.
+
+    Args:
+        log: The log of the run.
+
+    Returns:
+        The roots, or the reason why there are none.
+    """
     site_logs = [log[site] for site in log.sites]
     if not all(map(len, site_logs)):
         return _explain_no_roots("a site has no records")
@@ -340,6 +361,7 @@ def find_end_pose_roots(log: Log) -> EndPoseRoots:
         return _explain_no_roots("the run diverged")
     if any(log.changes(site) for site in log.sites):
         return _explain_no_roots("commands changed the loop while it ran")
+
     fixed = _fix_delays(log)
     try:
         conditions = derive_operating_conditions(fixed.scenario, own_laws=False)
@@ -350,11 +372,13 @@ def find_end_pose_roots(log: Log) -> EndPoseRoots:
         rest = follow_equilibrium(fixed.scenario, end)
     except ScenarioError as error:
         return _explain_no_roots(error.problem)
+
     sampled = compute_sampled_spectrum(conditions, rest, _ROOTS, fixed.uses)
     if sampled is not None:
         return _describe_end_pose_roots(
             sampled, sampled.basis, exact=sampled.deviation_per_s is None
         )
+
     continuous = compute_delay_spectrum(linearise_loop(conditions, rest), _ROOTS)
     basis = ", in continuous time"
     if conditions.varying or fixed.mean_age_s:
@@ -366,14 +390,15 @@ def _describe_end_pose_roots(spectrum: Spectrum, basis: str, *, exact: bool) -> 
     """Returns the rightmost root and the verdict, as the certificate states them.
 
     Args:
-        spectrum: the roots at the end pose.
-        basis: a phrase that states over which ticks the roots are computed.
-        exact: no delay is averaged or assumed to repeat.
+        spectrum: The roots at the end pose.
+        basis: A phrase that states over which ticks the roots are computed.
+        exact: True if no delay is averaged or assumed to repeat.
     """
     root = spectrum.rightmost
     verdict = spectrum.verdict
     if root is None:
         return EndPoseRoots(verdict, None, exact, f"this rest: {verdict}, without roots")
+
     omega = f" at {abs(root.s.imag):.4g} rad/s" if root.s.imag else ""
     drift = ""
     if spectrum.drifting:
@@ -386,12 +411,12 @@ class _FixedDelays(NamedTuple):
     """A recorded scenario in which every delay is known.
 
     Attributes:
-        scenario: the scenario up to the end of the records. A link whose delays only the
-            records know has its constant mean delay.
-        uses: the samples in use in the last quarter of the run; None if the scenario determines
-            all delays, or if no sample was received on some link.
-        mean_age_s: mean age of the samples on links with unknown delays, s, by (receiver,
-            sender).
+        scenario: The scenario up to the end of the records. A link whose delays only the
+            records show has its constant mean delay.
+        uses: The samples in use in the last quarter of the run. None if the scenario determines
+            all delays, or if no sample was received over some link.
+        mean_age_s: Mean age of the samples on links with unknown delays, in s, by (index of the
+            receiver, index of the sender).
     """
 
     scenario: Scenario
@@ -402,7 +427,7 @@ class _FixedDelays(NamedTuple):
 def _fix_delays(log: Log) -> _FixedDelays:
     """Returns the scenario of a log with the delays that the records show.
 
-    A tick without a record uses the samples of the tick before.
+    A tick without a record is assumed to use the samples of the tick before.
     """
     scenario = msgspec.structs.replace(log.scenario, duration_s=recorded_end_s(log))
     has_unknown_delay = {}
@@ -411,6 +436,7 @@ def _fix_delays(log: Log) -> _FixedDelays:
         has_unknown_delay[name] = link.random or link.measured or has_trace
     if not any(has_unknown_delay.values()):
         return _FixedDelays(scenario, None, {})
+
     sites = [log[name] for name in scenario.names]
     links = dict(scenario.links)
     rates_hz = [site.rate_hz for site in sites]
@@ -419,6 +445,7 @@ def _fix_delays(log: Log) -> _FixedDelays:
     last_ticks = [int(site.tick[-1]) * common_hz // site.rate_hz for site in sites]
     end = max(1, min(last_ticks))
     start = max(3 * end // 4, end - round(DRAWN_SPAN_S * common_hz))
+
     used = {}
     mean_age_s = {}
     for (i, site), (j, peer) in permutations(enumerate(sites), 2):
@@ -431,6 +458,7 @@ def _fix_delays(log: Log) -> _FixedDelays:
         if samples.min() < 0:
             # the peer had not sent a sample yet, or never sent a sample
             return _FixedDelays(scenario, None, {})
+
         first_sample = start * peer.rate_hz // common_hz
         used[i, j] = samples - first_sample
         name = f"{peer.name}->{site.name}"
@@ -438,6 +466,7 @@ def _fix_delays(log: Log) -> _FixedDelays:
             ages_s = ticks / site.rate_hz - samples / peer.rate_hz
             mean_age_s[i, j] = float(ages_s.mean())
             links[name] = ConstantDelay(delay_ms=1e3 * mean_age_s[i, j])
+
     span_s = (end - start) / common_hz
     uses = SamplesInUse(span_s, used)
     fixed_scenario = msgspec.structs.replace(scenario, links=links)
@@ -445,19 +474,24 @@ def _fix_delays(log: Log) -> _FixedDelays:
 
 
 def _explain_no_roots(reason: str) -> EndPoseRoots:
-    """Returns a result without roots, and the reason."""
+    """Returns a result without roots, with the reason."""
     return EndPoseRoots("", None, False, f"this rest: no roots: {reason}")
 
 
 def _choose_end_state(scenario: Scenario, site_logs: Sequence[SiteLog]) -> tuple[Array, Array]:
-    """Returns the angles and the estimates of all sites at the end of a run.
+    """Chooses the angles and the estimates of all sites at the end of a run.
 
-    Of a site at rest the last record is returned, of any other site the mean of the last
-    quarter. If arms chatter at a sampled wall, the state of the last quarter that is deepest in
-    the wall is returned.
+    For a site at rest they are those of the last record, for any other site the mean of the
+    last quarter. If arms chatter at a sampled wall, the state of the last quarter that is
+    deepest in the wall is chosen.
+
+    Args:
+        scenario: Scenario of the run.
+        site_logs: Logs of all sites.
 
     Returns:
-        Angles, shape (N, n), rad, and estimates, shape (N, P).
+        Angles, shape (N, n), in rad.
+        Estimates, shape (N, P).
     """
     count = min(map(len, site_logs))
     rows = slice(3 * count // 4, count)
@@ -465,6 +499,7 @@ def _choose_end_state(scenario: Scenario, site_logs: Sequence[SiteLog]) -> tuple
     have_same_times = True
     for site_log in site_logs:
         have_same_times &= np.array_equal(site_log.t_s[rows], first_times)
+
     if have_same_times and not all(map(_is_at_rest, site_logs)):
         joints = max(site_log.q.shape[1] for site_log in site_logs)
         padded = []
@@ -477,13 +512,14 @@ def _choose_end_state(scenario: Scenario, site_logs: Sequence[SiteLog]) -> tuple
         if deepest is not None:
             estimates = [site_log.theta_hat[rows][deepest] for site_log in site_logs]
             return q[deepest], pad_rows(estimates)
+
     angles = [_find_end_value(site_log, site_log.q) for site_log in site_logs]
     estimates = [_find_end_value(site_log, site_log.theta_hat) for site_log in site_logs]
     return pad_rows(angles), pad_rows(estimates)
 
 
 def _is_at_rest(site_log: SiteLog) -> bool:
-    """True if no joint moved faster than `SETTLED_SPEED_RAD_S` in the last second."""
+    """Returns True if no joint moved faster than `SETTLED_SPEED_RAD_S` in the last second."""
     t_s = site_log.t_s
     in_last_second = t_s > t_s[-1] - 1.0
     last_speeds = np.abs(site_log.qd[in_last_second])

@@ -1,17 +1,21 @@
-"""The loop of all sites, linearised at an equilibrium: a delay-differential equation.
+"""Linearises the control loop of all sites about an equilibrium, with its delays.
+
+The result is a delay-differential equation:
 
     x'(t) = A x(t) + sum_k A_k x(t - T_k) + B u(t) + sum_k B_k u(t - T_k),    y(t) = C x(t)
 
-A chain has ten estimates per link. Only one combination of them per joint takes part in small
-motions: the learnt gravity torque z = Y_G theta_hat in N m, with the regressor Y_G at rest and
-the rate z' = -Y_G Gamma Y' r. In the loop of chains, z replaces the estimates as state. Each
-omitted combination is constant or has no effect, and adds one root at zero.
+x contains the deviations of all states from the equilibrium, in the order of the scenario's
+sites: joint angles, joint velocities, and the estimates of the control laws. u are the torques
+that operators add on the joints, y the joint velocities, and T_k the delays of the links.
 
-Invariant:
-    - x holds deviations from the equilibrium, in the order of the scenario's sites.
-    - u is the torque ON the joints that operators add; y holds the joint velocities.
-    - Sites that follow in task space are coupled through the shared poses `SiteRates.x` and
-      their velocities.
+An arm with n joints (a chain) has ten estimates per link. Only one combination of them per
+joint takes part in small motions: the learnt gravity torque z = Y_G theta_hat in N m, with the
+regressor Y_G at rest and the rate z' = -Y_G Gamma Y' r. In the loop of chains, z replaces the
+estimates as state. Each omitted combination is constant or has no effect, and adds one root at
+zero.
+
+Sites that follow in task space are coupled through the shared poses `SiteRates.x` and their
+velocities.
 """
 
 from collections.abc import Sequence
@@ -32,18 +36,18 @@ from .operating_point import Equilibrium, OperatingConditions
 from .textbook_arm import evaluate_reference
 
 _DEPENDENT = 1e-9
-"""Pivots of a regressor's QR factorisation below this, relative to the largest, are zero."""
+"""Largest pivot of a QR factorisation that counts as zero, relative to the largest pivot."""
 
 
 class SiteJacobian(NamedTuple):
-    """The derivatives of one site's rates by the states that the loop keeps.
+    """The derivatives of one site's rates with respect to the states that the loop keeps.
 
     Attributes:
-        layout: layout of the columns; without an estimate if the law learns nothing.
-        rates: the derivatives, see `differentiate_site_rates`.
-        states: names of the states, as "q1", "qd2", "theta4"; "gravity2" is the learnt gravity
-            torque of joint 2.
-        omitted_states: number of estimates that no small motion changes or shows.
+        layout: Layout of the columns. Without an estimate if the law learns nothing.
+        rates: The derivatives, see `differentiate_site_rates`.
+        states: Names of the states, such as "q1", "qd2", "theta4". "gravity2" is the learnt
+            gravity torque of joint 2.
+        omitted_states: Number of estimates that no small motion changes or shows.
     """
 
     layout: site_dynamics.ArgumentLayout
@@ -53,7 +57,7 @@ class SiteJacobian(NamedTuple):
 
     @property
     def output(self) -> Array:
-        """The samples for the peers by the site's states, shape (3 m, states).
+        """The samples for the peers as a function of the site's states, shape (3 m, states).
 
         The rows are the shared pose x, its velocity, and the reflected torque.
         """
@@ -66,9 +70,9 @@ class DelayedTerm(NamedTuple):
     """The part of the loop that acts after one delay.
 
     Attributes:
-        delay_s: the delay in use, s.
-        A: matrix of the delayed state, shape (n, n).
-        B: matrix of the operators' delayed torque, where a law reflects it, shape (n, m).
+        delay_s: The delay, in s.
+        A: Matrix of the delayed state, shape (n, n).
+        B: Matrix of the operators' delayed torque, if a law reflects it, shape (n, m).
     """
 
     delay_s: float
@@ -77,20 +81,21 @@ class DelayedTerm(NamedTuple):
 
 
 class LinearLoop(NamedTuple):
-    """A linear loop with delays.
+    """A linear loop with delays, in the notation of the module's docstring.
 
     Attributes:
-        names: names of the states, as "m1.q1", "s.qd2", "m1.theta4".
-        inputs: names of the torques ON the joints, as "m1.tau1".
-        outputs: names of the joint velocities, as "m1.qd1".
-        A: shape (n, n).
-        B: shape (n, m).
-        C: shape (p, n).
-        delayed: one entry per distinct delay above zero, by rising delay.
-        omitted_states: number of states that no small motion changes or shows, each with a
-            root at zero.
-        E: diagonal of the matrix E in E x' = A x + ..., shape (n,): 1 for a state with a rate,
-            0 for an algebraic state, such as a wave. None: every state has a rate.
+        names: Names of the states, such as "m1.q1", "s.qd2", "m1.theta4".
+        inputs: Names of the torques on the joints, such as "m1.tau1".
+        outputs: Names of the joint velocities, such as "m1.qd1".
+        A: Matrix of the states, shape (n, n).
+        B: Matrix of the inputs, shape (n, m).
+        C: Matrix of the outputs, shape (p, n).
+        delayed: One entry per distinct delay above zero, by rising delay.
+        omitted_states: Number of states that no small motion changes or shows, each with a root
+            at zero.
+        E: Diagonal of the matrix E in E x' = A x + ..., shape (n,): 1 for a state with a rate,
+            0 for a state that an algebraic equation determines, such as a wave. None if every
+            state has a rate.
     """
 
     names: tuple[str, ...]
@@ -111,7 +116,12 @@ class LinearLoop(NamedTuple):
 
 
 def gather_site_arguments(conditions: OperatingConditions, rest: Equilibrium) -> list[Array]:
-    """Returns the arguments of each site's rates at an equilibrium, shape (arguments,) each."""
+    """Returns the arguments of each site's rates at an equilibrium, shape (arguments,) each.
+
+    Args:
+        conditions: The numbers of the loop.
+        rest: The equilibrium.
+    """
     layouts = [site_dynamics.lay_out_arguments(site) for site in conditions.sites]
     arguments = [np.zeros(layout.arguments) for layout in layouts]
     references = compute_references(conditions, rest)
@@ -156,10 +166,11 @@ def compute_references(conditions: OperatingConditions, rest: Equilibrium) -> li
 def differentiate_references(
     conditions: OperatingConditions, rest: Equilibrium
 ) -> dict[tuple[int, int], Array]:
-    """Returns the derivatives of site i's reference by site j's shared pose, by (i, j).
+    """Returns the derivatives of the references with respect to the shared poses.
 
-    Each derivative has shape (m, m). For positions it is alpha_ij times the unit matrix. A
-    reference with an orientation depends on the site's own pose too, as (i, i).
+    The derivative for (i, j) is that of site i's reference with respect to site j's pose, shape
+    (m, m). For positions it is alpha_ij times the unit matrix. A reference with an orientation
+    depends on the site's own pose too, as (i, i).
     """
     derivatives = {}
     poses = compute_shared_poses(conditions, rest)
@@ -170,6 +181,7 @@ def differentiate_references(
         has_orientation = len(poses[i]) > POSITION and conditions.sites[i].layout.task
         if not has_orientation:
             continue
+
         for j in {i, *followed}:
             columns = []
             for pose in poses:
@@ -191,6 +203,11 @@ def compute_couplings(
 
     Each effect is a matrix of shape (inputs, 3 m). An imported law receives each sample twice:
     within the sums that are weighted with the dominance factors, and by itself.
+
+    Args:
+        conditions: The numbers of the loop.
+        rest: The equilibrium.
+        sites: Derivatives of each site's rates.
     """
     references = differentiate_references(conditions, rest)
     couplings = {}
@@ -235,10 +252,10 @@ def differentiate_rates(
     """Returns the derivatives of each site's rates at an equilibrium, without its peers.
 
     Args:
-        conditions: the numbers of the loop.
-        rest: the equilibrium.
-        all_estimates: keep each estimate of a chain as a state, instead of only the learnt
-            gravity torques.
+        conditions: The numbers of the loop.
+        rest: The equilibrium.
+        all_estimates: True to keep each estimate of a chain as a state, instead of only the
+            learnt gravity torques.
     """
     arguments = gather_site_arguments(conditions, rest)
     references = differentiate_references(conditions, rest)
@@ -270,7 +287,7 @@ def _select_states(
     *,
     all_estimates: bool,
 ) -> SiteJacobian:
-    """Returns a site's derivatives by the states that the loop keeps of its estimate."""
+    """Returns a site's derivatives with respect to the states that the loop keeps."""
     motion = _name_motion(layout.joints)
     if isinstance(site.law_factory, NumericLaw):
         return SiteJacobian(layout, rates, (*motion, *site.law_factory.names))
@@ -280,12 +297,14 @@ def _select_states(
     if site.chain is None or all_estimates:
         estimates = tuple(f"theta{p + 1}" for p in range(layout.parameters))
         return SiteJacobian(layout, rates, (*motion, *estimates))
+
     effect = rates.tau[:, layout.estimate]
     # pivoted QR factorisation: the leading pivots are the independent rows of the effect
     _, R, pivots = qr(effect.T, mode="economic", pivoting=True)
     sizes = np.abs(np.diag(R))
     least_size = _DEPENDENT * max(1.0, sizes[0])
     rank = int(np.sum(sizes > least_size))
+
     joints = sorted(pivots[:rank].tolist())
     names = tuple(f"gravity{joint + 1}" for joint in joints)
     jacobian = _replace_estimate(layout, rates, effect[joints], names)
@@ -306,9 +325,13 @@ def _replace_estimate(
     T: Array,
     names: tuple[str, ...],
 ) -> SiteJacobian:
-    """Returns a site's derivatives with the states z = T theta_hat in place of theta_hat.
+    """Replaces the estimates theta_hat of a site by the states z = T theta_hat.
 
-    The estimate must act through z only, with T of shape (states, P).
+    Args:
+        layout: Layout of the columns with theta_hat.
+        rates: Derivatives with respect to theta_hat.
+        T: The matrix T, shape (states, P). The estimates must act through z only.
+        names: Names of the states z.
     """
     estimate_by_z = np.linalg.pinv(T)
 
@@ -346,12 +369,12 @@ def linearise_loop(
     *,
     all_estimates: bool = False,
 ) -> LinearLoop:
-    """Returns the loop linearised at an equilibrium, under given conditions.
+    """Returns the loop linearised at an equilibrium.
 
     Args:
-        conditions: the numbers of the loop.
-        rest: the equilibrium.
-        all_estimates: each estimate of a chain is a state, see `differentiate_rates`.
+        conditions: The numbers of the loop.
+        rest: The equilibrium.
+        all_estimates: True to make each estimate of a chain a state, see `differentiate_rates`.
     """
     sites = differentiate_rates(conditions, rest, all_estimates=all_estimates)
     states = _list_blocks([site.layout.states for site in sites])
@@ -361,6 +384,7 @@ def linearise_loop(
     A = np.zeros((state_count, state_count))
     B = np.zeros((state_count, port_count))
     C = np.zeros((port_count, state_count))
+
     input_effects = []
     for i, site in enumerate(sites):
         layout = site.layout
@@ -386,6 +410,7 @@ def linearise_loop(
         effect_of_torque = effect[:, 2 * peer.layout.coordinates :]
         reflected_by_port = peer.rates.reflected[:, peer.layout.external_torque]
         late_B[states[i], ports[j]] += effect_of_torque @ reflected_by_port
+
     loop = LinearLoop(
         names=_name_states(conditions, sites),
         inputs=_name_ports(conditions, sites, "tau"),
@@ -404,7 +429,7 @@ def linearise_loop(
 def _name_states(
     conditions: OperatingConditions, sites: Sequence[SiteJacobian]
 ) -> tuple[str, ...]:
-    """Returns the names of all states, as "m1.q1"."""
+    """Returns the names of all states, such as "m1.q1"."""
     names = []
     for name, site in zip(conditions.names, sites, strict=True):
         names += [f"{name}.{state}" for state in site.states]
@@ -416,7 +441,7 @@ def _name_ports(
     sites: Sequence[SiteJacobian],
     kind: str,
 ) -> tuple[str, ...]:
-    """Returns the names of a quantity of all joints, as "m1.tau1" for the kind "tau"."""
+    """Returns the names of a quantity of all joints, such as "m1.tau1" for the kind "tau"."""
     names = []
     for name, site in zip(conditions.names, sites, strict=True):
         names += [f"{name}.{kind}{joint + 1}" for joint in range(site.layout.joints)]
@@ -424,7 +449,11 @@ def _name_ports(
 
 
 def _sort_terms(terms: dict[float, tuple[Array, Array]]) -> tuple[DelayedTerm, ...]:
-    """Returns the delayed terms by rising delay."""
+    """Returns the delayed terms by rising delay.
+
+    Args:
+        terms: Matrices of state and torque, by the delay in s.
+    """
     delayed = []
     for delay_s in sorted(terms):
         A, B = terms[delay_s]
@@ -437,15 +466,21 @@ def add_law_forms(
     sites: Sequence[SiteJacobian],
     loop: LinearLoop,
 ) -> LinearLoop:
-    """Returns a loop with the states and the sent signals that laws add (`LinearForm`).
+    """Adds to a loop the states and the sent signals of the control laws (`LinearForm`).
 
     A sent signal is an algebraic state: it has no rate, and the peer receives it after the
     delay.
+
+    Args:
+        conditions: The numbers of the loop.
+        sites: Derivatives of each site's rates.
+        loop: The loop without these states.
     """
     inertias = []
     for site in sites:
         inverse_inertia = site.rates.qdd[:, site.layout.external_torque]
         inertias.append(np.linalg.inv(inverse_inertia))
+
     forms = conditions.find_forms(inertias)
     blocks, names = _index_form_states(conditions, forms, loop)
     state_count = len(names)
@@ -480,6 +515,7 @@ def add_law_forms(
                     A[signal] = A[acceleration]
                     B[signal] = B[acceleration]
             undelayed_A[signal, signal] -= np.eye(len(sites[i].rates.qdd))
+
     A, B = terms.pop(0.0)
     outputs, old_states = loop.C.shape
     new_columns = np.zeros((outputs, state_count - old_states))
@@ -494,7 +530,8 @@ def add_law_forms(
 
 
 _StateBlocks = dict[tuple[int, BlockKey], slice]
-"""The states of each signal of a law, by the site's index and the signal's name."""
+"""Positions of the states of each signal of a law, by index of the site and name of the signal.
+"""
 
 
 def _index_form_states(
@@ -502,7 +539,7 @@ def _index_form_states(
     forms: Sequence[LinearForm | None],
     loop: LinearLoop,
 ) -> tuple[_StateBlocks, list[str]]:
-    """Returns the state blocks of all laws' signals, and the names of all states."""
+    """Returns the positions of the states of all laws' signals, and the names of all states."""
     blocks: _StateBlocks = {}
     names = list(loop.names)
     for i, (site_name, form) in enumerate(zip(conditions.names, forms, strict=True)):
@@ -531,7 +568,16 @@ def _add_form(
     form: LinearForm,
     terms: dict[float, tuple[Array, Array]],
 ) -> None:
-    """Adds the linear form of site i's law to the terms, by delay."""
+    """Adds the linear form of site i's law to the matrices of the loop.
+
+    Args:
+        conditions: The numbers of the loop.
+        sites: Derivatives of each site's rates.
+        blocks: Positions of the states of all signals.
+        i: Index of the site.
+        form: Linear form of its law.
+        terms: Matrices of state and torque by delay, which are changed in place.
+    """
     site = sites[i]
     layout = site.layout
     ports = _list_blocks([jacobian.layout.joints for jacobian in sites])

@@ -1,6 +1,7 @@
-"""An imported control law as a function of numbers, differentiated by central differences.
+"""Differentiates a control law that a user wrote, by central differences.
 
-The law is evaluated for one tick,
+Such an imported law is known by its code only. It is evaluated as a function of numbers for one
+tick,
 
     (tau_k, m_k) = f(q, qd, m_{k-1}, q_des, qd_des, felt, peers, torque ON the arm)
 
@@ -40,21 +41,22 @@ _STILL = 1e-14
 
 
 class NumericLaw:
-    """The imported law of one site, built once; calling the object returns the law itself.
+    """The imported law of one site, as a function of numbers.
 
-    The object can therefore stand in for the law's factory in a `SiteSetup`.
+    The law is built once. Calling the object returns the law itself, so that the object can
+    stand in for the law's factory in a `SiteSetup`.
 
     Args:
-        setup: setup of the site.
-        code: the name by which the scenario refers to the law.
-        shares: dominance factors of the peers in force.
+        setup: Setup of the site.
+        code: Name by which the scenario refers to the law.
+        shares: Dominance factors of the peers in force.
 
     Attributes:
-        names: names of the numbers in the memory, as "error[1]".
-        memory: the memory at the start of a run.
+        names: Names of the numbers in the memory, such as "error[1]".
+        memory: The memory at the start of a run.
 
     Raises:
-        ScenarioError: the law sends vectors of its own, or follows with an end effector.
+        ScenarioError: The law sends vectors of its own, or follows with an end effector.
     """
 
     def __init__(self, setup: SiteSetup, code: str, shares: Sequence[float]) -> None:
@@ -106,7 +108,7 @@ class NumericLaw:
 
     @property
     def _memory_slice(self) -> slice:
-        """The slice of the memory in the arguments."""
+        """Position of the memory in the arguments."""
         start = 2 * self._layout.joints
         return slice(start, start + len(self.memory))
 
@@ -118,8 +120,8 @@ class NumericLaw:
         """Returns a full memory: the initial memory, overwritten by the known leading part.
 
         Args:
-            memory: known numbers: all of the memory, or at least the numbers that the law
-                itself remembers; longer arrays are cut. None: nothing is known.
+            memory: Known numbers: all of the memory, or at least the numbers that the law
+                itself remembers. Longer arrays are cut. None if nothing is known.
         """
         full_memory: Array = self.memory.copy()
         if memory is None:
@@ -136,8 +138,8 @@ class NumericLaw:
         The iteration ends early once the memory is constant.
 
         Args:
-            x: arguments in the order of `ArgumentLayout`, shape (arguments,).
-            ticks: the largest number of ticks.
+            x: Arguments in the order of `ArgumentLayout`, shape (arguments,).
+            ticks: Largest number of ticks.
         """
         memory = self._memory_slice
         x = x.copy()
@@ -157,10 +159,11 @@ class NumericLaw:
         imaginary parts of the result are the derivatives by central differences.
 
         Args:
-            x: arguments, shape (arguments,), or complex of shape (arguments, columns).
+            x: Arguments, shape (arguments,), or complex of shape (arguments, columns).
 
         Returns:
-            The torque, shape (n, ...), N m, and the memory's rate, shape (memory, ...), 1/s.
+            The torque, shape (n, ...), in N m.
+            The rate of the memory, shape (memory, ...), in 1/s.
         """
         if not np.iscomplexobj(x):
             return self._evaluate_rates(x)
@@ -206,8 +209,8 @@ class NumericLaw:
         """Returns the torque, and the numbers that the law itself remembers, after one tick.
 
         Args:
-            x: arguments, shape (arguments,).
-            previous: torque and angles of the previous tick, shape (2 n,).
+            x: Arguments, shape (arguments,).
+            previous: Torque and angles of the previous tick, shape (2 n,).
         """
         arrays = self._arrays
         n = self._layout.joints
@@ -240,7 +243,7 @@ class NumericLaw:
 
 
 def _name_memory(law: Any, count: int) -> tuple[str, ...]:
-    """Returns a name for each number that a law remembers, as "error[1]" or "memory[1]"."""
+    """Returns a name for each number that a law remembers, such as "error[1]" or "memory[1]"."""
     if callable(getattr(law, "memory", None)):
         return tuple(f"memory[{n + 1}]" for n in range(count))
     names = []

@@ -1,6 +1,8 @@
-"""Passivity and absolute stability at the haptic ports.
+"""Checks passivity and absolute stability at the haptic ports of a teleoperator.
 
-Torques u at ports with the admittance Y supply the mean power 1/4 u^H (Y + Y^H) u to the loop.
+A port is where an operator touches an arm. The admittance Y of the ports is the matrix from
+their torques u to their velocities. Torques u supply the mean power 1/4 u^H (Y + Y^H) u to the
+loop.
 A stable loop is passive if Y + Y^H has no negative eigenvalue at any frequency. A passive loop
 is stable with every passive environment, also with operators who are coupled to each other.
 
@@ -56,12 +58,12 @@ class Passivity(NamedTuple):
     """Passivity at one set of ports.
 
     Attributes:
-        minima: the least eigenvalue of Y + Y^H over frequency, rad/s per N m, and the bands
-            where it is negative.
-        size: the largest singular value of Y at these frequencies, shape (F,), rad/s per N m;
-            the eigenvalues of Y + Y^H lie within twice that.
-        lacking_nm_s_rad: the damping that would make the loop passive if each port had it,
-            N m s/rad; inf if it grows without bound towards the lowest frequencies.
+        minima: Least eigenvalue of Y + Y^H over frequency, in rad/s per N m, and the bands in
+            which it is negative.
+        size: Largest singular value of Y at these frequencies, shape (F,), in rad/s per N m.
+            The eigenvalues of Y + Y^H lie within twice that.
+        lacking_nm_s_rad: Damping that would make the loop passive if each port had it, in
+            N m s/rad. Infinite if it grows without bound towards the lowest frequencies.
     """
 
     minima: Minima
@@ -75,12 +77,12 @@ class Passivity(NamedTuple):
 
 
 class HandMatrices(NamedTuple):
-    """A measured hand at the end effector: F = -(M a + B v + K x), shape (n, n) each.
+    """Measured impedance of an operator at the end effector: F = -(M a + B v + K x).
 
     Attributes:
-        M: mass, kg.
-        B: damping, N s/m.
-        K: stiffness, N/m.
+        M: Mass, shape (n, n), in kg.
+        B: Damping, shape (n, n), in N s/m.
+        K: Stiffness, shape (n, n), in N/m.
     """
 
     M: Array
@@ -88,9 +90,12 @@ class HandMatrices(NamedTuple):
     K: Array
 
     def compute_resistance(self, w_rad_s: Array) -> Complex:
-        """Returns the Hermitian part of the hand's impedance, shape (F, n, n), N s/m.
+        """Returns the Hermitian part of the operator's impedance, shape (F, n, n), in N s/m.
 
         The impedance is Z(j w) = j w M + B + K / (j w).
+
+        Args:
+            w_rad_s: Frequencies w, shape (F,), in rad/s.
         """
         w = w_rad_s[:, np.newaxis, np.newaxis]
         mass_term = 1j * w * self.M
@@ -118,22 +123,24 @@ def check_against_hands(
     held: Sequence[Sequence[HandMatrices]],
     places: Sequence[Array],
 ) -> Minima | None:
-    """Returns the least eigenvalue of Z + Z^H + 2 D over every choice of hands.
+    """Checks the stability with measured operators, of whom any may hold any end effector.
 
-    D is the resistance of the hands at the ports. If the eigenvalue is negative at no
-    frequency, Z = Y^-1 together with D is passive, and so is each hand without D. The loop is
-    then stable with any of these hands, and with passive environments at the other ports. Like
-    passivity, the condition is sufficient.
+    The result is the least eigenvalue of Z + Z^H + 2 D over every choice of operators, where
+    Z = Y^-1, and D is the resistance of the operators at the ports. If the eigenvalue is
+    negative at no frequency, Z together with D is passive, and so is each operator without D.
+    The loop is then stable with any of these operators, and with passive environments at the
+    other ports. Like passivity, the condition is sufficient.
 
     Args:
-        response: the admittance Y at the ports.
-        w_rad_s: frequencies, rising, shape (F,).
-        held: the hands of which any may hold, for each end effector that is held.
-        places: for each of these end effectors, the matrix from the velocities at all ports to
+        response: Admittance Y at the ports.
+        w_rad_s: Frequencies, rising, shape (F,), in rad/s.
+        held: For each end effector that is held, the operators of whom any may hold it.
+        places: For each of these end effectors, the matrix from the velocities at all ports to
             its own velocity, shape (n, p).
 
     Returns:
-        The least eigenvalue over frequency, N m s/rad or N s/m; None if no hand is known.
+        The least eigenvalue over frequency, in N m s/rad or N s/m. None if no operator is
+        known.
     """
     if not held:
         return None
@@ -166,8 +173,8 @@ def weight_response(Y: Complex, weights: Array) -> Complex:
     Its Hermitian part has the same signs of eigenvalues as D Y + Y^H D.
 
     Args:
-        Y: response, shape (F, p, p).
-        weights: positive weights of the ports, shape (p,) or (F, p).
+        Y: Response, shape (F, p, p).
+        weights: Positive weights of the ports, shape (p,) or (F, p).
     """
     root = np.sqrt(weights)
     rows = root[..., :, np.newaxis]
@@ -184,15 +191,15 @@ def find_least_eigenvalue(Y: Complex) -> Array:
 
 
 def find_lacking_damping(Y: Complex, w_rad_s: Array) -> float:
-    """Returns the least b >= 0 with which (Y^-1 + b)^-1 is passive, N m s/rad.
+    """Returns the least damping b >= 0 with which (Y^-1 + b)^-1 is passive, in N m s/rad.
 
     A damper b at every port adds b to the impedance Z = Y^-1, so that the condition is
     Z + Z^H + 2 b >= 0. An integrator in the law can make Z ~ -K / w^2, a negative damping
-    without bound: then no b suffices, and the result is inf.
+    without bound. Then no b suffices, and the result is infinite.
 
     Args:
-        Y: admittance, shape (F, p, p), rad/s per N m.
-        w_rad_s: frequencies, rising, shape (F,).
+        Y: Admittance, shape (F, p, p), in rad/s per N m.
+        w_rad_s: Frequencies, rising, shape (F,), in rad/s.
     """
     Z = np.linalg.inv(Y).astype(np.complex128)
     lacking = -0.5 * find_least_eigenvalue(Z)
@@ -211,13 +218,13 @@ def check_passivity(
     w_rad_s: Array,
     weights: Array | None = None,
 ) -> Passivity:
-    """Returns the passivity at some ports, on a frequency grid that is refined at minima.
+    """Checks passivity at some ports, on a frequency grid that is refined at minima.
 
     Args:
-        response: velocities per torque, or another output with as many entries.
-        w_rad_s: frequencies, rising, shape (F,).
-        weights: positive weights of the ports, shape (p,); None: all are 1, and the quadratic
-            form is energy.
+        response: Velocities per torque, or another output with as many entries.
+        w_rad_s: Frequencies, rising, shape (F,), in rad/s.
+        weights: Positive weights of the ports, shape (p,). None if all are 1, so that the
+            quadratic form is energy.
     """
 
     def evaluate_weighted(w: Array) -> Complex:
@@ -242,12 +249,12 @@ def check_passivity(
 def llewellyn_parameter(Y: Complex) -> Array:
     """Returns Llewellyn's parameter of two scalar ports, shape (F,).
 
-    The parameter is (2 Re y11 Re y22 - Re(y12 y21)) / abs(y12 y21); the criterion asks for at
-    least 1. The parameter is limited to `MAX_LLEWELLYN`, the value of two ports without
-    transmission, and to -1 where Re y11 or Re y22 is negative.
+    The parameter is (2 Re y11 Re y22 - Re(y12 y21)) / abs(y12 y21). The criterion of absolute
+    stability requires at least 1. The parameter is limited to `MAX_LLEWELLYN`, the value of two
+    ports without transmission, and to -1 if Re y11 or Re y22 is negative.
 
     Args:
-        Y: admittance, shape (F, 2, 2).
+        Y: Admittance, shape (F, 2, 2).
     """
     y11 = Y[:, 0, 0].real
     y22 = Y[:, 1, 1].real
@@ -271,6 +278,9 @@ def llewellyn_rounding(Y: Complex) -> Array:
     """Returns the rounding error of Llewellyn's parameter, shape (F,).
 
     The error is large if almost nothing is transmitted from port to port.
+
+    Args:
+        Y: Admittance, shape (F, 2, 2).
     """
     y12 = Y[:, 0, 1]
     y21 = Y[:, 1, 0]
@@ -287,9 +297,9 @@ def clamp_ports(Y: Complex, keep: list[int], clamped: list[int]) -> Complex:
     The result is a Schur complement. Ports in neither list are free: no operator is there.
 
     Args:
-        Y: admittance, shape (F, p, p).
-        keep: ports of the result.
-        clamped: ports with velocity zero.
+        Y: Admittance, shape (F, p, p).
+        keep: Indices of the ports of the result.
+        clamped: Indices of the ports whose velocity is zero.
     """
     kept_rows = Y[:, keep]
     Y_kk: Complex = kept_rows[:, :, keep]
@@ -305,12 +315,12 @@ def clamp_ports(Y: Complex, keep: list[int], clamped: list[int]) -> Complex:
 
 
 class BestWeights(NamedTuple):
-    """The weights of the sites with the largest margin.
+    """The weights of the sites with the largest margin of absolute stability.
 
     Attributes:
-        margin: least eigenvalue of Y + Y^H with the best weights and each site's part scaled to
-            size 1, dimensionless, shape (F,); negative if no weights suffice.
-        weights: the best weights, relative to the first site's, shape (F, N).
+        margin: Least eigenvalue of Y + Y^H with the best weights and each site's part scaled to
+            size 1, dimensionless, shape (F,). Negative if no weights suffice.
+        weights: The best weights, relative to the first site's, shape (F, N).
     """
 
     margin: Array
@@ -318,15 +328,15 @@ class BestWeights(NamedTuple):
 
 
 def find_best_weights(Y: Complex, owner: NDArray[np.int64]) -> BestWeights:
-    """Returns the weights of the sites that maximise the least eigenvalue at each frequency.
+    """Finds the weights of the sites that maximise the least eigenvalue at each frequency.
 
     The least eigenvalue of D^1/2 Y D^-1/2 + its Hermitian is concave in ln D (a limit of the
     result of Sezginer and Overton for norms, IEEE Trans. Automatic Control 35 (1990)). The
     ellipsoid method therefore finds its maximum.
 
     Args:
-        Y: admittance, shape (F, p, p).
-        owner: index of the site of each port, shape (p,).
+        Y: Admittance, shape (F, p, p).
+        owner: Index of the site of each port, shape (p,).
     """
     scaled = _scale_sites(Y, owner)
     count = len(Y)
@@ -371,11 +381,11 @@ def find_best_weights(Y: Complex, owner: NDArray[np.int64]) -> BestWeights:
 
 
 def _shrink_ellipsoids(ellipsoids: Array, step: Array) -> Array:
-    """Returns the least ellipsoids around the half of each that can hold the maximum.
+    """Returns the least ellipsoids around the half of each that can contain the maximum.
 
     Args:
-        ellipsoids: matrices of the ellipsoids, shape (F, n, n).
-        step: from each centre to the border, along the ascent, shape (F, n).
+        ellipsoids: Matrices of the ellipsoids, shape (F, n, n).
+        step: Vector from each centre to the border, along the ascent, shape (F, n).
     """
     n = step.shape[1]
     if n == 1:
@@ -407,15 +417,15 @@ def _evaluate_margin(
     log_weights: Array,
     owner: NDArray[np.int64],
 ) -> tuple[Array, Array]:
-    """Returns the least eigenvalue under weights, and its gradient by their logarithms.
+    """Returns the least eigenvalue under weights, and its gradient with respect to their logs.
 
-    With its eigenvector v and the projection P_i on the ports of site i, the derivative by x_i
-    of v^H (e^{x/2} Y e^{-x/2} + its Hermitian) v is Re v^H (P_i Y - Y P_i) v.
+    With the eigenvector v and the projection P_i on the ports of site i, the derivative of
+    v^H (e^{x/2} Y e^{-x/2} + its Hermitian) v with respect to x_i is Re v^H (P_i Y - Y P_i) v.
 
     Args:
-        Y: response, shape (F, p, p).
-        log_weights: logarithms of the weights of all sites but the first, shape (F, N - 1).
-        owner: index of the site of each port, shape (p,).
+        Y: Response, shape (F, p, p).
+        log_weights: Logarithms of the weights of all sites but the first, shape (F, N - 1).
+        owner: Index of the site of each port, shape (p,).
     """
     # the first site's weight is 1
     first_site = np.zeros((len(Y), 1))
