@@ -1,10 +1,15 @@
-"""Inertia, torque, energy and end effector of an arm, over all rows of a log at once.
+"""Computes inertia, torque, energy and end effector of an arm, for many records at once.
 
-A chain has ten parameters per link, but its torques depend only on some linear combinations of
-them, the base parameters. Adaptation moves estimates along these combinations only, so errors
-of estimates are stated in them. The combinations follow from the geometry: the regressors of
-many random states are stacked, and a QR decomposition goes through their columns. A column that
-depends linearly on the columns before it adds no combination: its parameter joins theirs.
+There are two kinds of arms: the planar arm of the paper with two joints, and chains of any
+number of joints. `PlanarArmRows` and `ChainArmRows` have the same methods, in which the rows of
+the arguments are the records.
+
+A chain has ten inertial parameters per link, but its torques depend only on some linear
+combinations of them, the base parameters. Adaptive laws move estimates along these combinations
+only, so errors of estimates are stated in them. The combinations follow from the geometry: the
+regressors of many random states are stacked, and a QR decomposition goes through their columns.
+A column that depends linearly on the columns before it adds no combination, and its parameter
+joins theirs.
 
 Sources: M. Gautier, "Numerical calculation of the base inertial parameters of robots", J.
 Robotic Systems 8 (1991), for the QR decomposition; P. M. Wensing, S. Kim, J.-J. Slotine,
@@ -13,8 +18,8 @@ Robotics and Automation Letters 3 (2018), for the pseudo-inertia.
 
 Invariant:
     - The planar arm is written from Section IV and Eq. (12) of the paper, independently of the
-      core that ran the log.
-    - A chain is computed by the core's compiled functions, which the tests compare with
+      simulation kernel that executed the run.
+    - A chain is computed by the compiled functions of the kernel, which the tests compare with
       Pinocchio.
     - Both arms have the same methods, so that few callers need to know which arm they use.
 """
@@ -49,11 +54,11 @@ from ..scenario import Scenario
 from ..scenario.arms import ArmModel
 
 HANGING_RAD = 0.3
-"""A link whose angle to straight down is smaller than this hangs, rad."""
+"""Largest angle to straight down of a link that hangs, in rad."""
 _NO_WEIGHT_J = 1e-6
-"""An arm whose potential energy varies by less than this cannot hang, J."""
+"""Largest variation of the potential energy of an arm that cannot hang, in J."""
 _ENERGY_SWEEPS = 20
-"""Sweeps over all joints in the search for the least and the largest potential energy."""
+"""Number of sweeps over all joints in the search for the extreme potential energies."""
 
 Numbers = NDArray[Any]
 """Real numbers, or complex numbers for a derivative by complex step.
@@ -86,9 +91,9 @@ class PlacedArm:
     Uncertainty", Eq. (1)-(5) and (24). `theory.textbook_arm.PlacedChain` has the same methods.
 
     Attributes:
-        g_m_s2: gravitational acceleration, in m/s^2.
-        lengths_m: lengths of the two links.
-        q: joint angles, shape (2, ...), rad.
+        g_m_s2: Gravitational acceleration, in m/s^2.
+        lengths_m: Lengths of the two links.
+        q: Joint angles, shape (2, ...), in rad.
     """
 
     g_m_s2: float
@@ -96,7 +101,11 @@ class PlacedArm:
     q: Numbers
 
     def inertia_matrix(self, theta: Numbers) -> Numbers:
-        """Returns M(q), shape (2, 2, ...), kg m^2, for the parameters theta, shape (5, ...)."""
+        """Returns the inertia matrix M(q), shape (2, 2, ...), in kg m^2.
+
+        Args:
+            theta: Parameters, shape (5, ...).
+        """
         bend = theta[1] * np.cos(self.q[1])
         M_11 = theta[0] + 2.0 * bend
         M_12 = theta[2] + bend
@@ -105,7 +114,7 @@ class PlacedArm:
         return np.array([[M_11, M_12], [M_12, M_22]])
 
     def coriolis_matrix(self, theta: Numbers, qd: Numbers) -> Numbers:
-        """Returns C(q, qd) by Christoffel symbols, shape (2, 2, ...), kg m^2/s."""
+        """Returns C(q, qd) by Christoffel symbols, shape (2, 2, ...), in kg m^2/s."""
         h = -theta[1] * np.sin(self.q[1])
         qd_1, qd_2 = qd
         C_11 = h * qd_2
@@ -116,7 +125,7 @@ class PlacedArm:
         return np.array([[C_11, C_12], [C_21, C_22]])
 
     def gravity_torque(self, theta: Numbers) -> Numbers:
-        """Returns G(q), shape (2, ...), N m."""
+        """Returns the gravity torque G(q), shape (2, ...), in N m."""
         q_1, q_2 = self.q
         G_2 = theta[4] * self.g_m_s2 * np.cos(q_1 + q_2)
         G_1 = theta[3] * self.g_m_s2 * np.cos(q_1) + G_2
@@ -129,7 +138,10 @@ class PlacedArm:
         v: Numbers,
         a: Numbers,
     ) -> Numbers:
-        """Returns M(q) a + C(q, qd) v + G(q), shape (2, ...), N m: Y theta of Eq. (12)."""
+        """Returns M(q) a + C(q, qd) v + G(q), which is Y theta of Eq. (12), in N m.
+
+        Its shape is (2, ...).
+        """
         M = self.inertia_matrix(theta)
         C = self.coriolis_matrix(theta, qd)
         inertial = multiply_columns(M, a)
@@ -161,7 +173,7 @@ class PlacedArm:
         return solve_columns(M, torque - bias_torque)
 
     def end_effector_position(self) -> Numbers:
-        """Returns the position of the end effector from the base, shape (2, ...), m."""
+        """Returns the position of the end effector from the base, shape (2, ...), in m."""
         l1_m, l2_m = self.lengths_m
         inner = self.q[0]
         outer = self.q[0] + self.q[1]
@@ -170,7 +182,7 @@ class PlacedArm:
         return np.array([x, y])
 
     def position_jacobian(self) -> Numbers:
-        """Returns the Jacobian of the end effector's position, shape (2, 2, ...), m/rad."""
+        """Returns the Jacobian of the end effector's position, shape (2, 2, ...), in m/rad."""
         x, y = self.end_effector_position()
         l2_m = self.lengths_m[1]
         outer = self.q[0] + self.q[1]
@@ -180,13 +192,13 @@ class PlacedArm:
 
 
 class EndEffectorRows(NamedTuple):
-    """Motion of the end effector over K rows; a chain has three coordinates instead of two.
+    """Motion of the end effector over K rows. A chain has three coordinates instead of two.
 
     Attributes:
-        position: position, shape (K, 2) or (K, 3), m.
-        speed: velocity, shape (K, 2) or (K, 3), m/s.
-        J: Jacobian, shape (K, 2, n) or (K, 3, n), m/rad: a row per coordinate, a column per
-            joint.
+        position: Position, shape (K, 2) or (K, 3), in m.
+        speed: Velocity, shape (K, 2) or (K, 3), in m/s.
+        J: Jacobian, shape (K, 2, n) or (K, 3, n), in m/rad, with a row per coordinate and a
+            column per joint.
     """
 
     position: Array
@@ -194,12 +206,15 @@ class EndEffectorRows(NamedTuple):
     J: Array
 
     def find_force(self, torque: Array, least: float = 1e-15) -> Array:
-        """Returns the smallest force that explains a joint torque, shape (K, 2) or (K, 3), N.
+        """Returns the smallest force at the end effector that explains a joint torque, in N.
 
         Args:
-            torque: joint torque, shape (K, n), N m.
-            least: directions in which the end effector moves by less than this share of the
+            torque: Joint torque, shape (K, n), in N m.
+            least: Directions in which the end effector moves by less than this share of the
                 largest motion are treated as directions in which it cannot move.
+
+        Returns:
+            Force, shape (K, 2) or (K, 3).
         """
         J_transposed = self.J.transpose(0, 2, 1)
         inverse = np.linalg.pinv(J_transposed, rcond=least)
@@ -208,12 +223,12 @@ class EndEffectorRows(NamedTuple):
 
 
 class PlanarArmRows(NamedTuple):
-    """The planar two-link arm over rows; `ChainArmRows` has the same methods.
+    """The planar arm with two joints, for many poses. `ChainArmRows` has the same methods.
 
     Attributes:
-        theta: true parameters, Eq. (24), shape (5,).
-        g: gravitational acceleration, in m/s^2.
-        lengths_m: lengths of the two links.
+        theta: True parameters, Eq. (24), shape (5,).
+        g: Gravitational acceleration, in m/s^2.
+        lengths_m: Lengths of the two links.
     """
 
     theta: Array
@@ -227,15 +242,15 @@ class PlanarArmRows(NamedTuple):
 
     @property
     def gravity_parameters(self) -> NDArray[np.bool_]:
-        """True for the parameters of the torque of gravity, theta_4 and theta_5, shape (5,)."""
+        """True for the parameters of the gravity torque, theta_4 and theta_5, shape (5,)."""
         return np.arange(5) >= 3
 
     def place(self, q: Array) -> PlacedArm:
-        """Returns the arm in the poses of all rows; the rows become columns."""
+        """Returns the arm in the poses of all rows. The rows become columns."""
         return PlacedArm(self.g, self.lengths_m, q.T)
 
     def weightless(self) -> "PlanarArmRows":
-        """Returns the same arm without gravity: its torque is linear in v and a."""
+        """Returns the same arm without gravity, whose torque is linear in v and a."""
         return self._replace(g=0.0)
 
     def multiply_inertia(self, q: Array, x: Array) -> Array:
@@ -252,7 +267,15 @@ class PlanarArmRows(NamedTuple):
         v: Array,
         a: Array,
     ) -> Array:
-        """Returns Y(q, qd, v, a) theta_hat, shape (K, 2), N m; theta_hat has shape (K, 5)."""
+        """Returns the torque Y(q, qd, v, a) theta_hat, shape (K, 2), in N m.
+
+        Args:
+            theta_hat: Parameter estimates, shape (K, 5).
+            q: Joint angles, shape (K, 2), in rad.
+            qd: Joint velocities, shape (K, 2), in rad/s.
+            v: Reference velocities, shape (K, 2), in rad/s.
+            a: Reference accelerations, shape (K, 2), in rad/s^2.
+        """
         arm = self.place(q)
         torque = arm.required_torque(theta_hat.T, qd.T, v.T, a.T)
         return torque.T
@@ -265,18 +288,18 @@ class PlanarArmRows(NamedTuple):
         a: Array,
         r: Array,
     ) -> Array:
-        """Returns Y'r of r = qd - v, shape (K, 5)."""
+        """Returns Y'r of r = qd - v, with the regressor Y, shape (K, 5)."""
         arm = self.place(q)
         Y = arm.regressor_matrix(qd.T, v.T, a.T)
         gradient: Array = np.einsum("ijk,ki->kj", Y, r)
         return gradient
 
     def gravity_torque(self, q: Array) -> Array:
-        """Returns G(q), shape (K, 2), N m."""
+        """Returns the gravity torque G(q), shape (K, 2), in N m."""
         return self.place(q).gravity_torque(self.theta).T
 
     def potential_energy(self, q: Array) -> Array:
-        """Returns g (theta_4 sin q_1 + theta_5 sin(q_1 + q_2)), shape (K,), J."""
+        """Returns g (theta_4 sin q_1 + theta_5 sin(q_1 + q_2)), shape (K,), in J."""
         q_1, q_2 = q.T
         inner = self.theta[3] * np.sin(q_1)
         outer = self.theta[4] * np.sin(q_1 + q_2)
@@ -284,15 +307,15 @@ class PlanarArmRows(NamedTuple):
         return energy
 
     def friction(self, speed: Array) -> Array:
-        """Returns zeros: this arm has no friction in its joints, shape (K, 2), N m."""
+        """Returns zeros, shape (K, 2): this arm has no friction in its joints."""
         return np.zeros_like(speed)
 
     def stop_torque(self, q: Array, qd: Array) -> Array:  # noqa: ARG002 - as of a chain
-        """Returns zeros: the joints of this arm have no stops, shape (K, 2), N m."""
+        """Returns zeros, shape (K, 2): the joints of this arm have no stops."""
         return np.zeros_like(q)
 
     def place_end_effector(self, q: Array, qd: Array) -> EndEffectorRows:
-        """Returns the end effector in the plane."""
+        """Returns the motion of the end effector in the plane."""
         arm = self.place(q)
         position = arm.end_effector_position()
         J = arm.position_jacobian()
@@ -304,7 +327,11 @@ class PlanarArmRows(NamedTuple):
         )
 
     def hanging_angle(self, q: Array) -> float:
-        """Returns the largest angle of a link to straight down, in rad; q has shape (2,)."""
+        """Returns the largest angle of a link to straight down, in rad.
+
+        Args:
+            q: Joint angles of one pose, shape (2,), in rad.
+        """
         angles_to_down = []
         for link_angle in np.cumsum(q):
             angle = math.remainder(link_angle + math.pi / 2.0, math.tau)
@@ -325,7 +352,7 @@ def _put_torques(
 ) -> None:
     """Writes M a + C(q, qd) v + G + armature a + friction(v) of every row, shape (K, n).
 
-    theta has shape (K, 10 n), or (1, 10 n) for all rows.
+    theta has the shape (K, 10 n), or (1, 10 n) for all rows.
     """
     last = theta.shape[0] - 1
     for k in range(q.shape[0]):
@@ -420,14 +447,14 @@ def _put_end_effectors(
 
 
 class ChainArmRows(NamedTuple):
-    """A chain of n joints over rows, computed by the core's recursions.
+    """A chain of n joints, for many poses. The recursions of the simulation kernel compute it.
 
-    theta determines M, C and G. The inertia of the drives counts in M. The law knows friction
-    and drives, so its torque includes them.
+    theta determines M, C and G. The inertia of the drives (armature) is part of M. The control
+    laws know friction and drives, so that their torques include them.
 
     Attributes:
-        theta: true parameters, shape (10 n,).
-        chain: joints, gravity and end effector.
+        theta: True parameters, shape (10 n,).
+        chain: Joints, gravity and end effector.
     """
 
     theta: Array
@@ -435,17 +462,17 @@ class ChainArmRows(NamedTuple):
 
     @property
     def task(self) -> TaskSetup | None:
-        """The task that the end effector follows; None if the arm follows joint by joint."""
+        """The task that the end effector follows. None if the arm follows joint by joint."""
         return self.chain.task
 
     @property
     def gravity_parameters(self) -> NDArray[np.bool_]:
-        """True for the parameters of the torque of gravity: m and m c of every link."""
+        """True for the parameters of the gravity torque: m and m c of every link."""
         return np.arange(len(self.theta)) % LINK_PARAMETERS < 4
 
     @property
     def _rows(self) -> RowArray:
-        """The joints in the form that the core's functions expect."""
+        """The joints in the form that the functions of the kernel expect."""
         return build_chain(self.chain.joints, MAX_JOINTS)
 
     def _column(self, name: str) -> Array:
@@ -468,7 +495,7 @@ class ChainArmRows(NamedTuple):
         return bare._replace(chain=weightless_chain)
 
     def without_drives(self) -> "ChainArmRows":
-        """Returns this chain without armature and friction: its torque is linear in theta."""
+        """Returns this chain without armature and friction, whose torque is linear in theta."""
         return self._replace_in_joints(coulomb=0.0, viscous=0.0, armature_kg_m2=0.0)
 
     def multiply_inertia(self, q: Array, x: Array) -> Array:
@@ -491,9 +518,14 @@ class ChainArmRows(NamedTuple):
         v: Array,
         a: Array,
     ) -> Array:
-        """Returns Y(q, qd, v, a) theta_hat + armature a + friction(v), shape (K, n), N m.
+        """Returns Y(q, qd, v, a) theta_hat + armature a + friction(v), shape (K, n), in N m.
 
-        theta_hat has shape (K, 10 n), or (1, 10 n) for all rows.
+        Args:
+            theta_hat: Parameter estimates, shape (K, 10 n), or (1, 10 n) for all rows.
+            q: Joint angles, shape (K, n), in rad.
+            qd: Joint velocities, shape (K, n), in rad/s.
+            v: Reference velocities, shape (K, n), in rad/s.
+            a: Reference accelerations, shape (K, n), in rad/s^2.
         """
         torque = np.zeros_like(q)
         _put_torques(
@@ -516,7 +548,7 @@ class ChainArmRows(NamedTuple):
         a: Array,
         r: Array,  # noqa: ARG002 - as of the planar arm
     ) -> Array:
-        """Returns Y'r of r = qd - v, shape (K, 10 n)."""
+        """Returns Y'r of r = qd - v, with the regressor Y, shape (K, 10 n)."""
         gradient = np.zeros((len(q), len(self.theta)))
         _put_gradients(
             chain=self._rows,
@@ -530,7 +562,7 @@ class ChainArmRows(NamedTuple):
         return gradient
 
     def gravity_torque(self, q: Array) -> Array:
-        """Returns G(q), shape (K, n), N m."""
+        """Returns the gravity torque G(q), shape (K, n), in N m."""
         still = np.zeros_like(q)
         return self.law_torque(
             theta_hat=self.theta[np.newaxis],
@@ -544,9 +576,9 @@ class ChainArmRows(NamedTuple):
         """Returns position and Jacobian of the end effector, and the potential energy.
 
         Returns:
-            Position of the end effector, shape (K, 3), m.
+            Position of the end effector, shape (K, 3), in m.
             Its Jacobian, velocity above angular velocity, shape (K, 6, n).
-            Potential energy, shape (K,), J.
+            Potential energy, shape (K,), in J.
         """
         position = np.zeros((len(q), 3))
         J = np.zeros((len(q), 6, q.shape[1]))
@@ -564,12 +596,12 @@ class ChainArmRows(NamedTuple):
         return position, J, energy
 
     def potential_energy(self, q: Array) -> Array:
-        """Returns the links' potential energy against the base's origin, shape (K,), J."""
+        """Returns the potential energy of the links against the base, shape (K,), in J."""
         _, _, energy = self._place(q)
         return energy
 
     def friction(self, speed: Array) -> Array:
-        """Returns the friction torque against a motion of the joints, shape (K, n), N m."""
+        """Returns the friction torque against a motion of the joints, shape (K, n), in N m."""
         viscous = self._column("viscous") * speed
         # a smooth sign of the speed
         x = speed / COULOMB_SPEED
@@ -578,7 +610,7 @@ class ChainArmRows(NamedTuple):
         return viscous + coulomb
 
     def stop_torque(self, q: Array, qd: Array) -> Array:
-        """Returns the torque of the stops ON the joints, shape (K, n), N m.
+        """Returns the torque of the mechanical stops on the joints, shape (K, n), in N m.
 
         Stops are springs with dampers that never pull.
         """
@@ -586,6 +618,7 @@ class ChainArmRows(NamedTuple):
         damping = self._column("stop_damping")
         below = np.maximum(self._column("lower") - q, 0.0)
         above = np.maximum(q - self._column("upper"), 0.0)
+
         damping_torque = damping * qd
         push_up = np.maximum(stiffness * below - damping_torque, 0.0)
         push_down = np.maximum(stiffness * above + damping_torque, 0.0)
@@ -594,7 +627,7 @@ class ChainArmRows(NamedTuple):
         return lower_stop - upper_stop
 
     def place_end_effector(self, q: Array, qd: Array) -> EndEffectorRows:
-        """Returns the end effector in space, in the base's frame."""
+        """Returns the motion of the end effector in space, in the frame of the base."""
         position, full_J, _ = self._place(q)
         J = np.ascontiguousarray(full_J[:, :3])
         speed = np.einsum("kij,kj->ki", J, qd)
@@ -625,10 +658,10 @@ class ChainArmRows(NamedTuple):
         """Returns the angle of a pendulum with the same share of its potential energy, in rad.
 
         The least and the largest potential energy are searched joint by joint from this pose
-        on, without regard to stops. A chain without weight never hangs: the angle is infinite.
+        on, without regard to stops. A chain without weight never hangs: its angle is infinite.
 
         Args:
-            q: pose, shape (n,), rad.
+            q: Joint angles of one pose, shape (n,), in rad.
         """
         lowest_j = self._find_extreme_energy(q, 1.0)
         highest_j = self._find_extreme_energy(q, -1.0)
@@ -642,15 +675,15 @@ class ChainArmRows(NamedTuple):
         return math.acos(min(max(cosine, -1.0), 1.0))
 
     def _find_pose_energy(self, q: Array) -> float:
-        """Returns the potential energy in one pose, in J; q has shape (n,)."""
+        """Returns the potential energy in one pose, in J."""
         energy = self.potential_energy(q[np.newaxis])
         return float(energy[0])
 
     def _find_extreme_energy(self, q: Array, sign: float) -> float:
         """Returns the least (sign 1) or the largest (sign -1) potential energy, in J.
 
-        Coordinate descent over the revolute joints: as a function of one joint's angle the
-        energy is a + b cos q + c sin q, which its values at three angles determine.
+        Coordinate descent over the revolute joints is used: as a function of one joint's angle
+        the energy is a + b cos q + c sin q, which its values at three angles determine.
         """
         q = q.copy()
         is_prismatic = self._column("prismatic").astype(bool)
@@ -670,7 +703,7 @@ ArmRows = PlanarArmRows | ChainArmRows
 
 
 def build_arm_rows(scenario: Scenario, site: str) -> ArmRows:
-    """Returns the arm of a site, for computations over rows."""
+    """Returns the arm of a site, for computations over many poses."""
     model = scenario.arms[site]
     spec = scenario.sites[site]
     if model.chain is None:
@@ -687,11 +720,11 @@ def joint_positions_m(arm: ArmModel, q: Array) -> Array:
     """Returns the positions of base, joints and end effector in K poses, in m.
 
     Args:
-        arm: the arm.
-        q: joint angles, shape (K, n), rad.
+        arm: The arm.
+        q: Joint angles, shape (K, n), in rad.
 
     Returns:
-        Positions, shape (K, L, 2), of chains (K, L, 3).
+        Positions, shape (K, L, 2), or (K, L, 3) for chains.
     """
     if arm.chain is not None:
         return _chain_positions_m(arm.chain, q)
@@ -702,7 +735,10 @@ def joint_positions_m(arm: ArmModel, q: Array) -> Array:
 
 
 def _chain_positions_m(chain: ChainSetup, q: Array) -> Array:
-    """Returns the positions of base, joints and end effector of a chain, (K, n + 2, 3), m."""
+    """Returns the positions of base, joints and end effector of a chain, in m.
+
+    Their shape is (K, n + 2, 3).
+    """
     joints = build_chain(chain.joints)
     tip_m = np.array(chain.tip_m)
     # base, joints and end effector
@@ -721,7 +757,10 @@ def _chain_positions_m(chain: ChainSetup, q: Array) -> Array:
 
 
 def upright_axes(chain: ChainSetup) -> Array:
-    """Returns two horizontal unit vectors and the upward one, in the base's frame, (3, 3)."""
+    """Returns two horizontal unit vectors and the upward one, in the frame of the base.
+
+    Their components are the rows of the result, shape (3, 3).
+    """
     gravity = np.array(chain.gravity_m_s2)
     size = float(np.linalg.norm(gravity))
     up = -gravity / size if size else np.array([0.0, 0.0, 1.0])
@@ -736,16 +775,16 @@ def upright_axes(chain: ChainSetup) -> Array:
 
 
 DEPENDENT_SHARE = 1e-9
-"""A column depends on the columns before it if a smaller share of it is independent of them."""
+"""Largest independent share of a column that counts as dependent on the columns before it."""
 
 
 class BaseParameters(NamedTuple):
     """Combinations of parameters that torques determine: base = combination theta.
 
     Attributes:
-        kept: for each combination, the index of the parameter after which the combination is
+        kept: For each combination, the index of the parameter after which the combination is
             named, ascending, shape (B,).
-        combination: factors of all parameters, 1 for the naming parameter, shape (B, P).
+        combination: Factors of all parameters, 1 for the naming parameter, shape (B, P).
     """
 
     kept: NDArray[np.int64]
@@ -753,7 +792,12 @@ class BaseParameters(NamedTuple):
 
 
 def stack_regressors(arm: ChainArmRows, states: int) -> Array:
-    """Returns the regressors of random states, stacked, shape (states n, 10 n)."""
+    """Returns the regressors of random states, stacked, shape (states n, 10 n).
+
+    Args:
+        arm: The chain.
+        states: Number of random states.
+    """
     random = np.random.default_rng(1)
     n = len(arm.chain.joints)
     count = len(arm.theta)
@@ -769,6 +813,7 @@ def stack_regressors(arm: ChainArmRows, states: int) -> Array:
         v=qd[state],
         a=a[state],
     )
+
     columns = torque.reshape(states, count, n)
     regressors = columns.transpose(0, 2, 1)
     return regressors.reshape(-1, count)
@@ -776,13 +821,19 @@ def stack_regressors(arm: ChainArmRows, states: int) -> Array:
 
 @lru_cache(maxsize=64)
 def _find_chain_base(chain: ChainSetup, learnt: tuple[bool, ...]) -> BaseParameters:
-    """Returns the base parameters of a chain by a QR decomposition (Gautier 1991)."""
+    """Returns the base parameters of a chain by a QR decomposition (Gautier 1991).
+
+    Args:
+        chain: The chain.
+        learnt: True for each parameter that is learnt.
+    """
     arm = ChainArmRows(np.zeros(len(learnt)), chain)
     regressors = stack_regressors(arm, 4 * LINK_PARAMETERS)
     W = regressors[:, list(learnt)]
     indices = np.flatnonzero(learnt)
     norm = float(np.linalg.norm(W))
     least_size = DEPENDENT_SHARE * norm / np.sqrt(W.shape[1])
+
     Q = np.zeros((len(W), 0))
     kept = []
     for p, column in enumerate(W.T):
@@ -793,6 +844,7 @@ def _find_chain_base(chain: ChainSetup, learnt: tuple[bool, ...]) -> BaseParamet
         if size > least_size:
             Q = np.column_stack([Q, rest / size])
             kept.append(p)
+
     factors = np.linalg.lstsq(W[:, kept], W, rcond=None)[0]
     contributes = np.abs(factors) > DEPENDENT_SHARE
     kept_indices = indices[kept]
@@ -808,7 +860,7 @@ def find_base_parameters(arm: ArmRows, learnt: NDArray[np.bool_]) -> BaseParamet
     The five parameters of the planar arm are base parameters already.
 
     Args:
-        arm: the arm.
+        arm: The arm.
         learnt: True for each parameter that is learnt, shape (P,).
     """
     if isinstance(arm, ChainArmRows):
@@ -821,7 +873,11 @@ def find_base_parameters(arm: ArmRows, learnt: NDArray[np.bool_]) -> BaseParamet
 def find_pseudo_inertias(theta: Array) -> Array:
     """Returns the pseudo-inertia of every link, shape (n, 4, 4).
 
-    It is [[S, m c], [m c', m]] with S = tr(I) / 2 - I.
+    It is [[S, m c], [m c', m]] with S = tr(I) / 2 - I, the mass m, the first moment m c and the
+    inertia I of the link.
+
+    Args:
+        theta: Parameters of the links, shape (10 n,).
     """
     links = theta.reshape(-1, LINK_PARAMETERS)
     mass = links[:, 0]
@@ -844,7 +900,7 @@ def find_pseudo_inertias(theta: Array) -> Array:
 
 
 def find_consistent_links(theta: Array) -> list[bool]:
-    """Returns for each link whether a body with its parameters can exist.
+    """Returns for each link whether a rigid body with its parameters can exist.
 
     The condition is that the link's pseudo-inertia is positive definite (Wensing et al. 2018).
     """

@@ -209,6 +209,7 @@ def list_losses(log: Log) -> list[str]:
         if len(part):
             end_s = part.t_s[-1] + 1.0 / part.rate_hz
             times_s = np.append(part.t_s, end_s)
+
         for j, peer in enumerate(part.peers):
             # a loss begins where an edge is positive, and ends where it is negative
             edges = np.diff(lost[:, j], prepend=0, append=0)

@@ -111,6 +111,7 @@ class FileInventory:
             messages.log_ns.append(log_ns)
             messages.sequence.append(sequence)
             messages.size.append(len(payload))
+
         self._channel_infos = {**reader.channels, **self._channel_infos}
         self.metadata.update(reader.metadata)
         self.files.append(
@@ -169,6 +170,7 @@ class FileInventory:
             metadata={},
         )
         channel = self._channel_infos.get(topic, unknown)
+
         log_ns = np.frombuffer(self._messages[topic].log_ns, dtype=np.uint64)
         sizes = np.frombuffer(self._messages[topic].size, dtype=np.uint64)
         first_ns = int(log_ns.min()) if len(log_ns) else None
@@ -176,6 +178,7 @@ class FileInventory:
         span_s = 0.0
         if first_ns is not None and last_ns is not None:
             span_s = (last_ns - first_ns) / NS_PER_S
+
         # a time beyond the range of int64 would turn negative
         signed_ns = np.minimum(log_ns, (1 << 63) - 1).astype(np.int64)
         return {
@@ -345,12 +348,14 @@ def describe_session(log: Log) -> JsonObject:
     if log.driver == "live" and epoch_ns is not None:
         began = datetime.fromtimestamp(min(epoch_ns, _LAST_EPOCH_NS) // NS_PER_S, UTC)
         began_utc = began.strftime("%Y-%m-%d %H:%M:%S")
+
     version_prefix = "version_"
     versions = {
         key.removeprefix(version_prefix): value
         for key, value in session.items()
         if key.startswith(version_prefix)
     }
+
     return {
         "session": session["session"],
         "driver": log.driver,
@@ -489,8 +494,10 @@ def summarise_run(log: Log, twin: Log | None = None) -> JsonObject:
     settling_times_s = [site["settle_s"] for site in sites.values()]
     end_errors_rad = [site["max_error_end_rad"] for site in sites.values()]
     known_end_errors_rad = [error_rad for error_rad in end_errors_rad if error_rad is not None]
+
     scenario = log.scenario
     scenario_keys = ("name", "title", "sha256", "duration_s", "seed", "scheme")
+
     changes = [
         {
             "at_s": entry.change.at_s,
@@ -502,6 +509,7 @@ def summarise_run(log: Log, twin: Log | None = None) -> JsonObject:
         }
         for entry in list_changes(log)
     ]
+
     return {
         "scenario": {
             **{key: getattr(scenario, key) for key in scenario_keys},
@@ -547,17 +555,20 @@ def _summarise_site(log: Log, site: str, twin: Log | None) -> JsonObject:
     displacement = part.q[:0]
     if twin is not None:
         displacement = operator_displacement(log, twin, site)[2]
+
     executed = count_executed_ticks(log, site)
     expected = log.scenario.ticks(site)
     ticks = expected if executed is None else executed
     late_us = compute_percentiles(part.late_us, _LATENESS_PERCENTILES)
     busy_us = compute_percentiles(part.busy_us)
     at_limit = np.abs(part.tau) >= spec.limits.tau_limit_nm
+
     moved_max_rad = None
     moved_end_rad = None
     if len(displacement):
         moved_max_rad = np.abs(displacement).max(axis=0).tolist()
         moved_end_rad = displacement[-1].tolist()
+
     return {
         "role": spec.role,
         "rate_hz": spec.rate_hz,
@@ -601,9 +612,11 @@ def _summarise_link(log: Log, link: LinkSummary) -> JsonObject:
                 "deviation_ms": finite_or_none(moments.deviation_ms),
             }
         )
+
     age_ms: JsonObject = dict.fromkeys(ValueStatistics._fields)
     if link.age_ms:
         age_ms = link.age_ms._asdict()
+
     return {
         "delay_ms": finite_or_none(link.stated[0].link.moments().mean_ms),
         "stated": stated,

@@ -178,6 +178,7 @@ def read_arrivals(log: Log, site: str) -> dict[str, Arrivals]:
         tick = all_ticks[is_from_peer]
         sample = entries[is_from_peer, 1]
         delay_us = entries[is_from_peer, 2]
+
         # a link accepts no stamp before the epoch, and none further ahead than the limit
         latest_ns = tick * NS_PER_S // part.rate_hz + AHEAD_LIMIT_NS
         peer_rate_hz = log.scenario.sites[peer].rate_hz
@@ -340,12 +341,14 @@ def summarise_clock(log: Log, peer: str, site: str) -> ClockSummary | None:
     bounds_us = [report.bound_us.get(peer, 0) for report in stats]
     round_trips_us = [report.rtt_us.get(peer, -1) for report in stats]
     measured_us = [trip_us for trip_us in round_trips_us if trip_us >= 0]
+
     drift_ppm = None
     drift_bound_ppm = None
     for event in log.events:
         if event.kind == "clock" and event.member == site and event.about == peer:
             drift_ppm = event.drift_ppb / 1e3
             drift_bound_ppm = event.drift_bound_ppb / 1e3
+
     return ClockSummary(
         offset_us=stats[-1].offset_us[peer],
         offset_first_us=stats[0].offset_us[peer],
@@ -469,6 +472,7 @@ def summarise_links(log: Log) -> list[LinkSummary]:
             if peer in arrivals
         )
         sent[peer] = count_sent(log, peer, newest)
+
     return [
         _summarise_link(
             log=log,
@@ -645,6 +649,7 @@ def _count_samples(
     row = np.minimum(np.searchsorted(part.tick, use_tick), len(part) - 1)
     is_recorded = part.tick[row] == use_tick
     is_superseded = ~is_lost & is_recorded & (used[row] != first.sample)
+
     return SampleCounts(
         sent=len(delivery.stamp_ns),
         judged=judged,

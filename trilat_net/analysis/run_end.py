@@ -188,6 +188,7 @@ class RunEnd(NamedTuple):
             return f"diverged at {self.diverged_at_s:.4g} s: a joint passed its qd_limit_rad_s"
         if self.missing_sites:
             return f"undecided: no record of {', '.join(self.missing_sites)}"
+
         end_error = f"|e| {self.end_error_rad:.3g} {self.error_unit}"
         end_speed = f"|qd| {self.end_speed_rad_s:.3g} rad/s"
         end = f"{end_error} and {end_speed} in the last second"
@@ -195,6 +196,7 @@ class RunEnd(NamedTuple):
             if self.end_error_rad > SETTLED_ERROR_RAD:
                 return f"at rest, with errors that stay: {end}"
             return f"converged: {end}"
+
         joint = f" at {self.where}" if self.where else ""
         if behaviour is EndBehaviour.BOUNDED:
             motion = "bounded motion"
@@ -304,6 +306,7 @@ def trace_log(log: Log) -> RunTrace:
         tau_x.append(part.tau_x[-1] if len(part) else np.zeros(1))
         push_times_s.append(_find_unscripted_push_s(log, part))
         change_times_s += [tick / part.rate_hz for tick in log.changes(site)]
+
     return RunTrace(
         buckets=buckets,
         tau_x=tau_x,
@@ -536,6 +539,7 @@ def _judge_joint(
     may_stay = speed.trend is EnvelopeTrend.HARDLY or bool(scenario.external)
     is_slow = end.end_speed_rad_s <= SETTLED_SPEED_RAD_S
     rests = is_slow and (is_still or (speed.calm and may_stay))
+
     behaviour = _classify_joint(
         error=end.error,
         speed=speed,
@@ -655,6 +659,7 @@ def _classify_joint(
         return EndBehaviour.GROWS
     if error.trend is EnvelopeTrend.GROWS:
         return EndBehaviour.UNDECIDED
+
     if not rests and not still:
         if end_speed_rad_s <= SETTLED_SPEED_RAD_S:
             return EndBehaviour.UNDECIDED
@@ -663,6 +668,7 @@ def _classify_joint(
         if speed.trend is EnvelopeTrend.STEADY:
             return EndBehaviour.BOUNDED
         return EndBehaviour.UNDECIDED
+
     is_small = end_error_rad <= SETTLED_ERROR_RAD
     if error.calm and (is_small or error.trend is EnvelopeTrend.STEADY):
         return EndBehaviour.CONVERGED if rests else EndBehaviour.DECAYS

@@ -112,9 +112,11 @@ def list_changes(log: Log) -> list[AppliedChange]:
         AppliedChange(change, find_owner(change), None, describe_change(change))
         for change in log.scenario.timeline
     ]
+
     change_events = {
         (event.member, event.command): event for event in log.events if event.kind == "change"
     }
+
     for site in log.sites:
         log.commands(site)  # raises if a record names a change that is not valid for the site
         for tick, texts in log.changes(site).items():
@@ -226,6 +228,7 @@ def list_alarms(log: Log) -> list[RaisedAlarm]:
         (entry.site, entry.taken_at_tick): find_requester(entry.sentence)
         for entry in list_changes(log)
     }
+
     raised = []
     for site in log.sites:
         if log.scenario.sites[site].on_stale.action != "glide":

@@ -157,6 +157,7 @@ def compute_source_torque(
     position = end_effector.position
     speed = end_effector.speed
     J = end_effector.J
+
     if kind is TorqueKind.WALL:
         normal_force = wall_force(source, t_s, end_effector)
         force = normal_force[:, np.newaxis] * np.array(source.b)
@@ -175,6 +176,7 @@ def compute_source_torque(
         torque = _map_to_joints(J, force)
     else:
         raise ValueError(f"{kind.name} is no function of the state")
+
     is_active = _is_active(source, t_s)
     return np.where(is_active[:, np.newaxis], torque, 0.0)
 

@@ -231,6 +231,7 @@ class TwinGrowth(NamedTuple):
             }
             for growth in self.pushes
         ]
+
         return {
             "trend": None if self.worst is None else self.trend.name.lower(),
             "from_s": self.from_s,
@@ -260,11 +261,13 @@ class TwinGrowth(NamedTuple):
             return "twins: every push died down to the rounding of the numbers"
         if math.isnan(worst.rate_per_s):
             return "twins: the run is too short to tell"
+
         name = worst.push.name
         span = f"in {self.to_s - self.from_s:.4g} s ({worst.rate_per_s:+.3g} /s)"
         if self.trend in _FALLING:
             slowest = f"{name}, to {worst.factor:.3g} of its size {span}"
             return f"twins: every push dies away; the slowest, {slowest}"
+
         change = f"x {worst.factor:.3g} {span}, most at {worst.joint}"
         if self.trend is EnvelopeTrend.GROWS:
             return f"twins: a push of {name} grows {change}"
@@ -512,12 +515,14 @@ def _measure_leg(last: Array, scale: Array, largest: Array) -> Array:
         peak = np.max(largest, where=is_finite, initial=-np.inf)
         d = last * np.exp(scale - peak)[:, np.newaxis]
         d_rate = np.gradient(d, 1.0 / BUCKETS_PER_S, axis=0)
+
         # w is the ratio of d' to d over the whole leg. Each row is divided by the local size
         # of the difference, so that the rows where the difference is large do not dominate.
         size = np.exp(2.0 * (_running_maximum(largest) - peak))
         is_weighted = np.isfinite(largest) & (size > 0.0)
         weights = np.where(is_weighted, 1.0 / size, 0.0)[:, np.newaxis]
         w_squared = float((weights * d_rate**2).sum() / (weights * d**2).sum())
+
         squares = (d**2 + d_rate**2 / w_squared).sum(axis=1)
         log_amplitude: Array = np.log(squares) / 2.0 + peak
     return log_amplitude
@@ -747,24 +752,27 @@ def twin(
     push: Mapping[str, float] | Sequence[str] = (),
     delta: str = "",
 ) -> PushedTwins:
-    """Executes a run again, beside twins that are pushed at an instant, as `trilat twin`.
+    """Repeats a recorded run with small pushes at a given time, as `trilat twin` does.
+
+    A twin is a repeated run in which one quantity was changed by a small amount, the push. The
+    result shows how the difference between each twin and the run develops.
 
     >>> found = tn.twin(tn.simulate("two_sites", duration_s=4), at_s=1, push={"m.q1": 1e-6})
     >>> found.growth.pushes[0].rate_per_s < 0.0
     True
 
     Args:
-        log: the log, or its path.
-        at_s: time of the pushes, in s.
-        push: sizes by target, with one twin per push. A target is a joint's angle,
+        log: The log, or its path.
+        at_s: Time of the pushes, in s.
+        push: Sizes by target, with one twin per push. A target is a joint's angle,
             `{"m1.q1": 1e-6}`, its speed, `m1.qd1`, an estimate, `m1.theta1`, or many of them
             in a random direction, `m1.q` or `q`. By default the pushes are those of `certify`.
-        delta: sizes of a single push, as in "1e-9:1e-3", with one twin per decade.
+        delta: Sizes of a single push, as in "1e-9:1e-3", with one twin per decade.
 
     Raises:
-        UsageError: there is no such push, instant or range.
-        LogError: the log cannot be read, or not be executed again.
-        CodeWithheld: a law of the log may not run.
+        UsageError: There is no such target, time or range.
+        LogError: The log cannot be read, or cannot be executed again.
+        CodeWithheld: The code of a law of the log may not be executed.
     """
     log = log if isinstance(log, Log) else open_log(log)
     scenario = log.scenario
@@ -777,6 +785,7 @@ def twin(
     if delta and len(targets) > 1:
         names = ", ".join(target for target, _ in targets)
         raise UsageError(f"--delta sweeps the size of one push, not of {names}")
+
     sizes = []
     if delta:
         target, _ = next(iter(targets), ("q", 0.0))

@@ -40,14 +40,14 @@ from .site_dynamics import (
 from .textbook_arm import SINGULAR
 
 MAX_PROLONGATION = 8.0
-"""A run that is not at rest is extended up to this multiple of its duration."""
+"""Longest run that is simulated to find a rest, as a multiple of the duration of the run."""
 _MAX_RUN_TICKS = 4_000_000
-"""Limit of an extended run, in ticks of all sites together."""
+"""Length of the longest extended run, in ticks of all sites together."""
 
 MAX_EQUILIBRIUM_RESIDUAL = 1e-10
-"""The largest residual of an equilibrium."""
+"""Largest residual of an equilibrium, in rad/s^2."""
 _NEWTON_RESIDUAL = 1e-11
-"""A residual below this is rounding, rad/s^2."""
+"""Residual at which the Gauss-Newton steps end, in rad/s^2: it is the rounding error."""
 _GAUSS_NEWTON_STEPS = 60
 """Largest number of Gauss-Newton steps."""
 _MAX_STEP = 0.3
@@ -55,9 +55,9 @@ _MAX_STEP = 0.3
 _MAX_HALVINGS = 20
 """Largest number of times that a step is halved."""
 _SETTLING_TICKS = 20_000
-"""Ticks that the memory of an imported law has to become constant."""
+"""Number of ticks within which the memory of an imported law must become constant."""
 _FLAT = 1e-8
-"""A singular value this small, relative to the largest, counts as zero.
+"""Largest singular value that counts as zero, relative to the largest one.
 
 Its direction leads to further equilibria.
 """
@@ -139,12 +139,14 @@ def find_nearest_equilibrium(conditions: OperatingConditions, rest: Equilibrium)
     if conditions.has_forms:
         # the memory of such a law supplies the holding torque, and a pose does not contain it
         return rest._replace(residual=0.0)
+
     residual = compute_equilibrium_residual(conditions, rest)
     for _ in range(_GAUSS_NEWTON_STEPS):
         if np.abs(residual).max() <= _NEWTON_RESIDUAL:
             break
         step = _compute_gauss_newton_step(conditions, rest, residual)
         share = _limit_step(step)
+
         size = np.linalg.norm(residual)
         # a shorter step if the residual does not fall, as when a wall is touched
         for _ in range(_MAX_HALVINGS):
@@ -256,9 +258,11 @@ def predict_from_start(conditions: OperatingConditions, scenario: Scenario) -> E
         mean_pose = q.mean(axis=0)
         same_poses = np.tile(mean_pose, (len(q), 1))
         first_guess = start._replace(q=same_poses)
+
     rest = find_nearest_equilibrium(conditions, first_guess)
     if conditions.has_forms:
         return rest._replace(how="the start poses")
+
     for _ in range(3):
         deviation = _compute_deviation(conditions, start, rest)
         loop = linear_loop.linearise_loop(conditions, rest, all_estimates=True)
@@ -445,6 +449,7 @@ def _build_at_pose(pose: tuple[float, ...], conditions: OperatingConditions) -> 
         expected = _describe_pose(coordinates, task=bool(task))
         more = ",..." if coordinates > 2 else ""
         raise UsageError(f"--pose is {expected}, as in --pose 0.1,0.3{more}, not {pose}")
+
     target = np.array(pose, dtype=np.float64)
     q = [reach_pose(site, target) if task else target for site in conditions.sites]
     rest = Equilibrium(
@@ -453,6 +458,7 @@ def _build_at_pose(pose: tuple[float, ...], conditions: OperatingConditions) -> 
         how="the requested pose, with theta_hat = theta",
         residual=0.0,
     )
+
     _refuse_singular_poses(conditions, rest)
     if conditions.has_forms:
         return rest
@@ -490,6 +496,7 @@ def reach_pose(site: SiteSetup, pose: Array) -> Array:
         x[layout.q] = q
         x[layout.q_des] = pose
         arm = place_arm(site, q)
+
         following = compute_following(site, arm, x)
         largest_error = np.abs(following.e).max()
         if largest_error <= _NEWTON_RESIDUAL:
@@ -497,6 +504,7 @@ def reach_pose(site: SiteSetup, pose: Array) -> Array:
         assert following.J is not None
         step = np.linalg.lstsq(following.J, -following.e, rcond=_FLAT)[0]
         q = q + step * _limit_step(step)
+
     raise ScenarioError(
         f"its end effector does not reach the pose: {largest_error:.2g} m or rad remain",
         path=f"sites.{site.name}.q0_rad",
@@ -527,6 +535,7 @@ def _find_at_run_end(scenario: Scenario, conditions: OperatingConditions) -> Equ
     most_s = scenario.duration_s * extension
     run = FusedRun(extend_scenario(scenario, most_s))
     until_s = scenario.duration_s
+
     while True:
         mean_states = run.run_and_sample(until_s)
         last_speeds = [values[-BUCKETS_PER_S:, 1] for values in run.maxima]
@@ -552,6 +561,7 @@ def _find_at_run_end(scenario: Scenario, conditions: OperatingConditions) -> Equ
             f"the run still moves at {run.ran_s:.4g} s ({speed_rad_s:.2g} rad/s): "
             "the equilibrium nearest to the mean of its last quarter"
         )
+
     laws = scenario.controls
     if any(isinstance(law, ImportedLaw) for law in laws):
         # the memory of an imported law takes the position of its estimate
@@ -559,6 +569,7 @@ def _find_at_run_end(scenario: Scenario, conditions: OperatingConditions) -> Equ
         for law, estimate, memory in zip(laws, theta_hat, run.memories, strict=True):
             rows.append(memory if isinstance(law, ImportedLaw) else estimate)
         theta_hat = pad_rows(rows)
+
     estimates = _complete_estimates(conditions, theta_hat)
     start = Equilibrium(q, estimates, how, 0.0)
     start = _iterate_memories(conditions, start, 1)
@@ -588,6 +599,7 @@ def _describe_limits(conditions: OperatingConditions, rest: Equilibrium) -> Iter
             "the pose is no equilibrium: accelerations or rates of "
             f"{rest.residual:.2g} remain, and the roots are those of equations frozen at it"
         )
+
     arguments = linear_loop.gather_site_arguments(conditions, rest)
     for site, x in zip(conditions.sites, arguments, strict=True):
         if site.chain is None or site.chain.task is None:
@@ -603,6 +615,7 @@ def _describe_limits(conditions: OperatingConditions, rest: Equilibrium) -> Iter
                 f"{least:.3g}, damped below {task.singular_value:g}): the damping is part of "
                 "the loop, and J J+ is not 1"
             )
+
     all_rates = conditions.evaluate_rates(arguments)
     for site, x, rates in zip(conditions.sites, arguments, all_rates, strict=True):
         torques_nm = np.abs(rates.tau)

@@ -90,8 +90,7 @@ class SiteTickMap(NamedTuple):
         P: Matrix of the state, shape (n, n). X contains q, qd, the state eta of the estimate,
             and, for the scheme `second_order`, the torque of the previous tick.
         Q: Matrix of the inputs, shape (n, inputs).
-        output: Samples for the peers as a function of X, shape (3 m, n), see
-            `SiteJacobian.output`.
+        output: Samples for the peers as a function of X, shape (3 m, n), as in `SiteJacobian`.
         names: Names of the states.
     """
 
@@ -169,10 +168,12 @@ def _discretise_arm(jacobian: SiteJacobian, h_s: float) -> tuple[Array, Array]:
     torque_by_external = np.eye(joints) + rates.tau[:, external]
     qdd_by_external = rates.qdd[:, external]
     inverse_inertia = np.linalg.solve(torque_by_external.T, qdd_by_external.T).T
+
     # the torque that is held over the tick does not act on the free arm
     torque = rates.tau + rates.held
     qdd_by_torque = inverse_inertia @ torque[:, motion]
     free_qdd = rates.qdd[:, motion] - qdd_by_torque
+
     zero = np.zeros((joints, joints))
     A = np.block([[zero, np.eye(joints)], [free_qdd]])
     B = np.vstack([zero, inverse_inertia])
@@ -198,7 +199,10 @@ class CoupledTicks(NamedTuple):
 
 
 def couple_ticks(conditions: OperatingConditions, rest: Equilibrium) -> CoupledTicks:
-    """Returns the sites over a tick, and their effects on each other, without constant states."""
+    """Returns the sites over a tick, and their effects on each other.
+
+    States that are constant or without effect are left out.
+    """
     jacobians = differentiate_rates(conditions, rest)
     maps = []
     for site, jacobian in zip(conditions.sites, jacobians, strict=True):
@@ -235,16 +239,16 @@ def couple_ticks(conditions: OperatingConditions, rest: Equilibrium) -> CoupledT
 
 
 MAX_PERIOD_S = 60.0
-"""The longest period that is searched, and the longest analysed span of a trace."""
+"""Longest period that is searched, and longest analysed span of a delay trace, in s."""
 DRAWN_SPAN_S = 30.0
-"""The analysed span of delays that are drawn."""
+"""Analysed span of delays that are drawn at random, in s."""
 _LEAST_SPAN_S = 0.5
-"""The shortest analysed span.
+"""Shortest analysed span, in s.
 
 Shorter periods, and periods shorter than twice the ages, are repeated.
 """
 _SLIP = 0.05
-"""Delays count as repeating after a span if they repeat within this share of a tick.
+"""Largest change of delays that count as repeating after a span, as a share of a tick.
 
 If there is no such span, the span with the smallest slip is used, up to half a tick.
 """
@@ -254,17 +258,17 @@ _PART_TICKS = 100
 Columns may grow a thousandfold in each tick.
 """
 _COLUMNS = 8
-"""Columns of a block of the Krylov space."""
+"""Number of columns of a block of the Krylov space."""
 _MAX_COLUMNS = 240
 """Largest dimension of the Krylov space."""
 _RESIDUAL = 1e-9
 """Largest residual of an exact multiplier, relative to its modulus."""
 _LOOSE_RESIDUAL = 1e-4
-"""The same limit once the Krylov space has its largest dimension."""
+"""Largest residual once the Krylov space has its largest dimension."""
 _SMALLEST = 1e-7
-"""Multipliers below this share of the largest are not searched."""
+"""Smallest multiplier that is searched, as a share of the largest."""
 _SAME_ROOT = 1e-6
-"""Roots that differ by less than this, absolutely or relatively, count as equal."""
+"""Largest absolute or relative difference of roots that count as equal."""
 
 
 class SamplesInUse(NamedTuple):
@@ -325,6 +329,7 @@ def _find_period_s(links: Sequence[LinkBase], rates_hz: Sequence[int]) -> float 
         cycles = np.maximum(1.0, np.round(spans_s / cycle_s))
         difference_s = np.abs(spans_s - cycle_s * cycles)
         slips = np.maximum(slips, difference_s * max(rates_hz))
+
     limit = max(_SLIP, float(slips.min()))
     first_match = int(np.argmax(slips <= limit))
     for link in links:
@@ -421,6 +426,7 @@ def _plan_parts(
     peers: list[list[int]] = [[] for _ in ticks]
     for i, j in used:
         peers[i].append(j)
+
     done = [0] * len(ticks)
     parts = []
     for n in range(1, count + 1):
@@ -480,12 +486,14 @@ class _SpanMap:
             used[i, j] = np.minimum(samples, now - 1)
             oldest = int((now - used[i, j]).max())
             self._rows[j] = max(self._rows[j], 1 + oldest)
+
         self._peer_effects: list[list[_PeerEffect]] = [[] for _ in rates_hz]
         for (i, j), samples in used.items():
             block = np.ix_(self._states[i], self._states[j])
             effect = loop.effects[i, j][block]
             rows = samples + self._rows[j] - 1
             self._peer_effects[i].append(_PeerEffect(j, rows, effect))
+
         self._ticks = [round(uses.span_s * hz) for hz in rates_hz]
         part_count = -(-max(self._ticks) // _PART_TICKS)
         self._parts = _plan_parts(self._ticks, used, part_count)
@@ -563,6 +571,7 @@ class _SpanMap:
             for track, stop, rows in zip(tracks, part.stops, self._rows, strict=True):
                 last_states.append(track[stop : stop + rows])
             V = np.concatenate([states.reshape(-1, columns) for states in last_states])
+
             if divided:
                 V = self.divide_out_constant(V)
                 if n == len(self.scales):
@@ -572,6 +581,7 @@ class _SpanMap:
                 _split_into(V, last_states)
             if sizes is not None:
                 sizes.append(np.linalg.norm(V, axis=0))
+
         from_start = []
         for track, rows in zip(tracks, self._rows, strict=True):
             from_start.append(track[rows - 1 :])
@@ -706,6 +716,7 @@ def compute_sampled_spectrum(
     if uses.period_s is not None and uses.period_s * max(rates_hz) < 1.5:
         # every tick is like the tick before
         span_s = None
+
     loop = couple_ticks(conditions, rest)
     deviation_per_s = None
     if not loop.names:
@@ -720,6 +731,7 @@ def compute_sampled_spectrum(
     with limit_blas_threads():
         span = _SpanMap(loop, rates_hz, uses)
         mu, vectors, exact = _find_multipliers(span, len(loop.names), wanted + 1)
+
         log_scale = np.log(span.scales).sum()
         s = (np.log(mu) - log_scale) / uses.span_s
         is_still = exact & (np.abs(s) <= _STILL_PER_S)
@@ -737,6 +749,7 @@ def compute_sampled_spectrum(
             with np.errstate(all="ignore"):
                 _, tracks = span.apply(modes, divided=False)
                 roots = _describe_modes(s, tracks, loop, rates_hz)
+
     drifting = int(is_still.sum())
     return Spectrum(
         roots=tuple(roots[:wanted]),

@@ -58,7 +58,7 @@ DEFAULT_ROOTS = 6
 MAX_ROOTS = 60
 """Largest number of roots that can be requested."""
 SAMPLED_ROOT_DIFFERENCE = 0.01
-"""Largest difference of continuous and sampled roots that is not shown, as a share of abs(s)."""
+"""Largest difference of a continuous and a sampled root that is ignored, relative to abs(s)."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -118,6 +118,7 @@ class LinearAnalysis(Result):
                 f"the continuous loop is {self.continuous.verdict}, the sampled loop is "
                 f"{self.sampled.verdict}: {decides}"
             )
+
         if self.decisive.drifting:
             notes.append(
                 f"{self.decisive.drifting} of the roots at zero only drift: "
@@ -142,6 +143,7 @@ class LinearAnalysis(Result):
         edges = {}
         for scan in self.scans:
             edges[scan.key] = [edge._asdict() for edge in scan.edges]
+
         return {
             "scenario": self.scenario.name,
             "scenario_sha256": self.scenario.sha256,
@@ -167,6 +169,7 @@ class LinearAnalysis(Result):
             is_imported = isinstance(site.law_factory, NumericLaw)
             parameters = 0 if is_imported else site.layout.parameters
             theta_hat[site.name] = rest.theta_hat[n][:parameters].tolist()
+
         values: dict[str, Any] = {
             "how": rest.how,
             "residual": rest.residual,
@@ -302,6 +305,7 @@ def _spectrum_to_json(spectrum: Spectrum) -> dict[str, Any]:
             "states": list(root.states),
         }
         roots.append(values)
+
     return {
         "verdict": spectrum.verdict,
         "roots": roots,

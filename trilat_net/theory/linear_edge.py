@@ -382,6 +382,7 @@ def compute_growth_column(
             column.growth_per_s.append(float("nan"))
         if remark and remark not in column.remarks:
             column.remarks.append(remark)
+
     return column
 
 

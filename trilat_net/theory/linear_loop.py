@@ -217,6 +217,7 @@ def compute_couplings(
         zero = np.zeros((m, m))
         share = conditions.alpha[i, j] * np.eye(m)
         coupling = block_diag(references.get((i, j), zero), share, share)
+
         if layout.peers:
             samples = np.zeros((layout.peers, len(coupling), len(coupling)))
             # tau_x in a sample is the torque of the arm, and not the torque ON the arm
@@ -275,6 +276,7 @@ def differentiate_rates(
             for derivative in rates:
                 by_reference = derivative[:, layout.q_des]
                 derivative[:, : layout.states] += by_reference @ reference_by_state
+
         jacobian = _select_states(site, layout, rates, all_estimates=all_estimates)
         jacobians.append(jacobian)
     return jacobians

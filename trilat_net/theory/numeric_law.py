@@ -167,6 +167,7 @@ class NumericLaw:
         """
         if not np.iscomplexobj(x):
             return self._evaluate_rates(x)
+
         arguments: Array = x.real[:, 0]
         torque, rate = self._evaluate_rates(arguments)
         columns = []
@@ -182,6 +183,7 @@ class NumericLaw:
             step = upper[n] - lower[n]
             difference = upper_rates - lower_rates
             columns.append(difference / step)
+
         values = np.concatenate([torque, rate])
         derivatives = np.stack(columns, axis=1)
         imaginary_part = derivatives @ x.imag
@@ -215,6 +217,7 @@ class NumericLaw:
         arrays = self._arrays
         n = self._layout.joints
         row: Any = arrays.site[0]
+
         references_start = self._memory_slice.stop
         peers_start = references_start + 3 * n
         row.q[:] = x[:n]
@@ -223,17 +226,20 @@ class NumericLaw:
         row.q_des[:], row.qd_des[:], row.felt[:] = np.split(references, 3)
         row.tau_before[:], row.q_before[:] = np.split(previous, 2)
         row.on_arm[:] = x[len(x) - n :]
+
         arrays.links["used"] = _TICK - 1
         sample_length = 3 * n
         for j, link in enumerate(arrays.links):
             first = peers_start + sample_length * j
             sample = x[first : first + sample_length]
             link["q"][:], link["qd"][:], link["tau_x"][:] = np.split(sample, 3)
+
         if arrays.chain is None:
             # also computes the regressor, for gravity
             two_link_stages.update_errors(row)
         else:
             chain_stages.place_chain(row, arrays.chain)
+
         memory_start = self._memory_slice.start
         remembered = x[memory_start : memory_start + self._remembered_count]
         self._plugged_law.restore(remembered.tolist())
@@ -243,7 +249,7 @@ class NumericLaw:
 
 
 def _name_memory(law: Any, count: int) -> tuple[str, ...]:
-    """Returns a name for each number that a law remembers, such as "error[1]" or "memory[1]"."""
+    """Returns a name for each number that a law remembers, as "error[1]" or "memory[1]"."""
     if callable(getattr(law, "memory", None)):
         return tuple(f"memory[{n + 1}]" for n in range(count))
     names = []

@@ -300,6 +300,7 @@ def _find_linear_gains(scenario: Scenario, *, own_laws: bool) -> dict[str, Gains
                 source=scenario.name,
             )
         gains_by_site[name] = gains
+
     refuse_external_arms(scenario)
     return gains_by_site
 
@@ -334,6 +335,7 @@ def _find_final_link(scenario: Scenario, name: str, notes: list[str]) -> LinkBas
     link: LinkBase = scenario.links[name]
     for from_ns, later in scheduled_links(scenario.timeline, name):
         link = later if from_ns <= end_ns else link
+
     if link.measured:
         raise ScenarioError(
             "is 'measured': its delay is not known beforehand; "

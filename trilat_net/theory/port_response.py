@@ -1,9 +1,10 @@
-"""Frequency response of the loop at its haptic ports, free or with a site clamped.
+"""Computes the frequency response of the loop at its haptic ports, free or with a site clamped.
 
-Impedance and admittance of ports after Hogan, "Impedance control: an approach to manipulation",
-ASME J. Dynamic Systems, Measurement, and Control 107 (1985); teleoperators as networks of ports
-after Hannaford, "A design framework for teleoperators with kinesthetic feedback", IEEE Trans.
-Robotics and Automation 5 (1989).
+A port is where an operator touches an arm. The admittance of a port is its velocity per torque
+of the operator, and the impedance is the inverse. Impedance and admittance of ports after
+Hogan, "Impedance control: an approach to manipulation", ASME J. Dynamic Systems, Measurement,
+and Control 107 (1985); teleoperators as networks of ports after Hannaford, "A design framework
+for teleoperators with kinesthetic feedback", IEEE Trans. Robotics and Automation 5 (1989).
 
 Transparency compares the impedance at a site with another site free and clamped. It is torque
 over velocity along one joint, N m s/rad, with no torque of the operator on the other joints.
@@ -34,24 +35,24 @@ PortResponse = Callable[[Array], Complex]
 """Matrices, shape (F, p, m), for frequencies of shape (F,), rad/s."""
 
 ZERO_ROOT_RADIUS_PER_S = 1e-3
-"""Roots of the loop inside the circle of this radius count as zero, 1/s."""
+"""Largest absolute value of a root of the loop that counts as zero, in 1/s."""
 
 _BATCH = 512
-"""Frequencies that are solved together, which limits memory."""
+"""Number of frequencies that are solved together, which limits the memory."""
 _CIRCLE_POINTS = 64
-"""Points of the circle around zero on which the response is evaluated."""
+"""Number of points of the circle around zero on which the response is evaluated."""
 _HIGHEST_POWER = 6
 """Highest order of a pole at zero that is searched."""
 _NEGLIGIBLE = 1e-3
-"""Parts of the response below this share of its size count as zero."""
+"""Largest part of the response that counts as zero, as a share of its size."""
 
 
 class LoopOutput(NamedTuple):
     """An output of the loop's present and past state: y(t) = C x(t) + sum_k C_k x(t - T_k).
 
     Attributes:
-        C: shape (p, n).
-        delayed: pairs of a delay T_k, s, and the matrix C_k, shape (p, n).
+        C: Matrix of the present state, shape (p, n).
+        delayed: Pairs of a delay T_k, in s, and the matrix C_k, shape (p, n).
     """
 
     C: Array
@@ -82,9 +83,10 @@ class PoleAtZero(NamedTuple):
     """The pole of the response at zero frequency: Y(s) ~ residue / s + higher powers of 1 / s.
 
     Attributes:
-        order: the highest power of 1 / s; 0: there is no pole, and the velocity under a
+        order: Highest power of 1 / s. With 0 there is no pole, and the velocity under a
             constant torque stays bounded.
-        residue: growth of velocity under a constant torque, shape (p, m), rad/s^2 per N m.
+        residue: Growth of the velocity under a constant torque, shape (p, m), in rad/s^2 per N
+            m.
     """
 
     order: int
@@ -94,8 +96,8 @@ class PoleAtZero(NamedTuple):
     def passive(self) -> bool:
         """True if a passive network may have the pole.
 
-        A passive network has simple poles on the axis, with a residue that is symmetric and has
-        no negative eigenvalue.
+        A passive network has simple poles on the imaginary axis, with a residue that is
+        symmetric and has no negative eigenvalue.
         """
         differences = np.abs(self.residue - self.residue.T)
         asymmetry = differences.max(initial=0.0)
@@ -117,10 +119,10 @@ def evaluate_transfer(
     The function is C(s) (s E - A - sum_k A_k e^{-s T_k})^{-1} (B + sum_k B_k e^{-s T_k}).
 
     Args:
-        loop: the loop.
-        s: complex frequencies, shape (F,), 1/s.
-        output: the output C(s). None: the joint velocities, so that the result is the
-            admittance Y(s), rad/s per N m.
+        loop: The loop.
+        s: Complex frequencies, shape (F,), in 1/s.
+        output: The output C(s). None for the joint velocities, so that the result is the
+            admittance Y(s), in rad/s per N m.
     """
     output = LoopOutput(loop.C) if output is None else output
     outputs = len(output.C)
@@ -129,6 +131,7 @@ def evaluate_transfer(
     E = np.eye(len(loop.A))
     if loop.E is not None:
         E = np.diag(loop.E)
+
     for first in range(0, len(s), _BATCH):
         end = first + _BATCH
         batch = s[first:end]
@@ -146,8 +149,9 @@ def evaluate_transfer(
 def build_admittance(loop: LinearLoop) -> PortResponse:
     """Returns the admittance Y(j w) as a function of w.
 
-    The admittance is the velocity of each joint per torque of an operator at each joint, rad/s
-    per N m. The loop's outputs must be the velocities of the joints of its inputs, in order.
+    The admittance is the velocity of each joint per torque of an operator at each joint, in
+    rad/s per N m. The loop's outputs must be the velocities of the joints of its inputs, in
+    order.
     """
     velocities = loop.C.shape[0]
     torques = loop.B.shape[1]
@@ -163,12 +167,12 @@ def build_admittance(loop: LinearLoop) -> PortResponse:
 
 
 def to_imaginary_axis(w_rad_s: Array) -> Complex:
-    """Returns j w for frequencies w, rad/s."""
+    """Returns j w for frequencies w, in rad/s."""
     return np.asarray(1j * w_rad_s, dtype=np.complex128)
 
 
 def parse_port_site(port: str) -> str:
-    """Returns the site of a port or a state, "m1" of "m1.tau2"."""
+    """Returns the site of a port or a state, such as "m1" of "m1.tau2"."""
     return port.partition(".")[0]
 
 
@@ -183,7 +187,7 @@ def find_site_ports(loop: LinearLoop, site: str) -> list[int]:
     """Returns the indices of a site's joints among the ports.
 
     Raises:
-        UsageError: the loop has no such site.
+        UsageError: The loop has no such site.
     """
     ports = [n for n, name in enumerate(loop.inputs) if parse_port_site(name) == site]
     if not ports:
@@ -193,7 +197,7 @@ def find_site_ports(loop: LinearLoop, site: str) -> list[int]:
 
 
 def parse_port_joint(port: str) -> int:
-    """Returns the number of a port's joint, 2 of "m1.tau2"."""
+    """Returns the number of a port's joint, such as 2 of "m1.tau2"."""
     return int(port.rpartition("tau")[2])
 
 
@@ -217,17 +221,17 @@ def select_ports(response: PortResponse, ports: list[int]) -> PortResponse:
 
 
 def find_longest_delay_s(loop: LinearLoop) -> float:
-    """Returns the longest delay of a loop, s; 0 if it has no delay."""
+    """Returns the longest delay of a loop, in s. 0 if it has no delay."""
     return max((term.delay_s for term in loop.delayed), default=0.0)
 
 
 def find_pole_at_zero(loop: LinearLoop) -> PoleAtZero:
     """Returns the pole of the response at zero, by Cauchy's integral along a small circle.
 
-    Shared poses at which the arms can rest, and estimates without excitation, are roots of the
-    loop at zero. Most of them are not poles of Y, because a resting arm has no velocity. A loop
-    without friction has a pole: Y(s) ~ 1 / (m s). Roots within `ZERO_ROOT_RADIUS_PER_S` count
-    as zero.
+    Many roots of the loop are zero, because all arms can rest in other shared poses too, or
+    because nothing excites an estimate. Most of them are not poles of Y, because a resting arm
+    has no velocity. A loop without friction has a pole: Y(s) ~ 1 / (m s). Roots within
+    `ZERO_ROOT_RADIUS_PER_S` count as zero.
     """
     angles = 2j * math.pi * np.arange(_CIRCLE_POINTS) / _CIRCLE_POINTS
     unit_circle = np.exp(angles)
@@ -238,12 +242,14 @@ def find_pole_at_zero(loop: LinearLoop) -> PoleAtZero:
     for power in range(1, _HIGHEST_POWER + 1):
         mean = (values * circle**power).mean(axis=0)
         coefficients[power] = mean.real
+
     least = _NEGLIGIBLE * np.abs(values).max(initial=0.0)
     powers = []
     for power, coefficient in coefficients.items():
         size = np.abs(coefficient).max(initial=0.0)
         if size > least:
             powers.append(power)
+
     residue = np.zeros_like(coefficients[1])
     if 1 in powers:
         residue = coefficients[1] * ZERO_ROOT_RADIUS_PER_S
@@ -258,7 +264,7 @@ def clamp_site(loop: LinearLoop, site: str) -> LinearLoop:
     torque.
 
     Raises:
-        UsageError: there is no such site, or two clamped sites reflect force onto each other.
+        UsageError: There is no such site, or two clamped sites reflect force onto each other.
     """
     ports = find_site_ports(loop, site)
     other_ports = [n for n in range(len(loop.inputs)) if n not in ports]
@@ -331,16 +337,16 @@ _PER_DECADE = 100
 
 
 class Transparency(NamedTuple):
-    """Impedance along one joint at an operator's site, with another site free and clamped.
+    """Impedance that an operator feels along a joint, with another site free and clamped.
 
     Attributes:
-        operator_site: the operator's site.
-        other_site: the site that is free or clamped.
-        joint: number of the joint of the operator's site, from 1 on.
-        w_rad_s: frequencies, shape (F,).
-        free: impedance with the other site free, shape (F,), N m s/rad.
-        clamped: impedance with the other site clamped, shape (F,), N m s/rad.
-        band_hz: the band of the means, Hz.
+        operator_site: Site of the operator.
+        other_site: Site that is free or clamped.
+        joint: Number of the joint of the operator's site, from 1 on.
+        w_rad_s: Frequencies, shape (F,), in rad/s.
+        free: Impedance with the other site free, shape (F,), in N m s/rad.
+        clamped: Impedance with the other site clamped, shape (F,), in N m s/rad.
+        band_hz: The band over which means are taken, in Hz.
     """
 
     operator_site: str
@@ -363,7 +369,7 @@ class Transparency(NamedTuple):
 
     @property
     def ratio_db(self) -> float:
-        """Mean of 20 log10(abs(Z_clamped) / abs(Z_free)) over the band, dB."""
+        """Mean of 20 log10(abs(Z_clamped) / abs(Z_free)) over the band, in dB."""
         ratio = self.stiffest_nm_s_rad / self.softest_nm_s_rad
         return 20.0 * float(np.log10(ratio))
 
@@ -379,12 +385,12 @@ class Transparency(NamedTuple):
         return self._average_magnitude(difference)
 
     def interpolate_magnitudes(self, frequency_hz: float) -> tuple[float, float]:
-        """Returns the magnitudes of the free and the clamped impedance, N m s/rad.
+        """Returns the magnitudes of the free and the clamped impedance, in N m s/rad.
 
         The magnitudes are interpolated on logarithmic axes.
 
         Args:
-            frequency_hz: the frequency, Hz.
+            frequency_hz: The frequency, in Hz.
         """
         log_w = np.log(self.w_rad_s)
         target = np.log(2.0 * np.pi * frequency_hz)
@@ -411,21 +417,23 @@ class Transparency(NamedTuple):
 def measure_transparency(loop: LinearLoop, at: str, of: str) -> tuple[Transparency, ...]:
     """Returns the transparency along each joint of a site, with another site free and clamped.
 
-    The impedance is Z(j w) = 1 / Y_ii(j w) with Y of the loop; all other ports are free.
+    The impedance is Z(j w) = 1 / Y_ii(j w) with the admittance Y of the loop. All other ports
+    are free.
 
     Args:
-        loop: the loop.
-        at: the operator's site.
-        of: the site that is free or clamped.
+        loop: The loop.
+        at: Site of the operator.
+        of: Site that is free or clamped.
 
     Raises:
-        UsageError: there is no such site, or both are the same.
+        UsageError: There is no such site, or both are the same.
     """
     low, high = _SHOWN_HZ
     decades = np.log10(high / low)
     points = np.geomspace(low, high, 1 + round(_PER_DECADE * decades))
     frequencies_hz = np.union1d(points, TRANSPARENCY_BAND_HZ)
     w_rad_s = 2.0 * np.pi * frequencies_hz
+
     ports = find_site_ports(loop, at)
     if at == of:
         raise UsageError(f"a load at {at} would be at the operator's own site")
@@ -435,6 +443,7 @@ def measure_transparency(loop: LinearLoop, at: str, of: str) -> tuple[Transparen
     evaluate_clamped = select_ports(build_admittance(clamped_loop), clamped_ports)
     free = evaluate_free(w_rad_s)
     clamped = evaluate_clamped(w_rad_s)
+
     transparencies = []
     for n, port in enumerate(ports):
         transparency = Transparency(

@@ -1,14 +1,15 @@
-"""One site as a continuous system: rates of arm and estimates, and their Jacobian.
+"""Computes the rates of one site as a continuous system, and their derivatives.
 
-The Jacobian comes from a complex step: f'(x) = Im f(x + i h) / h with h = 1e-30, exact to
-rounding because nothing is subtracted. Squire and Trapp, "Using complex variables to estimate
-derivatives of real functions", SIAM Review 40 (1998).
+The state of a site is its joint angles, its joint velocities, and the estimates of its control
+law. The derivatives come from a complex step: f'(x) = Im f(x + i h) / h with h = 1e-30, exact
+to rounding because nothing is subtracted. Squire and Trapp, "Using complex variables to
+estimate derivatives of real functions", SIAM Review 40 (1998).
 
 Invariant:
-    - All arithmetic is plain NumPy on `textbook_arm`, without the compiled core, so that this
-      module and the core check each other.
-    - Where a law has branches (a wall, the bounds of an estimate), the real part decides, so
-      that a complex step yields the Jacobian of the branch in force.
+    - All arithmetic is plain NumPy on `textbook_arm`, without the compiled simulation kernel,
+      so that this module and the kernel check each other.
+    - If a law has branches (a wall, the bounds of an estimate), the real part decides, so that
+      a complex step yields the derivatives of the branch in force.
 """
 
 from collections.abc import Iterator
@@ -28,30 +29,31 @@ from .textbook_arm import Following, PlacedChain, follow_in_task, follow_joints,
 COMPLEX_STEP = 1e-30
 """Imaginary step h of the derivatives."""
 SWITCHING_TOLERANCE = 1e-9
-"""Within this distance a wall, m, or an end of an estimate's box is at its switching point."""
+"""Largest distance from a switching point: from a wall, in m, or from the limit of an estimate.
+"""
 
 
 class ArgumentLayout:
-    """The slices of a site's argument vector, in order: state, inputs from peers, own torque.
+    """Positions of the parts of a site's argument vector: state, inputs from peers, own torque.
 
     Args:
-        joints: number of joints n; length of q, qd and the external torque.
-        parameters: length of the estimate.
-        shared: length m of each part that comes from peers; 0: as many as there are joints.
-        peers: number of peers whose samples an imported law also reads one by one.
+        joints: Number of joints n, which is the length of q, qd and the external torque.
+        parameters: Length of the estimate.
+        shared: Length m of each part that comes from peers. 0 for as many as there are joints.
+        peers: Number of peers whose samples an imported law also reads one by one.
 
     Attributes:
-        q, qd: joint positions and velocities.
-        estimate: the estimate theta_hat, or the memory of an imported law.
-        q_des, qd_des: the reference q_id and its derivative; in task space the reference is a
+        q, qd: Joint angles and velocities.
+        estimate: The estimate theta_hat, or the memory of an imported law.
+        q_des, qd_des: The reference q_id and its derivative. In task space the reference is a
             pose, see `textbook_arm`.
-        peer_torque: the exogenous torque of the peers; in task space their force.
-        external_torque: torque that an operator adds ON the joints.
-        inputs: everything from peers: the reference, its derivative, their torque, and then the
+        peer_torque: External torque of the peers. In task space their force.
+        external_torque: Torque that an operator adds on the joints.
+        inputs: Everything from peers: the reference, its derivative, their torque, and then the
             samples of the single peers.
-        coordinates: length m of each part that comes from peers.
-        states: length of the site's state: q, qd and theta_hat.
-        arguments: length of the whole argument.
+        coordinates: Length m of each part that comes from peers.
+        states: Length of the site's state: q, qd and theta_hat.
+        arguments: Length of the whole vector.
     """
 
     def __init__(
@@ -81,7 +83,7 @@ class ArgumentLayout:
         self.inputs = slice(self.states, self.external_torque.start)
 
     def peer_sample(self, index: int) -> slice:
-        """Returns the slice of one peer's sample: its x, velocity, and exogenous torque."""
+        """Returns the position of one peer's sample: pose x, velocity, and external torque."""
         length = 3 * self.coordinates
         first = self.peer_torque.stop + length * index
         return slice(first, first + length)
@@ -114,20 +116,20 @@ def place_arm(site: SiteSetup, q: Numbers) -> PlacedArm | PlacedChain:
 
 
 class SiteRates(NamedTuple):
-    """Rates and torques of a site; in a Jacobian, each of them has a column per argument.
+    """Rates and torques of a site. In its derivatives, each of them has a column per argument.
 
     Attributes:
-        qdd: joint accelerations, shape (n, ...), rad/s^2.
-        estimate: the derivative of theta_hat, shape (P, ...).
-        tau: the unclamped torque of the control law, shape (n, ...), N m.
-        external: the torque of operators and environments that act continuously, shape (n,
-            ...), N m.
-        held: the torque of sampled operators and environments, which is held over a tick,
-            shape (n, ...), N m.
-        x: the pose that peers receive, shape (m, ...): joint angles, or position and
-            orientation, see `textbook_arm.Following`.
-        xd: the velocity of x.
-        reflected: the external and held torque as peers receive it; in task space a force.
+        qdd: Joint accelerations, shape (n, ...), in rad/s^2.
+        estimate: Derivative of theta_hat, shape (P, ...).
+        tau: Torque of the control law without its limit, shape (n, ...), in N m.
+        external: Torque of operators and environments that act continuously, shape (n, ...), in
+            N m.
+        held: Torque of operators and environments that act once per tick and hold their torque,
+            shape (n, ...), in N m.
+        x: Pose that peers receive, shape (m, ...): joint angles, or position and orientation,
+            see `textbook_arm.Following`.
+        xd: Velocity of x.
+        reflected: External and held torque as peers receive it. In task space a force.
     """
 
     qdd: Numbers
@@ -144,9 +146,9 @@ def compute_following(site: SiteSetup, arm: PlacedArm | PlacedChain, x: Numbers)
     """Returns how a site follows its reference, in joint space or in task space.
 
     Args:
-        site: setup of the site.
-        arm: the arm in the pose of x.
-        x: arguments of the site's rates, shape (arguments, ...).
+        site: Setup of the site.
+        arm: The arm in the pose of x.
+        x: Arguments of the site's rates, shape (arguments, ...).
     """
     layout = lay_out_arguments(site)
     Lambda = _as_columns(site.gains.Lambda, x)
@@ -154,6 +156,7 @@ def compute_following(site: SiteSetup, arm: PlacedArm | PlacedChain, x: Numbers)
     qd = x[layout.qd]
     reference = x[layout.q_des]
     reference_rate = x[layout.qd_des]
+
     if site.layout.task and isinstance(arm, PlacedChain):
         return follow_in_task(
             site=site,
@@ -177,8 +180,8 @@ def compute_shared_pose(site: SiteSetup, q: Numbers) -> Numbers:
     """Returns the pose that a site shares: joint angles, or the pose of its end effector.
 
     Args:
-        site: setup of the site.
-        q: joint positions, shape (n, ...).
+        site: Setup of the site.
+        q: Joint angles, shape (n, ...).
     """
     arm = place_arm(site, q)
     if isinstance(arm, PlacedChain) and site.chain is not None and site.chain.task is not None:
@@ -187,21 +190,23 @@ def compute_shared_pose(site: SiteSetup, q: Numbers) -> Numbers:
 
 
 def evaluate_site_rates(site: SiteSetup, x: Numbers) -> SiteRates:
-    """Returns the rates of a site with the actors in force.
+    """Returns the rates of a site with the operators and environments in force.
 
     The rates are Eq. (8)-(13) and (15) of the paper, or those of a law with known gravity.
 
     Args:
-        site: setup of the site.
-        x: arguments in the order of `lay_out_arguments`, shape (arguments, ...).
+        site: Setup of the site.
+        x: Arguments in the order of `lay_out_arguments`, shape (arguments, ...).
     """
     layout = lay_out_arguments(site)
     arm = place_arm(site, x[layout.q])
     qd = x[layout.qd]
     following = compute_following(site, arm, x)
+
     continuous = _sum_actors(site, arm, x, sampled=False)
     external = x[layout.external_torque] + continuous
     held = _sum_actors(site, arm, x, sampled=True)
+
     if isinstance(site.law_factory, NumericLaw):
         state_and_inputs = x[: layout.inputs.stop]
         law_arguments = np.concatenate([state_and_inputs, external + held])
@@ -211,6 +216,7 @@ def evaluate_site_rates(site: SiteSetup, x: Numbers) -> SiteRates:
     else:
         tau = _evaluate_known_gravity_law(site, arm, following, x)
         estimate_rate = 0.0 * x[layout.estimate]
+
     torque = tau + external + held
     theta = _as_columns(site.theta, qd)
     qdd = arm.joint_acceleration(theta, qd, torque)
@@ -227,7 +233,10 @@ def evaluate_site_rates(site: SiteSetup, x: Numbers) -> SiteRates:
 
 
 def differentiate_site_rates(site: SiteSetup, x: Array) -> SiteRates:
-    """Returns the derivatives of the rates at x by a complex step, a column per argument."""
+    """Returns the derivatives of the rates at x by a complex step.
+
+    Each derivative has a column per argument.
+    """
     steps = 1j * COMPLEX_STEP * np.eye(len(x))
     stepped = x[:, np.newaxis] + steps
     rates = evaluate_site_rates(site, stepped)
@@ -236,7 +245,7 @@ def differentiate_site_rates(site: SiteSetup, x: Array) -> SiteRates:
 
 
 def has_estimate(site: SiteSetup) -> bool:
-    """True if the site's state includes an estimate, or the memory of an imported law."""
+    """Returns True if the site's state includes an estimate, or an imported law's memory."""
     if isinstance(site.law_factory, NumericLaw):
         return len(site.law_factory.memory) > 0
     return site.gains.law is Law.ADAPTIVE
@@ -257,9 +266,9 @@ def _evaluate_known_gravity_law(
     following: Following,
     x: Numbers,
 ) -> Numbers:
-    """Returns the torque of a law with known gravity, shape (n, ...), N m.
+    """Returns the torque of a law with known gravity, shape (n, ...), in N m.
 
-    The law is tau = G(q) - d qd - J' (Kd ed + K e - k_f tau_peers), J = 1 in joint space.
+    The law is tau = G(q) - d qd - J' (Kd ed + K e - k_f tau_peers), with J = 1 in joint space.
     """
     layout = lay_out_arguments(site)
     gains = site.gains
@@ -284,10 +293,10 @@ def _evaluate_adaptive_law(
     following: Following,
     x: Numbers,
 ) -> tuple[Numbers, Numbers]:
-    """Returns the torque of an adaptive law, N m, and the rate of its estimate.
+    """Returns the torque of an adaptive law, in N m, and the rate of its estimate.
 
-    With the reference velocity v and acceleration a, r = qd - v and the bounded projection of
-    the rate onto the estimate's box, Eq. (10)-(13):
+    With the reference velocity v and acceleration a, r = qd - v, and the projection of the rate
+    that keeps the estimate in its box, the law is Eq. (10)-(13):
 
         tau = Y(q, qd, v, a) theta_hat - Kp r - J' Kd ed - rho r / sqrt(r^2 + w^2)
               - (1 - known) friction(v)
@@ -331,7 +340,7 @@ def _evaluate_adaptive_law(
 
 
 def _is_at_bound(site: SiteSetup, estimate: Numbers, rate: Numbers) -> Numbers:
-    """Returns where an estimate is at an end of its box and its rate points outward."""
+    """Returns True where an estimate is at a limit of its box and its rate points outward."""
     low = _as_columns(site.gains.low, estimate)
     high = _as_columns(site.gains.high, estimate)
     is_low = estimate.real <= low + SWITCHING_TOLERANCE
@@ -350,16 +359,16 @@ def _sum_actors(
     *,
     sampled: bool,
 ) -> Numbers:
-    """Returns the sum of the torques of the continuous or the sampled actors.
+    """Returns the sum of the torques of operators and environments.
 
     Args:
-        site: setup of the site, with the actors in force.
-        arm: the arm in the pose of x.
-        x: arguments of the site's rates, shape (arguments, ...).
-        sampled: True: sum over the sampled actors; False: over the continuous ones.
+        site: Setup of the site, with the operators and environments in force.
+        arm: The arm in the pose of x.
+        x: Arguments of the site's rates, shape (arguments, ...).
+        sampled: True for those that act once per tick, False for those that act continuously.
 
     Returns:
-        The torque ON the joints, shape (n, ...), N m.
+        Torque on the joints, shape (n, ...), in N m.
     """
     layout = lay_out_arguments(site)
     q = x[layout.q]
@@ -377,10 +386,10 @@ def _evaluate_actor(
     q: Numbers,
     qd: Numbers,
 ) -> Numbers:
-    """Returns the torque of one actor in force, shape (n, ...), N m.
+    """Returns the torque of one operator or environment in force, shape (n, ...), in N m.
 
-    An operator's motion has ended, and a scripted torque has the constant value `a`. A
-    user-written model keeps its parameters of the time `move_end_s`.
+    An operator's motion has ended, and a scripted torque has the constant value `a`. A model
+    that a user wrote keeps its parameters of the time `move_end_s`.
     """
     if actor.kind in SCRIPTED_KINDS:
         return _as_columns(actor.a, q)
@@ -417,7 +426,7 @@ def _evaluate_actor(
 
 
 def _evaluate_model(actor: TorqueSource, position: Numbers, velocity: Numbers) -> Numbers:
-    """Returns the effort of a user-written hand or environment, components first."""
+    """Returns the effort of an operator or environment that a user wrote, components first."""
     # models expect the components on the last axis
     positions = np.moveaxis(position, 0, -1)
     velocities = np.moveaxis(velocity, 0, -1)
@@ -427,10 +436,16 @@ def _evaluate_model(actor: TorqueSource, position: Numbers, velocity: Numbers) -
 
 
 def describe_switching_points(site: SiteSetup, x: Array) -> Iterator[str]:
-    """Yields a sentence for each switching point at x, where the Jacobian is one-sided."""
+    """Yields a sentence for each switching point at x, where the derivative is one-sided.
+
+    Args:
+        site: Setup of the site.
+        x: Arguments of the site's rates, shape (arguments,).
+    """
     layout = lay_out_arguments(site)
     arm = place_arm(site, x[layout.q])
     position = arm.end_effector_position()
+
     walls = [actor for actor in site.actors if actor.kind is TorqueKind.WALL]
     for n, wall in enumerate(walls):
         from_surface = np.array(wall.a) - position
@@ -440,6 +455,7 @@ def describe_switching_points(site: SiteSetup, x: Array) -> Iterator[str]:
                 f"{site.name} rests exactly on the surface of its wall {n + 1}: "
                 "it counts as not touching"
             )
+
     if site.gains.law is not Law.ADAPTIVE:
         return
     for p in np.flatnonzero(_find_switching_estimates(site, x)):
@@ -450,7 +466,7 @@ def describe_switching_points(site: SiteSetup, x: Array) -> Iterator[str]:
 
 
 def _find_switching_estimates(site: SiteSetup, x: Array) -> NDArray[np.bool_]:
-    """Returns True for each estimate that rests at an end of its box, shape (P,)."""
+    """Returns True for each estimate that rests at a limit of its box, shape (P,)."""
     layout = lay_out_arguments(site)
     gains = site.gains
     estimate = x[layout.estimate]

@@ -1,8 +1,9 @@
-"""A chain of joints in plain NumPy, and how a site follows its peers.
+"""Computes a chain of joints in plain NumPy, and how a site follows its peers.
 
-The linear analysis differentiates these textbook equations; they share no code with the
-compiled core. The planar arm is `analysis.arm_rows.PlacedArm`. Vectors have their components on
-the first axis and any number of columns behind it: shape (n,) or (n, B).
+The linear analysis differentiates these textbook equations. They share no code with the
+compiled simulation kernel, so that both check each other. The planar arm is
+`analysis.arm_rows.PlacedArm`. Vectors have their components on the first axis and any number of
+columns behind it: shape (n,) or (n, B).
 
 A spatial vector has its linear half first, at the origin of the link's own frame. Link i has
 the Jacobian J_i and the velocities V_i = J_i qd and W_i = J_i v. Its acceleration, which
@@ -115,12 +116,12 @@ class PlacedLink(NamedTuple):
     """A link of a chain in some poses.
 
     Attributes:
-        X: transformation of spatial velocities from the frame of the link before into this
+        X: Transformation of spatial velocities from the frame of the link before into this
             link's frame, shape (6, 6, ...).
-        S: spatial velocity of its joint at speed 1, shape (6,).
+        S: Spatial velocity of its joint at speed 1, shape (6,).
         J: Jacobian of the link, shape (6, n, ...).
-        R_base: orientation in the base, shape (3, 3, ...).
-        place_m: origin in the base, shape (3, ...), m.
+        R_base: Orientation in the base, shape (3, 3, ...).
+        place_m: Origin in the base, shape (3, ...), in m.
     """
 
     X: Numbers
@@ -131,18 +132,25 @@ class PlacedLink(NamedTuple):
 
 
 class PlacedChain:
-    """A chain in the poses q, shape (n, ...), with the same methods as `PlacedArm`."""
+    """A chain in given poses. It has the same methods as the planar arm, `PlacedArm`.
+
+    Args:
+        chain: The chain.
+        q: Joint angles, shape (n, ...), in rad or m.
+    """
 
     def __init__(self, chain: ChainSetup, q: Numbers) -> None:
         self._chain = chain
         self._q = q
         self._columns = q.shape[1:]
         self._links: list[PlacedLink] = []
+
         J = np.zeros((6, len(q), *self._columns))
         R_base = _repeat_columns(np.eye(3), self._columns)
         place_m = np.zeros((3, *self._columns))
         for i, joint in enumerate(chain.joints):
             R, p = _place_joint(joint, q[i])
+
             X = _transform_velocities(R, p)
             S = _find_joint_axis(joint)
             J = _multiply(X, J)
@@ -150,6 +158,7 @@ class PlacedChain:
             offset_m = multiply_columns(R_base, p)
             place_m = place_m + offset_m
             R_base = _multiply(R_base, R)
+
             link = PlacedLink(
                 X=X,
                 S=S,
@@ -204,7 +213,7 @@ class PlacedChain:
         v: Numbers,
         a: Numbers,
     ) -> Numbers:
-        """Returns M(q) a + C(q, qd) v + G(q) + friction(v), shape (n, ...), N m.
+        """Returns M(q) a + C(q, qd) v + G(q) + friction(v), shape (n, ...), in N m.
 
         M includes the inertia of the drives.
         """
@@ -216,7 +225,7 @@ class PlacedChain:
         return torque
 
     def friction_torque(self, v: Numbers) -> Numbers:
-        """Returns the torque of the joints' friction at speeds v, shape (n, ...), N m."""
+        """Returns the torque of the joints' friction at speeds v, shape (n, ...), in N m."""
         viscous = self._get_per_joint("viscous") * v
         # a smooth sign of the speed
         x = v / COULOMB_SPEED
@@ -225,12 +234,12 @@ class PlacedChain:
         return viscous + coulomb
 
     def gravity_torque(self, theta: Numbers) -> Numbers:
-        """Returns G(q), shape (n, ...), N m."""
+        """Returns the gravity torque G(q), shape (n, ...), in N m."""
         zeros = np.zeros_like(self._q)
         return self.required_torque(theta, zeros, zeros, zeros)
 
     def inertia_matrix(self, theta: Numbers) -> Numbers:
-        """Returns M(q) with the drives' inertia, shape (n, n, ...)."""
+        """Returns the inertia matrix M(q) with the drives' inertia, shape (n, n, ...)."""
         armatures = [joint.armature_kg_m2 for joint in self._chain.joints]
         M = _repeat_columns(np.diag(armatures), self._columns)
         for i, link in enumerate(self._links):
@@ -269,7 +278,7 @@ class PlacedChain:
         return total
 
     def end_effector_position(self) -> Numbers:
-        """Returns the position of the end effector in the base, shape (3, ...), m."""
+        """Returns the position of the end effector in the base, shape (3, ...), in m."""
         last = self._links[-1]
         tip_m = np.array(self._chain.tip_m)
         tip = _repeat_columns(tip_m, self._columns)
@@ -299,8 +308,8 @@ class PlacedChain:
     def pose_jacobian_rate(self, qd: Numbers) -> Numbers:
         """Returns the time derivative of the pose Jacobian along qd, shape (6, n, ...).
 
-        In the frame of the last link, the derivative of column k is
-        X (V_k x S_k) - V x (X S_k); the rotation of the frame adds to it.
+        In the frame of the last link, the derivative of column k is X (V_k x S_k) - V x (X
+        S_k). The rotation of the frame adds to it.
         """
         last = self._links[-1]
         V_last = multiply_columns(last.J, qd)
@@ -340,11 +349,11 @@ def _multiply_inertia_units(motion: Numbers) -> Numbers:
 
 
 def _transform_velocities(R: Numbers, p: Numbers) -> Numbers:
-    """Returns the matrix X that takes spatial velocities into a link's frame.
+    """Returns the matrix X that transforms spatial velocities into a link's frame.
 
     Args:
-        R: orientation of the link in the frame of the link before, shape (3, 3, ...).
-        p: origin of the link in that frame, shape (3, ...), m.
+        R: Orientation of the link in the frame of the link before, shape (3, 3, ...).
+        p: Origin of the link in that frame, shape (3, ...), in m.
     """
     R_transposed = _transpose(R)
     lever = _multiply(R_transposed, build_cross_matrix(p))
@@ -371,11 +380,12 @@ def _place_joint(joint: ChainJoint, q: Numbers) -> tuple[Numbers, Numbers]:
     the cross matrix K of the axis.
 
     Args:
-        joint: the joint.
-        q: position of the joint, shape (...), rad or m.
+        joint: The joint.
+        q: Position of the joint, shape (...), in rad or m.
 
     Returns:
-        The orientation, shape (3, 3, ...), and the origin, shape (3, ...), m.
+        The orientation, shape (3, 3, ...).
+        The origin, shape (3, ...), in m.
     """
     R_0 = np.array(joint.rotation)
     axis = np.array(joint.axis)
@@ -403,7 +413,7 @@ def rotation_from_vector(vector: Numbers) -> Numbers:
     It is computed by Rodrigues' formula, with series for small angles.
 
     Args:
-        vector: axis times angle, shape (3, ...), rad.
+        vector: Axis times angle, shape (3, ...), in rad.
     """
     square = np.sum(vector * vector, axis=0)
     is_small = square.real < _SMALL
@@ -428,7 +438,7 @@ def vector_from_rotation(R: Numbers) -> Numbers:
     It is computed from the quaternion of the rotation.
 
     Args:
-        R: rotation matrix, shape (3, 3, ...).
+        R: Rotation matrix, shape (3, 3, ...).
     """
     quaternion = _find_quaternion(R)
     w = quaternion[0]
@@ -436,12 +446,14 @@ def vector_from_rotation(R: Numbers) -> Numbers:
     square = np.sum(v * v, axis=0)
     is_small = square.real < _SMALL
     sine = np.sqrt(np.where(is_small, 1.0, square))
+
     # series of 2 atan(t) / sine, with t = tan(angle / 2)
     small_w = np.where(is_small, w, 1.0)
     small_square = np.where(is_small, square, 0.0)
     t_square = small_square / small_w**2
     series = 1.0 - t_square * (1.0 / 3.0 - t_square * (1.0 / 5.0 - t_square / 7.0))
     small_factor = 2.0 / small_w * series
+
     # the arctangent of a ratio of at most 1, so that no part of it divides by zero
     is_below = sine.real <= w.real
     nonzero_w = np.where(w == 0.0, 1.0, w)
@@ -449,6 +461,7 @@ def vector_from_rotation(R: Numbers) -> Numbers:
     ratio = np.where(is_below, sine, w) / divisor
     arctangent = np.arctan(ratio)
     half_angle = np.where(is_below, arctangent, 0.5 * np.pi - arctangent)
+
     factor = 2.0 * half_angle / sine
     vector: Numbers = np.where(is_small, small_factor, factor) * v
     return vector
@@ -459,6 +472,9 @@ def _find_quaternion(R: Numbers) -> Numbers:
 
     Each row of `products` is the quaternion times four times one of its parts. The row of the
     largest part has the smallest rounding error (Shepperd, 1978).
+
+    Args:
+        R: Rotation matrix, shape (3, 3, ...).
     """
     xx = R[0, 0]
     yy = R[1, 1]
@@ -469,6 +485,7 @@ def _find_quaternion(R: Numbers) -> Numbers:
     xy = R[0, 1] + R[1, 0]
     xz = R[0, 2] + R[2, 0]
     yz = R[1, 2] + R[2, 1]
+
     products = np.array(
         [
             [1.0 + xx + yy + zz, x, y, z],
@@ -477,11 +494,13 @@ def _find_quaternion(R: Numbers) -> Numbers:
             [z, xz, yz, 1.0 - xx - yy + zz],
         ]
     )
+
     diagonal = [products[n, n].real for n in range(4)]
     sizes = np.array(diagonal)
     largest = sizes.argmax(axis=0)
     row = largest[np.newaxis, np.newaxis]
     quaternion = np.take_along_axis(products, row, axis=0)[0]
+
     square = np.sum(quaternion * quaternion, axis=0)
     quaternion = quaternion / np.sqrt(square)
     has_negative_w = quaternion[0].real < 0.0
@@ -498,13 +517,14 @@ def relative_rotation_vector(other: Numbers, R: Numbers) -> Numbers:
 def evaluate_reference(shares: Array, site_pose: Numbers, shared: Sequence[Numbers]) -> Numbers:
     """Returns the pose that a site follows, in the coordinates of its shared pose, Eq. (6).
 
-    The position is the mean of the peers' positions, weighted with the dominance factors. The
-    orientation is Exp(-sum_j alpha_ij Log(R_i R_j')) R_i.
+    The position is the mean of the peers' positions, weighted with the dominance factors
+    alpha_ij. The orientation is Exp(-sum_j alpha_ij Log(R_i R_j')) R_i, with the orientations
+    R_j of the sites.
 
     Args:
-        shares: row of the dominance matrix, shape (N,).
-        site_pose: the shared pose of the site itself, shape (m, ...).
-        shared: the shared pose of each site, shape (m, ...).
+        shares: Row of the matrix of dominance factors, shape (N,).
+        site_pose: Shared pose of the site itself, shape (m, ...).
+        shared: Shared pose of each site, shape (m, ...).
     """
     pairs = zip(shares.tolist(), shared, strict=True)
     followed = [(share, pose) for share, pose in pairs if share]
@@ -528,17 +548,17 @@ class Following(NamedTuple):
     """How a site follows, in joint space or with its end effector along the followed axes.
 
     Attributes:
-        x: the shared pose, shape (m, ...).
-        xd: its velocity, and the angular velocity for an orientation, shape (m, ...).
-        e: error of the followed coordinates, shape (m, ...).
-        ed: their velocity less the reference's, shape (m, ...).
-        v: reference velocity of the joints, shape (n, ...).
-        a: derivative of v, shape (n, ...).
-        J: Jacobian of the followed axes, shape (m, n, ...); None in joint space, where it is
+        x: Shared pose, shape (m, ...).
+        xd: Its velocity, and the angular velocity for an orientation, shape (m, ...).
+        e: Error of the followed coordinates, shape (m, ...).
+        ed: Their velocity less the reference's, shape (m, ...).
+        v: Reference velocity of the joints, shape (n, ...).
+        a: Derivative of v, shape (n, ...).
+        J: Jacobian of the followed axes, shape (m, n, ...). None in joint space, where it is
             the unit matrix.
         A: J J' with its damping, shape (m, m, ...).
-        least: lower bound of the square of the undamped Jacobian's least singular value; inf in
-            joint space.
+        least: Lower bound of the square of the undamped Jacobian's least singular value.
+            Infinite in joint space.
     """
 
     x: Numbers
@@ -610,13 +630,13 @@ def follow_in_task(
     In a singular pose A and everything computed from it is NaN.
 
     Args:
-        site: setup of a site that follows in task space.
-        arm: the arm in the pose q.
-        Lambda: rates of the followed coordinates, 1/s.
-        q: joint positions, shape (n, ...).
-        qd: joint velocities, shape (n, ...).
-        x_des: reference of the shared pose, shape (m, ...).
-        xd_des: reference of its velocity, shape (m, ...).
+        site: Setup of a site that follows in task space.
+        arm: The arm in the pose q.
+        Lambda: Gains of the followed coordinates, in 1/s.
+        q: Joint angles, shape (n, ...).
+        qd: Joint velocities, shape (n, ...).
+        x_des: Reference of the shared pose, shape (m, ...).
+        xd_des: Reference of its velocity, shape (m, ...).
     """
     assert site.chain is not None
     assert site.chain.task is not None
@@ -664,7 +684,7 @@ def follow_in_task(
 
 
 def _subtract_poses(x: Numbers, x_des: Numbers) -> Numbers:
-    """Returns x - x_des, shape (m, ...); orientations differ by Log(R R_des')."""
+    """Returns x - x_des, shape (m, ...). Orientations differ by Log(R R_des')."""
     e = x - x_des
     if len(x) == POSITION:
         return e
@@ -684,7 +704,7 @@ def _damp(task: TaskSetup, J: Numbers) -> tuple[Numbers, float]:
     least squares).
 
     Args:
-        task: the task.
+        task: The task.
         J: Jacobian of the followed axes, shape (m, n, ...), with zero rows for the others.
     """
     m = len(task.axes)

@@ -540,11 +540,13 @@ def _interpolate_dominance(
         records = energy.motion.records
         dominance = energy.motion.dominance
         position = (t_s - records.t_s[0]) * records.rate_hz
+
         tick_before = np.floor(position + 1e-5)
         last_row = len(records.known) - 1
         row = np.clip(tick_before, 0, last_row).astype(np.int64)
         since_tick = np.maximum(position - row, 0.0)
         later_s = since_tick / records.rate_hz + ahead_s
+
         for j, peer in enumerate(energy.motion.peers):
             if peer not in energies:
                 continue

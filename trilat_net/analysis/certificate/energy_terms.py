@@ -627,12 +627,14 @@ def compute_work(site: SiteMotion) -> dict[str, Increment]:
     }
     if stops.any():
         work["stops"] = torque_work(site, stops, np.zeros_like(stops))
+
     for j, peer in enumerate(site.peers):
         work[f"{peer}->{records.site}"] = link_work(site, j)
     work["shares"] = dominance_change_work(site)
     work["rule"] = stale_rule_work(site)
     work["torque limit"] = torque_limit_work(site)
     work["estimates"] = estimate_work(site)
+
     if c.unknown_friction.any():
         work["friction"] = unknown_friction_work(site)
     if c.axes:
@@ -802,6 +804,7 @@ def singular_pose_work(site: SiteMotion) -> Increment:
         qd_des=ends.qd_des_left,
         r=ends.r_left,
     )
+
     right = _singular_pose_power(
         site=site,
         rows=slice(1, None),

@@ -367,6 +367,7 @@ def _find_curves(log: Log, books: Mapping[str, _SiteBooks]) -> Iterator[EnergyCu
             energies.append(("line", peer, line_j))
             if declared.observed:
                 energies.append(("known", peer, declared.observed[j]))
+
         for kind, peer, energy in energies:
             parts = energy.reshape(len(energy), -1)
             yield EnergyCurve(

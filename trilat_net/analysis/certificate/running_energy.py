@@ -90,6 +90,7 @@ class RecordWindow:
         self._axes = scenario.arms[site].axes
         self._limits = spec.limits
         self._kept = max(8, round(kept_s * self.rate_hz))
+
         # records move to the front only once as many again have arrived
         capacity = 2 * self._kept
         layout = scenario.layout(site)
@@ -99,12 +100,14 @@ class RecordWindow:
         if layout.hand:
             names.append("hand")
         lengths = layout.lengths()
+
         self._columns: dict[str, slice] = {}
         width = 0
         for name in names:
             end = width + lengths[name]
             self._columns[name] = slice(width, end)
             width = end
+
         self._floats = np.zeros((capacity, width))
         shape = (capacity, len(self.peers))
         self._used = np.full(shape, -1, dtype=np.int64)

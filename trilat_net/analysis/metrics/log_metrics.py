@@ -134,6 +134,7 @@ class LogMetrics(Result):
             for name, metrics in metrics_by_name.items():
                 values_by_name[name] = _values_to_json(metrics)
             content[kind] = values_by_name
+
         parameters = {}
         for site, estimates in self.estimates.items():
             parameters[site] = estimates.to_json()
@@ -347,11 +348,13 @@ def _details_to_json(metrics: LogMetrics) -> dict[str, Any]:
         "stiffness": [estimate._asdict() for estimate in metrics.stiffness],
         "felt": [_impedance_to_json(metrics, estimate) for estimate in metrics.responses],
     }
+
     if metrics.axes:
         by_axis = {}
         for name, entries in details.items():
             by_axis[name] = [_name_axis(metrics, entry) for entry in entries]
         return by_axis
+
     if metrics.joint_names:
         for entries in details.values():
             for entry in entries:

@@ -307,6 +307,7 @@ def _estimate_joints(
     torque = runs[site].torque
     usable = _find_still_rows(runs, site, alone=not environment)
     rows, recorded = find_latest_rows(runs[environment or site].records, records.t_s)
+
     for joint in range(records.qd.shape[1]):
         responses = [FrequencyResponse(why=NO_SCRIPT_TEXT)]
         if torque.script is not None and usable is not None:
@@ -331,6 +332,7 @@ def _estimate_joints(
                     rate_hz=records.rate_hz,
                     least=MIN_DRIVE_TORQUE_NM,
                 )
+
         spectrum = [response for response in responses if response.frequency_hz]
         spectrum.sort(key=lambda response: response.frequency_hz or 0.0)
         yield ImpedanceEstimate(

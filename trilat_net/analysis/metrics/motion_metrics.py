@@ -83,6 +83,7 @@ def measure_tracking(view: RunView, site: str) -> MetricValues:
     part = log[site]
     if not len(part):
         return unavailable(TRACKING, f"no records of {site}")
+
     space = log.scenario.sites[site].task.space
     limit = f"{site_signals.SETTLED_ERROR_RAD:g} {_ERROR_UNITS[space]}"
     metrics = measure_shared(
@@ -509,6 +510,7 @@ def measure_network(view: RunView, name: str) -> MetricValues:
     burst = metric(link.burst, unknown)
     if link.loss == 0.0:
         burst = Metric(None, "nothing was lost", applies=False)
+
     late = link.counts.late if link.counts else None
     return {
         "age_mean_ms": metric(age.mean if age else None, unused),

@@ -413,6 +413,7 @@ def _weigh_load(
             share = abs(sum(weighted)) / largest
         imbalance = metric(share, "no site that others follow is loaded")
         weight_metrics = {site: metric(weight[site]) for site in torque}
+
     return JointLoad(
         from_s=window.from_s,
         to_s=window.to_s,
