@@ -1,6 +1,6 @@
-"""Studies of many runs: trials, sweeps, tuning, benchmarks, experiments with people.
+"""Studies of many runs: trials, sweeps, tuning, benchmarks, and experiments with people.
 
 Invariant:
-    - A study is a function of its plan: the number of worker processes and the order in which
-      they finish do not change any result.
+    - A study is a function of its plan. The number of worker processes, and the order in which
+      they finish, do not change any result.
 """

@@ -1,8 +1,12 @@
-"""A Dask cluster that runs the items of a study.
+"""Connects to a Dask cluster, whose workers run the items of a study.
 
-Workers are checked before any item is sent. Each worker also checks itself before every batch,
-so that a worker that joins later meets the same requirements. A user's control law is not sent
-to workers: its hash covers one file, and that file may import others. The worker must have it.
+Dask distributes work over several machines: a scheduler assigns items, such as simulated runs,
+to worker processes. Results can be compared only if all workers compute in exactly the same
+way. Therefore workers are checked before any item is sent. Each worker also checks itself
+before every batch of items, so that a worker that joins later meets the same requirements.
+
+A user's control law is not sent to the workers, because its hash covers only one file, which
+may import others. The worker must have the file already.
 
 Invariant:
     - An item runs only on a worker with the same program, the same arithmetic and the same
@@ -28,24 +32,31 @@ from ..scenario.code_consent import ImportedCode
 from ..scenario.imported_code import read_code
 
 CONNECT_S = 10.0
-"""Longest wait for the answer of a scheduler and for its first worker, s."""
+"""Longest time to wait for a scheduler to reply, and for its first worker, in s."""
 NO_WORKER_S = 60.0
-"""Longest time that a cluster may be without a worker, s."""
+"""Longest time for which a cluster may be without a worker, in s."""
 _PACKAGES = ("numpy", "numba", "scipy")
+"""Packages whose versions influence the results."""
 
 
 def _import_distributed() -> Any:
-    """Returns the package `distributed`."""
+    """Imports the package `distributed`, which contains the client of Dask.
+
+    Raises:
+        UsageError: The package is not installed.
+    """
     return import_extra("distributed", "cluster", "clusters")
 
 
 WorkerIdentity = Mapping[str, str]
-"""Text of each property: program, sources, commit, arithmetic, Python, packages."""
+"""Properties of a worker as texts: the versions of the program, its sources, commit,
+arithmetic, Python and packages.
+"""
 
 
 @cache
 def describe_worker() -> WorkerIdentity:
-    """Returns the properties of this process on which results depend."""
+    """Returns the properties of this process on which its results depend."""
     root = Path(__file__).resolve().parents[1]
     digest = hashlib.sha256()
     for file in sorted(root.rglob("*.py")):
@@ -62,11 +73,12 @@ def describe_worker() -> WorkerIdentity:
 
 
 class WorkerRequirements(NamedTuple):
-    """The requirements on a worker.
+    """Requirements that every worker must meet.
 
     Attributes:
-        identity: the properties of the worker.
-        laws: the code and the SHA-256 of the file of each imported law.
+        identity: Properties that the worker must have.
+        laws: Name of each imported control law, such as "mylaws:Spring", with the SHA-256 of
+            its file, which the worker must have.
     """
 
     identity: WorkerIdentity
@@ -76,12 +88,18 @@ class WorkerRequirements(NamedTuple):
 def explain_unfit_worker(
     required: WorkerRequirements, identity: WorkerIdentity, lacks: Sequence[str]
 ) -> str:
-    """Returns the reason why a worker is refused, or "".
+    """Returns the reason why a worker must not run items.
+
+    Commits need not be the same, since one commit can differ from another in documentation
+    only. They are named as a hint if the source files differ.
 
     Args:
-        required: the requirements.
-        identity: the properties of the worker.
-        lacks: imported laws whose file the worker lacks.
+        required: Requirements.
+        identity: Properties of the worker.
+        lacks: Imported laws whose file the worker does not have.
+
+    Returns:
+        The end of a sentence that begins with "the worker". Empty if the worker may run items.
     """
     local = required.identity
     differing = [
@@ -102,15 +120,15 @@ def explain_unfit_worker(
 
 
 def _list_properties(identity: WorkerIdentity, names: Sequence[str]) -> str:
-    """Returns properties of a worker as a text."""
+    """Returns some properties of a worker as a text for an error message."""
     return ", ".join(f"{name} {identity.get(name, 'unknown')}" for name in names)
 
 
 def find_missing_laws(laws: Sequence[tuple[str, str]]) -> list[str]:
-    """Returns the laws whose file this process lacks, or has with another hash.
+    """Returns the laws whose file this process does not have, or has with other contents.
 
     Args:
-        laws: the code and the SHA-256 of the file of each law.
+        laws: Name of each law, with the SHA-256 of its file.
     """
     missing = []
     for code, sha256 in laws:
@@ -124,10 +142,10 @@ def find_missing_laws(laws: Sequence[tuple[str, str]]) -> list[str]:
 
 
 def check_this_worker(required: WorkerRequirements) -> None:
-    """Checks that this process meets the requirements.
+    """Checks that this process, a worker, meets the requirements.
 
     Raises:
-        UsageError: it does not; the text names the worker and the differences.
+        UsageError: It does not. The message names the worker and the differences.
     """
     reason = explain_unfit_worker(required, describe_worker(), find_missing_laws(required.laws))
     if reason:
@@ -140,10 +158,12 @@ def _make_probe() -> Callable[
 ]:
     """Returns a function that describes the process in which it is called.
 
-    It is nested so that Dask sends its code: the worker may lack this module.
+    A worker may have another version of this program, or none. Dask sends the code of a nested
+    function itself, and not only its name, so that the function runs on such a worker too.
     """
 
     def probe(laws: Sequence[tuple[str, str]]) -> tuple[WorkerIdentity, Sequence[str]]:
+        """Returns the properties of this process, and the laws that it does not have."""
         try:
             from trilat_net.studies import dask_cluster
         except ImportError:
@@ -154,13 +174,15 @@ def _make_probe() -> Callable[
 
 
 class DaskCluster:
-    """A connection to a Dask scheduler; a context manager that closes it, with its items.
+    """Connection to a Dask scheduler, a context manager that closes it.
+
+    Items that have not finished when the connection is closed are cancelled.
 
     Args:
-        address: address of the scheduler, as "tcp://HOST:PORT".
+        address: Address of the scheduler, such as "tcp://HOST:PORT".
 
     Raises:
-        UsageError: Dask is not installed, the scheduler does not answer, or it has no worker.
+        UsageError: Dask is not installed, or no scheduler replies at the address.
     """
 
     def __init__(self, address: str) -> None:
@@ -187,24 +209,28 @@ class DaskCluster:
 
     @property
     def executor(self) -> Executor:
-        """Executor that runs functions on the workers."""
+        """Executor that runs functions on the workers of the cluster."""
         executor: Executor = self._client.get_executor(pure=False)
         return executor
 
     @property
     def workers(self) -> int:
-        """Number of items that the workers run at the same time."""
+        """Number of items that all workers together run at the same time."""
         workers = self._client.scheduler_info()["workers"]
         return sum(worker["nthreads"] for worker in workers.values())
 
     def require(self, laws: Sequence[ImportedCode]) -> WorkerRequirements:
-        """Returns the requirements on every worker, and checks the present workers.
+        """Determines the requirements on every worker, and checks the workers that are present.
 
         Args:
-            laws: imported laws that the items need.
+            laws: Imported control laws that the items need.
+
+        Returns:
+            The requirements.
 
         Raises:
-            UsageError: there is no worker within `CONNECT_S`, or a worker is refused.
+            UsageError: No worker appeared within `CONNECT_S`, or a worker does not meet the
+                requirements.
         """
         try:
             self._client.wait_for_workers(1, timeout=CONNECT_S)
@@ -215,7 +241,8 @@ class DaskCluster:
             ) from None
         files = tuple(dict.fromkeys((law.code, law.source_sha256) for law in laws))
         required = WorkerRequirements(describe_worker(), files)
-        # asked of Dask itself first: code cannot be sent between versions of Python
+        # Dask itself reports the versions of Python. They are checked first, because code
+        # cannot be sent between different versions.
         python = required.identity["Python"]
         for worker, versions in self._client.get_versions()["workers"].items():
             worker_python = ".".join(str(versions["host"]["python"]).split(".")[:2])
@@ -235,10 +262,10 @@ class DaskCluster:
         return required
 
     def check_alive(self) -> None:
-        """Checks that the cluster still works.
+        """Checks that the cluster can still run items. Call this regularly while waiting.
 
         Raises:
-            RunFailed: the scheduler is gone, or has been without a worker for `NO_WORKER_S`.
+            RunFailed: The scheduler is gone, or had no worker for `NO_WORKER_S`.
         """
         try:
             workers = self.workers
@@ -253,10 +280,13 @@ class DaskCluster:
             )
 
     def is_worker_loss(self, error: BaseException) -> bool:
-        """True if an error says that the workers of an item died.
+        """Returns True if an error means that the workers of an item died.
+
+        Returns False for an error of the user, such as a worker that does not meet the
+        requirements.
 
         Raises:
-            RunFailed: the scheduler is gone, or a worker cannot receive items.
+            RunFailed: The scheduler is gone, or a worker cannot receive items.
         """
         if isinstance(error, _import_distributed().KilledWorker):
             return True

@@ -1,8 +1,8 @@
-"""95 % confidence intervals over the runs of many seeds: of a share, and of a mean.
+"""Computes 95 % confidence intervals over runs with many seeds, of a fraction and of a mean.
 
 Invariant:
-    - An interval is a function of its numbers.
-    - An interval of a mean has a width unless all numbers are equal.
+    - An interval is a function of the numbers alone.
+    - The interval of a mean has a positive width unless all numbers are equal.
 """
 
 from collections.abc import Sequence
@@ -12,13 +12,23 @@ import numpy as np
 
 
 def wilson_interval(successes: int, runs: int) -> tuple[float, float]:
-    """Returns the 95 % score interval of a share, which has a width even if all runs agree.
+    """Returns the 95 % Wilson score interval of a fraction, such as that of stable runs.
+
+    Unlike the simplest interval, this one has a positive width even if all runs agree.
 
     Source: Wilson, "Probable inference, the law of succession, and statistical inference", J.
     American Statistical Association 22 (1927); recommended by Brown, Cai and DasGupta,
     "Interval estimation for a binomial proportion", Statistical Science 16 (2001).
+
+    Args:
+        successes: Number of successful runs.
+        runs: Number of all runs. Without runs, the interval is (0, 1).
+
+    Returns:
+        The lower and the upper end.
     """
-    from scipy.stats import binomtest  # the import takes half a second
+    # Imported here, because the import takes half a second.
+    from scipy.stats import binomtest
 
     if runs == 0:
         return 0.0, 1.0
@@ -27,11 +37,11 @@ def wilson_interval(successes: int, runs: int) -> tuple[float, float]:
 
 
 class MeanInterval(NamedTuple):
-    """The mean of several runs' numbers, with its 95 % interval by Student's t.
+    """Mean of the numbers of several runs, with its 95 % interval by Student's t distribution.
 
     Attributes:
-        mean: the mean.
-        half: half the width of the interval.
+        mean: The mean.
+        half: Half the width of the interval.
     """
 
     mean: float
@@ -42,12 +52,20 @@ class MeanInterval(NamedTuple):
 
 
 def mean_interval(values: Sequence[float | None]) -> MeanInterval | None:
-    """Returns the mean of at least two numbers; None for fewer, or if a number is missing."""
+    """Returns the mean of the numbers of several runs, with its 95 % interval.
+
+    Args:
+        values: One number per run. None stands for a run without a number.
+
+    Returns:
+        The mean. None if there are fewer than two numbers, or if a number is missing.
+    """
     known = [value for value in values if value is not None]
     count = len(known)
     if count < 2 or count < len(values):
         return None
-    from scipy.special import stdtrit  # the import takes long
+    # Imported here, because the import takes long.
+    from scipy.special import stdtrit
 
     standard_error = float(np.std(known, ddof=1) / np.sqrt(count))
     quantile = float(stdtrit(count - 1, 0.975))

@@ -1,7 +1,9 @@
-"""Comparison of logs: the differences of their experiments, their metrics, and remarks.
+"""Compares recorded runs: the differences of their experiments, their metrics, and remarks.
+
+A log is the record of a run. Its scenario, the description of the experiment, is stored in it.
 
 Invariant:
-    - Numbers are given, and nothing is ranked.
+    - The comparison states numbers and ranks nothing.
 """
 
 from collections.abc import Iterator, Sequence
@@ -28,14 +30,15 @@ _MOST_REASONS = 6
 
 @dataclass(frozen=True, repr=False)
 class LogComparison(Result):
-    """A comparison of logs.
+    """Comparison of several logs.
 
     Attributes:
-        logs: the logs.
-        metrics: the metrics, with a row per quantity and a column per log.
-        differences: differences of the experiments; empty if the experiments are the same.
-        means: mean of each row if the logs differ in their seeds only; else empty.
-        remarks: for each column the verdict on the run, and remarks on its end.
+        logs: The logs.
+        metrics: The metrics, with one row per quantity and one column per log.
+        differences: Differences of the scenarios. Empty if all scenarios are the same.
+        means: Mean of each row, if the logs differ in the seeds of their random numbers only.
+            Empty otherwise.
+        remarks: For each column, the judgement of the run and remarks on its end.
     """
 
     logs: tuple[Log, ...]
@@ -45,12 +48,12 @@ class LogComparison(Result):
     remarks: dict[str, list[str]]
 
     def headline(self) -> str:
-        """Returns the names of the logs and the number of quantities."""
+        """Returns a sentence with the names of the logs and the number of quantities."""
         quantities = count_nouns(len(self.metrics.rows), "quantity")
         return f"{', '.join(self.metrics.columns)}: {quantities}"
 
     def blocks(self) -> Iterator[Block]:
-        """Yields the differences of the experiments, the metrics, and remarks per log."""
+        """Yields the differences of the scenarios, the table of metrics, and the remarks."""
         names = {log.scenario.name for log in self.logs}
         if len(names) > 1:
             yield f"logs of different scenarios: {', '.join(sorted(names))}"
@@ -73,7 +76,7 @@ class LogComparison(Result):
             yield f"and {len(reasons) - _MOST_REASONS} more, which --json names"
 
     def _explain_missing_values(self) -> Iterator[str]:
-        """Yields a sentence for each value that a log could have and lacks."""
+        """Yields a sentence for each metric that applies to a log but has no value."""
         for row in self.metrics.rows:
             for name, entry in zip(self.metrics.columns, row.entries, strict=True):
                 if entry.value is None and entry.applies:
@@ -105,7 +108,7 @@ class LogComparison(Result):
         return facts
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a row per quantity."""
+        """Returns one row per quantity, with the value of each log by its column name."""
         rows = []
         for row in self.metrics.rows:
             values = dict(zip(self.metrics.columns, row.values, strict=True))
@@ -114,15 +117,20 @@ class LogComparison(Result):
 
 
 def compare(*logs: str | Path | Log) -> LogComparison:
-    """Compares logs and the differences of their experiments; the command is `trilat compare`.
+    """Compares the metrics of logs, and the scenarios from which the logs come.
+
+    The command is `trilat compare`.
 
     >>> logs = [tn.simulate("two_sites", {"control.Kd": Kd}, duration_s=0.1) for Kd in (3, 5)]
     >>> len(tn.compare(*logs).metrics.row("rms_error_rad").values)
     2
 
+    Args:
+        logs: Logs or their paths, at least two.
+
     Raises:
-        UsageError: there are fewer than two logs.
-        LogError: a log cannot be read.
+        UsageError: There are fewer than two logs.
+        LogError: A log cannot be read.
     """
     opened = [log if isinstance(log, Log) else open_log(log) for log in logs]
     if len(opened) < 2:
@@ -145,24 +153,35 @@ def compare(*logs: str | Path | Log) -> LogComparison:
 
 
 def name_columns(files: Sequence[Path]) -> list[str]:
-    """Returns a column name per log: the file's name, with a part of its path if needed.
+    """Returns a short and distinct name for the column of each log.
 
-    The part is the shortest that makes the names differ.
+    The name is the file's name without its suffix, preceded by as many of its folders as are
+    needed to distinguish all files.
+
+    Args:
+        files: Paths of the logs.
     """
     most_parts = max(len(file.parts) for file in files)
     for depth in range(1, most_parts + 1):
         names = ["/".join(file.with_suffix("").parts[-depth:]) for file in files]
         if len(set(names)) == len(names):
             return names
+    # The same file was given twice.
     return [f"{n}: {file}" for n, file in enumerate(files, 1)]
 
 
 def average_repeats(
     logs: Sequence[Log], metrics: MetricComparison
 ) -> list[MeanInterval | None]:
-    """Returns the mean of each quantity over logs that differ in their seeds only.
+    """Averages each quantity over logs that repeat one experiment with different seeds.
 
-    The list is empty for other logs.
+    Args:
+        logs: The logs.
+        metrics: Their metrics.
+
+    Returns:
+        The mean of each row, or None if it cannot be computed. The list is empty if the logs
+        differ in more than their seeds.
     """
     first = logs[0].scenario
     seeds = {log.scenario.seed for log in logs}
@@ -176,11 +195,11 @@ def average_repeats(
 def _tabulate_quantities(
     metrics: MetricComparison, means: Sequence[MeanInterval | None]
 ) -> TextTable:
-    """Returns a table with a row per quantity and a column per log.
+    """Returns a table with one row per quantity and one column per log, in groups.
 
     Args:
-        metrics: the metrics.
-        means: mean of each row, for a further column; empty: no such column.
+        metrics: The metrics.
+        means: Mean of each row, for another column. Empty if there shall be no such column.
     """
     rows: list[list[str]] = []
     mean_by_row = dict(zip(metrics.rows, means, strict=True)) if means else {}

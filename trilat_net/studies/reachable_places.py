@@ -1,11 +1,11 @@
-"""Positions that an arm can reach with its end effector.
+"""Decides which positions an arm can reach with its end effector.
 
-A planar arm is judged by the lengths of its links. For a chain, a pose within the joint limits
-is searched numerically.
+For a planar arm with two links, the answer follows from the lengths of the links. For a chain
+of more joints, a pose within the joint limits is searched numerically.
 
 Invariant:
     - A position that counts as reachable can be reached.
-    - Some reachable positions of chains are not found.
+    - The converse does not hold: the search may miss a position that a chain can reach.
 """
 
 import math
@@ -17,29 +17,29 @@ from ..core.vectors import Array
 from ..scenario.arms import ArmModel
 
 PLANAR_MARGIN = 0.01
-"""Share of a planar arm's length by which a position must lie inside its reach.
-
-No goal then needs a straight arm.
+"""Fraction of a planar arm's length by which a position must lie inside its reach, so that no
+goal requires a straight arm.
 """
 FOUND_WITHIN_M = 1e-3
-"""Distance at which a pose counts as found, m."""
+"""Distance from the position at which the search succeeds, in m."""
 _STEPS = 40
 """Largest number of steps of the search."""
 _PROBE_RAD = 1e-6
-"""Step of the numerical Jacobian, rad or m."""
+"""Step of the numerical derivative, in rad or m."""
 _DAMPING = 1e-3
-"""Damping of the least squares, m^2."""
+"""Damping of the least squares, in m^2."""
 _LARGEST_STEP_RAD = 0.5
-"""Largest step of a joint, rad or m."""
+"""Largest change of a joint in one step, in rad or m."""
 
 
 def can_reach(arm: ArmModel, start_rad: Sequence[float] | Array, position_m: Array) -> bool:
-    """True if the end effector of an arm can reach a position.
+    """Returns whether the end effector of an arm can reach a position.
 
     Args:
-        arm: the model of the arm.
-        start_rad: joint angles from which a pose of a chain is searched, rad, shape (n,).
-        position_m: the position in the coordinates of `ArmModel.end_effector`, m.
+        arm: Model of the arm.
+        start_rad: Joint angles from which the search for a pose of a chain starts, shape (n,),
+            in rad.
+        position_m: The position, in the coordinates of `ArmModel.end_effector`, in m.
     """
     if arm.chain is not None:
         start = np.array(start_rad, dtype=np.float64)
@@ -52,12 +52,19 @@ def can_reach(arm: ArmModel, start_rad: Sequence[float] | Array, position_m: Arr
 
 
 def _find_pose(arm: ArmModel, q: Array, position_m: Array) -> bool:
-    """True if damped least squares find a pose within the joint limits (Wampler 1986).
+    """Searches a pose within the joint limits whose end effector is at a position.
+
+    Each step moves the joints by damped least squares (Wampler 1986): with the Jacobian J and
+    the distance e from the position, the step is J' (J J' + d I)^-1 e. The damping d keeps the
+    step finite near singular poses. Then the joints are clipped to their limits.
 
     Args:
-        arm: a chain.
-        q: joint positions from which the search starts, shape (n,).
-        position_m: the position, m.
+        arm: A chain.
+        q: Joint positions from which the search starts, shape (n,).
+        position_m: The position, in m.
+
+    Returns:
+        True if a pose was found.
     """
     assert arm.chain is not None
     lower = np.array([joint.lower for joint in arm.chain.joints])
@@ -67,22 +74,23 @@ def _find_pose(arm: ArmModel, q: Array, position_m: Array) -> bool:
         error_m = position_m - end_effector_m
         if float(np.linalg.norm(error_m)) <= FOUND_WITHIN_M:
             return True
+
         J = _compute_jacobian(arm, q, end_effector_m)
         damped = J @ J.T + _DAMPING * np.eye(len(end_effector_m))
         step = J.T @ np.linalg.solve(damped, error_m)
-        largest_rad = max(float(np.abs(step).max()), 1e-12)
+        largest_rad = max(float(np.abs(step).max()), 1e-12)  # avoids a division by zero
         step *= min(1.0, _LARGEST_STEP_RAD / largest_rad)
         q = np.clip(q + step, lower, upper)
     return False
 
 
 def _compute_jacobian(arm: ArmModel, q: Array, end_effector_m: Array) -> Array:
-    """Returns the numerical Jacobian of a chain's end effector, shape (m, n).
+    """Computes the Jacobian of a chain's end effector by forward differences, shape (m, n).
 
     Args:
-        arm: a chain.
-        q: joint positions, shape (n,).
-        end_effector_m: the position of the end effector at `q`, shape (m,), m.
+        arm: A chain.
+        q: Joint positions, shape (n,).
+        end_effector_m: Position of the end effector at `q`, shape (m,), in m.
     """
     jacobian = np.empty((len(end_effector_m), len(q)))
     for joint in range(len(q)):

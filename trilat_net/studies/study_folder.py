@@ -1,7 +1,9 @@
-"""The folder of a study: its plan, and a journal with one line per finished run.
+"""Manages the folder of a study: its plan, and a journal of the finished runs.
 
-A line of the journal is JSON, a tab, and the CRC-32 of study and JSON in hexadecimal digits.
-The journal is only appended to.
+A study consists of many runs, for example a sweep over parameters. Each finished run is
+appended to the journal as a line. If the study is interrupted, it continues after the runs in
+the journal. A line is JSON, a tab, and a checksum in hexadecimal digits: the CRC-32 of the text
+that identifies the study, followed by the JSON. The journal is only appended to.
 
 Invariant:
     - A torn line, and a line of another study, has a wrong checksum and is ignored.
@@ -32,12 +34,12 @@ from .executor import Progress, WorkerPool
 
 
 def format_command(*arguments: str) -> str:
-    """Returns a command line of the program with these arguments."""
+    """Returns a command line of this program, with its arguments quoted for a shell."""
     return join_arguments(["trilat", *arguments])
 
 
 def set_options(overrides: Iterable[str]) -> list[str]:
-    """Returns the arguments --set KEY=VALUE of a command for overrides KEY=VALUE."""
+    """Returns the arguments --set KEY=VALUE of a command, for overrides KEY=VALUE."""
     arguments = []
     for text in overrides:
         arguments += ["--set", text]
@@ -45,10 +47,12 @@ def set_options(overrides: Iterable[str]) -> list[str]:
 
 
 def format_toml_value(value: Any) -> str:
-    """Returns a value as TOML on one line, with numbers as short as possible.
+    """Returns a value as TOML on one line, for commands and overrides.
+
+    A number is written as short as possible, if it still parses back to the same number.
 
     Raises:
-        ScenarioError: TOML has no such value.
+        ScenarioError: TOML cannot express the value.
     """
     value = name_law_classes(value)
     if isinstance(value, Mapping):
@@ -66,30 +70,37 @@ def format_toml_value(value: Any) -> str:
         ) from None
 
 
+# Packages that compute the results, by their keys in the provenance of a log.
 _VERSIONS = ("version_trilat-net", "version_numba", "version_numpy")
 
 
 def describe_program() -> tuple[str, dict[str, str]]:
-    """Returns the fingerprint of the arithmetic and the versions of the computing packages.
+    """Returns what the results of this program depend on, apart from the plan of a study.
 
-    Results depend on both.
+    Returns:
+        The fingerprint of the arithmetic, and the versions of the computing packages.
     """
     provenance = collect_provenance()
     return compute_fingerprint(), {name: provenance[name] for name in _VERSIONS}
 
 
 def build_resume_hint(*arguments: str) -> str:
-    """Returns a hint how to continue a study that a full disk interrupted."""
+    """Returns advice on how to continue a study that was interrupted by a full disk.
+
+    Args:
+        arguments: Arguments of the command that continues the study.
+    """
     command = format_command(*arguments)
     return f"finished runs are kept: make room, and continue with: {command}"
 
 
 def encode_csv(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = ()) -> str:
-    """Returns rows as CSV with a header; None becomes an empty field.
+    """Returns rows as CSV text with a header. None becomes an empty field.
 
     Args:
-        rows: the rows.
-        columns: the columns; empty: all keys of the rows, in their order.
+        rows: The rows, as values by column.
+        columns: The columns. Empty stands for all keys of the rows, in the order in which they
+            first appear.
     """
     stream = io.StringIO()
     header = columns or list(dict.fromkeys(key for row in rows for key in row))
@@ -100,15 +111,15 @@ def encode_csv(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = ()) -
 
 
 class JournalEntry(Protocol):
-    """A finished run: a structure of plain values, one per cell and seed."""
+    """Interface of a finished run: a structure of plain values, identified by cell and seed."""
 
     @property
     def cell(self) -> Hashable:
-        """The cell of the run."""
+        """Part of the study to which the run belongs, such as the number of a grid point."""
 
     @property
     def seed(self) -> int:
-        """The seed of the run."""
+        """Seed of the random numbers of the run."""
 
 
 P = TypeVar("P")
@@ -117,16 +128,16 @@ E = TypeVar("E", bound=JournalEntry)
 
 
 class RunJournal(Generic[E]):
-    """The finished runs of a study; a context manager that closes the file.
+    """Journal of the finished runs of a study, a context manager that closes the file.
 
     Args:
-        path: the file.
-        study: text that identifies the study.
-        kind: the type of the entries.
-        remedy: advice in the error for a full disk.
+        path: Path of the file. Existing lines are read.
+        study: Text that identifies the study, such as the digest of its plan.
+        kind: Type of the entries.
+        remedy: Advice in the error message if the disk is full.
 
     Attributes:
-        done: the finished runs, by cell and seed; lines of another study are ignored.
+        done: Finished runs, by cell and seed. Lines of another study are ignored.
     """
 
     def __init__(self, path: Path, study: str, kind: type[E], remedy: str) -> None:
@@ -138,12 +149,12 @@ class RunJournal(Generic[E]):
         for line in content.split(b"\n"):
             text, tab, digits = line.rpartition(b"\t")
             if tab and digits == b"%08x" % self._checksum(text):
-                # json and not msgspec, because it accepts infinity
+                # The module json is used, because msgspec does not accept infinity.
                 entry = msgspec.convert(json.loads(text), kind)
                 self.done.setdefault((entry.cell, entry.seed), entry)
         self._file = extend_file(path)
         if content and not content.endswith(b"\n"):
-            # ends the torn line, so that it does not spoil the next one
+            # The last line is torn. It is ended here, so that it does not spoil the next one.
             self._write(b"\n")
 
     def __enter__(self) -> "RunJournal[E]":
@@ -154,10 +165,10 @@ class RunJournal(Generic[E]):
         self._file.close()
 
     def add(self, entry: E) -> None:
-        """Writes a run to the file at once; ignores a run that the journal has already.
+        """Writes a finished run to the file at once, unless the journal has it already.
 
         Raises:
-            LogRefused: the disk is full.
+            LogRefused: The disk is full.
         """
         if (entry.cell, entry.seed) in self.done:
             return
@@ -174,15 +185,18 @@ class RunJournal(Generic[E]):
         total: int,
         show: Progress,
     ) -> None:
-        """Executes the pending runs of a study, and writes each to the file as it ends.
+        """Executes the runs of a study that are not finished yet, and writes each as it ends.
 
         Args:
-            pool: the workers.
-            run: executes the run of a task.
-            tasks: the pending tasks, at most `total - done`.
-            done: number of finished runs.
-            total: number of all runs.
-            show: called with the number of finished runs and `total`.
+            pool: Workers that execute the runs.
+            run: Function that executes the run of a task.
+            tasks: Tasks of the pending runs, at most `total - done`.
+            done: Number of finished runs.
+            total: Number of all runs.
+            show: Function that is called with the number of finished runs and `total`.
+
+        Raises:
+            LogRefused: The disk is full.
         """
         results = pool.iterate_results(run, tasks, count=total - done)
         for number, (_, entry) in enumerate(results, done + 1):
@@ -190,28 +204,32 @@ class RunJournal(Generic[E]):
             show(number, total)
 
     def _write(self, data: bytes) -> None:
-        """Appends bytes to the file, or raises LogRefused."""
+        """Appends bytes to the file.
+
+        Raises:
+            LogRefused: The disk is full.
+        """
         try:
-            # on a full disk, write() returns the number of written bytes without an error
+            # On a full disk, write() returns a smaller number of bytes without an error.
             if self._file.write(data) != len(data):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         except OSError as error:
             raise describe_write_error(self._path, error, self._remedy) from None
 
     def _checksum(self, text: bytes) -> int:
-        """Returns the CRC-32 of the study and a line's text."""
+        """Returns the CRC-32 of the study's identification and the text of a line."""
         return zlib.crc32(text, zlib.crc32(self._study.encode()))
 
 
 class StudyFolder(NamedTuple, Generic[P, E]):
-    """The folder of a study.
+    """Folder of a study.
 
     Attributes:
-        path: path of the folder.
-        plan: the plan of the study.
-        facts: identification of the study, its arithmetic, and the package versions.
-        remedy: advice in the error for a full disk.
-        journal: function that opens the journal.
+        path: Path of the folder.
+        plan: Plan of the study.
+        facts: Plain values that identify the study, its arithmetic and the package versions.
+        remedy: Advice in the error message if the disk is full.
+        journal: Function that opens the journal.
     """
 
     path: Path
@@ -221,6 +239,6 @@ class StudyFolder(NamedTuple, Generic[P, E]):
     journal: Callable[[], RunJournal[E]]
 
     def read_done(self) -> list[tuple[Any, int]]:
-        """Returns the cells and seeds of the finished runs."""
+        """Returns the cell and the seed of each finished run."""
         with self.journal() as journal:
             return list(journal.done)

@@ -1,6 +1,7 @@
-"""Stability maps: runs of a scenario over a grid of its keys, in virtual time, on all cores.
+"""Computes stability maps: for which parameters of a scenario the arms are stable.
 
-docs/sweep.md describes the commands.
+A sweep runs a scenario over a grid of its keys, in virtual time and on all cores. docs/sweep.md
+describes the commands.
 """
 
 from .sweep_plan import plan_sweep
