@@ -1,29 +1,30 @@
-"""One candidate of a tuning: its scenario and command, its run in virtual time, and its score.
+"""Runs and scores one candidate of a tuning: a control law with a choice of gains.
 
-A candidate is a control law with a choice of gains. The error of its run is measured against
-the pose q* at which weightless arms would agree:
+The score contains the error of the run, its effort and its class. The error is measured against
+the pose q* at which weightless arms would agree. Here site i runs one arm with the joint angles
+q_i, and alpha_ij is the dominance factor, the weight with which site i follows site j.
 
 - Before any operator acts, q* = sum_i beta_i q_i(0). Here beta is the left Perron vector of the
-  dominance matrix alpha: the limit of x_i' = sum_j alpha_ij x_j - x_i.
-- While spring operators act, q* = sum_i beta_i K_i x_i / sum_i beta_i K_i per joint. The
-  operator at site i has the target x_i and the stiffness K_i; the equation follows from
-  sum_i beta_i tau_i = 0 in statics.
+  matrix alpha, and q* is the limit of x_i' = sum_j alpha_ij x_j - x_i.
+- While operators pull at arms like springs, q* = sum_i beta_i K_i x_i / sum_i beta_i K_i per
+  joint. The operator at site i has the target x_i and the stiffness K_i. The equation follows
+  from sum_i beta_i tau_i = 0 in statics, where tau_i is the torque of the operator.
 - After the operators have released the arms, q* stays.
 
-Torques without a target and walls ask for no pose. A scenario with such torques or walls is
-judged on its twin: the same scenario without them.
+Other torques and walls determine no pose. A scenario with such torques or walls is judged by
+its twin, which in this module means the same scenario without them.
 
 Invariant:
-    - A candidate's scenario is loaded with the same settings that its command names.
+    - The scenario of a candidate is loaded with the same settings that its command names.
     - A score is a function of the scenario alone. The errors of a run that does not reach its
       end are None.
-    - No gain and no control law enters the pose q*.
-    - A run has exactly one class, and only a settled run may stand on a front: a run that is
-      stable by the judgement of every run (`analysis.run_end`) and ends at the pose.
-    - Arms that hang have strayed, however close to each other they are. An arm hangs if both
-      links point down at the end and did not at the start.
-    - Arms fell if their mean ends more than 0.2 rad from the pose, in a log without a push that
-      could explain the distance.
+    - Neither gains nor control laws enter the pose q*.
+    - A run has exactly one class. Only a settled run may be part of a Pareto front: a run that
+      is stable by the general judgement (`analysis.run_end`) and ends at the pose.
+    - Arms that hang down have strayed, however close to each other they are. An arm hangs if
+      both links point down at the end and did not at the start.
+    - The arms of a log have fallen if their mean pose ends more than 0.2 rad from q* although
+      no operator or wall could explain the distance.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -55,16 +56,18 @@ from ..study_folder import format_command, format_toml_value, set_options
 from .search_space import GainValues, ModelInformation, SearchSpace, SiteControls
 
 CONFLICT_RAD = 0.02
-"""Operators whose targets are further than this from the consensus keep the arms separate."""
+"""Distance from q*, in rad, beyond which the target of an operator keeps the arms separate."""
 _POSE_SAMPLES_HZ = 100.0
-"""Rate at which the targets of operators are compared with the consensus."""
+"""Rate at which the targets of operators are compared with q*."""
 
 
 def check_comparable(scenario: Scenario) -> None:
-    """Refuses a scenario in which laws cannot be compared fairly.
+    """Refuses a scenario in which control laws cannot be compared fairly.
+
+    A fair comparison needs a pose that all arms could reach.
 
     Raises:
-        ScenarioError: states the reason and a remedy.
+        ScenarioError: The scenario is refused. The message states the reason and a remedy.
     """
     refuse_live_only(scenario)
     if any(spec.task.shared for spec in scenario.sites.values()):
@@ -100,9 +103,12 @@ def check_comparable(scenario: Scenario) -> None:
 
 
 def build_twin(scenario: Scenario) -> Scenario | None:
-    """Returns the scenario without walls and without torques that have no target.
+    """Returns the scenario without walls, and without operators that have no target pose.
 
-    None if the scenario has neither.
+    The pose at the end of the twin's run depends only on the dominance factors and the targets.
+
+    Returns:
+        The twin. None if the scenario has no such walls and operators.
     """
     sites = {}
     for name, spec in scenario.sites.items():
@@ -115,14 +121,14 @@ def build_twin(scenario: Scenario) -> Scenario | None:
 
 
 def compute_consensus_pose(scenario: Scenario, t_s: Array) -> Array:
-    """Returns q*, the pose of a weightless consensus (see the head of this module).
+    """Computes q*, the pose at which weightless arms would agree (see the head of this module).
 
     Args:
-        scenario: the scenario.
-        t_s: times, shape (K,), s.
+        scenario: The scenario.
+        t_s: Times, shape (K,), in s.
 
     Returns:
-        The pose at these times, shape (K, n), rad.
+        The pose at these times, shape (K, n), in rad.
     """
     beta = left_perron_vector(scenario.alpha)
     weights = dict(zip(scenario.names, beta, strict=True))
@@ -137,24 +143,25 @@ def compute_consensus_pose(scenario: Scenario, t_s: Array) -> Array:
         weighted_stiffness = weights[spring.site] * spring.stiffness_nm_rad * spring.acts
         stiffness += weighted_stiffness
         torque += weighted_stiffness * spring.target_rad
-    held = stiffness > 0.0
-    held_pose_rad = np.divide(torque, stiffness, where=held, out=np.zeros_like(torque))
+    is_held = stiffness > 0.0
+    held_pose_rad = np.divide(torque, stiffness, where=is_held, out=np.zeros_like(torque))
 
-    # row 0 is the start pose; each joint has the last row at which a spring held it
+    # A joint keeps the pose of the last time at which a spring held it. Row 0 is the start
+    # pose, for joints that no spring has held yet.
     poses_rad = np.vstack([start_rad, held_pose_rad])
     row_numbers = np.arange(1, len(t_s) + 1)[:, np.newaxis]
-    last_held = np.maximum.accumulate(np.where(held, row_numbers, 0), axis=0)
+    last_held = np.maximum.accumulate(np.where(is_held, row_numbers, 0), axis=0)
     return np.take_along_axis(poses_rad, last_held, axis=0)
 
 
 class _SpringHistory(NamedTuple):
-    """A spring operator at given times.
+    """An operator that pulls like a spring towards a target pose, at given times.
 
     Attributes:
-        site: the site of the operator.
-        stiffness_nm_rad: stiffness per joint, shape (n,), N m/rad.
-        acts: 1 at times at which the spring acts, else 0; shape (K, 1).
-        target_rad: target of the spring, shape (K, n), rad.
+        site: Site of the operator.
+        stiffness_nm_rad: Stiffness per joint, shape (n,), in N m/rad.
+        acts: 1 at times at which the spring acts and 0 at other times, shape (K, 1).
+        target_rad: Target pose, shape (K, n), in rad.
     """
 
     site: str
@@ -164,11 +171,11 @@ class _SpringHistory(NamedTuple):
 
 
 def _list_springs(scenario: Scenario, t_s: Array) -> Iterator[_SpringHistory]:
-    """Yields the spring operators of all sites.
+    """Yields the operators of all sites that pull like a spring.
 
     Args:
-        scenario: the scenario.
-        t_s: times, shape (K,), s.
+        scenario: The scenario.
+        t_s: Times, shape (K,), in s.
     """
     for name, spec in scenario.sites.items():
         for hand in spec.hands:
@@ -185,16 +192,17 @@ def _list_springs(scenario: Scenario, t_s: Array) -> Iterator[_SpringHistory]:
 
 
 STRAYED_RAD = 0.2
-"""Arms have strayed if their mean is further than this from q*: they fell, hang or were thrown.
+"""Distance of the arms' mean pose from q*, in rad, beyond which the arms have strayed. They
+fell, hang down or were thrown.
 """
 TOGETHER_RAD = 0.02
-"""Arms agree if each joint is no further than this from the mean of the arms."""
+"""Largest distance of a joint from the mean of the arms, in rad, at which the arms agree."""
 
 
 class CandidateClass(StrEnum):
-    """Class of a candidate, from the worst to the best; the values are those in JSON.
+    """Class of a candidate, from the worst to the best. The values are the texts in JSON.
 
-    The first class that applies counts.
+    A run belongs to the first class that applies, see `CLASS_MEANINGS`.
     """
 
     DIVERGED = "diverged"
@@ -206,7 +214,7 @@ class CandidateClass(StrEnum):
 
     @property
     def word(self) -> str:
-        """The word for people; for the judgement of a run it is the word of the certificate."""
+        """Word for people, the same as in the stability certificate where possible."""
         if self is CandidateClass.OSCILLATED:
             return Stability.NOT_STABLE.value
         if self is CandidateClass.SETTLED:
@@ -225,7 +233,7 @@ CLASS_MEANINGS = {
     CandidateClass.OPEN: "it hardly decays, or is undecided: a longer run may decide",
     CandidateClass.SETTLED: "it converged or decays, and no other class applies",
 }
-"""The meanings of the classes; docs/definitions.md defines the judgement of a run."""
+"""Meanings of the classes. docs/definitions.md defines the judgement of a run."""
 
 
 def classify_candidate(
@@ -234,12 +242,12 @@ def classify_candidate(
     """Returns the class of a candidate.
 
     Args:
-        ends: the judgements of the candidate's run and of its twin; without a twin, the same
+        ends: Judgements of the candidate's run and of its twin's run. Without a twin, the same
             judgement twice.
-        fall_rad: predicted distance of the twin's mean pose from q*, the largest over joints:
-            the distance at the end of a run twice as long, if the distance keeps growing at the
-            pace of the second half.
-        apart_rad: largest distance of a joint from the mean of the sites, in the last second.
+        fall_rad: Predicted distance of the twin's mean pose from q*, the largest over the
+            joints, in rad, see `_predict_fall_rad`.
+        apart_rad: Largest distance of a joint from the mean of the sites in the last second, in
+            rad.
     """
     stabilities = {end.stability for end in ends}
     if any(end.behaviour is EndBehaviour.DIVERGED for end in ends):
@@ -254,18 +262,22 @@ def classify_candidate(
 
 
 _SHORT_S = 0.5
-"""A log that ends this much before the planned duration is reported as short, s."""
+"""Time before the planned end of a run, in s, from which on its log is reported as short."""
 _POSE_SAMPLES = 2000
-"""Number of times at which the consensus pose of a log is computed."""
+"""Number of times at which q* of a log is computed."""
 
 
 def check_final_posture(log: Log) -> list[str]:
-    """Returns warnings about the end of a log, a sentence each.
+    """Returns warnings about the end of a log, one sentence each.
 
-    There are no warnings if the log is complete and its arms stand at the end.
+    They warn if the run is shorter than planned, and if arms hang down or fell, since the
+    errors and torques of such arms are small but say nothing about a control law.
+
+    Returns:
+        The warnings. Empty if the log is complete and its arms did not fall.
 
     Raises:
-        LogError: a record cannot be read.
+        LogError: A record cannot be read.
     """
     parts = {site: log[site] for site in log.sites if len(log[site])}
     diverged = [site for site, part in parts.items() if part.record(-1).mode == "diverged"]
@@ -296,17 +308,27 @@ def check_final_posture(log: Log) -> list[str]:
 
 
 def _warn_fallen(log: Log, end_poses_rad: dict[str, Array]) -> list[str]:
-    """Returns a warning if the mean pose of a log ends far from the consensus, else nothing.
+    """Returns a warning if the mean pose of a log ends far from q*.
 
-    An operator or an environment that could be the cause excludes a warning.
+    There is no warning if the scenario has no pose q*, or if an operator or a wall could be the
+    reason.
+
+    Args:
+        log: The log.
+        end_poses_rad: Mean pose of each site in the last second, shape (n,), in rad.
+
+    Returns:
+        At most one sentence.
     """
     scenario = log.scenario
     try:
         check_comparable(scenario)
-    except ScenarioError:  # the scenario has no common pose
+    except ScenarioError:
         return []
-    if build_twin(scenario) is not None or len(end_poses_rad) < len(scenario.names):
+    has_other_forces = build_twin(scenario) is not None
+    if has_other_forces or len(end_poses_rad) < len(scenario.names):
         return []
+
     end_s = min(float(log[site].t_s[-1]) for site in end_poses_rad)
     t_s = np.linspace(0.0, end_s, _POSE_SAMPLES)
     mean_rad = np.mean(list(end_poses_rad.values()), axis=0)
@@ -321,24 +343,23 @@ def _warn_fallen(log: Log, end_poses_rad: dict[str, Array]) -> list[str]:
 
 
 class CandidateScore(msgspec.Struct, frozen=True):
-    """The measured score of a candidate; docs/fair-comparison.md has the formulas.
+    """Measured score of a candidate. docs/fair-comparison.md has the formulas.
 
     Attributes:
-        outcome: the class of the candidate.
-        error_rad: RMS distance of the arms from q*, in rad; None if the run diverged.
-        spread_rad: the part of the error that is the distance between the arms at the same
-            time, without delays.
-        pose_rad: the part of the error that is the distance of the arms' mean from q*.
+        outcome: Class of the candidate.
+        error_rad: RMS distance of the arms from the pose q*, in rad. None if the run diverged.
+        spread_rad: Part of the error that is the distance between the arms at the same time,
+            without delays.
+        pose_rad: Part of the error that is the distance of the arms' mean from q*.
         effort_nm: RMS of the torque minus the gravity torque at the arm's own pose, in N m.
-        settled_s: time from which the largest |e| stays below 0.01 rad, in s; None if the
-            largest |e| is not below 0.01 rad at the end.
-        saturated: share of all joint torques that were at the clamp.
-        diverged_s: time at which the first site left its limits, in s, or None.
-        seeds: number of runs over which the score is averaged; the outcome is the worst of
-            them.
-        error_half_rad: half the width of the 95 % interval of the mean error; None for a single
+        settled_s: Time from which the largest |e| stays below 0.01 rad, in s, where e is the
+            error of a site against its peers. None if |e| is larger at the end.
+        saturated: Fraction of all joint torques that were at the torque limit.
+        diverged_s: Time at which the first site left its limits, in s. None if no site did.
+        seeds: Number of runs over which the score is averaged. The class is the worst of them.
+        error_half_rad: Half the width of the 95 % interval of the mean error. None for a single
             run.
-        effort_half_nm: the same for the mean effort.
+        effort_half_nm: The same for the mean effort.
     """
 
     outcome: CandidateClass
@@ -359,35 +380,42 @@ _AVERAGED = ("error_rad", "spread_rad", "pose_rad", "effort_nm", "settled_s", "s
 
 
 def average_scores(scores: Sequence[CandidateScore]) -> CandidateScore:
-    """Returns the score of a candidate from the scores of its seeds.
+    """Averages the scores of a candidate over its seeds.
 
-    A number that is missing for one of the seeds is None.
+    The class is the worst of all runs. A number that is missing for one of the seeds is None.
+
+    Args:
+        scores: Score for each seed.
     """
     if len(scores) == 1:
         return scores[0]
     rank = list(CandidateClass)
     worst = min(scores, key=lambda score: rank.index(score.outcome))
+
+    intervals = {}
     means = {}
     for field in _AVERAGED:
-        means[field] = mean_interval([getattr(score, field) for score in scores])
-    error = means["error_rad"]
-    effort = means["effort_nm"]
+        interval = mean_interval([getattr(score, field) for score in scores])
+        intervals[field] = interval
+        means[field] = None if interval is None else interval.mean
+    error = intervals["error_rad"]
+    effort = intervals["effort_nm"]
     return msgspec.structs.replace(
         worst,
-        **{field: mean and mean.mean for field, mean in means.items()},
+        **means,
         seeds=len(scores),
-        error_half_rad=error and error.half,
-        effort_half_nm=effort and effort.half,
+        error_half_rad=None if error is None else error.half,
+        effort_half_nm=None if effort is None else effort.half,
     )
 
 
 def measure_candidate(text: str, twin_text: str | None) -> CandidateScore:
-    """Runs a candidate and its twin, and returns the candidate's score.
+    """Runs a candidate and its twin, and scores the candidate.
 
     Args:
-        text: the canonical text of the candidate's scenario.
-        twin_text: the canonical text of the twin's scenario; None if the candidate has no twin
-            and is judged itself.
+        text: Canonical text of the candidate's scenario.
+        twin_text: Canonical text of the twin's scenario. None if there is no twin, so that the
+            candidate's own run is judged.
     """
     run = _measure_run(parse_scenario(text))
     twin = run if twin_text is None else _measure_run(parse_scenario(twin_text))
@@ -417,17 +445,17 @@ def measure_candidate(text: str, twin_text: str | None) -> CandidateScore:
 
 
 class _RunMeasures(NamedTuple):
-    """The measures of one run.
+    """Quantities that are measured in one run.
 
     Attributes:
-        end: the judgement of the run.
-        fall_rad: see `classify_candidate`.
-        apart_rad: see `classify_candidate`.
+        end: Judgement of the end of the run.
+        fall_rad: Predicted distance from q*, see `classify_candidate`.
+        apart_rad: Distance between the arms at the end, see `classify_candidate`.
         spread_rad: RMS distance of the arms from their mean, in rad.
         pose_rad: RMS distance of the arms' mean from q*, in rad.
-        effort_nm: see `CandidateScore`.
-        settled_s: see `CandidateScore`.
-        saturated: see `CandidateScore`.
+        effort_nm: See `CandidateScore`.
+        settled_s: See `CandidateScore`.
+        saturated: See `CandidateScore`.
     """
 
     end: RunEnd
@@ -441,7 +469,7 @@ class _RunMeasures(NamedTuple):
 
 
 def _measure_run(scenario: Scenario) -> _RunMeasures:
-    """Runs a scenario in virtual time and returns the measures of the run."""
+    """Runs a scenario in virtual time, and measures the run."""
     records_by_site, end = run_whole(scenario)
     records = list(records_by_site.values())
     t_s, q, e = _sample_at_common_times(records)
@@ -463,14 +491,17 @@ def _measure_run(scenario: Scenario) -> _RunMeasures:
 
 
 def _predict_fall_rad(t_s: Array, from_pose_rad: Array) -> float:
-    """Returns the predicted distance from q* in a run twice as long, the largest over joints.
+    """Predicts the distance from q* at the end of a run twice as long.
 
-    The distance is taken from means over the second before the middle and over the last second.
-    A growth in the second half goes on for the length of two halves.
+    The distance is averaged over the second before the middle of the run and over the last
+    second. If it grew in the second half, the growth is assumed to continue at the same pace.
 
     Args:
-        t_s: times, shape (K,), s.
-        from_pose_rad: distance of the mean pose from q*, shape (K, n), rad.
+        t_s: Times, shape (K,), in s.
+        from_pose_rad: Distance of the mean pose from q*, shape (K, n), in rad.
+
+    Returns:
+        The distance, the largest over the joints, in rad.
     """
     half_s = 0.5 * t_s[-1]
     at_end = t_s > t_s[-1] - END_WINDOW_S
@@ -482,13 +513,15 @@ def _predict_fall_rad(t_s: Array, from_pose_rad: Array) -> float:
 
 
 def _find_settling_time(t_s: Array, e: Array) -> float | None:
-    """Returns the last time at which |e| is not below 0.01 rad, in s; 0 if there is none.
-
-    None if the largest |e| is not below 0.01 rad at the end.
+    """Returns the last time at which |e| is not below 0.01 rad, in s.
 
     Args:
-        t_s: times, shape (K,), s.
-        e: errors, shape (N, K, n), rad.
+        t_s: Times, shape (K,), in s.
+        e: Errors, shape (N, K, n), in rad.
+
+    Returns:
+        The time. It is 0 if |e| is always below 0.01 rad, and None if |e| is not below 0.01 rad
+        at the end.
     """
     largest_rad = np.abs(e).max(axis=(0, 2))
     is_settled = largest_rad[-1] < SETTLED_ERROR_RAD
@@ -499,7 +532,15 @@ def _find_settling_time(t_s: Array, e: Array) -> float | None:
 
 
 def _measure_torques(scenario: Scenario, records: Sequence[RecordBatch]) -> tuple[float, float]:
-    """Returns the effort in N m, and the share of the joint torques that were at the clamp."""
+    """Returns the effort, and the fraction of the joint torques that were at their limit.
+
+    Args:
+        scenario: The scenario.
+        records: Records of each site.
+
+    Returns:
+        The RMS of the torque minus the gravity torque, in N m, and the fraction.
+    """
     mean_squares = []
     saturated_shares = []
     for record, site in zip(records, scenario.names, strict=True):
@@ -511,14 +552,17 @@ def _measure_torques(scenario: Scenario, records: Sequence[RecordBatch]) -> tupl
 
 
 def _sample_at_common_times(records: Sequence[RecordBatch]) -> tuple[Array, Array, Array]:
-    """Returns the times of the slowest site's ticks, and the latest q and e of all sites.
+    """Returns the joint angles and errors of all sites at common times.
+
+    Sites may have different tick rates. The times are those of the slowest site's ticks, and of
+    every other site the latest record is taken.
 
     Args:
-        records: the records of each site.
+        records: Records of each site.
 
     Returns:
-        The times, shape (K,), s; the joint angles, shape (N, K, n), rad; and the errors, shape
-        (N, K, n), rad.
+        The times, shape (K,), in s; the joint angles, shape (N, K, n), in rad; and the errors,
+        shape (N, K, n), in rad.
     """
     end_ns = min(record.t_ns[-1] for record in records)
     slowest_ns = min((record.t_ns for record in records), key=len)
@@ -533,16 +577,17 @@ def _sample_at_common_times(records: Sequence[RecordBatch]) -> tuple[Array, Arra
 
 
 def _rms(values: Array) -> float:
+    """Returns the root mean square of all values of an array."""
     return float(np.sqrt(np.mean(values**2)))
 
 
 class TuningScenario(NamedTuple):
-    """The experiment in which laws are compared, with its overrides.
+    """The scenario in which control laws are compared, with the overrides that produced it.
 
     Attributes:
-        experiment: the experiment as its author wrote it.
-        overrides: the overrides, as texts KEY=VALUE.
-        scenario: the experiment with the overrides.
+        experiment: Scenario as its author wrote it.
+        overrides: Overrides KEY=VALUE.
+        scenario: Scenario with the overrides.
     """
 
     experiment: ExperimentText
@@ -551,14 +596,17 @@ class TuningScenario(NamedTuple):
 
     @property
     def source(self) -> str:
-        """The name of the experiment in a command."""
+        """Name of the scenario in a command."""
         return self.experiment.label
 
     def with_controls(self, controls: SiteControls) -> "TuningScenario":
-        """Returns the experiment with the control of every site replaced.
+        """Returns the scenario with another table [control] for each site.
 
-        If all sites have the same control, a single override sets it, unless a site of the
-        experiment has gains of its own. Otherwise there is an override per site.
+        If all sites have the same table and a single override produces it, this override is
+        used, so that commands stay short. Otherwise there is one override per site.
+
+        Args:
+            controls: Table of each site.
         """
         site_overrides = [
             f"sites.{name}.control={format_toml_value(table)}"
@@ -566,10 +614,11 @@ class TuningScenario(NamedTuple):
         ]
         overrides = (*self.overrides, *site_overrides)
         scenario = self.experiment.load(overrides)
+
         first = next(iter(controls.values()))
         if all(table == first for table in controls.values()):
             common_overrides = (*self.overrides, f"control={format_toml_value(first)}")
-            # gains that a site of the experiment has may not belong to this law
+            # Loading fails if a site of the scenario sets a gain that this law does not have.
             with suppress(ScenarioError):
                 common_scenario = self.experiment.load(common_overrides)
                 if common_scenario.sites == scenario.sites:
@@ -579,33 +628,33 @@ class TuningScenario(NamedTuple):
     def with_gains(
         self, space: SearchSpace, knowledge: ModelInformation, gains: GainValues
     ) -> "TuningScenario":
-        """Returns the experiment under a law with a choice of gains.
+        """Returns the scenario under a control law with a choice of gains.
 
         Args:
-            space: the law and its gains.
-            knowledge: the model information that the law gets.
-            gains: the values of the gains.
+            space: The law and the ranges of its gains.
+            knowledge: Information about the arm's model that the law gets.
+            gains: Values of the gains.
         """
         return self.with_controls(space.controls(self.scenario, knowledge, gains))
 
     @property
     def texts(self) -> tuple[str, str | None]:
-        """The canonical texts of the scenario and of its twin; None without a twin."""
+        """Canonical texts of the scenario and of its twin. None replaces a missing twin."""
         twin = build_twin(self.scenario)
         return self.scenario.text, None if twin is None else twin.text
 
     @property
     def command(self) -> str:
-        """The command that makes a log of the experiment."""
+        """The command that simulates the scenario and records a log."""
         return format_command("sim", self.source, *set_options(self.overrides))
 
 
 class CandidateItem(NamedTuple):
-    """Task of a worker: the runs of one candidate.
+    """Work for a worker process: the runs of one candidate.
 
     Attributes:
-        runs: for each seed the canonical texts of the scenario and of its twin.
-        name: the name of the candidate, for messages.
+        runs: For each seed, the canonical texts of the scenario and of its twin.
+        name: Name of the candidate in error messages.
     """
 
     runs: tuple[tuple[str, str | None], ...]
@@ -616,17 +665,17 @@ class CandidateItem(NamedTuple):
 
 
 def build_candidate_item(seeds: Sequence[TuningScenario]) -> CandidateItem:
-    """Returns the task that measures a candidate.
+    """Returns the work that measures a candidate.
 
     Args:
-        seeds: the candidate's experiment with each seed.
+        seeds: Scenario of the candidate with each seed.
     """
     name = ", ".join(seeds[0].overrides) or seeds[0].source
     return CandidateItem(tuple(seed.texts for seed in seeds), name)
 
 
 def measure_candidate_task(task: CandidateItem) -> CandidateScore:
-    """Runs a candidate with all of its seeds and returns its score; any worker can do it."""
+    """Runs a candidate with all of its seeds, in any process, and returns its score."""
     scores = [measure_candidate(text, twin_text) for text, twin_text in task.runs]
     return average_scores(scores)
 
@@ -634,14 +683,14 @@ def measure_candidate_task(task: CandidateItem) -> CandidateScore:
 def load_tuning_scenario(
     source: str | Path | Mapping[str, Any] | Scenario, overrides: Sequence[str] = ()
 ) -> TuningScenario:
-    """Returns an experiment with overrides.
+    """Loads a scenario in which control laws are to be compared.
 
     Args:
-        source: the experiment: a shipped name, a path, a TOML text, tables or a scenario.
-        overrides: the overrides, as texts KEY=VALUE.
+        source: Name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
+        overrides: Overrides KEY=VALUE.
 
     Raises:
-        ScenarioError: the experiment does not exist, or is not valid with the overrides.
+        ScenarioError: The scenario does not exist, or is not valid with the overrides.
     """
     experiment = read_experiment(source)
     return TuningScenario(experiment, tuple(overrides), experiment.load(overrides))

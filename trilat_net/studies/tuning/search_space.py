@@ -1,18 +1,19 @@
-"""The search space of each control law, and the model information that all laws share.
+"""Defines which gains of each control law are tuned, and within which ranges.
 
 A search space lists the gains of a law, each with its unit and range. `SearchSpace.controls`
-turns a choice of gains into the control tables of all sites.
+turns a choice of gains into the table [control] of every site. To be fair, all laws get the
+same information about the model of their arm.
 
 Invariant:
-    - The ranges are log-uniform.
-    - A gain is one number for both joints, and for all sites of a role.
-    - A quantity has the same range in every law: stiffness is K or Kp Lambda, damping is d or
-      Kp.
-    - For a chain the number is the gain of the heaviest joint. The other joints have a share of
-      it, see `weigh_joints`.
-    - All laws get the same gravity parameters: the true ones times a common share.
-    - No law gets the inertia: a law that estimates it starts at zero. The law `known` is the
-      exception.
+    - Gains are searched uniformly in their logarithms.
+    - A gain is a single number for both joints, and for all sites of a role.
+    - A quantity has the same range in every law: the stiffness is K or Kp Lambda, and the
+      damping is d or Kp.
+    - For a chain of joints, the number is the gain of the joint with the largest inertia. The
+      gains of the other joints are fractions of it, see `weigh_joints`.
+    - All laws get the same gravity parameters: the true ones times a common factor.
+    - No law gets the inertia. A law that estimates the inertia starts at zero. The law `known`
+      is the exception.
 """
 
 import inspect
@@ -42,41 +43,54 @@ from ...scenario.imported_code import (
 from ...scenario.laws import BUILT_IN
 
 MIN_BOX = 0.1
-"""Least half width of a box of estimates, as a share of the estimated parameter."""
+"""Least half width of a box of estimates, as a fraction of the estimated parameter."""
 
 
 def _round_parameter(value: float) -> float:
-    """Returns a parameter with 12 significant digits, so that commands stay short."""
+    """Returns a parameter rounded to 12 significant digits, so that commands stay short."""
     return float(f"{value:.12g}")
 
 
 class ModelInformation(NamedTuple):
-    """Model information that every law gets.
+    """Information about the model of the arms that every control law gets.
 
     Attributes:
-        gravity: the gravity parameters that laws get, as a share of the true ones.
+        gravity: Factor by which the gravity parameters that laws get differ from the true ones.
     """
 
     gravity: float = 1.0
 
     @property
     def box(self) -> float:
-        """Half width of a box of estimates, as a share of the estimated parameter.
+        """Half width of the box of estimates, relative to the estimated parameter.
 
-        The width is twice the error of the gravity parameters, but at least `MIN_BOX`.
+        Some adaptive laws keep their estimates within a box. The width is twice the error of the
+        gravity parameters, but the box is never narrower than `MIN_BOX`.
         """
         return max(MIN_BOX, 2.0 * abs(1.0 / self.gravity - 1.0))
 
     def prior(self, scenario: Scenario, site: str) -> list[float]:
-        """Returns the first estimate of theta, shape (P,): no inertia, and shared gravity."""
+        """Returns the first estimate of the parameters theta of an arm, shape (P,).
+
+        The parameters of inertia are 0, and the gravity parameters are the true ones times
+        `gravity`.
+
+        Args:
+            scenario: The scenario.
+            site: Site of the arm.
+        """
         arm = build_arm_rows(scenario, site)
         theta = np.where(arm.gravity_parameters, arm.theta * self.gravity, 0.0)
         return [_round_parameter(value) for value in theta]
 
     def box_sides(self, scenario: Scenario, site: str) -> tuple[list[float], list[float]]:
-        """Returns the lower and the upper sides of the box of estimates, shape (P,) each.
+        """Returns the lower and upper limits of the box of estimates, shape (P,) each.
 
-        The parameters of inertia are unbounded: nothing is known about them.
+        The parameters of inertia are not limited, because nothing is known about them.
+
+        Args:
+            scenario: The scenario.
+            site: Site of the arm.
         """
         is_gravity = build_arm_rows(scenario, site).gravity_parameters.tolist()
         estimate = self.prior(scenario, site)
@@ -94,7 +108,7 @@ class ModelInformation(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The model information as a clause of a sentence."""
+        """Description of the information, as a clause of a sentence."""
         if self.gravity == 1.0:
             gravity = "the exact gravity parameters"
         else:
@@ -103,13 +117,13 @@ class ModelInformation(NamedTuple):
 
 
 def build_model_information(gravity_percent: float) -> ModelInformation:
-    """Returns the model information with a share of the true gravity.
+    """Returns the model information with wrong gravity parameters, to test robustness.
 
     Args:
-        gravity_percent: the share, in per cent.
+        gravity_percent: Gravity parameters that laws get, in per cent of the true ones.
 
     Raises:
-        UsageError: the share is not from 50 to 150 %.
+        UsageError: The number is not from 50 to 150.
     """
     if not 50.0 <= gravity_percent <= 150.0:
         raise UsageError(f"--gravity is from 50 to 150 % of the truth, not {gravity_percent:g}")
@@ -117,20 +131,20 @@ def build_model_information(gravity_percent: float) -> ModelInformation:
 
 
 GainValues = Mapping[str, float]
-"""The values of a law's tuned gains, by name."""
+"""Values of the tuned gains of a law, by name."""
 SiteControls = dict[str, dict[str, Any]]
-"""The complete table [control] of each site, by the name of the site."""
+"""Complete table [control] of each site, by the name of the site."""
 
 
 class TunedGain(NamedTuple):
-    """A gain of a law that is searched between `low` and `high`.
+    """A gain of a control law that is searched in a range.
 
     Attributes:
-        name: the name of the gain.
-        unit: the unit of the gain; "" without a unit.
-        low: the least value.
-        high: the largest value.
-        where: the role of the sites that have the gain; "" if all sites have it.
+        name: Name of the gain.
+        unit: Unit of the gain. Empty if it has none.
+        low: Least value.
+        high: Largest value.
+        where: Role of the sites that have the gain. Empty if all sites have it.
     """
 
     name: str
@@ -141,13 +155,14 @@ class TunedGain(NamedTuple):
 
 
 class SearchSpace(NamedTuple):
-    """A law with the ranges in which its gains are searched.
+    """A control law with the ranges in which its gains are searched.
 
     Attributes:
-        law: the name of the law; `known` is `adaptive` with Gamma = 0 and the true inertia.
-        knobs: the gains that are searched.
-        known_facts: the part of the common model information that the law uses, in words.
-        kind: the class of a built-in law; None for a user's law.
+        law: Name of the law. The law `known` is `adaptive` without adaptation (Gamma = 0) and
+            with the true inertia.
+        knobs: Gains that are searched.
+        known_facts: Part of the common model information that the law uses, in words.
+        kind: Class of a built-in law. None for a user's law.
     """
 
     law: str
@@ -158,9 +173,15 @@ class SearchSpace(NamedTuple):
     def controls(
         self, scenario: Scenario, knowledge: ModelInformation, gains: GainValues
     ) -> SiteControls:
-        """Returns the control table of every site for a choice of gains.
+        """Returns the table [control] of every site for a choice of gains.
 
-        For chains, a gain that makes a torque becomes a list with a value per joint.
+        For chains of joints, a gain that produces a torque becomes a list with one value per
+        joint.
+
+        Args:
+            scenario: The scenario.
+            knowledge: Information about the arm's model that the law gets.
+            gains: Values of the gains.
         """
         longest_ms = 0.5 * _find_longest_round_trip_ms(scenario)
         tables = {}
@@ -187,12 +208,21 @@ class SearchSpace(NamedTuple):
         gains: GainValues,
         longest_ms: float,
     ) -> dict[str, Any]:
-        """Returns the control table of one site, with scalar gains."""
-        if self.kind is None:
+        """Returns the table [control] of one site, where each gain is a single number.
+
+        Args:
+            scenario: The scenario.
+            site: Name of the site.
+            knowledge: Information about the arm's model that the law gets.
+            gains: Values of the gains.
+            longest_ms: Half of the longest round trip between two sites, in ms.
+        """
+        if self.kind is None:  # a user's law
             table: dict[str, Any] = {"law": self.law, **gains}
             if self.known_facts == _GRAVITY_ONLY:
                 table["gravity"] = knowledge.gravity
             return table
+
         law = self.law
         estimate = knowledge.prior(scenario, site)
         if law == _KNOWN:
@@ -200,18 +230,21 @@ class SearchSpace(NamedTuple):
             gains = {**gains, "Gamma": 0.0}
             arm = build_arm_rows(scenario, site)
             estimate = np.where(arm.gravity_parameters, estimate, arm.theta).tolist()
-        facts = TuningSite(
+        tuning_site = TuningSite(
             role=scenario.sites[site].role,
             gravity=knowledge.gravity,
             estimate=estimate,
             box=knowledge.box_sides(scenario, site),
             longest_ms=longest_ms,
         )
-        return {"law": law, **self.kind.write_control(gains, facts)}
+        return {"law": law, **self.kind.write_control(gains, tuning_site)}
 
 
 def _find_longest_round_trip_ms(scenario: Scenario) -> float:
-    """Returns the longest mean round trip between two sites, in ms."""
+    """Returns the longest mean round trip between two sites, in ms.
+
+    A round trip is the sum of the mean delays of a link and of the link back.
+    """
     mean_delays_ms = {name: link.moments().mean_ms for name, link in scenario.links.items()}
     round_trips_ms = []
     for name, delay_ms in mean_delays_ms.items():
@@ -221,32 +254,43 @@ def _find_longest_round_trip_ms(scenario: Scenario) -> float:
 
 
 _TORQUE_GAINS = ("rho_nm", "Kp", "Kd", "K", "d", "P_e", "b", "B")
-"""Gains that make a torque: the joints of a chain have them in proportion to their inertia."""
+"""Gains that produce a torque. The joints of a chain have them in proportion to their inertia.
+"""
 
 
 def _spread_over_joints(table: dict[str, Any], weights: Sequence[float]) -> None:
-    """Replaces the torque gains of a control table by lists with a value per joint."""
+    """Replaces each gain of a table that produces a torque by a list with a value per joint.
+
+    Args:
+        table: Table [control] of a site, which is changed in place.
+        weights: Fraction of the gain that each joint has.
+    """
     for key in _TORQUE_GAINS:
         if key in table:
             table[key] = [float(f"{table[key] * weight:.4g}") for weight in weights]
 
 
 _STABLE_SHARE = 0.9
-"""Share of the largest stable product of damping rate and tick period that tuning uses."""
+"""Fraction of the largest stable product of damping rate and tick period that tuning uses."""
 
 
 def weigh_joints(scenario: Scenario) -> list[float]:
-    """Returns the share that each joint of a chain has in a gain that makes a torque.
+    """Returns the fraction that each joint of a chain has of a gain that produces a torque.
 
-    The share of joint i is its inertia while the other joints are free, 1 / (M^-1)_ii, as a
-    part of the largest such inertia. Of the sites' start poses the least inertia counts.
+    The fraction of joint i is its inertia while the other joints are free, 1 / (M^-1)_ii, in
+    relation to the largest such inertia of all joints. M is the inertia matrix. Of the start
+    poses of the sites, the one with the least inertia counts.
 
-    All shares are reduced if the arms could not take the largest damping of the ranges at their
-    tick rate: `validate` refuses damping gains D for which the largest eigenvalue of h M^-1 D
-    reaches 1 under scheme `second_order`, or 2 under `digital`.
+    All fractions are reduced if, at their tick rate, the arms could not take the largest
+    damping of the ranges. `validate` refuses damping gains D for which the largest eigenvalue
+    of h M^-1 D, with the period h of a tick, reaches 1 under the integration scheme
+    `second_order`, or 2 under `digital`.
+
+    Args:
+        scenario: The scenario.
 
     Returns:
-        The shares, at most 1, with two significant digits; empty for planar arms.
+        The fractions, at most 1, with two significant digits. Empty for planar arms.
     """
     chains = [
         (scenario.sites[name], model)
@@ -258,10 +302,11 @@ def weigh_joints(scenario: Scenario) -> list[float]:
     inverses = [np.linalg.inv(model.inertia(np.array(site.q0_rad))) for site, model in chains]
     inertia = np.min([1.0 / np.diag(inverse) for inverse in inverses], axis=0)
     weights = inertia / inertia.max()
+
     limit = 1.0 if scenario.scheme == "second_order" else 2.0
     largest_damping = DAMPING[1] + ERROR_DAMPING[1]
     for (site, _), inverse in zip(chains, inverses, strict=True):
-        # M^-1 D has the eigenvalues of the symmetric D^(1/2) M^-1 D^(1/2)
+        # M^-1 D has the eigenvalues of the symmetric matrix D^(1/2) M^-1 D^(1/2).
         root = np.sqrt(weights)
         fastest = np.linalg.eigvalsh(root * inverse * root[:, None])[-1] / site.rate_hz
         weights *= min(1.0, _STABLE_SHARE * limit / (largest_damping * fastest))
@@ -269,12 +314,16 @@ def weigh_joints(scenario: Scenario) -> list[float]:
 
 
 _KNOWN = "known"
+"""Name of the search space of `adaptive` with known inertia."""
 _GRAVITY_ONLY = "gravity"
-"""`known_facts` of a law that uses the gravity parameters only."""
+"""Value of `known_facts` for a law that uses the gravity parameters only."""
 
 
 def _list_search_spaces() -> Iterator[SearchSpace]:
-    """Yields the search spaces of the built-in laws that have gains to tune."""
+    """Yields the search spaces of the built-in laws that have gains to tune.
+
+    The law `known` has the gains of `adaptive` except for the adaptation gain Gamma.
+    """
     for name, kind in BUILT_IN.items():
         knobs = tuple(_read_range(gain, entry) for gain, entry in kind.tune.items())
         if knobs:
@@ -286,31 +335,37 @@ def _list_search_spaces() -> Iterator[SearchSpace]:
 
 
 def _read_range(gain: str, entry: GainRange) -> TunedGain:
-    """Returns the gain that an entry of a built-in law's `tune` describes."""
+    """Returns the tuned gain that an entry of a built-in law's attribute `tune` describes.
+
+    Args:
+        gain: Name of the gain.
+        entry: Least value, largest value, unit, and possibly the role of the sites.
+    """
     low, high, unit = entry[:3]
     role = entry[3] if len(entry) == 4 else ""
     return TunedGain(gain, unit, low, high, where=role)
 
 
 SEARCH_SPACES = {space.law: space for space in _list_search_spaces()}
-"""The search spaces of the laws that can be tuned, by the name of the law."""
+"""Search spaces of the laws that can be tuned, by the name of the law."""
 
 DEFAULT_LAWS = ("adaptive", "adaptive_box", "p_d", "pd_d")
-"""The laws that are compared unless others are named: all of them take any number of sites."""
+"""Laws that are compared by default. All of them work with any number of sites."""
 PAPER_GAINS: GainValues = {"Lambda": 1.0, "Kp": 1.0, "Kd": 3.0, "Gamma": 1.0}
-"""The gains that the paper prints for `adaptive`."""
+"""Gains that the paper prints for `adaptive`."""
 
 
 def select_search_spaces(laws: Sequence[str], scenario: Scenario) -> list[SearchSpace]:
-    """Returns the search spaces of the named laws, in order and without duplicates.
+    """Returns the search spaces of some laws, in their order and without duplicates.
 
     Args:
-        laws: names of built-in laws, or classes as in "mylaws:Spring"; empty: `DEFAULT_LAWS`.
-        scenario: the scenario in which the laws are compared.
+        laws: Names of built-in laws, or classes as in "mylaws:Spring". Empty stands for
+            `DEFAULT_LAWS`.
+        scenario: Scenario in which the laws are compared.
 
     Raises:
-        UsageError: a law does not exist or has no gains to tune.
-        ScenarioError: a law does not fit the sites of the scenario.
+        UsageError: A law does not exist or has no gains to tune.
+        ScenarioError: A law does not fit the number or the roles of the sites.
     """
     names = list(dict.fromkeys(laws)) or list(DEFAULT_LAWS)
     roles = [spec.role for spec in scenario.sites.values()]
@@ -331,16 +386,16 @@ def select_search_spaces(laws: Sequence[str], scenario: Scenario) -> list[Search
 def build_user_search_space(code: str) -> SearchSpace:
     """Returns the search space of a user's law, from the attribute `tune` of its class.
 
-    The attribute holds (low, high) or (low, high, unit) per gain, as in
-    `tune = {"K": (10.0, 300.0)}`. A class with an argument `gravity` gets the share of gravity
-    that all laws get.
+    The attribute contains (low, high) or (low, high, unit) for each gain, as in
+    `tune = {"K": (10.0, 300.0)}`. If the class has an argument `gravity`, it gets the factor of
+    the gravity parameters that all laws get.
 
     Args:
-        code: the class, as in "mylaws:Spring".
+        code: Module and class, as in "mylaws:Spring".
 
     Raises:
-        ScenarioError: the class does not exist.
-        UsageError: the class has no ranges, or a range is not valid.
+        ScenarioError: The class does not exist.
+        UsageError: The class has no ranges, or a range is not valid.
     """
     sha256 = read_code(code, "--law").sha256
     key = CodeKey(code, sha256, "{}")
@@ -358,12 +413,18 @@ def build_user_search_space(code: str) -> SearchSpace:
 
 
 def _parse_user_range(code: str, name: Any, entry: Any) -> TunedGain:
-    """Returns the gain that an entry of a user's `tune` describes.
+    """Returns the tuned gain that an entry of a user's attribute `tune` describes.
+
+    Args:
+        code: Module and class, for the error message.
+        name: Name of the gain.
+        entry: The range, (low, high) or (low, high, unit) with 0 < low < high.
 
     Raises:
-        UsageError: the entry is not (low, high) or (low, high, unit) with 0 < low < high.
+        UsageError: The entry is not such a range.
     """
     values = list(entry) if isinstance(entry, tuple | list) else []
+    # An empty text replaces a missing value. It is accepted as a unit, but not as a limit.
     low, high, unit = (*values, "", "", "")[:3]
     in_order = is_number(low) and is_number(high) and 0.0 < low < high
     if not in_order or not isinstance(unit, str):
