@@ -64,8 +64,8 @@ class ModelInformation(NamedTuple):
     def box(self) -> float:
         """Half width of the box of estimates, relative to the estimated parameter.
 
-        Some adaptive laws keep their estimates within a box. The width is twice the error of the
-        gravity parameters, but the box is never narrower than `MIN_BOX`.
+        Some adaptive laws keep their estimates within a box. The width is twice the error of
+        the gravity parameters, but the box is never narrower than `MIN_BOX`.
         """
         return max(MIN_BOX, 2.0 * abs(1.0 / self.gravity - 1.0))
 

@@ -1,17 +1,23 @@
-"""The tuning procedure: the plan of a comparison, the search of each law, and the Pareto front.
+"""Plans and runs the tuning of control laws, and determines their Pareto fronts.
 
-Every law gets the same number of candidates. The first half is a Latin hypercube in the
-logarithms of the gains (McKay, Beckman and Conover, Technometrics 21, 1979). The second half
-refines the law's own front, in four rounds with shrinking steps.
+The gains of every law are tuned in the same way, so that the laws can be compared fairly. A
+candidate is a law with a choice of gains. Two objectives are minimised: the error, and the
+effort of the motors. The Pareto front of a law consists of the candidates for which no other
+candidate is better in both.
+
+Every law gets the same number of candidates. The first half is a Latin hypercube, an evenly
+spread random sample, in the logarithms of the gains (McKay, Beckman and Conover, Technometrics
+21, 1979). The second half refines the law's own front, in four rounds with shrinking steps.
 
 Invariant:
-    - The result is a function of the plan alone: neither the number of processes nor their
-      speed enters.
+    - The result is a function of the plan alone. It does not depend on the number of processes
+      or on their speed.
     - The candidates are a function of the seed, the search space and the scores of earlier
       rounds. Their number is the budget.
-    - Both objectives, error and effort, are minimised.
-    - Only stable runs that end at the pose compete. Of equal runs the first stays.
-    - The gains that the paper prints are measured, never searched, and stand on no front.
+    - Only stable runs that end at the common pose of the arms compete. Of two equal runs the
+      first one stays.
+    - The gains that the paper prints are measured, but they are not searched and belong to no
+      front.
 """
 
 from collections import Counter
@@ -58,11 +64,11 @@ from .search_space import (
 )
 
 ObjectivePoint = tuple[float, float]
-"""The objective and the effort of a run."""
+"""Objective and effort of a run. The objective is the error or the settling time."""
 
 
 class Objective(StrEnum):
-    """The objective that is minimised besides effort."""
+    """Objective that is minimised besides the effort."""
 
     ERROR = "error"
     SETTLING = "settling"
@@ -73,7 +79,12 @@ class Objective(StrEnum):
         return "rad" if self is Objective.ERROR else "s"
 
     def point(self, score: CandidateScore) -> ObjectivePoint | None:
-        """Returns (objective, effort) of a run, or None if the run may not stand on a front."""
+        """Returns the objective and the effort of a candidate.
+
+        Returns:
+            The pair. None if the candidate may not be part of a front, because it is not stable
+            or does not end at the common pose.
+        """
         value = score.error_rad if self is Objective.ERROR else score.settled_s
         if score.outcome is not CandidateClass.SETTLED:
             return None
@@ -83,16 +94,19 @@ class Objective(StrEnum):
 
 
 def find_pareto_front(points: Sequence[ObjectivePoint | None]) -> list[int]:
-    """Returns the indices of the points that no point dominates, by rising effort.
+    """Returns the indices of the points of the Pareto front, in the order of rising effort.
+
+    A point is part of the front if no other point is at least as good in both objectives.
 
     Args:
-        points: the points; None stands for a run that does not compete.
+        points: The points. None stands for a run that does not compete.
     """
     competitors = []
     for index, point in enumerate(points):
         if point is not None:
             value, effort_nm = point
             competitors.append((effort_nm, value, index))
+    # In the order of rising effort, only points with a smaller objective are not dominated.
     front = list[int]()
     least_value = float("inf")
     for _, value, index in sorted(competitors):
@@ -103,15 +117,15 @@ def find_pareto_front(points: Sequence[ObjectivePoint | None]) -> list[int]:
 
 
 def compute_crowding(points: Sequence[ObjectivePoint]) -> list[float]:
-    """Returns the crowding distance of each point of a front: large for an isolated point.
+    """Returns the crowding distance of each point of a front, large for isolated points.
 
-    The distance is half the perimeter of the box between the neighbours of the point, each side
-    relative to the span of the front. The two ends have infinity. Source: Deb, Pratap, Agarwal
-    and Meyarivan, "A fast and elitist multiobjective genetic algorithm: NSGA-II", IEEE Trans.
-    Evolutionary Computation 6 (2002).
+    The distance is half the perimeter of the box between the two neighbours of the point, where
+    each side is relative to the span of the front. The distance of the first and the last point
+    is infinite. Source: Deb, Pratap, Agarwal and Meyarivan, "A fast and elitist multiobjective
+    genetic algorithm: NSGA-II", IEEE Trans. Evolutionary Computation 6 (2002).
 
     Args:
-        points: the points of the front, by rising effort.
+        points: Points of the front, in the order of rising effort.
     """
     if len(points) < 3:
         return [float("inf")] * len(points)
@@ -127,32 +141,34 @@ def compute_crowding(points: Sequence[ObjectivePoint]) -> list[float]:
 
 
 REFINEMENT_STEPS = (0.12, 0.08, 0.05, 0.03)
-"""Standard deviation of the steps of each refinement round, as a share of the logarithm of a
-gain's range.
+"""Standard deviation of the steps of each refinement round, as a fraction of the range of a
+gain in logarithms.
 """
 GAIN_DIGITS = 4
-"""Significant digits to which gains are rounded before they are run: a command can name them.
+"""Significant digits to which gains are rounded before they are run, so that commands stay
+short.
 """
 
 CandidateGains = dict[str, float]
+"""Values of the gains of a candidate, by name."""
 
 
 class CandidateSearch:
-    """The search of one law's gains, round by round.
+    """Search for the best gains of one control law, in several rounds.
 
-    In each round the caller runs the candidates of `propose_candidates` and passes their scores
-    to `record_scores`.
+    In each round, the caller runs the candidates of `propose_candidates` and passes their
+    scores to `record_scores`.
 
     Args:
-        space: the law and the ranges of its gains.
-        budget: number of candidates.
-        seed: seed of the search, the same for every law.
-        objective: the objective besides effort.
+        space: The law and the ranges of its gains.
+        budget: Number of candidates.
+        seed: Seed of the random numbers, which is the same for every law.
+        objective: Objective besides the effort.
 
     Attributes:
-        tried: the gains of all candidates that have run, in order.
-        scores: the scores of these candidates, in the same order.
-        rounds: number of candidates of each round; the sum is the budget.
+        tried: Gains of all candidates that have run, in order.
+        scores: Scores of these candidates, in the same order.
+        rounds: Number of candidates of each round. Their sum is the budget.
     """
 
     def __init__(
@@ -175,19 +191,24 @@ class CandidateSearch:
 
     @property
     def points(self) -> list[ObjectivePoint | None]:
-        """(objective, effort) of each candidate; None if it may not stand on a front."""
+        """Objective and effort of each candidate. None if it may not be part of a front."""
         return [self._objective.point(score) for score in self.scores]
 
     @property
     def front(self) -> list[int]:
-        """Indices of the candidates that no candidate of this law dominates, by effort."""
+        """Indices of the candidates on the law's Pareto front, by rising effort."""
         return find_pareto_front(self.points)
 
     @property
     def front_points(self) -> list[ObjectivePoint]:
-        """(objective, effort) of the candidates on the front, by rising effort."""
+        """Objective and effort of the candidates on the front, by rising effort."""
         points = self.points
-        return [point for index in self.front if (point := points[index]) is not None]
+        front_points = []
+        for index in self.front:
+            point = points[index]
+            if point is not None:
+                front_points.append(point)
+        return front_points
 
     @property
     def outcomes(self) -> dict[CandidateClass, int]:
@@ -196,14 +217,14 @@ class CandidateSearch:
         return {outcome: counts[outcome] for outcome in CandidateClass}
 
     def propose_candidates(self, round_number: int) -> list[CandidateGains]:
-        """Returns the candidates of a round, after all earlier rounds have been recorded.
+        """Returns the candidates of a round. The earlier rounds must have been recorded.
 
         Args:
-            round_number: 0 for the Latin hypercube, then the refinement rounds.
+            round_number: 0 for the Latin hypercube, and 1 to 4 for the refinement rounds.
         """
         shape = (self.rounds[round_number], len(self.space.knobs))
         if round_number == 0:
-            # imported late: SciPy costs half a second, and most commands do not need it
+            # Imported here, because SciPy costs half a second and most commands do not need it.
             from scipy.stats import qmc
 
             count, dimensions = shape
@@ -218,20 +239,26 @@ class CandidateSearch:
     def record_scores(
         self, gains: Sequence[CandidateGains], scores: Sequence[CandidateScore]
     ) -> None:
-        """Records the scores of a round's candidates.
+        """Records the scores of the candidates of a round.
 
         Args:
-            gains: the candidates.
-            scores: their scores, in the same order.
+            gains: The candidates.
+            scores: Their scores, in the same order.
         """
         self.tried += gains
         self.scores += scores
 
     def _select_parents(self, count: int) -> Array:
-        """Returns the positions that a round refines, shape (count, gains), each in [0, 1].
+        """Selects the candidates that a refinement round varies.
 
-        Every other parent is the best candidate. The others take turns by rank, see
-        `_rank_candidates`.
+        Every other parent is the best candidate. The others are taken in turn from the ranking
+        of `_rank_candidates`.
+
+        Args:
+            count: Number of parents.
+
+        Returns:
+            Their positions in the search space, shape (count, gains), each number in [0, 1].
         """
         best, ranked = self._rank_candidates(count)
         parents = []
@@ -243,11 +270,19 @@ class CandidateSearch:
         return positions
 
     def _rank_candidates(self, count: int) -> tuple[int, list[int]]:
-        """Returns the index of the best candidate, and the indices of candidates to refine.
+        """Ranks the candidates that are worth refining.
 
-        With a front, the best candidate has the least objective, and the most isolated points
-        of the front come first. Without a front, the candidates with the least error come
-        first, those that diverged last; a quarter of `count` of them is kept.
+        If there is a front, the best candidate is the one with the least objective, and the
+        most isolated points of the front come first. If there is no front yet, the candidates
+        with the least error come first and those that diverged last, and only some of them are
+        kept.
+
+        Args:
+            count: Number of candidates of the round. Without a front, a quarter of this number
+                is kept.
+
+        Returns:
+            The index of the best candidate, and the indices of the ranked candidates.
         """
         front = self.front
         if front:
@@ -266,7 +301,8 @@ class CandidateSearch:
         """Returns the gains at a position in the search space, rounded and within their ranges.
 
         Args:
-            position: shares of the logarithms of the ranges, shape (gains,), each in [0, 1].
+            position: Relative positions within the logarithms of the ranges, shape (gains,),
+                each in [0, 1].
         """
         logs = self._log_low + position * self._log_range
         gains = {}
@@ -277,24 +313,26 @@ class CandidateSearch:
 
 
 DEFAULT_BUDGET = 64
-"""Candidates per law: four laws on `free` take some minutes on two cores."""
+"""Default number of candidates per law. Four laws on `free` take some minutes on two cores."""
 MAX_BUDGET = 100_000
+"""Largest number of candidates per law."""
 MAX_TUNING_SEEDS = 1000
+"""Largest number of seeds of each candidate."""
 MAX_TICKS = 10_000_000
-"""Largest number of ticks of a candidate, over all sites: a run of a minute with three sites at
-1 kHz has 180 000.
+"""Largest number of ticks of a candidate, over all sites. A run of a minute with three sites at
+1 kHz has 180 000 ticks.
 """
 _PROBE_S = 2.0
-"""Duration of the run from which the time of a search is estimated, s."""
+"""Duration of the run from which the duration of a search is estimated, in s."""
 
 
 class PaperGainsResult(NamedTuple):
-    """The measured result of the gains that the paper prints.
+    """Measured result of the gains that the paper prints.
 
     Attributes:
-        name: the name of the candidate.
-        candidate: the candidate as an experiment.
-        score: the score of the candidate.
+        name: Name of the variant, such as "as printed".
+        candidate: Scenario with these gains.
+        score: Score of the candidate.
     """
 
     name: str
@@ -303,16 +341,16 @@ class PaperGainsResult(NamedTuple):
 
 
 class TuningPlan(NamedTuple):
-    """A comparison of laws, checked and ready to run.
+    """A comparison of tuned control laws that was checked and is ready to run.
 
     Attributes:
-        base: the experiment.
-        spaces: the laws with their search spaces.
-        budget: number of candidates per law.
-        seed: seed of the search.
-        objective: the objective besides effort.
-        knowledge: the model information that all laws get.
-        others: the experiment with further seeds; the score of a candidate is the mean over all
+        base: Scenario in which the laws are compared.
+        spaces: The laws with their search spaces.
+        budget: Number of candidates per law.
+        seed: Seed of the search.
+        objective: Objective besides the effort.
+        knowledge: Information about the model of the arms that all laws get.
+        others: The scenario with further seeds. The score of a candidate is the mean over all
             seeds.
     """
 
@@ -326,7 +364,7 @@ class TuningPlan(NamedTuple):
 
     @property
     def runs(self) -> int:
-        """Number of runs, with those of the printed gains and of twins."""
+        """Number of all runs, including those of the printed gains and of the twins."""
         paper_candidates = len(self.build_paper_scenarios(self.base))
         candidates = len(self.spaces) * self.budget + paper_candidates
         seeds = 1 + len(self.others)
@@ -335,16 +373,20 @@ class TuningPlan(NamedTuple):
 
     @property
     def twin(self) -> bool:
-        """True if the pose is measured on a twin: then every candidate takes two runs."""
+        """True if the final pose is measured in a twin, so that every candidate takes two runs.
+
+        A twin is the scenario without walls and without operators that have no target pose.
+        """
         return build_twin(self.base.scenario) is not None
 
     def build_paper_scenarios(self, base: TuningScenario) -> dict[str, TuningScenario]:
-        """Returns an experiment with the gains that the paper prints, by name.
+        """Returns the scenario with the gains that the paper prints, in two variants by name.
 
-        There are two variants: with the model information that all laws get, and without any.
+        In the first variant the law gets the same model information as all laws. In the second
+        it gets no information.
 
         Args:
-            base: the experiment.
+            base: The scenario.
         """
         space = SEARCH_SPACES["adaptive"]
         informed = space.controls(base.scenario, self.knowledge, PAPER_GAINS)
@@ -355,15 +397,15 @@ class TuningPlan(NamedTuple):
         }
 
     def estimate_s(self, jobs: int | None = None) -> float:
-        """Returns an estimate of the duration of the search, in s, from a short run.
+        """Estimates the duration of the search from a short run, in s of real time.
 
         Args:
-            jobs: number of processes; None: one per core.
+            jobs: Number of worker processes. None stands for all cores.
         """
         scenario = self.base.scenario
         probe_s = min(scenario.duration_s, _PROBE_S)
         probe = msgspec.structs.replace(scenario, duration_s=probe_s).text
-        measure_candidate(probe, None)  # loads the compiled core
+        measure_candidate(probe, None)  # loads the compiled kernel, so that it is not timed
         clock = SystemClock()
         start_ns = clock.monotonic_ns()
         measure_candidate(probe, None)
@@ -375,15 +417,18 @@ class TuningPlan(NamedTuple):
     def run(
         self, jobs: int | None = None, progress: Progress = ignore_progress, on: Workers = None
     ) -> "TuningResult":
-        """Searches the gains of every law and returns the result.
+        """Searches the gains of all laws.
+
+        In each round, the candidates of all laws are run together, so that no worker waits for
+        the slowest candidate of each law.
 
         Args:
-            jobs: number of processes; None: one per core.
-            progress: called with the number of finished and of all candidates.
-            on: the workers to use; None: processes of this machine.
+            jobs: Number of worker processes. None uses all cores.
+            progress: Function that is called with the number of finished and of all candidates.
+            on: Workers to use instead of processes of this machine.
 
         Raises:
-            RunFailed: a candidate ended its workers, or the cluster is not available any more.
+            RunFailed: A candidate killed its workers, or the cluster is no longer available.
         """
         searches = [
             CandidateSearch(space, self.budget, self.seed, self.objective)
@@ -404,7 +449,7 @@ class TuningPlan(NamedTuple):
             progress(finished + in_round, total)
 
         if not is_core_cached():
-            # compiles the core once, before the processes start
+            # A short run compiles the simulation kernel once, before the processes start.
             FusedRun(self.base.scenario).advance_to(_PROBE_S)
         with open_worker_pool(jobs, on, most=total) as pool:
             for round_number in range(len(searches[0].rounds)):
@@ -414,6 +459,8 @@ class TuningPlan(NamedTuple):
                     items += self._build_items(bases, search.space, candidates)
                 if round_number == 0:
                     items += paper_items
+                # The scores come in the order of the items: those of each law, and in the first
+                # round those of the printed gains, which remain in the end.
                 scores = iter(pool.map(measure_candidate_task, items, report_progress))
                 finished += len(items)
                 for search, candidates in zip(searches, proposals, strict=True):
@@ -430,12 +477,12 @@ class TuningPlan(NamedTuple):
         space: SearchSpace,
         candidates: Sequence[CandidateGains],
     ) -> list[CandidateItem]:
-        """Returns the tasks that measure candidates of one law.
+        """Returns the work that measures candidates of one law.
 
         Args:
-            bases: the experiment with each seed.
-            space: the law and its gains.
-            candidates: the values of the gains.
+            bases: Scenario with each seed.
+            space: The law and its gains.
+            candidates: Values of the gains of each candidate.
         """
         items = []
         for gains in candidates:
@@ -445,17 +492,17 @@ class TuningPlan(NamedTuple):
 
 
 _EDGE = 1.02
-"""A gain within 2 % of an end of its range stands at the edge."""
+"""Factor within which a gain counts as being at an end of its range."""
 
 
 @dataclass(frozen=True, repr=False)
 class TuningResult(Result):
-    """The result of a comparison of tuned laws.
+    """Result of a comparison of tuned control laws.
 
     Attributes:
-        plan: the comparison.
-        found: the search of each law, in the order of the plan.
-        printed: the results of the gains that the paper prints.
+        plan: The comparison.
+        found: Search of each law, in the order of the plan.
+        printed: Results of the gains that the paper prints.
     """
 
     plan: TuningPlan
@@ -463,13 +510,13 @@ class TuningResult(Result):
     printed: list[PaperGainsResult]
 
     def blocks(self) -> Iterator[Any]:
-        """Yields the blocks of the result as text."""
+        """Yields the result as text for the terminal."""
         from .tuning_report import compose_tuning
 
         return compose_tuning(self)
 
     def headline(self) -> str:
-        """Returns the scenario, the laws and the sizes of their fronts, as a sentence."""
+        """Returns a sentence with the number of points of each law's front."""
         fronts = ", ".join(f"{search.space.law} {len(search.front)}" for search in self.found)
         return f"{self.plan.base.scenario.name}: points on the front: {fronts}"
 
@@ -488,7 +535,7 @@ class TuningResult(Result):
         }
 
     def _describe_scenario(self) -> dict[str, Any]:
-        """Returns the entry "scenario" of `to_dict`."""
+        """Returns the plain values that describe the scenario, for `to_dict`."""
         base = self.plan.base
         scenario = base.scenario
         limits_nm = {name: spec.limits.tau_limit_nm for name, spec in scenario.sites.items()}
@@ -503,9 +550,9 @@ class TuningResult(Result):
         }
 
     def _describe_procedure(self) -> dict[str, Any]:
-        """Returns the entry "procedure" of `to_dict`."""
+        """Returns the plain values that describe how the gains were tuned, for `to_dict`."""
         plan = self.plan
-        facts: dict[str, Any] = {
+        procedure: dict[str, Any] = {
             "candidates_per_law": plan.budget,
             "seed": plan.seed,
             "seeds": 1 + len(plan.others),
@@ -521,12 +568,14 @@ class TuningResult(Result):
         }
         weights = weigh_joints(plan.base.scenario)
         if weights:
-            facts["joint_weights"] = weights
-        facts["outcomes"] = {outcome.value: text for outcome, text in CLASS_MEANINGS.items()}
-        return facts
+            procedure["joint_weights"] = weights
+        procedure["outcomes"] = {
+            outcome.value: text for outcome, text in CLASS_MEANINGS.items()
+        }
+        return procedure
 
     def _describe_law(self, search: CandidateSearch) -> dict[str, Any]:
-        """Returns the entry of a law in `to_dict`: its search space, front and candidates."""
+        """Returns the search space, front and candidates of a law, for `to_dict`."""
         candidates = []
         for gains, score in zip(search.tried, search.scores, strict=True):
             candidates.append({"gains": gains, **msgspec.to_builtins(score)})
@@ -549,7 +598,7 @@ class TuningResult(Result):
         }
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a row per candidate."""
+        """Returns one row per candidate of each law, as plain values."""
         rows = []
         for law, facts in self.to_dict()["laws"].items():
             for candidate in facts["candidates"]:
@@ -558,14 +607,20 @@ class TuningResult(Result):
         return rows
 
     def candidate(self, search: CandidateSearch, index: int) -> TuningScenario:
-        """Returns the candidate with an index in a law's search, as an experiment."""
+        """Returns the scenario of a candidate.
+
+        Args:
+            search: Search of the candidate's law.
+            index: Index of the candidate in this search.
+        """
         plan = self.plan
         return plan.base.with_gains(search.space, plan.knowledge, search.tried[index])
 
     def list_edge_gains(self, search: CandidateSearch) -> list[str]:
-        """Returns the gains of a law's best point that stand at an edge of their range.
+        """Lists the gains of a law's best candidate that lie at an end of their range.
 
-        The best value of such a gain may lie outside the range.
+        The best value of such a gain may lie outside of the range, so that the range should be
+        widened. The best candidate is that with the least objective.
         """
         if not search.front:
             return []
@@ -578,7 +633,7 @@ class TuningResult(Result):
         return names
 
     def list_overall_front(self, search: CandidateSearch) -> list[int]:
-        """Returns the indices of a law's candidates that no candidate of any law dominates."""
+        """Returns the indices of a law's candidates on the common Pareto front of all laws."""
         points = []
         owners = []
         for other in self.found:
@@ -601,14 +656,14 @@ def plan_tuning(
     gravity_percent: float = 100.0,
     seeds: int = 1,
 ) -> TuningPlan:
-    """Returns the plan of a comparison of tuned laws, checked and ready to run.
+    """Plans a comparison of tuned control laws, and checks that it can run.
 
-    The arguments are those of `trilat_net.tune`; overrides are texts KEY=VALUE. The seeds of
-    the scenario count up from its own seed.
+    The arguments are those of `trilat_net.tune`. Overrides are texts KEY=VALUE. If `seeds` is
+    larger than 1, the seeds count up from the scenario's own seed.
 
     Raises:
-        ScenarioError: the scenario is not valid, or laws cannot be compared in it.
-        UsageError: another argument is not valid.
+        ScenarioError: The scenario is not valid, or laws cannot be compared in it.
+        UsageError: Another argument is not valid.
     """
     if not 1 <= budget <= MAX_BUDGET:
         raise UsageError(

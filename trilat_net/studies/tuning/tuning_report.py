@@ -1,14 +1,15 @@
-"""Presents a comparison of tuned laws: as tables, a Markdown page, JSON, and a figure.
+"""Presents a comparison of tuned control laws as tables, a Markdown page, JSON and a figure.
 
-The figure shows error against effort. `write_tuning` writes front.json, front.md, front.png and
-front.pdf.
+The Pareto front of a law consists of the gains for which no other gains of the law are better
+in both error and effort. The figure shows error against effort. `write_tuning` writes the files
+front.json, front.md, front.png and front.pdf.
 
 Invariant:
-    - The files are a function of the result alone: equal plans give equal bytes.
-    - The JSON is the result; the other files are views of it.
-    - The heads of the tables carry the units, and each run is counted in exactly one class.
-    - The figure shows every stable run at the pose, whether on a front or not. The gains that
-      the paper prints are stars, on no front.
+    - The files are a function of the result alone. Equal plans give equal bytes.
+    - The JSON contains the complete result. The other files are views of it.
+    - The headers of the tables contain the units. Each run is counted in exactly one class.
+    - The figure shows every stable run that ends at the common pose, on a front or not. The
+      gains that the paper prints are stars and belong to no front.
 """
 
 import json
@@ -32,13 +33,14 @@ from .search_space import SEARCH_SPACES, weigh_joints
 from .tuning_plan import MAX_BUDGET, CandidateSearch, Objective, TuningPlan, TuningResult
 
 _MAX_FRONT_ROWS = 8
-"""Points of a front that the text shows; the files hold all of them."""
+"""Largest number of points of a front that the terminal shows. The files have all points."""
 
 
 def compose_tuning(tuned: TuningResult) -> Iterator[Block]:
-    """Yields the text of a comparison.
+    """Yields the text of a comparison for the terminal.
 
-    The text has the laws, the classes, the fronts, the printed gains, notes, and commands.
+    The text contains a table of the laws, the meanings of the classes, the fronts, the gains
+    that the paper prints, notes, and commands that repeat the best runs.
     """
     yield tabulate_laws(tuned)
     yield from (f"  {line}" for line in list_class_meanings())
@@ -72,7 +74,7 @@ def compose_tuning(tuned: TuningResult) -> Iterator[Block]:
 
 
 def tabulate_laws(tuned: TuningResult) -> TextTable:
-    """Returns a table with a row per law: the class counts and the two ends of the front."""
+    """Returns a table with one row per law: the class counts and the two ends of the front."""
     classes = list(reversed(CandidateClass))
     objective = f"{tuned.plan.objective} {tuned.plan.objective.unit}"
     heads = ("law", "tried", *(outcome.word for outcome in classes), "front", "of all")
@@ -90,9 +92,11 @@ def tabulate_laws(tuned: TuningResult) -> TextTable:
 
 
 def _format_front_ends(search: CandidateSearch) -> list[str]:
-    """Returns the table cells of the two ends of a front.
+    """Returns the table cells of the two ends of a law's front.
 
-    The cells are the least objective with its effort, and the least effort with its objective.
+    Returns:
+        The least objective with its effort, and the least effort with its objective. All cells
+        are "-" if the law has no front.
     """
     front = search.front_points
     if not front:
@@ -104,15 +108,19 @@ def _format_front_ends(search: CandidateSearch) -> list[str]:
 
 
 def tabulate_search(plan: TuningPlan) -> TextTable:
-    """Returns a table with a row per gain: its law and range, and the facts the law gets."""
+    """Returns a table of the search spaces, with one row per gain.
+
+    The information that a law gets about the model of the arm is named in its first row.
+    """
     rows = []
     for space in plan.spaces:
-        facts = space.known_facts  # stands in the first row of the law only
+        information = space.known_facts
         for knob in space.knobs:
             name = f"{knob.name} ({knob.where})" if knob.where else knob.name
             unit = knob.unit or "-"
-            rows.append((space.law, name, unit, f"{knob.low:g}", f"{knob.high:g}", facts))
-            facts = ""
+            row = (space.law, name, unit, f"{knob.low:g}", f"{knob.high:g}", information)
+            rows.append(row)
+            information = ""
     heads = ("law", "gain", "unit", "from", "to", "information")
     return TextTable(heads, rows, align="lllrrl")
 
@@ -120,14 +128,15 @@ def tabulate_search(plan: TuningPlan) -> TextTable:
 def tabulate_front(
     tuned: TuningResult, search: CandidateSearch, most: int = MAX_BUDGET
 ) -> TextTable:
-    """Returns a table of a law's front, by rising effort.
+    """Returns a table of a law's front, in the order of rising effort.
 
-    A * marks the points that no candidate of any law dominates.
+    A * marks the points that are on the common front of all laws.
 
     Args:
-        tuned: the comparison.
-        search: the search of the law.
-        most: largest number of rows; of a longer front, evenly spread points with both ends.
+        tuned: The comparison.
+        search: Search of the law.
+        most: Largest number of rows. Of a longer front, evenly spread points are shown, with
+            the first and the last one.
     """
     count = len(search.front)
     shown = {round(n) for n in np.linspace(0, count - 1, min(most, count))}
@@ -146,7 +155,7 @@ def tabulate_front(
 
 
 def tabulate_paper_gains(tuned: TuningResult) -> TextTable:
-    """Returns a table with a row per variant of the gains that the paper prints."""
+    """Returns a table with one row per variant of the gains that the paper prints."""
     rows = []
     for result in tuned.printed:
         score = result.score
@@ -155,6 +164,7 @@ def tabulate_paper_gains(tuned: TuningResult) -> TextTable:
 
 
 _SCORE_HEADS = ("error rad", "spread rad", "pose rad", "effort N m", "settled s", "clamped %")
+"""Headers of the columns of a score."""
 
 
 def _format_score(score: CandidateScore) -> tuple[str, ...]:
@@ -170,18 +180,23 @@ def _format_score(score: CandidateScore) -> tuple[str, ...]:
 
 
 def _format_mean(mean: float | None, half: float | None) -> str:
-    """Returns a mean as text, with its interval if there is one."""
+    """Returns a mean as a text, with its interval if it has one.
+
+    Args:
+        mean: The mean, or None.
+        half: Half the width of the interval, or None.
+    """
     if mean is None or half is None:
         return format_number(mean)
     return str(MeanInterval(mean, half))
 
 
 def describe_procedure(plan: TuningPlan) -> list[str]:
-    """Returns the conditions that are the same for all laws, a sentence each."""
+    """Returns the conditions that are the same for all laws, as one sentence each."""
     scenario = plan.base.scenario
     sampled = (plan.budget + 1) // 2
     limits_nm = np.hstack([spec.limits.tau_limit_nm for spec in scenario.sites.values()])
-    limit_range = dict.fromkeys((limits_nm.min(), limits_nm.max()))  # one entry if all agree
+    limit_range = dict.fromkeys((limits_nm.min(), limits_nm.max()))  # one entry if both agree
     limits = " to ".join(f"{limit:g}" for limit in limit_range)
     knowledge = plan.knowledge.text
     if any(space.law == "known" for space in plan.spaces):
@@ -217,12 +232,15 @@ def describe_procedure(plan: TuningPlan) -> list[str]:
 
 
 def list_class_meanings() -> list[str]:
-    """Returns the meanings of the classes, a line each; the first class that applies counts."""
+    """Returns the classes with their meanings, one line each.
+
+    A run belongs to the first class that applies.
+    """
     return [f"{outcome.word}: {text}" for outcome, text in CLASS_MEANINGS.items()]
 
 
 def build_tuning_page(tuned: TuningResult) -> str:
-    """Returns the comparison as a page in Markdown, with a command per point of a front."""
+    """Returns the comparison as a Markdown page, with a command for each point of a front."""
     scenario = tuned.plan.base.scenario
     parts = [
         f"# {scenario.name}: laws compared fairly",
@@ -262,13 +280,20 @@ def _format_code(lines: Sequence[str]) -> str:
 FRONT_WIDTH_IN = 3.5
 """Width of the figure, in inches: a column of a page with two columns."""
 _HEIGHT_IN = 3.1
+"""Height of the figure, in inches."""
 _SIZE_PT = 8.0
+"""Font size of the figure."""
 _MARKS = ("o", "s", "^", "D", "v", "P")
+"""Markers of the laws."""
+# Labels of the vertical axis.
 _LABELS = {Objective.ERROR: "error (rad)", Objective.SETTLING: "settling time (s)"}
 
 
 def draw_front(tuned: TuningResult) -> Figure:
-    """Returns a figure with the fronts of all laws in one panel, on logarithmic axes."""
+    """Draws the fronts of all laws in one panel, with error against effort.
+
+    The axes are logarithmic if all numbers are positive.
+    """
     with style.styled_figure(REPORT_SIZE, _HEIGHT_IN) as figure:
         figure.set_figwidth(FRONT_WIDTH_IN)
         axes = figure.add_subplot()
@@ -297,8 +322,13 @@ def draw_front(tuned: TuningResult) -> Figure:
 
 
 def _draw_law(axes: Axes, search: CandidateSearch) -> Line2D:
-    """Draws a law's stable runs faintly and its front on top; returns its legend entry."""
+    """Draws all stable runs of a law faintly, and its front as a line of steps on top.
+
+    Returns:
+        The legend entry of the law, with the numbers of stable and of all candidates.
+    """
     law = search.space.law
+    # A built-in law has the same marker and colour in every figure.
     laws = list(dict.fromkeys([*SEARCH_SPACES, law]))
     rank = laws.index(law)
     marker = _MARKS[rank % len(_MARKS)]
@@ -331,7 +361,11 @@ def _draw_law(axes: Axes, search: CandidateSearch) -> Line2D:
 
 
 def _draw_paper_gains(axes: Axes, tuned: TuningResult) -> list[Line2D]:
-    """Draws the gains that the paper prints as stars; returns their legend entries."""
+    """Draws the gains that the paper prints as stars.
+
+    Returns:
+        Their legend entries. If a variant has no point in the figure, its entry states why.
+    """
     entries = []
     for result, fill in zip(tuned.printed, ("full", "none"), strict=True):
         look: dict[str, Any] = {
@@ -356,7 +390,7 @@ def _draw_paper_gains(axes: Axes, tuned: TuningResult) -> list[Line2D]:
 
 
 def write_tuning(tuned: TuningResult, folder: Path) -> list[Path]:
-    """Writes a comparison into an existing folder, and returns the paths of the files."""
+    """Writes the files of a comparison into an existing folder, and returns their paths."""
     json_path = folder / "front.json"
     page_path = folder / "front.md"
     picture_paths = [folder / "front.png", folder / "front.pdf"]
