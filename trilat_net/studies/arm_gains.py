@@ -376,6 +376,7 @@ class _GainSearch:
         self._margin = margin
         # Damping ratio at the edge, where the damping is the same and K larger by the margin.
         self._damping = damping / math.sqrt(margin)
+
         self.conditions = derive_operating_conditions(scenario)
         self.constant_conditions = self.conditions
         self.rate_hz = self.conditions.sites[0].rate_hz
@@ -389,6 +390,7 @@ class _GainSearch:
         # The heaviest mass is stable up to k = (2 zeta / T)^2, where T is the age. At this k
         # the damping must keep its margin to the sampled-data limit.
         self._least_k = (2.0 * self._damping / self.age_s) ** 2
+
         model = scenario.arms[scenario.names[0]]
         largest_factor = 1.0 if scenario.scheme == "second_order" else 2.0
         # A motion swings from tick to tick if its damping per inertia exceeds this value.

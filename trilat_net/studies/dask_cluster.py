@@ -239,6 +239,7 @@ class DaskCluster:
                 f"--on {self.address}: the scheduler has no worker; "
                 f"start some with: dask worker {self.address}"
             ) from None
+
         files = tuple(dict.fromkeys((law.code, law.source_sha256) for law in laws))
         required = WorkerRequirements(describe_worker(), files)
         # Dask itself reports the versions of Python. They are checked first, because code

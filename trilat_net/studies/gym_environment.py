@@ -414,13 +414,15 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         positions_m = {}
         for name, row in zip(names, self._run.q, strict=True):
             arm = arms[name]
-            angles_rad = row[: arm.counts.joints]
+            angles_rad = row[: arm.counts.joints]  # rows are as long as that of the longest arm
             q[name] = angles_rad
             positions_m[name] = np.array(arm.end_effector(angles_rad.tolist()))
+
         bodies = {}
         for site, plant in self._plants.items():
             poses = np.reshape(plant.state.bodies, (-1, 7))
             bodies[site] = dict(zip(self.scenario.bodies_m(site), poses, strict=True))
+
         user_arrays = self._run.arrays(names.index(self._user))
         return Scene(
             t_s=self._k / self._tick_rate_hz,
@@ -473,7 +475,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
             "goal": np.array(self.task.goal, dtype=np.float64),
         }
         if self._base.arms[self._user].shares_pose:
-            # a rotation vector jumps where it passes half a turn
+            # A rotation vector jumps where it passes half a turn.
             parts["q_des"] = expand_poses(parts["q_des"])
             parts["peer_q"] = expand_poses(parts["peer_q"])
         return parts

@@ -64,12 +64,14 @@ class LogComparison(Result):
             yield TextTable(header, rows)
         else:
             yield "the same experiment"
+
         yield ""
         yield _tabulate_quantities(self.metrics, self.means)
         yield ""
         for name, lines in self.remarks.items():
             for line in lines:
                 yield MarkedText("[bold]note[/bold]", f"{name}: {line}")
+
         reasons = list(self._explain_missing_values())
         yield from reasons[:_MOST_REASONS]
         if len(reasons) > _MOST_REASONS:
@@ -93,7 +95,8 @@ class LogComparison(Result):
                 "sha256": log.scenario.sha256,
             }
             logs.append(entry)
-        facts: dict[str, Any] = {
+
+        comparison: dict[str, Any] = {
             "logs": logs,
             "differences": [difference._asdict() for difference in self.differences],
             "remarks": self.remarks,
@@ -104,8 +107,8 @@ class LogComparison(Result):
             for row, mean in zip(self.metrics.rows, self.means, strict=True):
                 if mean is not None:
                     means[row.quantity.key] = mean._asdict()
-            facts["means"] = means
-        return facts
+            comparison["means"] = means
+        return comparison
 
     def to_rows(self) -> list[dict[str, Any]]:
         """Returns one row per quantity, with the value of each log by its column name."""
@@ -143,6 +146,7 @@ def compare(*logs: str | Path | Log) -> LogComparison:
         verdict = describe_judgement(certify_run(log))
         remarks[name] = [verdict, *check_final_posture(log)]
     metrics = compare_metrics(opened, names)
+
     return LogComparison(
         logs=tuple(opened),
         metrics=metrics,

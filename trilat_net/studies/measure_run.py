@@ -288,6 +288,7 @@ class WindowStats:
         self._q_least = np.minimum(self._q_least, q_least)
         self._q_most = np.maximum(self._q_most, q_most)
         self._push_sum -= inside.tau_x.sum(axis=0)
+
         if self._walls:
             tip = self._arm.place_end_effector(inside.q, inside.qd)
             t_s = inside.t_ns / NS_PER_S
@@ -797,6 +798,7 @@ def evaluate_expectations(expect: Expect, metrics: RunMetrics) -> list[Expectati
         limit = getattr(expect, key)
         if limit is not None:
             outcomes.append(_compare_with_limit(key, _read_metric(key, metrics), limit))
+
     outcomes += _evaluate_poses(expect, metrics)
     if expect.no_gaps:
         gaps = ExpectationResult(

@@ -294,6 +294,7 @@ def _draw_cells(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
         count = len(CELL_CLASSES)
         palette = ListedColormap([CLASS_COLOURS[verdict] for verdict in CELL_CLASSES])
         colours = {"cmap": palette, "norm": BoundaryNorm(np.arange(count + 1) - 0.5, count)}
+
     x = _compute_borders(plane.x)
     y = _compute_borders(plane.y)
     axes.pcolormesh(x, y, values, rasterized=True, **colours)
@@ -353,6 +354,7 @@ def _draw_line(axes: Axes, plane: MapPlane, line: MapLine) -> None:
     keep_x = np.diff(x, append=np.inf) > 0.0
     keep_y = np.diff(y, append=np.inf) > 0.0
     kept_excess = np.ma.masked_invalid(excess[np.ix_(keep_y, keep_x)])
+
     look = _LINE_STYLES[line.rank % len(_LINE_STYLES)]
     contour = axes.contour(
         x[keep_x],
@@ -503,6 +505,7 @@ def _draw_colour_bar(figure: Figure, grid: Sequence[Axes], plane: MapPlane) -> N
         colours.set_clim(0.0, 1.0)
         label = "share of stable runs"
         pointed = "neither"
+
     bar = figure.colorbar(
         colours, ax=list(grid), fraction=0.05, pad=0.02, aspect=30, extend=pointed
     )
@@ -526,6 +529,7 @@ def _draw_counts(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
     text_height_pt = 1.2 * _COUNT_PT
     if cell_width_pt < text_width_pt or cell_height_pt < text_height_pt:
         return
+
     stable = panel.stable
     decided = panel.decided
     disagree = (stable > 0) & (stable < decided)
@@ -555,6 +559,7 @@ def _draw_legend(figure: Figure, plane: MapPlane, lines: Sequence[Sequence[MapLi
             handles.append(Line2D([], [], label="edge of the verdicts", **_VERDICT_EDGE))
     elif plane.seeds == 1:
         handles += _list_class_handles(plane)
+
     if any(_find_undecided(plane, panel).any() for panel in plane.panels):
         if plane.judged_by_twins:
             label = "no exponent"
@@ -564,6 +569,8 @@ def _draw_legend(figure: Figure, plane: MapPlane, lines: Sequence[Sequence[MapLi
             label = CellClass.UNDECIDED.value
         look = {**_HATCHED, "linewidth": 0.5}
         handles.append(Patch(label=label, **look))
+
+    # Panels may share a line, which has one entry.
     line_of_label = {line.label: line for panel_lines in lines for line in panel_lines}
     for label, line in line_of_label.items():
         look = _LINE_STYLES[line.rank % len(_LINE_STYLES)]

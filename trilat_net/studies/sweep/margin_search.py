@@ -342,7 +342,7 @@ def search_margin_task(task: MarginItem) -> GridPointMargin:
 
 
 def _find_nearest(value: float, edges: Sequence[float]) -> float | None:
-    """Returns the edge that is nearest to a value; None if there are no edges."""
+    """Returns the edge that is nearest to a value. None if there are no edges."""
     return min(edges, key=lambda edge: abs(edge - value), default=None)
 
 
@@ -371,10 +371,16 @@ class SweepMargins(Result):
         return build_sweep_command(plan, "--margin", search_range, "--tolerance", tolerance)
 
     def table(self) -> TextTable:
-        """Returns a table with one row per edge. A grid point without edges has one row too."""
+        """Returns a table with one row per edge. A grid point without edges has one row too.
+
+        The columns are the values of the grid point, the measured edge, and the edges from the
+        linear analysis and from the closed-form criterion, each with its difference from the
+        measured edge.
+        """
         plan = self.plan
         several_seeds = len({point.seed for point in self.found}) > 1
         has_closed_form = any(point.closed is not None for point in self.found)
+
         heads = [label_axis(axis.key, plan.base) for axis in plan.axes[:-1]]
         if plan.laws:
             heads.append("law")
@@ -385,6 +391,7 @@ class SweepMargins(Result):
         if has_closed_form:
             heads += ["closed form", "difference"]
         heads.append("runs")
+
         rows = []
         for point in self.found:
             position = [

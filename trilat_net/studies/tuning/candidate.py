@@ -77,6 +77,8 @@ def check_comparable(scenario: Scenario) -> None:
             path="task.space",
             source=scenario.name,
         )
+
+    # Sites that follow each other but nobody else never move towards the other sites.
     groups = find_closed_groups(scenario.alpha)
     if len(groups) > 1:
         group_names = [", ".join(scenario.names[site] for site in group) for group in groups]
@@ -86,6 +88,8 @@ def check_comparable(scenario: Scenario) -> None:
             path="dominance",
             source=scenario.name,
         )
+
+    # An operator that pulls away from the common pose keeps the arms separate.
     t_s = np.arange(0.0, scenario.duration_s, 1.0 / _POSE_SAMPLES_HZ)
     pose_rad = compute_consensus_pose(scenario, t_s)
     for spring in _list_springs(scenario, t_s):
@@ -421,6 +425,8 @@ def measure_candidate(text: str, twin_text: str | None) -> CandidateScore:
     twin = run if twin_text is None else _measure_run(parse_scenario(twin_text))
     ends = (run.end, twin.end)
     outcome = classify_candidate(ends, twin.fall_rad, twin.apart_rad)
+
+    # The numbers of a run that ended early cannot be compared with those of other runs.
     diverged_s = [end.diverged_at_s for end in ends if end.diverged_at_s is not None]
     if diverged_s:
         return CandidateScore(
@@ -433,6 +439,8 @@ def measure_candidate(text: str, twin_text: str | None) -> CandidateScore:
             saturated=run.saturated,
             diverged_s=diverged_s[0],
         )
+
+    # The distance between the arms is measured in the run, and the pose in its twin.
     return CandidateScore(
         outcome=outcome,
         error_rad=float(np.hypot(run.spread_rad, twin.pose_rad)),
@@ -477,6 +485,7 @@ def _measure_run(scenario: Scenario) -> _RunMeasures:
     from_mean_rad = q - mean_rad
     from_pose_rad = mean_rad - compute_consensus_pose(scenario, t_s)
     in_last_second = t_s > t_s[-1] - END_WINDOW_S
+
     effort_nm, saturated = _measure_torques(scenario, records)
     return _RunMeasures(
         end=end,

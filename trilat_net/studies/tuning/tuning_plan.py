@@ -579,6 +579,7 @@ class TuningResult(Result):
         candidates = []
         for gains, score in zip(search.tried, search.scores, strict=True):
             candidates.append({"gains": gains, **msgspec.to_builtins(score)})
+
         overall_front = self.list_overall_front(search)
         front = []
         for index in search.front:
@@ -589,6 +590,7 @@ class TuningResult(Result):
                 "command": self.candidate(search, index).command,
             }
             front.append(point)
+
         return {
             "told": search.space.known_facts,
             "searched": [knob._asdict() for knob in search.space.knobs],
@@ -689,6 +691,8 @@ def plan_tuning(
         )
         raise ScenarioError(problem, path="duration_s", source=base.source)
     check_comparable(scenario)
+
+    # If nothing is random, all seeds give the same run.
     others = []
     if scenario.random:
         for other_seed in range(scenario.seed + 1, scenario.seed + seeds):

@@ -44,6 +44,7 @@ def compose_tuning(tuned: TuningResult) -> Iterator[Block]:
     """
     yield tabulate_laws(tuned)
     yield from (f"  {line}" for line in list_class_meanings())
+
     for search in tuned.found:
         if search.front:
             yield ""
@@ -52,6 +53,7 @@ def compose_tuning(tuned: TuningResult) -> Iterator[Block]:
         "  * no candidate of any law is better in both objectives; of a long front "
         f"{_MAX_FRONT_ROWS} points are shown"
     )
+
     yield ""
     yield tabulate_paper_gains(tuned)
     for search in tuned.found:
@@ -60,6 +62,7 @@ def compose_tuning(tuned: TuningResult) -> Iterator[Block]:
                 f"note: {search.space.law} is best at the edge of the range of {gain}; widen "
                 "the search"
             )
+
     yield ""
     if not any(search.front for search in tuned.found):
         yield (
@@ -70,7 +73,8 @@ def compose_tuning(tuned: TuningResult) -> Iterator[Block]:
     yield "commands for the last point of each front; front.md has the others:"
     for search in tuned.found:
         if search.front:
-            yield f"  {tuned.candidate(search, search.front[-1]).command}"
+            last_point = search.front[-1]
+            yield f"  {tuned.candidate(search, last_point).command}"
 
 
 def tabulate_laws(tuned: TuningResult) -> TextTable:
@@ -192,7 +196,11 @@ def _format_mean(mean: float | None, half: float | None) -> str:
 
 
 def describe_procedure(plan: TuningPlan) -> list[str]:
-    """Returns the conditions that are the same for all laws, as one sentence each."""
+    """Returns the conditions that are the same for all laws, as one sentence each.
+
+    They are the candidates, the scenario, the model information that laws get, the objectives,
+    and further conditions that apply only to some comparisons.
+    """
     scenario = plan.base.scenario
     sampled = (plan.budget + 1) // 2
     limits_nm = np.hstack([spec.limits.tau_limit_nm for spec in scenario.sites.values()])
@@ -210,6 +218,7 @@ def describe_procedure(plan: TuningPlan) -> list[str]:
         "error: RMS distance of the arms from the pose of a weightless consensus; effort: RMS "
         "of tau - G(q)",
     ]
+
     weights = weigh_joints(scenario)
     if weights:
         shares = ", ".join(f"{weight:g}" for weight in weights)
@@ -253,6 +262,7 @@ def build_tuning_page(tuned: TuningResult) -> str:
         "## Fronts",
         "A * marks the points that no candidate of any law dominates.",
     ]
+
     for search in tuned.found:
         parts.append(f"### {search.space.law}")
         if search.front:
@@ -261,6 +271,7 @@ def build_tuning_page(tuned: TuningResult) -> str:
             parts.append(_format_code(commands))
         else:
             parts.append("No candidate of this law is stable and at the pose.")
+
     parts.append("## As printed")
     parts.append(tabulate_paper_gains(tuned).markdown())
     parts.append(_format_code([result.candidate.command for result in tuned.printed]))
