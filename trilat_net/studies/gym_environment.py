@@ -201,7 +201,7 @@ class ReachTask:
         step_s = scene.t_s - self._last_s
         self._last_s = scene.t_s
         if distance_m > self._within_m:
-            self._reached_s = scene.t_s
+            self._reached_s = scene.t_s  # the time at the goal starts anew
         stayed_s = scene.t_s - self._reached_s
         succeeded = stayed_s >= self._stay_s
         reward = -distance_m * step_s + float(succeeded)

@@ -170,7 +170,7 @@ def name_columns(files: Sequence[Path]) -> list[str]:
         names = ["/".join(file.with_suffix("").parts[-depth:]) for file in files]
         if len(set(names)) == len(names):
             return names
-    # The same file was given twice.
+    # Some files are the same, or differ only in their suffix.
     return [f"{n}: {file}" for n, file in enumerate(files, 1)]
 
 

@@ -882,7 +882,11 @@ def _compare_with_limit(key: str, measured: float | None, limit: float) -> Expec
 
 
 def _evaluate_poses(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:
-    """Yields the outcome of the expected end pose of each site that has one."""
+    """Compares the pose of each site in its last record with the expected pose.
+
+    Yields:
+        An outcome for each site with an expected pose. The joint with the largest error counts.
+    """
     tolerance_rad = expect.end_pose_within_rad
     for site, expected in expect.end_pose_rad.items():
         key = f"end_pose_rad.{site}"
@@ -952,7 +956,8 @@ def _compare_with_range(
     limit_text = f"{least:g} to {most:g} {unit}".rstrip()
     if measured is None:
         return ExpectationResult(name, False, missing_text, limit_text)
-    text = " to ".join(f"{value:.4g}" for value in dict.fromkeys(measured))
+    distinct_values = dict.fromkeys(measured)  # a single value is printed once
+    text = " to ".join(f"{value:.4g}" for value in distinct_values)
     distance = min(measured.least - least, most - measured.most)
     half_width = 0.5 * (most - least)
     return ExpectationResult(

@@ -240,7 +240,9 @@ def _write_caption(
         The position of the top of the caption, as a fraction of the height.
     """
     top = (_CAPTION_LINE_IN * len(caption) + 0.04) / height_in
-    reserved = top + _SHARED_LABEL_IN / height_in * shares_labels
+    reserved = top
+    if shares_labels:
+        reserved += _SHARED_LABEL_IN / height_in
     engine: Any = figure.get_layout_engine()
     engine.set(rect=(0.0, reserved, 1.0, 1.0 - reserved))
     figure.text(

@@ -322,13 +322,16 @@ def find_map_edges(plane: MapPlane, panel: MapPanel) -> list[tuple[float, Stabil
         is_decided = np.isfinite(stable_share) & (stable_share != 0.5)
         decided = np.flatnonzero(is_decided)
         is_stable = stable_share[decided] > 0.5
-        for n in np.flatnonzero(is_stable[1:] != is_stable[:-1]):
+
+        # Compare each decided grid point with the next decided one.
+        changes = np.flatnonzero(is_stable[1:] != is_stable[:-1])
+        for n in changes:
             below, above = decided[n : n + 2].tolist()
             edge = StabilityEdge(
                 low=y[below],
                 high=y[above],
                 stable_below=bool(is_stable[n]),
-                sharp=above == below + 1,
+                sharp=above == below + 1,  # no undecided grid point lies between
             )
             edges.append((x, edge))
     return edges

@@ -719,10 +719,12 @@ def _load_cell(plan: SweepPlan, indices: Sequence[int]) -> Scenario:
         ScenarioError: The scenario is not valid or cannot run on this machine. The message
             names the law if laws are swept.
     """
+    # The number of a cell has one digit per dimension of the grid, see `SweepPlan.cell`.
     number = 0
     for count, index in zip(plan.shape, indices, strict=True):
         number = number * count + index
     cell = plan.cell(number)
+
     try:
         scenario = plan.scenario(*cell.overrides)
         sweep_cell.check_sweepable(scenario)

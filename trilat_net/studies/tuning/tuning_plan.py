@@ -263,8 +263,13 @@ class CandidateSearch:
         best, ranked = self._rank_candidates(count)
         parents = []
         for n in range(count):
-            index = best if n % 2 == 0 else ranked[n // 2 % len(ranked)]
-            parents.append([self.tried[index][knob.name] for knob in self.space.knobs])
+            index = best
+            if n % 2 == 1:
+                index = ranked[n // 2 % len(ranked)]
+            gains = self.tried[index]
+            parents.append([gains[knob.name] for knob in self.space.knobs])
+
+        # Position 0 is the least value of a gain, and position 1 the largest.
         logs = np.log(np.reshape(parents, (count, len(self.space.knobs))))
         positions: Array = (logs - self._log_low) / self._log_range
         return positions

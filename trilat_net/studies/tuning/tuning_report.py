@@ -78,7 +78,11 @@ def compose_tuning(tuned: TuningResult) -> Iterator[Block]:
 
 
 def tabulate_laws(tuned: TuningResult) -> TextTable:
-    """Returns a table with one row per law: the class counts and the two ends of the front."""
+    """Returns a table that summarises the search of each law in a row.
+
+    The row has the number of candidates and of candidates of each class, the number of points
+    on the law's front and on the common front of all laws, and the two ends of the front.
+    """
     classes = list(reversed(CandidateClass))
     objective = f"{tuned.plan.objective} {tuned.plan.objective.unit}"
     heads = ("law", "tried", *(outcome.word for outcome in classes), "front", "of all")
