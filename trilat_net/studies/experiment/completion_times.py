@@ -1,17 +1,17 @@
-"""Completion times of trials with a time limit: medians, their intervals, and sign tests.
+"""Computes completion times of trials with a time limit: medians, intervals, and sign tests.
 
 A trial that was not completed has no completion time. If the trial reached the limit, its time
 is known only to be longer than the limit (right censoring). If the trial failed before the
 limit, the task was never completed. Both count as longer than every measured time.
 
-That is enough for order statistics. The median of Kaplan and Meier is exact if more than half
-of the trials were completed; otherwise the median was not reached. A mean would need the times
+This is enough for order statistics. The median of Kaplan and Meier is exact if more than half
+of the trials were completed. Otherwise the median was not reached. A mean would need the times
 themselves, and replacing them by the limit would make different conditions look alike.
 
 Invariant:
     - The limit never enters a sum or a difference.
-    - Trials are summarised per unit and condition before units are compared, so that more
-      trials do not count as more participants.
+    - Trials are summarised per unit (a participant or a pair) and condition before units are
+      compared, so that more trials do not count as more participants.
 
 Sources: Kaplan and Meier, "Nonparametric estimation from incomplete observations", J. American
 Statistical Association 53 (1958); Conover, "Practical nonparametric statistics", 3rd edition
@@ -34,19 +34,19 @@ SUCCESS = "succeeded"
 
 
 class CompletionTime(NamedTuple):
-    """Completion time of the trials under a condition.
+    """Completion time of the trials under one condition.
 
     Attributes:
-        condition: name of the condition.
-        trials: number of trials that count.
-        censored: number of trials that were not completed: `timed_out` and those that failed
+        condition: Name of the condition.
+        trials: Number of trials that count.
+        censored: Number of trials that were not completed: `timed_out` and those that failed
             sooner.
-        timed_out: number of trials that reached the time limit.
-        number: number of units.
-        median: median over units of each unit's median time, in s; None if it was not reached.
-        interval: interval of the median, of 95 % or more, by order statistics, in s. The upper
-            end is None if it was not reached. The interval is None if there are too few units,
-            or if the lower end was not reached either.
+        timed_out: Number of trials that reached the time limit.
+        number: Number of units (participants or pairs).
+        median: Median over units of each unit's median time, in s. None if it was not reached.
+        interval: Interval of the median, of 95 % or more, by order statistics, in s. The upper
+            end is None if it was not reached. The whole interval is None if there are too few
+            units, or if the lower end was not reached either.
     """
 
     condition: str
@@ -62,15 +62,15 @@ class CompletionComparison(NamedTuple):
     """Comparison of the completion times of two conditions, within units.
 
     Attributes:
-        first: name of the first condition.
-        second: name of the second condition.
-        number: number of units that have both conditions.
-        longer: number of units whose median was longer under the second condition.
-        shorter: number of units whose median was shorter under the second condition. The other
+        first: Name of the first condition.
+        second: Name of the second condition.
+        number: Number of units (participants or pairs) that have both conditions.
+        longer: Number of units whose median was longer under the second condition.
+        shorter: Number of units whose median was shorter under the second condition. The other
             units are ties, for example if both medians were not reached.
-        difference: median over units of second minus first, in s; None if it depends on medians
+        difference: Median over units of second minus first, in s. None if it depends on medians
             that were not reached.
-        p: p value of the two-sided exact sign test, ties left out; None for fewer than two
+        p: p value of the two-sided exact sign test without the ties. None for fewer than two
             units that differ.
         p_holm: p corrected for all comparisons.
     """
@@ -86,14 +86,19 @@ class CompletionComparison(NamedTuple):
 
 
 def is_completed(row: Row) -> bool:
-    """Returns whether a trial was completed; a row without `succeeded` counts as completed."""
+    """Returns True if a trial was completed. A row without `succeeded` counts as completed."""
     return str(row.get(SUCCESS, 1)).strip() not in ("0", "0.0", "False")
 
 
 def find_median(times_s: Sequence[float]) -> float:
-    """Returns the median of times in s; censored times are infinite.
+    """Returns the median of times, in s.
 
-    The median is infinite (not reached) if half of the trials or more were not completed.
+    Args:
+        times_s: Times, in s. They are infinite for trials that were not completed.
+
+    Returns:
+        The median. It is infinite (not reached) if half of the trials or more were not
+        completed.
     """
     ordered = sorted(times_s)
     count = len(ordered)
@@ -110,11 +115,11 @@ def find_unit_medians(
     A median that was not reached is infinite.
 
     Args:
-        rows: trials with `completion_s` and `succeeded`, as in `trials.csv`.
-        unit: the key of the independently sampled unit: "participant" or "pair".
+        rows: Trials with `completion_s` and `succeeded`, as in `trials.csv`.
+        unit: Key of the independently sampled unit: "participant" or "pair".
 
     Raises:
-        UsageError: a time is not a finite number.
+        UsageError: A time is not a finite number.
     """
     times_s: dict[str, dict[str, list[float]]] = {}
     for row in rows:
@@ -136,8 +141,8 @@ def summarise_times(
     """Returns the completion time of each condition, in the order of the rows.
 
     Args:
-        rows: trials, as for `find_unit_medians`.
-        limit_s: time limit of a trial, in s.
+        rows: Trials, as for `find_unit_medians`.
+        limit_s: Time limit of a trial, in s.
         unit: "participant" or "pair".
     """
     summaries: list[CompletionTime] = []
@@ -160,12 +165,18 @@ def summarise_times(
 
 
 def find_median_interval(times_s: Sequence[float]) -> tuple[float, float | None] | None:
-    """Returns an interval of at least 95 % for a median, by order statistics, in s.
+    """Returns an interval of at least 95 % for a median, by order statistics.
 
-    The r-th smallest and the r-th largest time enclose the median with probability
-    1 - 2 P(B < r), where B is binomial with p = 1/2; r is the largest rank for which this
-    probability is 95 % or more. There is no such rank, and the interval is None, for fewer than
-    six times. Censored times are infinite; an upper end that was not reached is None.
+    The r-th smallest and the r-th largest time enclose the median with probability 1 - 2 P(B <
+    r), where B is binomial with p = 1/2. r is the largest rank for which this probability is 95
+    % or more.
+
+    Args:
+        times_s: Times, in s. They are infinite for trials that were not completed.
+
+    Returns:
+        Lower and upper end, in s. The upper end is None if it was not reached. The whole
+        interval is None if there is no such rank, which holds for fewer than six times.
     """
     ordered = sorted(times_s)
     tail = (1.0 - CONFIDENCE) / 2.0
@@ -185,14 +196,13 @@ def find_median_interval(times_s: Sequence[float]) -> tuple[float, float | None]
 def compare_times(
     rows: Sequence[Row], *, unit: str = "participant"
 ) -> list[CompletionComparison]:
-    """Returns the comparison of each pair of conditions, in the order of the rows.
+    """Compares the completion times of each pair of conditions, in the order of the rows.
 
     Each unit counts for the condition under which its median is longer. A median that was not
-    reached is longer than any that was reached, and two medians that were not reached are a
-    tie.
+    reached is longer than any that was reached. Two medians that were not reached are a tie.
 
     Args:
-        rows: trials, as for `find_unit_medians`.
+        rows: Trials, as for `find_unit_medians`.
         unit: "participant" or "pair".
     """
     medians = find_unit_medians(rows, unit)
@@ -211,12 +221,12 @@ def compare_times(
 def _compare(
     first: str, second: str, pairs: Sequence[tuple[float, float]]
 ) -> CompletionComparison:
-    """Returns the comparison of two conditions.
+    """Compares the completion times of two conditions.
 
     Args:
-        first: name of the first condition.
-        second: name of the second condition.
-        pairs: the medians of each unit under both conditions, in s.
+        first: Name of the first condition.
+        second: Name of the second condition.
+        pairs: Medians of each unit under both conditions, in s.
     """
     longer = sum(second_s > first_s for first_s, second_s in pairs)
     shorter = sum(second_s < first_s for first_s, second_s in pairs)
@@ -236,10 +246,16 @@ def _compare(
 
 
 def _find_median_difference(pairs: Sequence[tuple[float, float]]) -> float | None:
-    """Returns the median difference in s; None if it depends on medians that were not reached.
+    """Returns the median of the differences of two conditions, in s.
 
     A median that was not reached may have any value above 0, so that each difference lies
     between two bounds. The median difference is known if the medians of both bounds agree.
+
+    Args:
+        pairs: Medians of each unit under both conditions, in s.
+
+    Returns:
+        The median difference. None if it depends on medians that were not reached.
     """
     if not pairs:
         return None

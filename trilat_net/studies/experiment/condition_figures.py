@@ -1,8 +1,8 @@
-"""Figures that compare a measure under the conditions of an experiment with people.
+"""Draws figures that compare a measure between the conditions of an experiment with people.
 
-`draw_conditions` shows a measure by condition, `draw_learning` over the trials of a block.
-Completion times need other figures if some trials were not completed in time, because such a
-time is only known to exceed the limit: then medians take the place of means.
+`draw_conditions` shows a measure by condition, and `draw_learning` shows it over the trials of
+a block. If some trials were not completed in time, their completion time is only known to
+exceed the limit. Then a mean does not exist, and `draw_times` shows medians instead.
 
 Invariant:
     - Each participant is drawn: a point for each condition with data, joined by a thin line.
@@ -47,14 +47,15 @@ _LIMIT: Look = {"color": style.FAINT, "linewidth": 1.0, "linestyle": "--"}
 
 
 def draw_conditions(rows: Sequence[Row], measure: str, *, unit: str = "participant") -> Figure:
-    """Returns the figure of a measure by condition.
+    """Draws a measure by condition.
 
-    The figure shows the mean of each unit, and the mean over units with its 95 % interval.
+    The figure shows the mean of each participant or pair, and the mean over them with its 95 %
+    interval.
 
     Args:
-        rows: tidy rows, as for `statistics`.
-        measure: name of the measure in the rows.
-        unit: "participant" or "pair".
+        rows: A row per trial, as for `statistics`.
+        measure: Name of the measure in the rows.
+        unit: "participant" or "pair", for which means are computed first.
     """
     all_means = average_trials(rows, measure, unit)
     means = {condition: by_unit for condition, by_unit in all_means.items() if by_unit}
@@ -72,15 +73,15 @@ def draw_conditions(rows: Sequence[Row], measure: str, *, unit: str = "participa
 
 
 def draw_times(rows: Sequence[Row], limit_s: float, *, unit: str = "participant") -> Figure:
-    """Returns the figure of completion times by condition, for times with a limit.
+    """Draws completion times by condition, for trials with a time limit.
 
-    The points are the medians of each unit. An open marker on the line of the limit stands for
-    a median beyond the limit.
+    The points are the medians of each participant or pair. An open marker on the line of the
+    limit stands for a median beyond the limit.
 
     Args:
-        rows: tidy rows, as for `completion_times`.
-        limit_s: time limit of a trial, in s.
-        unit: "participant" or "pair".
+        rows: A row per trial, as for `completion_times`.
+        limit_s: Time limit of a trial, in s.
+        unit: "participant" or "pair", for which medians are computed first.
     """
     medians = find_unit_medians(rows, unit)
     interval_look = {**_MEAN, "marker": "_"}
@@ -112,10 +113,10 @@ def draw_times(rows: Sequence[Row], limit_s: float, *, unit: str = "participant"
 def _list_unit_lines(
     values: Mapping[str, Mapping[str, float]],
 ) -> Iterator[tuple[list[int], list[float]]]:
-    """Yields the line of each unit: the columns of its conditions, and its values there.
+    """Yields the line of each participant or pair: columns of conditions, and values.
 
     Args:
-        values: a value by condition and unit. Each condition is a column of the figure.
+        values: A value by condition and unit. Each condition is a column of the figure.
     """
     units = dict.fromkeys(chain.from_iterable(values.values()))
     for unit in units:
@@ -147,11 +148,11 @@ def _plot_times(
     """Draws completion times as a line, with an open marker for each time beyond the limit.
 
     Args:
-        axes: the panel.
-        positions: positions of the times along the horizontal axis.
-        times_s: the times, in s; infinite beyond the limit.
-        limit_s: time limit of a trial, in s.
-        look: look of the line and its markers.
+        axes: The panel.
+        positions: Positions of the times along the horizontal axis.
+        times_s: The times, in s. They are infinite beyond the limit.
+        limit_s: Time limit of a trial, in s.
+        look: Options of the line and its markers.
     """
     limited_s = [min(time_s, limit_s) for time_s in times_s]
     axes.plot(positions, limited_s, **look)
@@ -181,15 +182,16 @@ def draw_learning(
     unit: str = "participant",
     limit_s: float | None = None,
 ) -> Figure:
-    """Returns the figure of a measure over the trials of a block, with a line per condition.
+    """Draws a measure over the trials of a block, with a line per condition.
 
     Args:
-        rows: tidy rows, as for `statistics`, with the number of each `trial` in its block.
-        measure: name of the measure in the rows.
-        unit: "participant" or "pair".
-        limit_s: time limit of a trial, in s, if some trials were not completed in time. The
+        rows: A row per trial, as for `statistics`, with the number of each `trial` in its
+            block.
+        measure: Name of the measure in the rows.
+        unit: "participant" or "pair", for which means are computed first.
+        limit_s: Time limit of a trial, in s, if some trials were not completed in time. The
             figure then shows medians, and open markers on the line of the limit for medians
-            beyond the limit.
+            beyond it. None if all trials were completed.
     """
     if limit_s is not None:
         return _draw_learning_times(rows, limit_s, unit)
@@ -211,7 +213,7 @@ def draw_learning(
 
 
 def _assign_looks(rows: Sequence[Row]) -> dict[str, Look]:
-    """Returns the look of each condition's line, in the order of the rows."""
+    """Returns the options of each condition's line, in the order of the rows."""
     conditions = dict.fromkeys(row["condition"] for row in rows)
     looks: dict[str, Look] = {}
     for index, condition in enumerate(conditions):
@@ -236,7 +238,7 @@ def _group_by_trial(rows: Sequence[Row], condition: str) -> dict[Any, list[Row]]
 
 
 def _draw_learning_times(rows: Sequence[Row], limit_s: float, unit: str) -> Figure:
-    """Returns the figure of completion times over the trials, for times with a limit."""
+    """Draws completion times over the trials, for trials with a time limit."""
     with style.styled_figure(_FORM, _HEIGHT_IN) as figure:
         axes = _add_panel(figure, COMPLETION)
         axes.axhline(limit_s, **_LIMIT)
@@ -264,6 +266,6 @@ def _add_panel(figure: Figure, measure: str) -> Axes:
 
 
 def _plot_interval(axes: Axes, position: float, mean: ConditionMean, look: Look) -> None:
-    """Draws the vertical line of an interval; without an interval, a point at the mean."""
+    """Draws the vertical line of an interval, or a point at the mean without an interval."""
     ends = mean.interval or (mean.mean, mean.mean)
     axes.plot([position, position], ends, **look)

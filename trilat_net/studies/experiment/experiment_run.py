@@ -1,7 +1,9 @@
-"""An experiment in its folder: the log of each trial, journals, and tables.
+"""Runs an experiment and keeps its results in a folder: logs, journals and tables.
 
-`begin_experiment` creates the folder, `Experiment.run` runs the remaining trials with synthetic
-participants, and `trilat experiment run --live` runs them with people.
+`begin_experiment` creates the folder. `Experiment.run` runs the remaining trials with synthetic
+participants, which are models of people. `trilat experiment run --live` runs them with people.
+A journal is a file to which each finished trial is appended, so that an interrupted experiment
+can be continued.
 
 Invariant:
     - A folder belongs to the plan whose digest it contains.
@@ -42,17 +44,17 @@ LOGS = "logs"
 
 
 class Note(msgspec.Struct, frozen=True):
-    """An event with people that is not a finished trial, in a journal of its own.
+    """An event with people that is not a finished trial. Notes have a journal of their own.
 
     Attributes:
-        cell: the unique name of the event: a step and a participant, or an aborted trial.
+        cell: Unique key of the event: a step and a participant, or an aborted trial.
         kind: "consent", "questionnaire" or "aborted".
-        who: the participant; for a trial all participants.
-        number: the trial that the event belongs to, precedes or follows.
-        unix_s: the time by the machine's clock, in s.
-        text: the name of a questionnaire, or why a trial was aborted.
-        answers: the answers by item; None for a missing answer.
-        seed: 0, as the journal expects a seed.
+        who: Pseudonym of the participant. For a trial, those of all participants.
+        number: Number of the trial to which the event belongs.
+        unix_s: Time on the machine's clock, in s.
+        text: Name of a questionnaire, or the reason why a trial was aborted.
+        answers: Answers by item. None for a missing answer.
+        seed: Always 0. The journal expects a seed.
     """
 
     cell: str
@@ -69,9 +71,9 @@ class ExperimentStatus(NamedTuple):
     """The progress of an experiment.
 
     Attributes:
-        done: number of trials in the journal.
-        total: number of trials of the plan.
-        next: the first trial that is not done; None if all are done.
+        done: Number of trials in the journal.
+        total: Number of trials of the plan.
+        next: The first trial that is not done. None if all are done.
     """
 
     done: int
@@ -82,10 +84,14 @@ class ExperimentStatus(NamedTuple):
 class Experiment(Result):
     """An experiment in its folder.
 
+    Args:
+        folder: The folder.
+        plan: The protocol and its trials.
+
     Attributes:
-        folder: the folder.
-        plan: the protocol and its trials.
-        unit: the participants of a trial: "pair" or "participant".
+        folder: The folder.
+        plan: The protocol and its trials.
+        unit: "pair" if two participants take part together, otherwise "participant".
     """
 
     def __init__(self, folder: Path, plan: ExperimentPlan) -> None:
@@ -95,14 +101,14 @@ class Experiment(Result):
         self._remedy = build_resume_hint("experiment", "run", str(folder))
 
     def open_trials(self, *, people: bool | None = None) -> RunJournal[TrialEntry]:
-        """Opens the journal of trials, to read or to continue the experiment.
+        """Opens the journal of trials, to read it or to continue the experiment.
 
         Args:
-            people: True if people continue the experiment, False if synthetic participants
-                do; None to read only.
+            people: True if people continue the experiment, False if synthetic participants do.
+                None to read only.
 
         Raises:
-            UsageError: the finished trials are of the other kind of participants.
+            UsageError: The finished trials are of the other kind of participants.
         """
         if people is not None:
             entries = self.read_entries().values()
@@ -123,12 +129,12 @@ class Experiment(Result):
         return RunJournal(self.folder / NOTES_FILE, self.plan.digest, Note, self._remedy)
 
     def read_entries(self) -> dict[int, TrialEntry]:
-        """Returns the finished trials, by number."""
+        """Returns the results of the finished trials, by number."""
         with self.open_trials() as journal:
             return {entry.cell: entry for entry in journal.done.values()}
 
     def read_notes(self) -> list[Note]:
-        """Returns the notes in order."""
+        """Returns the notes in the order in which they were made."""
         if not (self.folder / NOTES_FILE).exists():
             return []
         with self.open_notes() as journal:
@@ -146,7 +152,7 @@ class Experiment(Result):
         return choices
 
     def _draw_choices(self, staircase: Staircase) -> None:
-        """Notes the choices of synthetic participants for all pairs.
+        """Notes the choices of synthetic participants for all pairs of a staircase.
 
         The choices follow from the plan, so that they can be drawn before any trial is run.
         """
@@ -186,9 +192,9 @@ class Experiment(Result):
         """Runs the remaining trials with synthetic participants, and writes the tables.
 
         Args:
-            jobs: the number of processes; None for one per core.
-            show: called with the numbers of finished and of all trials.
-            on: a Dask scheduler's address or an executor that runs the trials.
+            jobs: Number of processes. None for one per core.
+            show: Function that is called with the numbers of finished and of all trials.
+            on: Address of a Dask scheduler, or an executor that runs the trials.
         """
         logs = make_subfolder(self.folder / LOGS)
         plan = self.plan
@@ -221,7 +227,7 @@ class Experiment(Result):
     def _describe_trial(
         self, planned: PlannedTrial, entry: TrialEntry, choices: Choices
     ) -> dict[str, Any]:
-        """Returns the row of a trial."""
+        """Returns the row of a trial: its place in the plan, result, measures and log."""
         row: dict[str, Any] = {
             "trial_number": planned.number,
             self.unit: "-".join(planned.group),
@@ -245,7 +251,7 @@ class Experiment(Result):
         }
 
     def _describe_pair(self, planned: PlannedTrial, choices: Choices) -> dict[str, Any]:
-        """Returns the columns of a trial in a staircase; practice trials have no values."""
+        """Returns the columns of a trial in a staircase. Practice trials have no values."""
         if planned.practice:
             return {"difference": None, "right": None}
         difference, right = self.plan.find_pair(planned, choices)
@@ -270,7 +276,7 @@ class Experiment(Result):
         return rows
 
     def list_scores(self) -> list[dict[str, Any]]:
-        """Returns a row for each answered questionnaire, with its score under its name.
+        """Returns a row for each completed questionnaire, with the score under the form's name.
 
         The score is None if an answer is missing.
         """
@@ -331,7 +337,7 @@ class Experiment(Result):
         return self.folder / TRIALS_FILE
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the plan and the progress, as `trilat experiment status --json` does."""
+        """Returns the progress, which `trilat experiment status --json` prints."""
         status = self.status()
         protocol = self.plan.protocol
         return {
@@ -345,7 +351,7 @@ class Experiment(Result):
         }
 
     def blocks(self) -> Iterator[Block]:
-        """Yields the text of the status, with a row for each condition.
+        """Yields the text of the progress, with a row for each condition.
 
         The completion time is a median, in which a trial that was not completed counts as
         longer than any other.
@@ -423,9 +429,13 @@ def check_experiment(file: str | Path) -> ExperimentPlan:
 
 
 def begin_experiment(file: str | Path, out: str | Path | None = None) -> Experiment:
-    """Returns an experiment in a new folder, by default runs/experiment-NAME-N.
+    """Creates the folder of an experiment, by default runs/experiment-NAME-N.
 
     The folder contains the protocol, and the plan with the scenarios as JSON.
+
+    Args:
+        file: File of the protocol.
+        out: The folder. None for the default.
     """
     plan = check_experiment(file)
     default_name = f"experiment-{plan.protocol.name}"
@@ -443,13 +453,13 @@ def begin_experiment(file: str | Path, out: str | Path | None = None) -> Experim
 
 
 def open_experiment(folder: str | Path) -> Experiment:
-    """Returns the experiment of a folder, as `trilat experiment status` does.
+    """Opens the experiment in a folder, as `trilat experiment status` does.
 
     >>> tn.open_experiment("runs/experiment-reaching-001").status().done  # doctest: +SKIP
     240
 
     Raises:
-        UsageError: the folder holds no experiment, or its plan was changed.
+        UsageError: The folder contains no experiment, or its plan was changed.
     """
     path = Path(folder)
     try:
@@ -485,14 +495,15 @@ def run_experiment(
     >>> done.to_frame().groupby("condition").completion_s.mean()  # doctest: +SKIP
 
     Args:
-        source: the file of a protocol, or the folder of an experiment to continue.
-        out: the folder; by default the first of runs/experiment-NAME-N that does not exist.
-        jobs: the number of processes; None for one per core.
-        on: a Dask scheduler's address or an executor that runs the trials.
-        progress: called with the numbers of finished and of all trials.
+        source: File of a protocol, or the folder of an experiment to continue.
+        out: Folder of the experiment. By default the first of runs/experiment-NAME-N that does
+            not exist.
+        jobs: Number of processes. None for one per core.
+        on: Address of a Dask scheduler, or an executor that runs the trials.
+        progress: Function that is called with the numbers of finished and of all trials.
 
     Raises:
-        UsageError: the protocol cannot be carried out, or the folder holds something else.
+        UsageError: The protocol cannot be carried out, or the folder contains something else.
     """
     if Path(source).is_dir():
         experiment = open_experiment(source)
@@ -502,7 +513,7 @@ def run_experiment(
 
 
 def list_log_problems(experiment: Experiment) -> Iterator[str]:
-    """Yields the finished trials whose log is missing or was changed."""
+    """Yields a sentence for each finished trial whose log is missing or was changed."""
     done = experiment.read_entries()
     for planned in experiment.plan.trials:
         entry = done.get(planned.number)

@@ -1,8 +1,10 @@
-"""The protocol of an experiment with people, and the plan of its trials.
+"""Reads the protocol of an experiment with people, and plans its trials.
 
-A protocol is a TOML file. It names the scenario, the conditions (scenario keys with different
-values), the task, and the number of participants and trials. The plan lists all trials in their
-order, with balanced orders of conditions and drawn targets.
+A protocol is a TOML file. It names the scenario (the robot arms and their network), the
+conditions (keys of the scenario with different values), the task, and the number of
+participants and trials. The plan lists all trials in their order. Orders of conditions are
+balanced over the participants, so that practice and fatigue affect all conditions alike, and
+targets are drawn.
 
 Invariant:
     - The plan follows from the protocol and from the scenarios of its conditions.
@@ -37,7 +39,7 @@ from .tasks import AnyTask, ReachTrial
 Wait = Annotated[float, Meta(ge=0.0, le=60.0)]
 """A waiting time, in s."""
 Pseudonym = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_]{1,20}\Z")]
-"""Name of a participant; the name becomes part of file names."""
+"""Name of a participant, which becomes part of file names."""
 Count = Annotated[int, Meta(ge=1, le=1000)]
 Counted = Annotated[int, Meta(ge=0, le=1000)]
 Feedback = Literal[
@@ -55,9 +57,9 @@ class CatchTrials(Frozen, frozen=True):
     """Trials of another condition within a block, which keep participants from anticipating.
 
     Attributes:
-        condition: condition of the catch trials.
-        share: share of the counted trials of a block, rounded. Blocks of the condition itself
-            have no catch trials.
+        condition: Condition of the catch trials.
+        share: Share of the counted trials of a block that are catch trials. Their number is
+            rounded. Blocks of the condition itself have no catch trials.
     """
 
     condition: Name
@@ -65,17 +67,17 @@ class CatchTrials(Frozen, frozen=True):
 
 
 class Training(Frozen, frozen=True):
-    """Training in which authority moves from an expert to a learner.
+    """Training in which the authority over the slave arm moves from an expert to a learner.
 
     The first user is the expert, the second user the learner.
 
     Attributes:
-        lead: for each condition, the expert's part of the users' total share at the slave, in
-            the first and in the last trial of the training.
-        before: number of trials of the learner alone before the training.
-        after: number of trials of the learner alone right after the training (transfer).
-        retention: number of trials of the learner alone after a rest (retention).
-        rest_s: rest before the retention trials, in s.
+        lead: For each condition, the expert's part of the users' authority in the first and in
+            the last trial of the training, from 0 to 1.
+        before: Number of trials of the learner alone before the training.
+        after: Number of trials of the learner alone right after the training (transfer).
+        retention: Number of trials of the learner alone after a rest (retention).
+        rest_s: Rest before the retention trials, in s.
     """
 
     lead: dict[Name, tuple[Share, Share]]
@@ -85,7 +87,7 @@ class Training(Frozen, frozen=True):
     rest_s: Annotated[float, Meta(ge=0.0, le=1e6)] = 600.0
 
     def describe(self) -> str:
-        """Returns the sentence on the training for a methods paragraph."""
+        """Returns a sentence about the training for the methods section of a paper."""
         courses: list[str] = []
         for condition, (first, last) in self.lead.items():
             courses.append(f"{first:g} to {last:g} ({condition})")
@@ -100,34 +102,35 @@ class Training(Frozen, frozen=True):
 
 
 class Protocol(Frozen, frozen=True):
-    """Protocol of an experiment, with the keys of its TOML file.
+    """Protocol of an experiment. The attributes are the keys of its TOML file.
 
     Attributes:
-        name: name of the experiment.
-        title: title of the experiment for people.
-        scenario: name or path of the scenario on which all conditions are based.
-        users: the sites that participants hold; two sites are held by a pair.
-        participants: number of participants, or their pseudonyms.
-        design: how the order of conditions is balanced over participants, see
+        name: Name of the experiment.
+        title: Title of the experiment for people.
+        scenario: Name or path of the scenario on which all conditions are based.
+        users: Names of the sites whose arms participants hold. Two sites are held by a pair.
+        participants: Number of participants, or their pseudonyms.
+        design: How the order of conditions is balanced over participants, see
             docs/experiments.md.
-        trials: number of counted trials of a block; a block has all trials of a condition.
-        practice: number of practice trials before the counted trials of a block.
-        foreperiod_s: range of the time from the start of a trial until its target appears, in
-            s; the time is drawn uniformly.
-        seed: seed of orders, targets and synthetic participants.
-        set: scenario keys with the same value in all conditions.
-        conditions: for each condition by name, the scenario keys that it sets.
-        task: task of the participants.
-        model: parameters of synthetic participants.
-        consent: text that people agree to before their first trial; "" requests no consent.
-        questionnaires: the questionnaires, and when people answer them.
-        rest_s: shortest rest between two blocks, in s.
-        feedback: the measures that people see after a trial.
-        force_limit_n: largest force of the live hand, in N, for each participant who needs a
-            lower limit, by pseudonym.
-        catch: trials of another condition within a block; they do not count.
-        training: trials in which authority moves from an expert to a learner.
-        staircase: pairs of trials that adapt a scenario key to a participant's threshold.
+        trials: Number of counted trials of a block. A block has all trials of a condition.
+        practice: Number of practice trials before the counted trials of a block.
+        foreperiod_s: Shortest and longest time from the start of a trial until its target
+            appears, in s. The time is drawn uniformly.
+        seed: Seed of orders, targets and synthetic participants.
+        set: Scenario keys with the same value in all conditions.
+        conditions: For each condition by name, the scenario keys that it sets.
+        task: Task of the participants.
+        model: Parameters of synthetic participants.
+        consent: Text to which people agree before their first trial. Empty to request no
+            consent.
+        questionnaires: The questionnaires, and when people answer them.
+        rest_s: Shortest rest between two blocks, in s.
+        feedback: Measures that people see after a trial.
+        force_limit_n: For each participant who needs a lower limit, by pseudonym, the largest
+            force with which the participant can push the arm, in N.
+        catch: Trials of another condition within a block. They do not count.
+        training: Trials in which authority moves from an expert to a learner.
+        staircase: Pairs of trials that adapt a scenario key to a participant's threshold.
     """
 
     name: Name
@@ -156,14 +159,14 @@ class Protocol(Frozen, frozen=True):
     def list_phases(
         self, condition: str, random: np.random.Generator
     ) -> list[tuple[str, float | None]]:
-        """Returns the phase and the lead of each trial of a block after practice.
+        """Lists the phase and the lead of each trial of a block, without practice trials.
 
-        The lead is the first user's part of the two users' total share at the slave; None keeps
-        the scenario's shares.
+        The lead is the first user's part of the authority that two users have over the slave.
+        None keeps the scenario's dominance factors.
 
         Args:
-            condition: condition of the block.
-            random: draws the order in the pairs of a staircase.
+            condition: Condition of the block.
+            random: Generator that draws the order within the pairs of a staircase.
         """
         phases: list[tuple[str, float | None]] = []
         if self.staircase is not None:
@@ -192,7 +195,7 @@ class Protocol(Frozen, frozen=True):
 
     @property
     def groups(self) -> list[tuple[str, ...]]:
-        """The participants who take part together: single participants, or pairs."""
+        """Pseudonyms of the participants who take part together, alone or in pairs."""
         participants = self.participants
         if isinstance(participants, int):
             digits = len(str(participants))
@@ -208,23 +211,23 @@ class PlannedTrial(NamedTuple):
     """A trial of the plan.
 
     Attributes:
-        number: number of the trial in the experiment, from 1.
-        group: the participants, in the order of the protocol's users.
-        condition: name of the condition.
-        block: number of the block within the group, from 1.
-        trial: number of the trial within the block, from 1; practice trials are first.
-        practice: whether the trial is a practice trial, which does not count.
-        before: number of earlier trials of the group.
-        target: number of the target. The first target of each block is drawn, so that effects
-            of target direction are not mistaken for learning. Both trials of a staircase pair
-            have the same target.
-        seed: seed of the random numbers of the trial.
-        catch: whether the trial is a catch trial: of another condition than its block, and not
-            counted.
-        phase: phase of a training: "before", "training", "after" or "retention"; or the trial
-            of a staircase pair: "standard" or "comparison".
-        lead: the first user's part of the two users' total share at the slave; None keeps the
-            scenario's shares.
+        number: Number of the trial in the experiment, from 1.
+        group: Pseudonyms of the participants, in the order of the protocol's users.
+        condition: Name of the condition.
+        block: Number of the block within the group, from 1.
+        trial: Number of the trial within the block, from 1. Practice trials are first.
+        practice: True for a practice trial, which does not count.
+        before: Number of earlier trials of the group.
+        target: Number of the target. The first target of each block is drawn, so that effects
+            of the target's direction are not mistaken for learning. Both trials of a staircase
+            pair have the same target.
+        seed: Seed of the random numbers of the trial.
+        catch: True for a catch trial, which has another condition than its block and does not
+            count.
+        phase: Phase of a training: "before", "training", "after" or "retention". In a
+            staircase: "standard" or "comparison". Otherwise empty.
+        lead: The first user's part of the authority that two users have over the slave. None
+            keeps the scenario's dominance factors.
     """
 
     number: int
@@ -242,14 +245,14 @@ class PlannedTrial(NamedTuple):
 
     @property
     def file(self) -> str:
-        """The file name of the trial's log."""
+        """File name of the trial's log."""
         group = "-".join(self.group)
         position = f"b{self.block}-t{self.trial:02d}"
         return f"{self.number:05d}-{group}-{position}-{self.condition}.mcap"
 
 
 Choices = Mapping[int, float]
-"""The chosen trial, 1 or 2, of each staircase pair, by the number of its second trial."""
+"""Chosen trial, 1 or 2, of each staircase pair, by the number of the pair's second trial."""
 
 
 class Step(NamedTuple):
@@ -257,9 +260,9 @@ class Step(NamedTuple):
 
     Attributes:
         kind: "consent", "trial" or "questionnaire".
-        planned: the trial of the step; for a consent the next trial, for a questionnaire the
-            trial before.
-        form: the questionnaire; None for other kinds.
+        planned: The trial of the step. For a consent this is the next trial, for a
+            questionnaire the previous one.
+        form: The questionnaire. None for other kinds.
     """
 
     kind: Literal["consent", "trial", "questionnaire"]
@@ -268,7 +271,7 @@ class Step(NamedTuple):
 
     @property
     def key(self) -> str:
-        """The identifier of the step in notes and messages."""
+        """Identifier of the step in notes and messages."""
         key = f"{self.kind} {self.planned.number}"
         if self.form is not None:
             return f"{key} {self.form.name}"
@@ -280,9 +283,9 @@ class ExperimentPlan(Result):
     """A protocol, the scenario of each condition, and all trials in their order.
 
     Attributes:
-        protocol: the protocol.
-        scenarios: the scenario of each condition, by name.
-        trials: all trials in their order.
+        protocol: The protocol.
+        scenarios: Scenario of each condition, by name.
+        trials: All trials in their order.
         digest: SHA-256 of protocol and scenarios, in hexadecimal digits.
     """
 
@@ -292,7 +295,7 @@ class ExperimentPlan(Result):
     digest: str
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the plan as `trilat experiment check --json` prints it."""
+        """Returns a summary of the plan, which `trilat experiment check --json` prints."""
         protocol = self.protocol
         uncounted = [trial for trial in self.trials if trial.practice or trial.catch]
         return {
@@ -324,13 +327,17 @@ class ExperimentPlan(Result):
                         yield Step("questionnaire", planned, find_form(form))
 
     def judge_choices(self, planned: PlannedTrial, choices: Choices) -> list[bool]:
-        """Returns for each choice in a trial's block whether the choice is right.
+        """Judges the choices that participants have made in the staircase of a block.
 
-        The right choice is the comparison trial: the trial of the pair with the larger value.
+        After each pair of trials the participant says in which one the difference was larger.
+        The right answer is the comparison trial.
 
         Args:
-            planned: any trial of the block.
-            choices: the choices of the participants.
+            planned: Any trial of the block.
+            choices: Choices of the participants.
+
+        Returns:
+            For each choice in the block, True if it is right.
         """
         block_start = planned.number - planned.trial
         block_end = block_start + self.trials[-1].trial
@@ -344,7 +351,13 @@ class ExperimentPlan(Result):
     def find_pair(self, planned: PlannedTrial, choices: Choices) -> tuple[float, bool | None]:
         """Returns the difference within a trial's pair, and whether the choice was right.
 
-        Before the choice, the second value is None.
+        Args:
+            planned: A trial of the pair.
+            choices: Choices of the participants.
+
+        Returns:
+            The difference in the unit of the staircase's key. True if the choice was right,
+            False if it was wrong, None before the choice.
         """
         staircase = self.protocol.staircase
         assert staircase is not None
@@ -355,7 +368,7 @@ class ExperimentPlan(Result):
         return difference, is_right
 
     def find_scenario(self, planned: PlannedTrial, choices: Choices) -> Scenario:
-        """Returns the scenario of a trial; a staircase adapts it to the earlier choices."""
+        """Returns the scenario of a trial. A staircase adapts it to the earlier choices."""
         scenario = self.scenarios[planned.condition]
         staircase = self.protocol.staircase
         if staircase is None or planned.practice:
@@ -376,7 +389,7 @@ class ExperimentPlan(Result):
         return self.protocol.rest_s if starts_later_block else 0.0
 
     def list_orders(self) -> dict[str, list[str]]:
-        """Returns the order of conditions for each group by its name."""
+        """Returns the order of conditions of each group, by the name of the group."""
         orders: dict[str, list[str]] = {}
         for trial in self.trials:
             if trial.catch:
@@ -409,10 +422,10 @@ class ExperimentPlan(Result):
 
 
 def read_protocol(file: str | Path) -> Protocol:
-    """Returns the protocol of a TOML file.
+    """Reads a protocol from a TOML file.
 
     Raises:
-        UsageError: the file cannot be read, or a key or value in it is not valid.
+        UsageError: The file cannot be read, or a key or value in it is not valid.
     """
     path = Path(file)
     try:
@@ -432,15 +445,15 @@ def plan_experiment(
     folder: Path | None = None,
     scenarios: Mapping[str, Scenario] | None = None,
 ) -> ExperimentPlan:
-    """Returns the plan of a protocol.
+    """Plans the trials of a protocol.
 
     Args:
-        protocol: the protocol.
-        folder: folder to which the path of the protocol's scenario is relative.
-        scenarios: the scenario of each condition; None loads them from the protocol's scenario.
+        protocol: The protocol.
+        folder: Folder to which the path of the protocol's scenario is relative.
+        scenarios: Scenario of each condition. None loads them from the protocol's scenario.
 
     Raises:
-        UsageError: the protocol cannot be carried out; the error lists all problems.
+        UsageError: The protocol cannot be carried out. The error lists all problems.
     """
     problems = list(_find_problems(protocol))
     condition_scenarios: dict[str, Scenario] = {}
@@ -472,7 +485,11 @@ def plan_experiment(
 def _list_keys(table: Mapping[str, Any], path: str = "") -> dict[str, Any]:
     """Returns the dotted keys of a table of scenario settings with their values.
 
-    Tables of sites, links and rows of dominance are expanded; other tables stay values.
+    Tables of sites, links and dominance factors are expanded. Other tables stay values.
+
+    Args:
+        table: The table.
+        path: Dotted key of the table. Empty for the top level.
     """
     keys = dict[str, Any]()
     for name, value in table.items():
@@ -513,7 +530,7 @@ def _find_pseudonym_problems(protocol: Protocol) -> Iterator[str]:
 
 
 def _find_table_problems(protocol: Protocol) -> Iterator[str]:
-    """Yields the problems with catch trials, a training, and a staircase."""
+    """Yields the problems with catch trials, a training, or a staircase."""
     catch = protocol.catch
     training = protocol.training
     staircase = protocol.staircase
@@ -545,7 +562,11 @@ def _find_form_problems(protocol: Protocol) -> Iterator[str]:
 
 
 def _find_group_problems(protocol: Protocol) -> Iterator[str]:
-    """Yields the problems with the users, and with the number of participants."""
+    """Yields the problems with the users and the number of participants.
+
+    Some designs balance the orders of conditions only if the number of groups is a multiple of
+    the number of orders.
+    """
     users = protocol.users
     name_count = len(_list_pseudonyms(protocol))
     if not 1 <= len(users) <= 2 or len(set(users)) < len(users):
@@ -584,8 +605,8 @@ def _check_scenario(scenario: Scenario, protocol: Protocol) -> Scenario:
     """Returns the scenario of a condition if the experiment can be run with it.
 
     Raises:
-        ScenarioError: a user's site is missing or has no live hand, or a wall, a share, a
-            force limit or a key of the staircase does not fit.
+        ScenarioError: A user's site is missing or cannot be held by a person, or a wall, a
+            dominance factor, a force limit or a key of the staircase does not fit.
     """
     for user in protocol.users:
         if user not in scenario.names:
@@ -616,12 +637,21 @@ def _check_scenario(scenario: Scenario, protocol: Protocol) -> Scenario:
 def limit_forces(
     scenario: Scenario, protocol: Protocol, group: Sequence[str]
 ) -> dict[str, Any]:
-    """Returns the specifications of sites whose live hand gets a lower force limit.
+    """Returns the specifications of sites whose participants need a lower force limit.
 
     The limits are those of `force_limit_n` for the participants of a group.
 
+    Args:
+        scenario: Scenario of the condition.
+        protocol: The protocol.
+        group: Pseudonyms of the participants.
+
+    Returns:
+        The changed specifications by site.
+
     Raises:
-        ScenarioError: a live hand has no force limit, or a lower limit already.
+        ScenarioError: The scenario has no force limit for this site, or has a lower limit
+            already.
     """
     limited_sites: dict[str, Any] = {}
     # The lengths may differ: `_find_problems` reports a group that is too small.
@@ -645,15 +675,15 @@ def limit_forces(
 
 
 def list_orders(design: str, conditions: Sequence[str], seed: int) -> list[tuple[str, ...]]:
-    """Returns the orders of conditions, which are assigned to participants in turn.
+    """Lists the orders of conditions, which are assigned to participants in turn.
 
     Args:
         design: "williams": each condition is equally often at each position, and equally often
             right after each other condition (Williams 1949); an odd number of conditions needs
-            twice as many orders. "latin": a cyclic Latin square, which balances the positions
-            alone. "random": 1000 random permutations. "fixed": the order of `conditions`.
-        conditions: names of the conditions.
-        seed: seed of random permutations.
+            twice as many orders. "latin": a cyclic Latin square, which balances only the
+            positions. "random": 1000 random permutations. "fixed": the order of `conditions`.
+        conditions: Names of the conditions.
+        seed: Seed of random permutations.
     """
     count = len(conditions)
     if design == "fixed":
@@ -717,7 +747,17 @@ def _list_trials(protocol: Protocol) -> Iterator[PlannedTrial]:
 
 
 def _draw_catches(protocol: Protocol, condition: str, group: int, block: int) -> set[int]:
-    """Returns the indices of the catch trials in a block, from 0 with practice included."""
+    """Draws which trials of a block are catch trials.
+
+    Args:
+        protocol: The protocol.
+        condition: Condition of the block.
+        group: Index of the group.
+        block: Index of the block.
+
+    Returns:
+        Indices of the catch trials in the block, from 0 with practice trials included.
+    """
     catch = protocol.catch
     if catch is None or catch.condition == condition:
         return set()

@@ -1,10 +1,10 @@
-"""Questionnaires that people answer on the page of an experiment.
+"""Defines questionnaires that people answer on the page of an experiment.
 
-NASA-TLX, SUS and a questionnaire on the sense of agency ship with trilat-net; a protocol may
-define others.
+NASA-TLX (workload), SUS (usability) and a questionnaire on the sense of agency ship with
+trilat-net. A protocol may define others.
 
 Invariant:
-    - An answer is a number of the questionnaire's scale or None; anything else is refused.
+    - An answer is a number of the questionnaire's scale, or None. Anything else is refused.
     - None stands for an item without an answer, such as a slider that nobody touched. It is
       stored and counted as missing.
     - A questionnaire with a missing answer has no score.
@@ -29,26 +29,26 @@ Name = Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,39}$")]
 Text = Annotated[str, Meta(max_length=300)]
 
 CHOICE = "choice"
-"""The form after a pair of trials of a staircase: a forced choice, which must be answered."""
+"""Name of the form after a pair of trials of a staircase, which must be answered."""
 Answers = Mapping[str, float | None]
-"""Answers by item; None for a missing answer."""
+"""Answers by item. None for a missing answer."""
 
 
 class Questionnaire(Frozen, frozen=True):
-    """A questionnaire of a protocol; a shipped questionnaire needs only its name.
+    """A questionnaire of a protocol. A shipped questionnaire needs only its name.
 
     Attributes:
-        name: the name of a shipped questionnaire (`tlx`, `sus`, `agency`), or another name.
+        name: Name of a shipped questionnaire (`tlx`, `sus`, `agency`), or another name.
         after: "block" if people answer after each block, "experiment" if they answer once after
             the last block.
-        title: the heading.
-        items: the texts of the rated items, by their names in the table.
-        low: the text at the lower end of the scale.
-        high: the text at the upper end of the scale.
-        ends: other texts at the two ends, by item.
-        least: the smallest number of the scale.
-        most: the largest number of the scale.
-        step: the distance between two numbers of the scale.
+        title: Heading of the form.
+        items: Texts of the rated items, by their names in the table.
+        low: Text at the lower end of the scale.
+        high: Text at the upper end of the scale.
+        ends: For items that differ, the texts at both ends.
+        least: Smallest number of the scale.
+        most: Largest number of the scale.
+        step: Distance between two numbers of the scale.
     """
 
     name: Name
@@ -64,17 +64,17 @@ class Questionnaire(Frozen, frozen=True):
 
     @property
     def is_forced(self) -> bool:
-        """Whether every item must be answered."""
+        """True if every item must be answered."""
         return self.name == CHOICE
 
     def read(self, values: Sequence[float | None]) -> dict[str, float | None]:
-        """Returns the answers by item.
+        """Checks the answers that a page sent, and returns them by item.
 
         Args:
-            values: the answers in the order of the items; None for a missing answer.
+            values: Answers in the order of the items. None for a missing answer.
 
         Raises:
-            UsageError: there are more or fewer values than items, a value is not on the scale,
+            UsageError: There are more or fewer values than items, a value is not on the scale,
                 or a required answer is missing.
         """
         are_valid = all(self._is_valid(value) for value in values)
@@ -84,15 +84,17 @@ class Questionnaire(Frozen, frozen=True):
         return dict(zip(self.items, values, strict=True))
 
     def _is_valid(self, value: float | None) -> bool:
-        """Returns whether a value is on the scale, or a missing answer that is allowed."""
+        """Returns True if a value is on the scale, or is a missing answer that is allowed."""
         if value is None:
             return not self.is_forced
         return value in range(self.least, self.most + 1, self.step)
 
     def score(self, answers: Answers) -> float | None:
-        """Returns the score: raw NASA-TLX, the score of SUS, or the mean of the answers.
+        """Computes the score of a completed questionnaire.
 
-        Returns None if an answer is missing.
+        Returns:
+            Raw NASA-TLX, the score of SUS, or the mean of the answers. None if an answer is
+            missing.
         """
         complete = {item: value for item, value in answers.items() if value is not None}
         if len(complete) < len(answers):
@@ -113,10 +115,10 @@ def _read_shipped() -> dict[str, Any]:
 
 
 def find_form(questionnaire: Questionnaire) -> Questionnaire:
-    """Returns a questionnaire with its items.
+    """Returns a questionnaire with its items, which those that are shipped need not state.
 
     Raises:
-        UsageError: the questionnaire has no items and no shipped one has its name, or its scale
+        UsageError: The questionnaire has no items and no shipped one has its name, or its scale
             does not have 2 to 101 numbers.
     """
     name = questionnaire.name

@@ -1,11 +1,11 @@
-"""Adaptive staircases, which find the smallest difference that a participant perceives.
+"""Finds the smallest difference that a participant perceives, with an adaptive staircase.
 
 A staircase consists of pairs of trials. In one trial of a pair, a key of the scenario has its
-standard value, in the other a larger value; the order of the two is drawn. After each pair, the
+standard value, in the other a larger value. The order of the two is drawn. After each pair, the
 participant says in which trial the value was larger. After `down` right answers in a row the
 difference is divided by `factor`, and after a wrong answer it is multiplied by `factor`
-(Levitt, 1971). The difference settles where steps down and up are equally likely, that is,
-where the probability of a right answer is 0.5^(1 / down): 0.707 for `down` = 2.
+(Levitt, 1971). The difference settles where steps down and up are equally likely. There the
+probability of a right answer is 0.5^(1 / down), for example 0.707 for `down` = 2.
 
 Invariant:
     - The differences in a block follow from the protocol and from the earlier answers of the
@@ -23,9 +23,9 @@ from ...fields import Frozen, Positive
 from .questionnaires import CHOICE, Questionnaire, Text
 
 STANDARD = "standard"
-"""The phase of a trial with the standard value."""
+"""Phase of a trial with the standard value."""
 COMPARISON = "comparison"
-"""The phase of a trial with the larger value."""
+"""Phase of a trial with the larger value."""
 SKIPPED_REVERSALS = 2
 """Number of reversals before the difference is near its final value."""
 
@@ -34,14 +34,14 @@ class Staircase(Frozen, frozen=True):
     """A key of the scenario that is adapted to the perception of each participant.
 
     Attributes:
-        key: the key of the scenario.
-        start: the first difference, which is also the largest, in the key's unit.
-        standard: the value to compare with.
-        factor: the factor by which the difference changes.
-        down: the number of right answers in a row after which the difference decreases.
-        asks: the question after each pair.
-        deviation: standard deviation of a synthetic participant's perception, in the key's
-            unit; None stands for a quarter of `start`.
+        key: The key of the scenario.
+        start: First difference, which is also the largest, in the key's unit.
+        standard: Value of the key in the standard trial.
+        factor: Factor by which the difference changes.
+        down: Number of right answers in a row after which the difference decreases.
+        asks: Question after each pair.
+        deviation: Standard deviation of a synthetic participant's perception, in the key's
+            unit. None stands for a quarter of `start`.
     """
 
     key: str
@@ -54,13 +54,13 @@ class Staircase(Frozen, frozen=True):
 
     @property
     def measure(self) -> str:
-        """The threshold's name with its unit: threshold_delay_ms for link.delay_ms."""
+        """Name of the threshold with its unit, such as threshold_delay_ms for link.delay_ms."""
         parts = [part for part in self.key.split(".") if not part.isdigit()]
         return f"threshold_{parts[-1]}"
 
     @property
     def form(self) -> Questionnaire:
-        """The questionnaire after each pair; the answer is 1 or 2."""
+        """The questionnaire after each pair. The answer is 1 or 2."""
         return Questionnaire(
             name=CHOICE,
             title="Which one?",
@@ -71,7 +71,14 @@ class Staircase(Frozen, frozen=True):
         )
 
     def _list_directions(self, right: Sequence[bool]) -> list[int]:
-        """Returns the direction after each answer: -1 down, 1 up, or 0 for no change."""
+        """Returns the direction in which the difference changes after each answer.
+
+        Args:
+            right: For each answer, True if it was right.
+
+        Returns:
+            For each answer -1 for down, 1 for up, or 0 for no change.
+        """
         directions: list[int] = []
         right_in_row = 0
         for is_right in right:
@@ -88,7 +95,7 @@ class Staircase(Frozen, frozen=True):
         """Returns the difference of each pair, and of the next pair.
 
         Args:
-            right: whether each earlier answer was right.
+            right: For each earlier answer, True if it was right.
         """
         differences = [self.start]
         for direction in self._list_directions(right):
@@ -97,14 +104,18 @@ class Staircase(Frozen, frozen=True):
         return differences
 
     def find_threshold(self, right: Sequence[bool]) -> float | None:
-        """Returns the threshold, in the key's unit: the geometric mean of the reversals.
+        """Computes the threshold, the geometric mean of the differences at the reversals.
 
-        A reversal is a step in another direction than the step before. The first two reversals
-        do not count. If the number of reversals is odd, the third does not count either, so
-        that as many reversals lead up as down. Returns None if no reversals are left.
+        A reversal is a step in another direction than the previous step. The first two
+        reversals do not count, because the difference is still far from its final value. If the
+        number of reversals is odd, the third does not count either, so that as many reversals
+        lead up as down.
 
         Args:
-            right: whether each answer was right.
+            right: For each answer, True if it was right.
+
+        Returns:
+            The threshold in the key's unit. None if no reversals are left.
         """
         # There is one difference more than directions: that of the next pair.
         pairs = zip(self.list_differences(right), self._list_directions(right), strict=False)
@@ -120,15 +131,18 @@ class Staircase(Frozen, frozen=True):
         return float(np.exp(np.mean(np.log(counted))))
 
     def draw_choice(self, difference: float, comparison: int, seed: int) -> int:
-        """Returns the trial of a pair, 1 or 2, that a synthetic participant chooses.
+        """Draws which trial of a pair a synthetic participant chooses.
 
         The participant perceives each trial with a normal error, so that the choice is right
         with probability Phi(difference / (sqrt(2) deviation)) (Green and Swets, 1966).
 
         Args:
-            difference: the difference of the pair, in the key's unit.
-            comparison: the trial with the larger value, 1 or 2.
-            seed: the seed of the choice.
+            difference: Difference within the pair, in the key's unit.
+            comparison: Number of the trial with the larger value, 1 or 2.
+            seed: Seed of the choice.
+
+        Returns:
+            Number of the chosen trial, 1 or 2.
         """
         deviation = self.deviation or self.start / 4.0
         random = np.random.default_rng([seed, 2])
@@ -138,7 +152,7 @@ class Staircase(Frozen, frozen=True):
         return comparison if difference + error > 0.0 else standard
 
     def describe(self) -> str:
-        """Returns the procedure as a sentence of a methods paragraph."""
+        """Returns the procedure as a sentence for the methods section of a paper."""
         right_percent = 100.0 * 0.5 ** (1.0 / self.down)
         return (
             f"{self.key} was adapted in a two-interval forced choice against "

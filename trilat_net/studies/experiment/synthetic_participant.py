@@ -1,7 +1,7 @@
-"""A model of a person at a master, for experiments without people.
+"""Models a person who moves a master arm, for experiments without people.
 
-The synthetic participant sees the slave over the network, and moves its hand so that the slave
-reaches the target:
+The synthetic participant sees the slave arm over the network, and moves the hand at its master
+so that the slave reaches the target:
     - It makes movements of minimum jerk (Flash and Hogan, 1985), whose ends scatter with their
       length (Harris and Wolpert, 1998) and whose durations follow Fitts' law.
     - Before a correction it waits until the slave is at rest, as people do with a delay
@@ -11,7 +11,7 @@ reaches the target:
     - With practice it becomes faster by an exponential law.
 
 Invariant:
-    - The motion follows from the views, the parameters and the seed of the participant.
+    - The motion follows from what the participant sees, its parameters and its seed.
 """
 
 import math
@@ -39,17 +39,17 @@ DELAY_MARGIN = 0.7
 
 
 class ParticipantModel(Frozen, frozen=True):
-    """The mean parameters of synthetic participants, who differ from each other.
+    """Mean parameters of synthetic participants, who differ from each other.
 
     Attributes:
-        reaction_s: time from a view to the reaction, in s.
-        fitts_a_s: duration of a movement of no difficulty, in s.
-        fitts_b_s: additional duration for each bit of the index of difficulty, in s.
-        noise: standard deviation of a movement's end, as a share of the movement's length.
-        crossover_rad_s: rate at which a moving target is followed without a delay, in rad/s.
-        learning: share by which a first trial is slower than a practised trial.
-        practised: number of trials after which half of that share is gone.
-        spread: standard deviation of the logarithm of a participant's parameters.
+        reaction_s: Time from what the participant sees to the reaction, in s.
+        fitts_a_s: Duration of a movement of no difficulty, in s.
+        fitts_b_s: Additional duration for each bit of the index of difficulty, in s.
+        noise: Standard deviation of a movement's end, as a share of the movement's length.
+        crossover_rad_s: Rate at which a moving target is followed without a delay, in rad/s.
+        learning: Share by which a first trial is slower than a practised trial.
+        practised: Number of trials after which half of this share is gone.
+        spread: Standard deviation of the logarithm of a participant's parameters.
     """
 
     reaction_s: Annotated[float, Meta(ge=0.0, le=2.0)] = 0.25
@@ -62,7 +62,7 @@ class ParticipantModel(Frozen, frozen=True):
     spread: Share = 0.15
 
     def draw(self, seed: int) -> "ParticipantModel":
-        """Returns the parameters of one participant, drawn about the mean parameters."""
+        """Draws the parameters of one participant around the mean parameters."""
         random = np.random.default_rng(seed)
         factors = np.exp(self.spread * random.standard_normal(5)).tolist()
         reaction, fitts_a, fitts_b, noise, crossover = factors
@@ -77,17 +77,20 @@ class ParticipantModel(Frozen, frozen=True):
 
 
 class SyntheticParticipant:
-    """A synthetic participant at one master in one trial; a hand program as users write them.
+    """A synthetic participant at one master in one trial.
+
+    It has the interface of a hand program, as users may write one: the site calls `act` at a
+    fixed rate.
 
     Args:
-        facts: the description of the participant's site.
-        model: the participant's parameters.
-        goal: the goal of the trial.
-        slave: the site of the slave, the slave's arm, and a function that returns the force on
-            the end effector, in N, from joint angles and torques.
-        before: the number of trials that the participant has done before.
-        seed: the seed of the trial.
-        user: the participant's index among the users, from 0.
+        facts: Description of the participant's site.
+        model: Parameters of the participant.
+        goal: Goal of the trial.
+        slave: Name of the slave's site, the slave's arm, and a function that returns the force
+            on the end effector, in N, from joint angles and torques.
+        before: Number of trials that the participant has done before.
+        seed: Seed of the trial.
+        user: Index of the participant among the users, from 0.
     """
 
     def __init__(
@@ -119,7 +122,11 @@ class SyntheticParticipant:
         self._moved_s = 0.0
 
     def act(self, now: HandView) -> Array:
-        """Returns the target position of the hand, in m."""
+        """Returns the target position of the hand, in m.
+
+        Args:
+            now: What the participant sees at its site.
+        """
         slave = now.peers[self._slave_index]
         slave_m = self._see_slave(now, slave)
         if not self._goal.has_authority(now.t_s, self._user):
@@ -142,7 +149,10 @@ class SyntheticParticipant:
         return self._interpolate_movement(now.t_s)
 
     def _see_slave(self, now: HandView, slave: PeerView) -> Array:
-        """Returns the position of the slave's end effector in the view, in m."""
+        """Returns the position of the slave's end effector that the participant sees, in m.
+
+        The time at which the slave last moved is remembered.
+        """
         slave_m = place_slave(self._arm, slave.q)[: self._axes]
         if self._slave_m is None:
             self._start_m = now.pose
@@ -157,7 +167,7 @@ class SyntheticParticipant:
     def _find_next_start_s(self, slave: PeerView) -> float:
         """Returns the earliest time of the next movement, in s.
 
-        The hand and the slave must have come to rest. Then the participant reacts; before a
+        The hand and the slave must have come to rest. Then the participant reacts. Before a
         correction, the participant also waits for the delayed view of the slave.
         """
         rest_s = max(self._begins_s + self._duration_s, self._moved_s)
@@ -166,7 +176,7 @@ class SyntheticParticipant:
         return max(rest_s, 0.0) + wait_s
 
     def _find_press_step(self, slave: PeerView, t_s: float) -> Array:
-        """Returns the step towards the required force, in m; 0 away from the wall."""
+        """Returns the step towards the required force, in m. It is 0 away from the wall."""
         force_n = self._find_force_n(slave.q, slave.tau_x)
         towards_m = (self._goal.find_target_m(t_s) - self._goal.start_m)[: self._axes]
         step_m: Array = towards_m * (self._goal.width_m / np.linalg.norm(towards_m))
@@ -175,7 +185,12 @@ class SyntheticParticipant:
         return step_m * (1.0 - force_n / self._goal.force_n)
 
     def _start_movement(self, t_s: float, step_m: Array) -> None:
-        """Starts a movement by a step, with noise in proportion to the step's length."""
+        """Starts a movement by a step, with noise in proportion to the step's length.
+
+        Args:
+            t_s: Present time, in s.
+            step_m: The step, in m.
+        """
         model = self._model
         length_m = float(np.linalg.norm(step_m))
         scatter_m = model.noise * length_m * self._random.standard_normal(self._axes)
@@ -192,8 +207,8 @@ class SyntheticParticipant:
     def _interpolate_movement(self, t_s: float) -> Array:
         """Returns the position of the present movement of minimum jerk, in m.
 
-        With s from 0 to 1 over the movement, the position is start + (end - start) (10 s^3 - 15
-        s^4 + 6 s^5).
+        With s from 0 to 1 over the movement, the position is
+        start + (end - start) (10 s^3 - 15 s^4 + 6 s^5).
         """
         s = 1.0
         if self._duration_s:
@@ -208,9 +223,12 @@ class SyntheticParticipant:
         The rate is at most 0.7 / (reaction time + 2 age of the slave's sample), in 1/s.
 
         Args:
-            now: the present view.
-            distance_m: the slave's distance from the target, in m.
-            age_s: age of the slave's sample, in s.
+            now: What the participant sees.
+            distance_m: Distance of the slave from the target, in m.
+            age_s: Age of the slave's sample, in s.
+
+        Returns:
+            The target position of the hand, in m.
         """
         # The age is the delay of one direction; a correction is seen after both directions.
         loop_delay_s = self._model.reaction_s + 2.0 * age_s

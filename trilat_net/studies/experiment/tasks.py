@@ -1,14 +1,16 @@
-"""The tasks of an experiment: reach a target, hand over, press a wall, track a path.
+"""Defines the tasks of an experiment: reach a target, hand over, press a wall, track a path.
 
-A protocol defines a `TrialTask` with its numbers. For each trial the task makes a `TrialGoal`,
-which places the target at every time and judges how the trial ends.
+A protocol defines a `TrialTask` with its numbers, such as the distance of the targets. For each
+trial the task makes a `TrialGoal`. The goal knows where the target is at every time, and judges
+how the trial ends. The participants move the slave arm over the network with their master arms.
 
 Invariant:
     - The goal of a trial follows from the task's numbers, the trial's seed, and the start of
       the slave's arm.
     - A trial is judged by the position of the slave's end effector and by the force on it. The
-      delayed pictures of the users play no role.
-    - A trial ends by dwelling at the goal, by its time, or by a violation of the task's rules.
+      delayed pictures that the users see play no role.
+    - A trial ends when the end effector has stayed at the goal, when its time is over, or when
+      a rule of the task is broken.
 """
 
 import math
@@ -26,13 +28,13 @@ Seconds = Annotated[float, Meta(gt=0.0, le=600.0)]
 
 
 class TrialTask(Frozen, frozen=True, tag_field="kind"):
-    """A task, as a protocol defines it; `make_goal` returns the goal of a trial.
+    """A task, as a protocol defines it. `make_goal` returns the goal of a trial.
 
     Attributes:
-        description: the task in a phrase, for texts and plans.
-        instructions: the template of the text for participants.
-        learning_measure: the measure that decreases with practice.
-        needs_wall: whether the task is judged by the force on the slave, which needs a wall.
+        description: The task in a phrase, for texts and plans.
+        instructions: Template of the text for participants.
+        learning_measure: Name of the measure that decreases with practice.
+        needs_wall: True if the task is judged by the force on the slave, which needs a wall.
     """
 
     description: ClassVar[str] = ""
@@ -41,49 +43,53 @@ class TrialTask(Frozen, frozen=True, tag_field="kind"):
     needs_wall: ClassVar[bool] = False
 
     def render_instructions(self, slave: str) -> str:
-        """Returns the instructions for participants; `slave` is the name of the slave."""
+        """Returns the instructions for participants, with the slave's name and numbers."""
         return self.instructions.format(slave=slave, task=self)
 
     @property
     def longest_s(self) -> float:
-        """The longest duration of a trial after its target appears, in s."""
+        """Longest duration of a trial after its target appears, in s."""
         raise NotImplementedError
 
     @property
     def has_limit(self) -> bool:
-        """Whether a trial fails after `longest_s`; otherwise every trial lasts that long."""
+        """True if a trial fails after `longest_s`. Otherwise every trial lasts that long."""
         return True
 
     @property
     def needs_pair(self) -> bool:
-        """Whether the task needs two users."""
+        """True if the task needs two users."""
         return False
 
     def make_goal(self, start_m: Array, number: int, seed: int) -> "TrialGoal":
         """Returns the goal of a trial.
 
         Args:
-            start_m: the position of the slave's end effector at the start, shape (2,) or (3,),
-                in m.
-            number: the number of the target, from 0.
-            seed: the seed of the trial.
+            start_m: Position of the slave's end effector at the start, shape (2,) or (3,), in
+                m.
+            number: Number of the target, from 0.
+            seed: Seed of the trial.
         """
         raise NotImplementedError
 
 
 class TrialGoal:
-    """The goal of one trial.
+    """The goal of one trial: where its target is, and when the trial ends.
+
+    Args:
+        start_m: Position of the slave's end effector at the start, in m.
+        width_m: Diameter of the target, in m.
 
     Attributes:
-        start_m: the position of the target before it appears, in m: the start of the slave.
-        width_m: the diameter of the target, in m.
-        appears_s: the time at which the target appears, in s: the end of the fore-period.
-        is_moving: whether the target moves from then on.
-        force_n: the force to press with, in N; 0 if the task has no force.
-        lead: the first user's part of the authority that two users share over the slave until a
-            handover; None for the scenario's dominance factors.
-        handover: the time from the target's appearance until the second user receives the
-            authority, and the duration of the change, both in s; None without a handover.
+        start_m: Position of the target before it appears, in m: the start of the slave.
+        width_m: Diameter of the target, in m.
+        appears_s: Time at which the target appears, in s. Users must wait until then.
+        is_moving: True if the target moves from then on.
+        force_n: Force to press with, in N. 0 if the task has no force.
+        lead: The first user's part of the authority that two users share over the slave, until
+            a handover. None for the scenario's dominance factors.
+        handover: Time from the target's appearance until the second user receives the
+            authority, and duration of the change, both in s. None without a handover.
     """
 
     is_moving = False
@@ -100,28 +106,36 @@ class TrialGoal:
         """Returns the target position of the end effector, shape (2,) or (3,), in m.
 
         Args:
-            t_s: time since the epoch, in s.
-            user: the user, from 0, whose target is returned; None for the middle of all users'
-                targets.
+            t_s: Time since the start of the session, in s.
+            user: Index of the user whose target is returned, from 0. None for the middle of all
+                users' targets.
         """
         if t_s < self.appears_s:
             return self.start_m
         return self._find_target_m(t_s - self.appears_s, user)
 
     def judge(self, t_s: float, position_m: Array, force_n: float = 0.0) -> "Outcome | None":
-        """Returns the outcome of the trial; None while the trial goes on.
+        """Judges whether the trial ends now.
 
         Args:
-            t_s: time since the epoch, in s.
-            position_m: the position of the end effector, shape (2,) or (3,), in m.
-            force_n: the magnitude of the force on the end effector, in N.
+            t_s: Time since the start of the session, in s.
+            position_m: Position of the end effector, shape (2,) or (3,), in m.
+            force_n: Magnitude of the force on the end effector, in N.
+
+        Returns:
+            The outcome of the trial. None while the trial goes on.
         """
         if t_s < self.appears_s:
             return None
         return self._judge(t_s, position_m, force_n)
 
     def has_authority(self, t_s: float, user: int) -> bool:
-        """Returns whether a user, from 0, has any authority over the slave."""
+        """Returns True if a user has any authority over the slave.
+
+        Args:
+            t_s: Time since the start of the session, in s.
+            user: Index of the user, from 0.
+        """
         if self.lead is None:
             return True
         begins_s, ramp_s = self.handover or (math.inf, 0.0)
@@ -133,23 +147,31 @@ class TrialGoal:
         return abs(self.lead - 1) > 0.05
 
     def find_corridor(self, t_s: float) -> tuple[Array, float] | None:  # noqa: ARG002 - there is none
-        """Returns the corridor to the target, which nobody may leave; None without a corridor.
+        """Returns the corridor to the target, which nobody may leave.
 
         Args:
-            t_s: time since the epoch, in s.
+            t_s: Time since the start of the session, in s.
 
         Returns:
-            The start of the corridor and its width, both in m.
+            The start of the corridor and its width, both in m. None without a corridor.
         """
         return None
 
-    def measure(self, after_s: Array, position_m: Array, force_n: Array) -> dict[str, float]:  # noqa: ARG002
-        """Returns the measures that only this task has.
+    def compute_measures(
+        self,
+        after_s: Array,
+        position_m: Array,
+        force_n: Array,  # noqa: ARG002
+    ) -> dict[str, float]:
+        """Computes the measures that only this task has.
 
         Args:
-            after_s: times since the target's appearance, shape (K,), in s.
-            position_m: positions of the slave's end effector, shape (K, 2) or (K, 3), in m.
-            force_n: magnitudes of the force on the end effector, shape (K,), in N.
+            after_s: Times since the target's appearance, shape (K,), in s.
+            position_m: Positions of the slave's end effector, shape (K, 2) or (K, 3), in m.
+            force_n: Magnitudes of the force on the end effector, shape (K,), in N.
+
+        Returns:
+            The measures by name. Empty if the task has none.
         """
         return {}
 
@@ -166,8 +188,8 @@ class Outcome(NamedTuple):
     """The outcome of a trial.
 
     Attributes:
-        succeeded: whether the task was done.
-        ended_s: the time of the end, in s since the epoch.
+        succeeded: True if the task was done.
+        ended_s: Time of the end, in s since the start of the session.
     """
 
     succeeded: bool
@@ -175,20 +197,20 @@ class Outcome(NamedTuple):
 
 
 class ReachTrial(TrialTask, frozen=True, tag="reach"):
-    """Targets on a ring about the start, each opposite the previous one (ISO 9241-411).
+    """The task to reach targets on a ring, each opposite the previous one (ISO 9241-411).
 
     Attributes:
-        targets: the number of targets.
-        distance_m: radius of the ring, in m.
-        width_m: diameter of a target, in m.
-        dwell_s: how long the end effector has to stay in the target, in s.
-        timeout_s: time after which the trial has failed, in s.
-        corridor_m: width of the straight corridor to the target, in m, which nobody may leave;
+        targets: Number of targets.
+        distance_m: Radius of the ring around the start, in m.
+        width_m: Diameter of a target, in m.
+        dwell_s: How long the end effector must stay in the target, in s.
+        timeout_s: Time after which the trial has failed, in s.
+        corridor_m: Width of the straight corridor to the target, in m, which nobody may leave.
             None if the users may choose the path.
-        handover_s: time after which the second user receives the first user's authority, in s;
+        handover_s: Time after which the second user receives the first user's authority, in s.
             None without a handover.
-        ramp_s: duration of the handover, in s. The end effector must stay in the target
-            meanwhile; then the next target appears.
+        ramp_s: Duration of the handover, in s. The end effector must stay in the target
+            meanwhile. Then the next target appears.
     """
 
     description: ClassVar[str] = "reaching to a ring of targets"
@@ -208,7 +230,7 @@ class ReachTrial(TrialTask, frozen=True, tag="reach"):
 
     @property
     def needs_pair(self) -> bool:
-        """Whether one user hands the slave over to the other."""
+        """True if one user hands the slave over to the other."""
         return self.handover_s is not None
 
     def render_instructions(self, slave: str) -> str:
@@ -223,7 +245,7 @@ class ReachTrial(TrialTask, frozen=True, tag="reach"):
 
     @property
     def longest_s(self) -> float:
-        """The time-out, in s, which begins again with the second target of a handover."""
+        """The time-out, in s. With a handover it begins again at the second target."""
         if self.handover_s is None:
             return self.timeout_s
         second_appears_s = self.handover_s + self.ramp_s
@@ -236,8 +258,9 @@ class ReachTrial(TrialTask, frozen=True, tag="reach"):
         return _ReachGoal(self, start_m, [target_m, next_target_m])
 
     def _place_target_m(self, start_m: Array, number: int) -> Array:
-        """Returns the position of a target, in m; consecutive targets are nearly opposite."""
-        # Even numbers advance around the ring, odd numbers are half a ring further.
+        """Returns the position of a target, in m. Consecutive targets are nearly opposite."""
+        # Targets with even numbers advance around the ring. Those with odd numbers are half a
+        # ring further.
         half_ring = self.targets // 2
         index = (number // 2 + (number % 2) * half_ring) % self.targets
         angle = 2.0 * math.pi * index / self.targets
@@ -258,10 +281,11 @@ class _DwellGoal(TrialGoal):
         self._inside_since_s = math.inf
 
     def _is_inside(self, after_s: float, position_m: Array, force_n: float) -> bool:
-        """Returns whether the condition of the goal is met."""
+        """Returns True if the condition of the goal is met."""
         raise NotImplementedError
 
     def _judge(self, t_s: float, position_m: Array, force_n: float) -> Outcome | None:
+        """Ends the trial if the condition was met long enough, or if the time is over."""
         if self._is_inside(t_s - self.appears_s, position_m, force_n):
             self._inside_since_s = min(self._inside_since_s, t_s)
         else:
@@ -289,8 +313,17 @@ class _ReachGoal(_DwellGoal):
         self._handover_s, ramp_s = self.handover or (-1.0, 0.0)
         self._second_appears_s = self._handover_s + ramp_s
 
-    def measure(self, after_s: Array, position_m: Array, force_n: Array) -> dict[str, float]:  # noqa: ARG002
-        """Returns the largest distance from the target during the handover, in mm."""
+    def compute_measures(
+        self,
+        after_s: Array,
+        position_m: Array,
+        force_n: Array,  # noqa: ARG002
+    ) -> dict[str, float]:
+        """Returns the largest distance from the target during the handover, in mm.
+
+        While one user hands the slave over to the other, its end effector should stay at the
+        target. The distance tells how steady it stayed. Empty without a handover.
+        """
         has_begun = after_s >= self._handover_s
         is_handover = has_begun & (after_s < self._second_appears_s)
         target_m = self._waypoints_m[1]
@@ -312,15 +345,18 @@ class _ReachGoal(_DwellGoal):
         return self._waypoints_m[1:] if has_second_appeared else self._waypoints_m[:2]
 
     def _find_target_m(self, after_s: float, user: int | None) -> Array:  # noqa: ARG002 - all users see the same
+        """Returns the end of the present movement, which all users see alike."""
         return self._find_segment(after_s)[1]
 
     def _is_inside(self, after_s: float, position_m: Array, force_n: float) -> bool:  # noqa: ARG002 - no force
+        """Returns True if the end effector is in the last target that will appear."""
         target_m = self._find_target_m(after_s, None)
         error_m = float(np.linalg.norm(position_m - target_m))
         # Before the second target appears, the trial cannot succeed.
         return error_m <= self.width_m / 2.0 and after_s >= self._second_appears_s
 
     def _judge(self, t_s: float, position_m: Array, force_n: float) -> Outcome | None:
+        """Ends the trial as failed if the end effector left the corridor."""
         if self._corridor_m is not None:
             start_m, end_m = self._find_segment(t_s - self.appears_s)
             path_m = end_m - start_m
@@ -334,16 +370,16 @@ class _ReachGoal(_DwellGoal):
 
 
 class ContactTrial(TrialTask, frozen=True, tag="contact"):
-    """A wall that must be pressed with a force.
+    """The task to press a wall with a force.
 
     Attributes:
-        axis: the axis of the arm's base frame along which the target is drawn, from 0.
-        distance_m: distance from the start to the target, in m; negative for the other side.
-        width_m: diameter of the target, in m.
-        force_n: the force to press with, in N.
-        tolerance_n: largest error of the force, in N.
-        dwell_s: how long the force must be held, in s.
-        timeout_s: time after which the trial has failed, in s.
+        axis: Axis of the arm's base frame along which the target is drawn, from 0.
+        distance_m: Distance from the start to the target, in m. Negative for the other side.
+        width_m: Diameter of the target, in m.
+        force_n: Force to press with, in N.
+        tolerance_n: Largest error of the force, in N.
+        dwell_s: How long the force must be held, in s.
+        timeout_s: Time after which the trial has failed, in s.
     """
 
     description: ClassVar[str] = "holding a force at a wall"
@@ -372,7 +408,7 @@ class ContactTrial(TrialTask, frozen=True, tag="contact"):
 
 
 class _ContactGoal(_DwellGoal):
-    """A target at a wall, and a force to press with."""
+    """A target at a wall, and a force with which to press it."""
 
     def __init__(self, task: ContactTrial, start_m: Array) -> None:
         super().__init__(task, start_m)
@@ -382,10 +418,19 @@ class _ContactGoal(_DwellGoal):
         self._target_m: Array = start_m + task.distance_m * direction
 
     def _find_target_m(self, after_s: float, user: int | None) -> Array:  # noqa: ARG002 - it does not move
+        """Returns the target at the wall, which does not move."""
         return self._target_m
 
-    def measure(self, after_s: Array, position_m: Array, force_n: Array) -> dict[str, float]:  # noqa: ARG002
-        """Returns the mean of the force that had to be held, and the RMS of its error, in N."""
+    def compute_measures(
+        self,
+        after_s: Array,
+        position_m: Array,
+        force_n: Array,  # noqa: ARG002
+    ) -> dict[str, float]:
+        """Returns the mean of the force that had to be held, and the RMS of its error, in N.
+
+        Both are taken over the time for which the force had to be held at the end of the trial.
+        """
         is_dwell = after_s >= after_s[-1] - self._dwell_s
         held_n = force_n[is_dwell]
         errors_n = held_n - self.force_n
@@ -393,20 +438,23 @@ class _ContactGoal(_DwellGoal):
         return {"wall_force_n": float(held_n.mean()), "error_force_n": rms_error_n}
 
     def _is_inside(self, after_s: float, position_m: Array, force_n: float) -> bool:  # noqa: ARG002 - only the force counts
+        """Returns True if the force is right within the tolerance."""
         return abs(force_n - self.force_n) <= self._tolerance_n
 
 
 class TrackTrial(TrialTask, frozen=True, tag="track"):
-    """A path of sines of incommensurate frequencies along one axis, which nobody can foresee.
+    """The task to follow a target that moves along one axis in a way that nobody can foresee.
+
+    The path is a sum of sines whose frequencies have no common multiple.
 
     Attributes:
-        axis: the axis of the arm's base frame, from 0.
-        amplitude_m: largest distance of the path from the start, in m.
-        frequencies_hz: frequencies of the sines, in Hz; their phases are drawn for every trial.
-        duration_s: duration of a trial, in s.
-        width_m: diameter of the target, in m.
-        apart_m: distance along the axis between the targets of the two users, in m. The users
-            have to agree on a position.
+        axis: Axis of the arm's base frame, from 0.
+        amplitude_m: Largest distance of the path from the start, in m.
+        frequencies_hz: Frequencies of the sines, in Hz. Their phases are drawn for every trial.
+        duration_s: Duration of a trial, in s.
+        width_m: Diameter of the target, in m.
+        apart_m: Distance along the axis between the targets of the two users, in m. If it is
+            not 0, the users must agree on a position.
     """
 
     description: ClassVar[str] = "tracking a path of sines"
@@ -429,12 +477,12 @@ class TrackTrial(TrialTask, frozen=True, tag="track"):
 
     @property
     def needs_pair(self) -> bool:
-        """Whether the users see different targets."""
+        """True if the users see different targets."""
         return self.apart_m > 0.0
 
     @property
     def longest_s(self) -> float:
-        """The duration of a trial, in s."""
+        """Duration of a trial, in s."""
         return self.duration_s
 
     def make_goal(self, start_m: Array, number: int, seed: int) -> TrialGoal:  # noqa: ARG002 - the seed draws the path
@@ -454,8 +502,17 @@ class _TrackGoal(TrialGoal):
         self._task = task
         self._phases = phases
 
-    def measure(self, after_s: Array, position_m: Array, force_n: Array) -> dict[str, float]:  # noqa: ARG002
-        """Returns whose target the slave followed: 1 the first user's, 0 the second user's."""
+    def compute_measures(
+        self,
+        after_s: Array,
+        position_m: Array,
+        force_n: Array,  # noqa: ARG002
+    ) -> dict[str, float]:
+        """Returns whose target the slave followed, as a number between the two users.
+
+        The number is 1 for the first user's target, 0 for the second user's, and 0.5 for the
+        middle. Empty if both users have the same target.
+        """
         task = self._task
         if not task.needs_pair:
             return {}
@@ -465,6 +522,7 @@ class _TrackGoal(TrialGoal):
         return {"first_settled": 0.5 + mean_error_m / task.apart_m}
 
     def _find_target_m(self, after_s: float, user: int | None) -> Array:
+        """Returns the point of the path, with the offset of a user's target."""
         task = self._task
         rates_rad_s = 2.0 * math.pi * np.array(task.frequencies_hz)
         # The path begins at the start: each sine is 0 when the target appears.
@@ -478,6 +536,7 @@ class _TrackGoal(TrialGoal):
         return target_m
 
     def _judge(self, t_s: float, position_m: Array, force_n: float) -> Outcome | None:  # noqa: ARG002 - by its time
+        """Ends the trial as completed when its time is over."""
         if t_s >= self.appears_s + self._task.duration_s:
             return Outcome(True, t_s)
         return None
@@ -487,12 +546,12 @@ AnyTask = ReachTrial | ContactTrial | TrackTrial
 
 
 def place_slave(arm: Any, shared: Sequence[float]) -> Array:
-    """Returns the position of an end effector, in m, from the coordinates of its site.
+    """Returns the position of an end effector, in m, from the state that its site sends.
 
     Args:
-        arm: the arm of the site.
-        shared: the coordinates that the site shares: joint angles in rad, or the pose of the
-            end effector.
+        arm: Arm of the site.
+        shared: Coordinates that the sites exchange: joint angles in rad, or the pose of the end
+            effector.
     """
     position = shared[:3] if arm.shares_pose else arm.end_effector(shared)
     return np.array(position, dtype=np.float64)

@@ -1,7 +1,8 @@
-"""One trial of an experiment: its scenario, its judgement, and the measures of its log.
+"""Runs and judges one trial of an experiment, and computes its measures from its log.
 
-`ExperimentTrial` is a trial with people, whose log a live session records. `SyntheticTrial` is
-a trial of synthetic participants, which runs in virtual time.
+In a trial the participants move the slave arm over the network, to do a task such as reaching a
+target. `ExperimentTrial` is a trial with people, whose log a live session records.
+`SyntheticTrial` is a trial of synthetic participants, which runs in virtual time.
 
 Invariant:
     - The result of a trial follows from its log, for people and for synthetic participants
@@ -53,14 +54,14 @@ REST_S = 0.1
 
 
 class TrialEntry(msgspec.Struct, frozen=True):
-    """A finished trial in the journal.
+    """Result of a finished trial, as the journal stores it.
 
     Attributes:
-        cell: the number of the trial.
-        seed: the seed of the trial.
-        sha256: the digest of the trial's log.
-        succeeded: whether the task was done.
-        measures: the measures by name, with units in the names.
+        cell: Number of the trial.
+        seed: Seed of the trial.
+        sha256: Digest of the trial's log.
+        succeeded: True if the task was done.
+        measures: Measures by name, with units in the names.
         people: False for synthetic participants.
     """
 
@@ -75,9 +76,12 @@ class TrialEntry(msgspec.Struct, frozen=True):
 class TrialJudge:
     """Judges a trial by the records of the slave, one after the other.
 
+    Args:
+        trial: The trial.
+
     Attributes:
-        goal: the goal of the trial.
-        outcome: the outcome of the trial; None while the trial goes on.
+        goal: Goal of the trial.
+        outcome: Outcome of the trial. None while the trial goes on.
     """
 
     def __init__(self, trial: "ExperimentTrial") -> None:
@@ -86,12 +90,15 @@ class TrialJudge:
         self.outcome: Outcome | None = None
 
     def accept(self, t_s: float, q: Sequence[float], tau_x: Sequence[float]) -> Outcome | None:
-        """Judges a record of the slave; returns the outcome once the trial has ended.
+        """Judges a record of the slave.
 
         Args:
-            t_s: time since the epoch, in s.
-            q: joint positions, in rad or m.
-            tau_x: exogenous torques, in N m or N.
+            t_s: Time since the start of the session, in s.
+            q: Joint positions, in rad or m.
+            tau_x: External torques, in N m or N.
+
+        Returns:
+            The outcome once the trial has ended. None before.
         """
         if self.outcome is None:
             # The force is computed only for tasks that need it, because it takes long.
@@ -105,11 +112,11 @@ class _MotionSamples(NamedTuple):
     """Samples of the motion of the slave's end effector.
 
     Attributes:
-        indices: indices of the records, shape (K,).
-        t_s: times of the records, shape (K,), in s.
-        positions_m: positions, shape (K, 2) or (K, 3), in m.
-        velocities_m_s: velocities, of the same shape, in m/s.
-        rate_hz: rate of the samples, in 1/s.
+        indices: Indices of the records, shape (K,).
+        t_s: Times of the records, shape (K,), in s.
+        positions_m: Positions, shape (K, 2) or (K, 3), in m.
+        velocities_m_s: Velocities, of the same shape, in m/s.
+        rate_hz: Rate of the samples, in 1/s.
     """
 
     indices: Ints
@@ -123,20 +130,20 @@ class ExperimentTrial:
     """A trial of the plan with people.
 
     Args:
-        protocol: the protocol of the experiment.
-        scenario: the scenario of the trial's condition.
-        planned: the trial in the plan.
-        digest: the digest of the plan.
+        protocol: Protocol of the experiment.
+        scenario: Scenario of the trial's condition.
+        planned: The trial in the plan.
+        digest: Digest of the plan.
 
     Attributes:
         people: False for synthetic participants.
-        protocol: the protocol of the experiment.
-        planned: the trial in the plan.
-        slave: the site of the slave.
-        arm: the arm of the slave.
-        scenario: the scenario of this trial, which lasts as long as the trial may.
-        appears_s: the time at which the target appears, in s.
-        longest_s: the latest end of the trial, in s.
+        protocol: Protocol of the experiment.
+        planned: The trial in the plan.
+        slave: Name of the site of the slave.
+        arm: Arm of the slave.
+        scenario: Scenario of this trial, which lasts as long as the trial may.
+        appears_s: Time at which the target appears, in s.
+        longest_s: Latest end of the trial, in s.
     """
 
     people = True
@@ -150,12 +157,15 @@ class ExperimentTrial:
         self.arm = scenario.arms[scenario.slave]
         start = self.arm.end_effector(scenario.sites[self.slave].q0_rad)
         self._start_m = np.array(start, dtype=np.float64)
+
         shortest_s, longest_s = protocol.foreperiod_s
         random = np.random.default_rng(planned.seed)
         foreperiod_s = random.uniform(shortest_s, longest_s)
         self.appears_s = round(float(foreperiod_s), 3)
+
         scenario = self._set_authority(scenario)
-        # One period of the hands is added, because the judge sees a trial's end that late.
+        # Synthetic participants act, and their trial is judged, once per 1 / HAND_HZ. The end
+        # of a trial may be noticed that late.
         self.longest_s = self.appears_s + protocol.task.longest_s + 1.0 / HAND_HZ
         kind = "" if self.people else "synthetic "
         about = (
@@ -176,7 +186,8 @@ class ExperimentTrial:
     def _set_authority(self, scenario: Scenario) -> Scenario:
         """Returns the scenario with the users' authority over the slave in this trial.
 
-        The two users share the sum of their dominance factors. A handover exchanges the parts.
+        The two users share the sum of their dominance factors, which are the weights with which
+        the slave follows them. A handover exchanges the parts during the trial.
         """
         goal = self.make_goal()
         if goal.lead is None:
@@ -186,7 +197,7 @@ class ExperimentTrial:
         sum_of_shares = row[first] + row[second]
 
         def divide_shares(lead: float) -> dict[str, float]:
-            """Returns the slave's row of dominance factors for the first user's part."""
+            """Returns the slave's dominance factors, given the first user's part from 0 to 1."""
             first_share = sum_of_shares * lead
             return {**row, first: first_share, second: sum_of_shares - first_share}
 
@@ -233,7 +244,7 @@ class ExperimentTrial:
         """Executes the log of the trial again, and returns the trial's result.
 
         Raises:
-            LogError: the records are not those of a run, or they end before the trial does.
+            LogError: The records are not those of a run, or they end before the trial does.
         """
         log = open_log(path)
         if not verify(log).passed:
@@ -251,7 +262,7 @@ class ExperimentTrial:
         )
 
     def _judge_log(self, log: Log) -> Outcome | None:
-        """Returns the outcome of the trial in a log; None if the log ends before the trial."""
+        """Returns the outcome of the trial in a log. None if the log ends before the trial."""
         judge = TrialJudge(self)
         records = log[self.slave]
         times_s = records.t_s.tolist()
@@ -266,7 +277,11 @@ class ExperimentTrial:
         return None
 
     def _measure(self, log: Log, outcome: Outcome) -> dict[str, float]:
-        """Returns the measures of a trial, with units in the names."""
+        """Computes the measures of a trial, with units in the names.
+
+        They are the measures of the slave's motion, the forces and the work of each user, and
+        the mean age of the first user's samples at the slave.
+        """
         measures = self._measure_motion(log, outcome.ended_s)
         aligned = align_records(log)
         users = self.protocol.users
@@ -309,7 +324,13 @@ class ExperimentTrial:
     def _measure_pair(
         self, aligned: Mapping[str, AlignedRecords], forces: Sequence[Array], ended_s: float
     ) -> dict[str, float]:
-        """Returns the measures of two users, as if each pushed at the slave's end effector."""
+        """Computes the measures of two users, as if each pushed at the slave's end effector.
+
+        Args:
+            aligned: Records of each site.
+            forces: Forces of each user in the user's records, in N.
+            ended_s: End of the trial, in s.
+        """
         motion = self._sample_motion(aligned[self.slave], 0.0, ended_s)
         interpolated: list[Array] = []
         for user, force in zip(self.protocol.users, forces, strict=True):
@@ -323,7 +344,7 @@ class ExperimentTrial:
         return {name: value for name, value in measures.items() if value is not None}
 
     def _measure_motion(self, log: Log, ended_s: float) -> dict[str, float]:
-        """Returns the measures of the slave's motion after the target has appeared."""
+        """Computes the measures of the slave's motion after the target has appeared."""
         goal = self.make_goal()
         records = log[self.slave]
         motion = self._sample_motion(records, goal.appears_s, ended_s)
@@ -348,7 +369,7 @@ class ExperimentTrial:
         if smoothness is not None:
             measures["sparc"] = smoothness
         after_s = motion.t_s - goal.appears_s
-        measures |= goal.measure(after_s, motion.positions_m, force_n)
+        measures |= goal.compute_measures(after_s, motion.positions_m, force_n)
         end_m = motion.positions_m[-1]
         points = {"start": goal.start_m, "target": targets_m[-1], "end": end_m}
         for name, point in points.items():
@@ -359,7 +380,7 @@ class ExperimentTrial:
 
 
 class SyntheticTrial(ExperimentTrial):
-    """A trial of synthetic participants."""
+    """A trial of synthetic participants, which are models of people."""
 
     people = False
 
@@ -394,7 +415,11 @@ class SyntheticTrial(ExperimentTrial):
         return self.protocol.model.draw(participant_seed)
 
     def find_end_s(self) -> float:
-        """Runs the trial, compiled, until it ends; returns its end in s since the epoch."""
+        """Runs the trial, compiled, until it ends.
+
+        Returns:
+            The end of the trial, in s since the start of the session.
+        """
         scenario = self.scenario
         judge = TrialJudge(self)
         slave = self.slave
@@ -432,12 +457,14 @@ class SyntheticTrial(ExperimentTrial):
 def run_trial(task: tuple[Protocol, str, PlannedTrial, str, Path]) -> TrialEntry:
     """Runs a trial of synthetic participants, and keeps its log.
 
+    Worker processes call this function. The task is one argument, because it is sent to them.
+
     Args:
-        task: the protocol, the text of the scenario, the planned trial, the digest of the
-            plan, and the folder of the log.
+        task: The protocol, the text of the scenario, the planned trial, the digest of the plan,
+            and the folder of the log.
 
     Raises:
-        LogError: the log is not that of its run.
+        LogError: The log is not that of its run.
     """
     protocol, text, planned, digest, folder = task
     trial = SyntheticTrial(protocol, parse_scenario(text), planned, digest)
