@@ -1,4 +1,4 @@
-"""Analysis of an experiment: means, comparisons, figures, and a methods paragraph.
+"""Analyses an experiment with people: means, comparisons, figures, and a methods paragraph.
 
 `analyse_experiment` reads the journals of an experiment's folder and writes tables, figures and
 a report into the folder. `compute_experiment_power` plans the number of participants.
@@ -6,10 +6,10 @@ a report into the folder. `compute_experiment_power` plans the number of partici
 Invariant:
     - The analysis follows from the journals alone.
     - Practice and catch trials do not count.
-    - A trial that was not completed counts, and its completion time is censored: longer than
+    - A trial that was not completed counts. Its completion time is censored: it is longer than
       that of any completed trial (see `completion_times`).
-    - Every measure that trials have is summarised, also if all its values are equal; a measure
-      with missing numbers states how many are missing.
+    - Every measure that trials have is summarised, also if all its values are equal. If numbers
+      of a measure are missing, their number is stated.
     - Every number in a figure or a sentence is also in a table.
     - The methods paragraph describes the analyses that were computed, and no others.
 """
@@ -80,15 +80,15 @@ NOT_REACHED = "not reached"
 
 
 class MissingAnswers(NamedTuple):
-    """Number of items of a questionnaire without an answer under a condition.
+    """Number of items of a questionnaire without an answer under one condition.
 
     Attributes:
-        questionnaire: name of the questionnaire.
-        condition: condition of the block; "" for a questionnaire after the experiment.
-        asked: number of items, over all completed questionnaires.
-        missing: number of these items without an answer.
-        forms: number of questionnaires.
-        unscored: number of questionnaires without a score because an answer is missing.
+        questionnaire: Name of the questionnaire.
+        condition: Condition of the block. Empty for a questionnaire after the experiment.
+        asked: Number of items, over all completed questionnaires.
+        missing: Number of these items without an answer.
+        forms: Number of completed questionnaires.
+        unscored: Number of questionnaires without a score because an answer is missing.
     """
 
     questionnaire: str
@@ -102,24 +102,35 @@ class MissingAnswers(NamedTuple):
 class ExperimentAnalysis(Result):
     """The statistics of an experiment.
 
+    Creating this object computes everything except the figures.
+
+    Args:
+        experiment: The experiment in its folder.
+        exclude: Participants or pairs whose data do not count, with the reasons.
+
     Attributes:
-        rows: the trials that count; with a training, only those after it.
-        learning_rows: the trials that count in all phases of a training.
-        throughput_rows: a row for each unit (participant or pair) and condition.
-        gain_rows: a row for each unit and condition.
-        threshold_rows: a row for each unit and condition.
-        means: for each measure, the mean under each condition; `completion_s` is included only
+        unit: "participant" or "pair", which is sampled independently.
+        rows: Trials that count. With a training, only those after it.
+        learning_rows: Trials that count, in all phases of a training.
+        throughput_rows: Throughput of each unit and condition.
+        gain_rows: Gain by a training, of each unit and condition.
+        threshold_rows: Threshold by a staircase, of each unit and condition.
+        means: For each measure, the mean under each condition. `completion_s` is included only
             if all trials were completed.
-        comparisons: for each measure, the comparison of each pair of conditions.
-        times: the completion time under each condition, for a task with a time limit.
-        time_comparisons: comparison of each pair of conditions, if some trials were not
-            completed.
-        missing_answers: missing answers of each questionnaire and condition.
-        absent: the reason for each measure that this experiment could have but that no trial
-            has a number for.
-        models: mixed models of the forces of users within pairs.
-        methods: the methods paragraph of a paper.
-        paths: the written files.
+        comparisons: For each measure, the comparison of each pair of conditions.
+        times: Completion time under each condition, for a task with a time limit.
+        time_comparisons: Comparison of the completion times of each pair of conditions, if some
+            trials were not completed.
+        missing_answers: Missing answers of each questionnaire and condition.
+        absent: For each measure that this experiment could have but that no trial has a number
+            for, the reason.
+        models: Mixed models of the forces of users within pairs.
+        methods: Methods paragraph of a paper.
+        paths: Files that were written.
+
+    Raises:
+        UsageError: No trial that counts is done, or an excluded participant or pair does not
+            exist.
     """
 
     def __init__(self, experiment: Experiment, exclude: Mapping[str, str] = {}) -> None:
@@ -156,7 +167,11 @@ class ExperimentAnalysis(Result):
         self.paths: list[Path] = []
 
     def _check_excluded(self) -> None:
-        """Raises UsageError if an excluded participant or pair does not exist."""
+        """Checks that the excluded participants or pairs exist.
+
+        Raises:
+            UsageError: One of them does not exist.
+        """
         groups = self._experiment.plan.protocol.groups
         names = {"-".join(group) for group in groups}
         unknown = sorted(self._exclude.keys() - names)
@@ -167,7 +182,7 @@ class ExperimentAnalysis(Result):
             )
 
     def _is_counted(self, row: Mapping[str, Any]) -> bool:
-        """Returns whether a trial counts: not excluded, not for practice and no catch trial."""
+        """Returns True if a trial counts: not excluded, not for practice and no catch trial."""
         if row[self.unit] in self._exclude:
             return False
         return not (row["practice"] or row["catch"])
@@ -178,7 +193,7 @@ class ExperimentAnalysis(Result):
         return sorted(rows, key=lambda row: conditions.index(row["condition"]))
 
     def _list_unit_measures(self) -> list[str]:
-        """Returns the measures that each unit has once under a condition."""
+        """Lists the measures that each unit has once under a condition: gains and thresholds."""
         keys = [key for row in (*self.gain_rows[:1], *self.threshold_rows[:1]) for key in row]
         return [key for key in keys if key.startswith(("gain_", "threshold_"))]
 
@@ -193,27 +208,31 @@ class ExperimentAnalysis(Result):
             self.comparisons[measure] = compare_conditions(rows, measure, unit=self.unit)
 
     def _has_censored_times(self) -> bool:
-        """Returns whether some of the trials that count were not completed."""
+        """Returns True if some of the trials that count were not completed."""
         return any(time.censored for time in self.times)
 
     @property
     def _limit_s(self) -> float:
-        """The time limit of a trial, in s."""
+        """Time limit of a trial, in s."""
         return self._experiment.plan.protocol.task.longest_s
 
     @property
     def _is_reaching(self) -> bool:
-        """Whether the task is to reach targets."""
+        """True if the task is to reach targets."""
         return self._experiment.plan.protocol.task.description.startswith("reaching")
 
     def _summarise_times(self) -> None:
-        """Summarises the completion times, and compares them if trials were not completed."""
+        """Summarises the completion times, and compares them if some trials were not completed."""
         self.times = summarise_times(self.rows, self._limit_s, unit=self.unit)
         if self._has_censored_times():
             self.time_comparisons = compare_times(self.rows, unit=self.unit)
 
     def _find_absent(self, forms: Sequence[str]) -> dict[str, str]:
-        """Returns the reason for each measure that this experiment could have and lacks."""
+        """Returns the reason for each measure that this experiment could have and lacks.
+
+        Args:
+            forms: Names of the questionnaires.
+        """
         absent = {}
         for name in forms:
             scores = [row.get(name) for row in self.of(name)]
@@ -252,7 +271,7 @@ class ExperimentAnalysis(Result):
             )
 
     def of(self, measure: str) -> Sequence[Row]:
-        """Returns the rows that have a measure."""
+        """Returns the rows that have a measure: of trials, of units, or of questionnaires."""
         rows_by_kind = {
             "throughput": self.throughput_rows,
             "gain": self.gain_rows,
@@ -266,7 +285,10 @@ class ExperimentAnalysis(Result):
         return [row for row in self._scores if measure in row]
 
     def _find_throughput(self) -> Iterator[dict[str, Any]]:
-        """Yields the throughput of each unit and condition, if the task is reaching."""
+        """Yields the throughput of each unit and condition, if the task is reaching.
+
+        The throughput combines speed and accuracy. It needs at least two completed trials.
+        """
         if not self._is_reaching:
             return
         groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
@@ -312,7 +334,7 @@ class ExperimentAnalysis(Result):
                 yield {self.unit: unit, "condition": condition, **gains}
 
     def _is_censored(self, measure: str) -> bool:
-        """Returns whether a measure is the completion time and some trials are censored."""
+        """Returns True if a measure is the completion time and some trials were not completed."""
         has_limit = self._experiment.plan.protocol.task.has_limit
         if measure != COMPLETION or not has_limit:
             return False
@@ -323,8 +345,8 @@ class ExperimentAnalysis(Result):
     ) -> dict[str, dict[str, float]]:
         """Returns the mean of a learning measure for each condition and unit.
 
-        If some completion times are censored, medians take the place of means. A median that
-        was not reached is left out.
+        If some trials were not completed, medians take the place of means. A median that was
+        not reached is left out.
         """
         if not self._is_censored(measure):
             return average_trials(rows, measure, self.unit)
@@ -336,7 +358,7 @@ class ExperimentAnalysis(Result):
         return reached
 
     def _find_thresholds(self) -> Iterator[dict[str, Any]]:
-        """Yields the threshold of each unit and condition.
+        """Yields the threshold of each unit and condition, if the protocol has a staircase.
 
         Staircases without enough reversals have no threshold.
         """
@@ -359,7 +381,7 @@ class ExperimentAnalysis(Result):
                 }
 
     def _write_methods(self) -> str:
-        """Returns the methods paragraph."""
+        """Returns the methods paragraph of a paper, with the numbers of this experiment."""
         plan = self._experiment.plan
         protocol = plan.protocol
         scenario = next(iter(plan.scenarios.values()))
@@ -403,7 +425,7 @@ class ExperimentAnalysis(Result):
         return write_methods(facts)
 
     def _list_computed(self) -> list[str]:
-        """Returns the computed analyses, of those that a methods paragraph describes."""
+        """Lists which analyses were computed, of those that a methods paragraph describes."""
         tests = list(chain.from_iterable(self.comparisons.values()))
         means = list(chain.from_iterable(self.means.values()))
         is_computed = {
@@ -418,7 +440,7 @@ class ExperimentAnalysis(Result):
         return [analysis for analysis, computed in is_computed.items() if computed]
 
     def _describe_times(self) -> str:
-        """Returns the sentence on trials that were not completed, "" if all were completed."""
+        """Returns the sentence about trials that were not completed. Empty if all were."""
         trials = sum(time.trials for time in self.times)
         censored = sum(time.censored for time in self.times)
         if not censored:
@@ -434,7 +456,7 @@ class ExperimentAnalysis(Result):
         )
 
     def _describe_missing_answers(self) -> str:
-        """Returns the sentence on missing answers, "" if no answer is missing."""
+        """Returns the sentence about missing answers. Empty if no answer is missing."""
         missing = sum(answers.missing for answers in self.missing_answers)
         asked = sum(answers.asked for answers in self.missing_answers)
         unscored = sum(answers.unscored for answers in self.missing_answers)
@@ -447,9 +469,12 @@ class ExperimentAnalysis(Result):
         )
 
     def write(self, folder: Path) -> "ExperimentAnalysis":
-        """Writes tables, figures, the methods paragraph and the JSON file into a folder.
+        """Writes tables, figures, the methods paragraph and a report into a folder.
 
-        `paths` then lists the written files.
+        Afterwards, `paths` lists the written files.
+
+        Returns:
+            This analysis.
         """
         folder = make_folder(folder)
         self.paths = []
@@ -486,7 +511,7 @@ class ExperimentAnalysis(Result):
         return texts
 
     def _draw_figures(self) -> dict[str, Any]:
-        """Returns the figures by name."""
+        """Draws the figures, and returns them by name."""
         figures = {
             name: draw_conditions(self.of(name), name, unit=self.unit) for name in self.means
         }
@@ -505,7 +530,7 @@ class ExperimentAnalysis(Result):
         """Returns the text of the analysis with its figures, as Markdown.
 
         Args:
-            figures: names of the PNG files beside the page.
+            figures: Names of the PNG files beside the page.
         """
         protocol = self._experiment.plan.protocol
         parts = [f"# {protocol.title or protocol.name}"]
@@ -522,7 +547,7 @@ class ExperimentAnalysis(Result):
     def fit_models(self) -> Iterator[MixedModel]:
         """Yields mixed models of the forces of users within pairs.
 
-        There are models only if statsmodels is installed.
+        There are models only if the package statsmodels is installed.
         """
         pairs = {row[self.unit] for row in self.rows}
         if self.unit == "participant" or len(pairs) < 2 or find_spec("statsmodels") is None:
@@ -550,7 +575,7 @@ class ExperimentAnalysis(Result):
         return [test._asdict() for test in chain.from_iterable(self.comparisons.values())]
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the analysis as `trilat experiment analyse --json` prints it."""
+        """Returns the analysis, which `trilat experiment analyse --json` prints."""
         models = {model.measure: model._asdict() for model in self.models}
         for model in models.values():
             model["effects"] = [effect._asdict() for effect in model["effects"]]
@@ -597,7 +622,7 @@ class ExperimentAnalysis(Result):
         yield self.methods
 
     def _write_time_blocks(self) -> Iterator[Block]:
-        """Yields the numbers of completed trials and the completion times."""
+        """Yields the numbers of completed trials, and the completion times."""
         if not self.times:
             return
         yield (
@@ -686,7 +711,11 @@ class ExperimentAnalysis(Result):
             yield ""
 
     def _write_single_unit_block(self, unit: str) -> Iterator[Block]:
-        """Yields a table of all measures, with a column for each condition."""
+        """Yields a table of all measures, with a column for each condition.
+
+        Args:
+            unit: Name of the only participant or pair.
+        """
         conditions = list(dict.fromkeys(row["condition"] for row in self.rows))
         yield (
             f"means over the trials of a condition; one {self.unit}, {unit}, "
@@ -706,7 +735,7 @@ def analyse_experiment(
     *,
     exclude: Mapping[str, str] = {},
 ) -> ExperimentAnalysis:
-    """Returns the statistics of an experiment and writes them into its folder.
+    """Computes the statistics of an experiment and writes them into its folder.
 
     The command is `trilat experiment analyse`.
 
@@ -716,13 +745,14 @@ def analyse_experiment(
     (3.06, 3.22)
 
     Args:
-        folder: folder of the experiment.
-        out: folder for tables and figures; by default the experiment's folder `analysis`.
-        exclude: participants or pairs whose data do not count, with the reasons.
+        folder: Folder of the experiment.
+        out: Folder for tables and figures. By default the folder `analysis` in the experiment's
+            folder.
+        exclude: Participants or pairs whose data do not count, with the reasons.
 
     Raises:
-        UsageError: there is no experiment, no trial is done, or an excluded participant or
-            pair does not exist.
+        UsageError: There is no experiment, no trial is done, or an excluded participant or pair
+            does not exist.
     """
     experiment = open_experiment(folder)
     analysis = ExperimentAnalysis(experiment, exclude)
@@ -734,13 +764,18 @@ def analyse_experiment(
 class PowerOfExperiment(Result):
     """Number of participants that an effect needs.
 
+    Args:
+        d_z: Size of the effect.
+        participants: Planned number of participants, or None.
+        seed: Seed of the simulated experiments.
+
     Attributes:
-        d_z: the size of the effect: mean over standard deviation of the differences within
+        d_z: Size of the effect: mean over standard deviation of the differences within
             participants.
-        least: the smallest number of participants for each desired power.
-        participants: planned number of participants; None without a plan.
-        power: power with the planned number, by the noncentral t distribution.
-        simulated: power with the planned number from simulated experiments, with its 95 %
+        least: Smallest number of participants for each desired power.
+        participants: Planned number of participants. None without a plan.
+        power: Power with the planned number, by the noncentral t distribution.
+        simulated: Power with the planned number from simulated experiments, with its 95 %
             interval.
     """
 
@@ -762,7 +797,7 @@ class PowerOfExperiment(Result):
             )
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the numbers as `trilat experiment power --json` prints them."""
+        """Returns the numbers, which `trilat experiment power --json` prints."""
         simulated = None if self.simulated is None else self.simulated._asdict()
         least = [
             {"power": wanted, "participants": number} for wanted, number in self.least.items()
@@ -776,7 +811,7 @@ class PowerOfExperiment(Result):
         }
 
     def blocks(self) -> Iterator[Block]:
-        """Yields the text."""
+        """Yields the text: the number of participants for each power, and the power as planned."""
         yield (
             "paired comparison of two conditions, two-sided, alpha 0.05, "
             f"effect d_z {self.d_z:g}"
@@ -795,7 +830,7 @@ class PowerOfExperiment(Result):
 def compute_experiment_power(
     effect: float, participants: int | None = None, *, seed: int = 1
 ) -> PowerOfExperiment:
-    """Returns the number of participants that an effect needs.
+    """Computes the number of participants that an effect needs.
 
     The command is `trilat experiment power`.
 
@@ -803,13 +838,13 @@ def compute_experiment_power(
     34
 
     Args:
-        effect: mean over standard deviation of the differences within participants, Cohen's
+        effect: Mean over standard deviation of the differences within participants, Cohen's
             d_z.
-        participants: planned number of participants, whose power is computed and simulated.
-        seed: seed of the simulated experiments.
+        participants: Planned number of participants, whose power is computed and simulated.
+        seed: Seed of the simulated experiments.
 
     Raises:
-        UsageError: the effect needs more participants than `find_least_number` tries.
+        UsageError: The effect needs more participants than `find_least_number` tries.
     """
     return PowerOfExperiment(effect, participants, seed)
 
@@ -821,12 +856,17 @@ def _describe_mean(mean: ConditionMean) -> str:
 
 
 def _list_points(rows: Sequence[Row], name: str) -> Array:
-    """Returns the points `name` of trials in m: a row for each trial, with columns x and y."""
+    """Returns a point of each trial, in m, shape (K, 2).
+
+    Args:
+        rows: The K trials.
+        name: Name of the point: "start", "target" or "end".
+    """
     return np.array([[row[f"{name}_{axis}_m"] for axis in "xy"] for row in rows])
 
 
 def _format_interval(interval: tuple[float, float | None] | None) -> str:
-    """Returns an interval as text; an upper end of None was not reached."""
+    """Returns an interval as text. An upper end of None was not reached."""
     if interval is None:
         return "-"
     low, high = interval
@@ -835,7 +875,7 @@ def _format_interval(interval: tuple[float, float | None] | None) -> str:
 
 
 def _flatten(row: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Yields the cells of a row; an interval has a cell for each end."""
+    """Yields the cells of a row. An interval has a cell for each end."""
     for key, value in row.items():
         if key in ("interval", "bootstrap"):
             low, high = value or (None, None)

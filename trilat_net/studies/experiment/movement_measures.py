@@ -1,4 +1,4 @@
-"""Measures of human movement and cooperation in a trial, each by a published definition.
+"""Computes measures of human movement and cooperation, each by a published definition.
 
 A measure takes arrays of samples that are equally spaced in time, with a row for each sample,
 and returns a number. All quantities are in SI units.
@@ -12,10 +12,10 @@ and returns a number. All quantities are in SI units.
 | workload and usability by questionnaire | `raw_tlx`, `weighted_tlx`, `sus_score` |
 
 Invariant:
-    - A measure is a function of its samples alone.
+    - A measure depends only on its samples.
     - A measure that the samples do not determine is None, for example the smoothness of an arm
-      at rest or the effective width of end points that all coincide.
-    - Arrays of different shapes and answers outside their scale are errors.
+      at rest, or the effective width of end points that all coincide.
+    - Arrays of different shapes, and answers outside their scale, are errors.
 """
 
 from collections.abc import Mapping, Sequence
@@ -35,12 +35,12 @@ def _read(name: str, values: ArrayLike, dimensions: int) -> Array:
     """Returns samples as an array of finite numbers, shape (K,) or (K, D).
 
     Args:
-        name: name of the samples in error messages.
-        values: the samples.
+        name: Name of the samples in error messages.
+        values: The samples.
         dimensions: 1 for shape (K,), 2 for shape (K, D).
 
     Raises:
-        UsageError: the shape is another, or a sample is not finite.
+        UsageError: The array has another shape, or a sample is not finite.
     """
     samples = np.asarray(values, dtype=np.float64)
     if samples.ndim != dimensions or not samples.size:
@@ -57,7 +57,7 @@ def _read_same_shape(**values: ArrayLike) -> list[Array]:
     """Returns several arrays of samples, all of the same shape (K, D).
 
     Raises:
-        UsageError: the shapes differ, or a sample is not finite.
+        UsageError: The shapes differ, or a sample is not finite.
     """
     arrays = {name: _read(name, value, 2) for name, value in values.items()}
     different_shapes = {array.shape for array in arrays.values()}
@@ -88,16 +88,20 @@ def sparc(
     cutoff_hz: float = 10.0,
     threshold: float = 0.05,
 ) -> float | None:
-    """Returns the spectral arc length of a movement (SPARC), None at rest.
+    """Computes the spectral arc length of a movement (SPARC), a measure of its smoothness.
 
-    The value is negative; a value closer to 0 means a smoother movement.
+    The value is negative. A value closer to 0 means a smoother movement. A movement that is not
+    smooth has a spectrum of speed with many bumps, whose curve is long.
 
     Args:
-        speed: speed of a movement from its start to its end, m/s or rad/s, shape (K,).
-        rate_hz: samples per second.
-        padding: the samples are padded with zeros to 2^padding times the next power of two.
-        cutoff_hz: frequencies above this frequency count as noise.
-        threshold: share of the largest magnitude below which the spectrum ends.
+        speed: Speed of a movement from its start to its end, in m/s or rad/s, shape (K,).
+        rate_hz: Samples per second.
+        padding: The samples are padded with zeros to 2^padding times the next power of two.
+        cutoff_hz: Frequencies above this one count as noise.
+        threshold: Share of the largest magnitude below which the spectrum ends.
+
+    Returns:
+        The spectral arc length. None at rest.
 
     Source: Balasubramanian, Melendez-Calderon, Roby-Brami and Burdet, "On the analysis of
     movement smoothness", J. NeuroEngineering and Rehabilitation 12:112 (2015).
@@ -130,7 +134,7 @@ def path_length_m(places: ArrayLike) -> float:
     """Returns the length of a path, in m.
 
     Args:
-        places: positions along the path, in m, shape (K, D).
+        places: Positions along the path, in m, shape (K, D).
     """
     steps = np.diff(_read("places", places, 2), axis=0)
     step_lengths = np.linalg.norm(steps, axis=1)
@@ -140,15 +144,18 @@ def path_length_m(places: ArrayLike) -> float:
 def movement_time_s(
     speed: ArrayLike, rate_hz: float, *, share: float = ONSET_SHARE
 ) -> float | None:
-    """Returns the duration of a movement, in s; None at rest.
+    """Returns the duration of a movement, in s.
 
     The movement lasts from the first to the last sample whose speed is at least `share` of the
     peak speed.
 
     Args:
-        speed: speed, in m/s or rad/s, shape (K,).
-        rate_hz: samples per second.
-        share: share of the peak speed at which the movement starts and ends.
+        speed: Speed, in m/s or rad/s, shape (K,).
+        rate_hz: Samples per second.
+        share: Share of the peak speed at which the movement starts and ends.
+
+    Returns:
+        The duration. None at rest.
     """
     samples = np.abs(_read("speed", speed, 1))
     if not samples.any():
@@ -160,12 +167,12 @@ def movement_time_s(
 
 
 def energy_j(force: ArrayLike, velocity: ArrayLike, rate_hz: float) -> float:
-    """Returns the work of a force f on a body with velocity v: the integral of f'v, in J.
+    """Returns the work of a force f on a body with velocity v, the integral of f'v, in J.
 
     Args:
-        force: force on the body, in N, shape (K, D).
-        velocity: velocity of the body, in m/s, of the same shape.
-        rate_hz: samples per second.
+        force: Force on the body, in N, shape (K, D).
+        velocity: Velocity of the body, in m/s, of the same shape.
+        rate_hz: Samples per second.
     """
     forces, velocities = _read_same_shape(force=force, velocity=velocity)
     power = (forces * velocities).sum(axis=1)
@@ -184,13 +191,15 @@ A range of this width holds 96 % of normally distributed end points.
 class Throughput(NamedTuple):
     """Throughput of a sequence of movements to targets of equal distance and width.
 
+    The throughput combines the speed and the accuracy of aimed movements in one number.
+
     Args:
-        width_m: effective width, 4.133 standard deviations of the end points along the axis of
+        width_m: Effective width, 4.133 standard deviations of the end points along the axis of
             the task, in m.
-        distance_m: effective distance: the mean distance moved along the axis of the task, in
+        distance_m: Effective distance, the mean distance moved along the axis of the task, in
             m.
-        difficulty_bits: index of difficulty, log2(distance / width + 1), in bit.
-        time_s: mean movement time, in s.
+        difficulty_bits: Index of difficulty, log2(distance / width + 1), in bit.
+        time_s: Mean movement time, in s.
     """
 
     width_m: float
@@ -212,17 +221,18 @@ def measure_throughput(
     *,
     serial: bool = False,
 ) -> Throughput | None:
-    """Returns the throughput of a user's movements under a condition.
-
-    The throughput is None if the end points do not spread.
+    """Computes the throughput of a user's movements under one condition.
 
     Args:
-        starts: centres of the targets from which the movements start, in m, shape (K, D).
-        targets: centres of the targets to reach, in m, of the same shape.
-        ends: end points of the movements, in m, of the same shape.
-        times_s: duration of each movement, in s, shape (K,).
-        serial: whether each movement starts at the end point of the previous movement, as
-            around a ring. The overshoot of the previous movement then adds to the distance.
+        starts: Centres of the targets from which the movements start, in m, shape (K, D).
+        targets: Centres of the targets to reach, in m, of the same shape.
+        ends: End points of the movements, in m, of the same shape.
+        times_s: Duration of each movement, in s, shape (K,).
+        serial: True if each movement starts at the end point of the previous one, as around a
+            ring. The overshoot of the previous movement then adds to the distance.
+
+    Returns:
+        The throughput. None if the end points do not spread.
 
     Source: ISO/TS 9241-411 (2012); Soukoreff and MacKenzie, "Towards a standard for pointing
     device evaluation", Int. J. Human-Computer Studies 61 (2004). As MacKenzie's class
@@ -267,18 +277,18 @@ def measure_throughput(
 
 
 def find_internal_force(first: ArrayLike, second: ArrayLike) -> Array:
-    """Returns the first user's part of the forces on an object that cancel each other.
+    """Returns the part of two users' forces on an object that cancels.
 
     If the two users' forces along an axis have opposite signs, the smaller force cancels an
-    equal part of the larger force; otherwise no force cancels. The second user's part is the
+    equal part of the larger force. Otherwise no force cancels. The second user's part is the
     negative of the first user's. `internal_rms_n` in docs/metrics.md is the RMS of this force.
 
     Args:
-        first: force of the first user on the object, in N, shape (K, D).
-        second: force of the second user on the object, in N, of the same shape.
+        first: Force of the first user on the object, in N, shape (K, D).
+        second: Force of the second user on the object, in N, of the same shape.
 
     Returns:
-        The part, in N, shape (K, D).
+        The first user's part, in N, shape (K, D).
 
     Source: Groten, Feth, Goshy, Peer, Kenny and Buss, "Experimental analysis of dominance in
     haptic collaboration", IEEE RO-MAN (2009).
@@ -297,14 +307,15 @@ class PairMeasures(NamedTuple):
     Args:
         internal_rms_n: RMS of the force that cancels, over all axes and samples, in N.
         useful_rms_n: RMS of the sum of both forces, which moves the object, in N.
-        internal_share: part of the forces that cancels, 0 to 1; None if both forces are zero.
-        first_effort_share: the first user's part of the integral of the squared forces; None
-            if both forces are zero.
-        first_work_j: work of the first user on the object, in J.
-        second_work_j: work of the second user on the object, in J.
-        first_taken_j: energy that the first user absorbs, in J: the integral of the negative
+        internal_share: Part of the forces that cancels, from 0 to 1. None if both forces are
+            zero.
+        first_effort_share: The first user's part of the integral of the squared forces. None if
+            both forces are zero.
+        first_work_j: Work of the first user on the object, in J.
+        second_work_j: Work of the second user on the object, in J.
+        first_taken_j: Energy that the first user absorbs, in J: the integral of the negative
             part of the user's power.
-        second_taken_j: energy that the second user absorbs, likewise.
+        second_taken_j: Energy that the second user absorbs, in J.
     """
 
     internal_rms_n: float
@@ -320,13 +331,13 @@ class PairMeasures(NamedTuple):
 def measure_pair(
     first: ArrayLike, second: ArrayLike, velocity: ArrayLike, rate_hz: float
 ) -> PairMeasures:
-    """Returns the forces and the work of two users on a shared object.
+    """Computes the forces and the work of two users on a shared object.
 
     Args:
-        first: force of the first user on the object, in N, shape (K, D).
-        second: force of the second user on the object, in N, of the same shape.
-        velocity: velocity of the object, in m/s, of the same shape.
-        rate_hz: samples per second.
+        first: Force of the first user on the object, in N, shape (K, D).
+        second: Force of the second user on the object, in N, of the same shape.
+        velocity: Velocity of the object, in m/s, of the same shape.
+        rate_hz: Samples per second.
     """
     first_force, second_force, velocities = _read_same_shape(
         first=first, second=second, velocity=velocity
@@ -361,14 +372,14 @@ def measure_pair(
 # --- questionnaires ---------------------------------------------------------------------------
 
 TLX_SCALES = ("mental", "physical", "temporal", "performance", "effort", "frustration")
-"""Scales of the NASA Task Load Index; `performance` runs from good, 0, to poor, 100."""
+"""Scales of the NASA Task Load Index. `performance` runs from good, 0, to poor, 100."""
 
 
 def _list_ratings(ratings: Mapping[str, float]) -> list[float]:
     """Returns the six ratings in the order of `TLX_SCALES`.
 
     Raises:
-        UsageError: a scale is missing or unknown, or a rating is not between 0 and 100.
+        UsageError: A scale is missing or unknown, or a rating is not between 0 and 100.
     """
     if ratings.keys() != set(TLX_SCALES):
         rated = ", ".join(ratings) or "nothing"
@@ -383,7 +394,7 @@ def raw_tlx(ratings: Mapping[str, float]) -> float:
     """Returns the raw NASA Task Load Index: the mean of six ratings.
 
     Args:
-        ratings: a rating from 0 to 100 for each of `TLX_SCALES`.
+        ratings: A rating from 0 to 100 for each of `TLX_SCALES`.
 
     Source: Hart, "NASA-Task Load Index (NASA-TLX); 20 years later", Proc. Human Factors and
     Ergonomics Society 50 (2006).
@@ -395,8 +406,8 @@ def weighted_tlx(ratings: Mapping[str, float], weights: Mapping[str, int]) -> fl
     """Returns the weighted NASA Task Load Index: the weighted mean of six ratings.
 
     Args:
-        ratings: a rating from 0 to 100 for each of `TLX_SCALES`.
-        weights: how often each scale was chosen in the 15 comparisons of two scales.
+        ratings: A rating from 0 to 100 for each of `TLX_SCALES`.
+        weights: How often each scale was chosen in the 15 comparisons of two scales.
 
     Source: Hart and Staveland, "Development of NASA-TLX (Task Load Index): results of empirical
     and theoretical research", Advances in Psychology 52 (1988).
@@ -421,7 +432,7 @@ def sus_score(answers: Sequence[int]) -> float:
     """Returns the score of the System Usability Scale (SUS), from 0 to 100.
 
     Args:
-        answers: ten answers from 1 (strongly disagree) to 5, in the order of the questions.
+        answers: Ten answers from 1 (strongly disagree) to 5, in the order of the questions.
 
     Source: Brooke, "SUS: a quick and dirty usability scale", Usability Evaluation in Industry
     (1996).

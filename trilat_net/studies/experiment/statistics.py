@@ -1,12 +1,13 @@
-"""Statistics of experiments with people: means, tests, power, and a methods paragraph.
+"""Computes statistics of experiments with people: means, tests, power, and a methods paragraph.
 
 All functions read tidy rows: each trial is a mapping with `participant`, `pair`, `condition`
 and the measures by name, as in `trials.csv`. A trial whose value of a measure is None or ""
-does not count for that measure.
+does not count for that measure. A unit is what is sampled independently: a participant, or a
+pair whose members take part together.
 
 Invariant:
-    - Trials are averaged per participant and condition before any test, so that more trials
-      do not count as more participants.
+    - Trials are averaged per unit and condition before any test, so that more trials do not
+      count as more participants.
     - A measure that both users of a pair share is tested with `unit="pair"`.
     - A statistic that the data do not determine is None.
     - Equal rows and seeds give equal numbers.
@@ -56,15 +57,16 @@ def average_trials(
 ) -> dict[str, dict[str, float]]:
     """Returns the mean of a measure over the trials of each condition and unit.
 
-    The result maps conditions, and in each of them units, to means, in the order of the rows.
-
     Args:
-        rows: trials.
-        measure: the name of the measure.
-        unit: the key of the independently sampled unit: "participant" or "pair".
+        rows: Trials.
+        measure: Name of the measure.
+        unit: Key of the independently sampled unit: "participant" or "pair".
+
+    Returns:
+        Means by condition and unit, in the order of the rows.
 
     Raises:
-        UsageError: no row has the measure, a row lacks a key, or a value is not a finite
+        UsageError: No row has the measure, a row lacks a key, or a value is not a finite
             number.
     """
     values: dict[str, dict[str, list[float]]] = {}
@@ -98,12 +100,12 @@ def read_number(value: Any, measure: str, row: Row) -> float:
     """Returns the value of a measure in a row as a number.
 
     Args:
-        value: a number, or its text from a CSV file.
-        measure: the name of the measure, for the error message.
-        row: the trial, for the error message.
+        value: A number, or its text from a CSV file.
+        measure: Name of the measure, for the error message.
+        row: The trial, for the error message.
 
     Raises:
-        UsageError: the value is not a finite number.
+        UsageError: The value is not a finite number.
     """
     try:
         number = float(value)
@@ -117,19 +119,19 @@ def read_number(value: Any, measure: str, row: Row) -> float:
 
 
 class ConditionMean(NamedTuple):
-    """Mean and spread of a measure under a condition, over units.
+    """Mean and spread of a measure under one condition, over units.
 
     Deviation and intervals are None for fewer than two units.
 
     Args:
-        condition: name of the condition.
-        number: number of units with at least one trial.
-        mean: mean of the means of the units.
-        deviation: standard deviation of the means of the units.
+        condition: Name of the condition.
+        number: Number of units with at least one trial.
+        mean: Mean of the means of the units.
+        deviation: Standard deviation of the means of the units.
         interval: 95 % interval of the mean by Student's t.
         bootstrap: 95 % interval of the mean by the bias-corrected and accelerated bootstrap
             (BCa).
-        missing: number of trials, or questionnaires, without a number; they are not averaged.
+        missing: Number of trials, or questionnaires, without a number. They are not averaged.
     """
 
     condition: str
@@ -149,10 +151,10 @@ def summarise_conditions(
     The conditions are in the order of the rows.
 
     Args:
-        rows: trials, as for `average_trials`.
-        measure: name of the measure.
+        rows: Trials, as for `average_trials`.
+        measure: Name of the measure.
         unit: "participant" or "pair".
-        seed: seed of the bootstrap.
+        seed: Seed of the bootstrap.
     """
     means = average_trials(rows, measure, unit)
     rows_without_value = [row for row in rows if row.get(measure) in (None, "")]
@@ -166,7 +168,7 @@ def summarise_conditions(
 
 
 def _summarise(condition: str, values: list[float], seed: int) -> ConditionMean:
-    """Returns mean, spread and intervals of the means of the units, without missing trials."""
+    """Returns mean, spread and intervals of the means of the units."""
     mean = mean_interval(values)
     if mean is None:
         return ConditionMean(
@@ -190,7 +192,8 @@ def _summarise(condition: str, values: list[float], seed: int) -> ConditionMean:
 def bootstrap_interval(values: Sequence[float], seed: int = 0) -> tuple[float, float] | None:
     """Returns the 95 % interval of a mean by the BCa bootstrap.
 
-    The interval is None for fewer than two values.
+    Returns:
+        Lower and upper end. None for fewer than two values.
 
     Source: Efron, "Better bootstrap confidence intervals", J. American Statistical Association
     82 (1987).
@@ -220,22 +223,23 @@ def bootstrap_interval(values: Sequence[float], seed: int = 0) -> tuple[float, f
 class Comparison(NamedTuple):
     """Comparison of a measure between two conditions, within units.
 
-    Interval, tests and effect sizes need two units; with fewer they are None.
+    Interval, tests and effect sizes need two units. With fewer they are None.
 
     Args:
-        measure: name of the measure.
-        first: name of the first condition.
-        second: name of the second condition.
-        number: number of units that have both conditions.
-        difference: mean of second minus first.
+        measure: Name of the measure.
+        first: Name of the first condition.
+        second: Name of the second condition.
+        number: Number of units that have both conditions.
+        difference: Mean of second minus first.
         interval: 95 % interval of the difference by Student's t.
-        t: statistic of the paired test, with number - 1 degrees of freedom; None if all
+        t: Statistic of the paired test, with number - 1 degrees of freedom. None if all
             differences are equal.
-        p: two-sided p value of the paired test.
+        p: Two-sided p value of the paired test.
         p_holm: p corrected for all comparisons of the measure.
-        d_z: difference over the standard deviation of the differences.
-        d_av: difference over the mean of the standard deviations of both conditions.
-        p_wilcoxon: two-sided p value of the signed-rank test, not corrected; differences of
+        d_z: Effect size: difference over the standard deviation of the differences.
+        d_av: Effect size: difference over the mean of the standard deviations of both
+            conditions.
+        p_wilcoxon: Two-sided p value of the signed-rank test, not corrected. Differences of
             zero are left out.
     """
 
@@ -256,7 +260,12 @@ class Comparison(NamedTuple):
 def compare_conditions(
     rows: Sequence[Row], measure: str, *, unit: str = "participant"
 ) -> list[Comparison]:
-    """Returns the comparison of each pair of conditions, in the order of the rows.
+    """Compares each pair of conditions, in the order of the rows.
+
+    Args:
+        rows: Trials, as for `average_trials`.
+        measure: Name of the measure.
+        unit: "participant" or "pair".
 
     Sources: Holm, "A simple sequentially rejective multiple test procedure", Scandinavian J.
     Statistics 6 (1979); Lakens, "Calculating and reporting effect sizes to facilitate
@@ -276,7 +285,14 @@ def compare_conditions(
 def _compare(
     measure: str, first: str, second: str, means: Mapping[str, Mapping[str, float]]
 ) -> Comparison:
-    """Returns the comparison of two conditions over the units that have both."""
+    """Compares two conditions over the units that have both.
+
+    Args:
+        measure: Name of the measure.
+        first: Name of the first condition.
+        second: Name of the second condition.
+        means: Means by condition and unit.
+    """
     units = [unit for unit in means[first] if unit in means[second]]
     first_means = np.array([means[first][unit] for unit in units])
     second_means = np.array([means[second][unit] for unit in units])
@@ -308,9 +324,13 @@ def _compare(
 
 
 def correct_holm(p: Sequence[float | None]) -> list[float | None]:
-    """Returns p values corrected for their number by Holm's method, in the order of `p`.
+    """Corrects p values for their number by Holm's method.
 
-    A value of None does not count as a test and stays None.
+    Args:
+        p: p values. None does not count as a test.
+
+    Returns:
+        The corrected values in the same order. None stays None.
     """
     ascending = sorted((value, index) for index, value in enumerate(p) if value is not None)
     corrected: list[float | None] = [None] * len(p)
@@ -330,12 +350,12 @@ class MixedEffect(NamedTuple):
     """Effect of a condition relative to the first condition.
 
     Args:
-        condition: name of the condition.
-        estimate: estimated difference from the first condition.
-        error: standard error of the estimate.
+        condition: Name of the condition.
+        estimate: Estimated difference from the first condition.
+        error: Standard error of the estimate.
         interval: 95 % interval of the estimate.
-        t: estimate over its standard error.
-        p: two-sided p value of t.
+        t: Estimate over its standard error.
+        p: Two-sided p value of t.
     """
 
     condition: str
@@ -349,16 +369,18 @@ class MixedEffect(NamedTuple):
 class MixedModel(NamedTuple):
     """Mixed model of a measure, fitted to the means of participants by REML.
 
-    The formula is `measure ~ condition + (1 | pair/participant)`.
+    REML is the method of restricted maximum likelihood. The formula of the model is
+    `measure ~ condition + (1 | pair/participant)`: pairs, and participants within pairs, may
+    differ by random amounts.
 
     Args:
-        measure: name of the measure.
-        reference: the first condition, with which the other conditions are compared.
-        effects: the effect of each other condition.
-        freedom: degrees of freedom of t: observations less participants less effects. They
+        measure: Name of the measure.
+        reference: The first condition, with which the other conditions are compared.
+        effects: Effect of each other condition.
+        freedom: Degrees of freedom of t: observations less participants less effects. They
             equal those of the analysis of variance if all participants have all conditions.
-        variances: variance of "pair", of "participant" within a pair, and of the "residual".
-        notes: warnings of the fit, for example of a variance at 0.
+        variances: Variance of "pair", of "participant" within a pair, and of the "residual".
+        notes: Warnings of the fit, for example of a variance at 0.
     """
 
     measure: str
@@ -370,11 +392,11 @@ class MixedModel(NamedTuple):
 
 
 def fit_mixed_model(rows: Sequence[Row], measure: str) -> MixedModel:
-    """Returns the mixed model of a measure, with users nested within pairs.
+    """Fits a mixed model of a measure, with users nested within pairs.
 
     The model is for measures of single users. A measure that both users of a pair share is
-    tested by `compare_conditions` with `unit="pair"`. The fit needs
-    `pip install 'trilat-net[stats]'`.
+    tested by `compare_conditions` with `unit="pair"`. The fit needs `pip install
+    'trilat-net[stats]'`.
 
     Raises:
         UsageError: statsmodels is not installed, a participant is in two pairs, or there are
@@ -422,10 +444,15 @@ def fit_mixed_model(rows: Sequence[Row], measure: str) -> MixedModel:
 
 
 def _fit(formulas: Any, frame: Any, measure: str) -> Any:
-    """Returns the fit with the larger likelihood, of two optimizers.
+    """Fits a mixed model with two optimizers, and returns the fit with the larger likelihood.
+
+    Args:
+        formulas: The module `statsmodels.formula.api`.
+        frame: Data frame with a row for each mean.
+        measure: Name of the measure, for the error message.
 
     Raises:
-        UsageError: neither optimizer gives finite numbers.
+        UsageError: Neither optimizer gives finite numbers.
     """
     parts = {"participant": "0 + C(participant)"}
     model = formulas.mixedlm(
@@ -449,7 +476,7 @@ def _find_pairs(rows: Sequence[Row]) -> dict[str, str]:
     """Returns the pair of each participant.
 
     Raises:
-        UsageError: a participant is in two pairs, or no pair has two participants.
+        UsageError: A participant is in two pairs, or no pair has two participants.
     """
     pairs: dict[str, str] = {}
     for row in rows:
@@ -466,7 +493,13 @@ def _find_pairs(rows: Sequence[Row]) -> dict[str, str]:
 
 
 def _read_effect(fit: Any, condition: str, freedom: int) -> MixedEffect:
-    """Returns the effect of a condition from a fit, with `freedom` degrees of freedom."""
+    """Returns the effect of a condition from a fit.
+
+    Args:
+        fit: The fit of statsmodels.
+        condition: Name of the condition.
+        freedom: Degrees of freedom of the t statistic.
+    """
     stats = import_scipy_stats()
     name = f"condition[T.{condition}]"
     estimate = float(fit.fe_params[name])
@@ -487,17 +520,19 @@ def _read_effect(fit: Any, condition: str, freedom: int) -> MixedEffect:
 
 
 def power(d_z: float, number: int, *, alpha: float = 0.05) -> float:
-    """Returns the power of a two-sided paired t test, by the noncentral t distribution.
+    """Computes the power of a two-sided paired t test, by the noncentral t distribution.
+
+    The power is the probability that the test finds an effect of a given size.
 
     Source: Cohen, "Statistical power analysis for the behavioral sciences" (1988).
 
     Args:
-        d_z: the size of the effect: mean over standard deviation of the differences.
-        number: number of units.
-        alpha: significance level.
+        d_z: Size of the effect: mean over standard deviation of the differences.
+        number: Number of units.
+        alpha: Significance level.
 
     Raises:
-        UsageError: there are fewer than two units, or alpha is not between 0 and 1.
+        UsageError: There are fewer than two units, or alpha is not between 0 and 1.
     """
     if number < 2 or not 0.0 < alpha < 1.0:
         raise UsageError(
@@ -518,8 +553,14 @@ def find_least_number(
 ) -> int:
     """Returns the smallest number of units whose `power` is at least `wanted`.
 
+    Args:
+        d_z: Size of the effect: mean over standard deviation of the differences.
+        wanted: Desired power, between 0 and 1.
+        alpha: Significance level.
+        most: Largest number of units that is tried.
+
     Raises:
-        UsageError: more than `most` units are needed, or `wanted` is not between 0 and 1.
+        UsageError: More than `most` units are needed, or `wanted` is not between 0 and 1.
     """
     if not 0.0 < wanted < 1.0 or power(d_z, most, alpha=alpha) < wanted:
         raise UsageError(
@@ -535,12 +576,12 @@ class SimulatedPower(NamedTuple):
     """Share of simulated experiments in which two conditions differ significantly.
 
     Args:
-        first: name of the first condition.
-        second: name of the second condition.
-        d_z: the size of the simulated effect.
-        found: share of the experiments with p below alpha.
+        first: Name of the first condition.
+        second: Name of the second condition.
+        d_z: Size of the simulated effect.
+        found: Share of the experiments with p below alpha.
         interval: 95 % interval of `found`.
-        found_holm: share of the experiments with the corrected p below alpha.
+        found_holm: Share of the experiments with the corrected p below alpha.
     """
 
     first: str
@@ -562,19 +603,19 @@ def simulate_power(
     repetitions: int = 500,
     seed: int = 0,
 ) -> list[SimulatedPower]:
-    """Returns the power for each pair of conditions, from simulated experiments.
+    """Computes the power for each pair of conditions from simulated experiments.
 
     Trials are drawn from normal distributions and compared by `compare_conditions`.
 
     Args:
-        means: the expected mean of a measure by condition.
-        number: number of participants.
-        trial_deviation: standard deviation from trial to trial.
-        trials: number of trials of a participant under a condition.
-        effect_deviation: standard deviation, over participants, of the effect of a condition.
-        alpha: significance level of the tests.
-        repetitions: number of simulated experiments.
-        seed: seed of the random numbers.
+        means: Expected mean of a measure by condition.
+        number: Number of participants.
+        trial_deviation: Standard deviation from trial to trial.
+        trials: Number of trials of a participant under a condition.
+        effect_deviation: Standard deviation, over participants, of the effect of a condition.
+        alpha: Significance level of the tests.
+        repetitions: Number of simulated experiments.
+        seed: Seed of the random numbers.
     """
     generator = np.random.default_rng(seed)
     experiments: list[list[Comparison]] = []
@@ -599,8 +640,8 @@ def _list_rows(values: Array, means: Mapping[str, float]) -> list[Row]:
     """Returns a row for each simulated trial.
 
     Args:
-        values: deviations from the means, by participant, condition and trial.
-        means: the expected mean of each condition.
+        values: Deviations from the means, by participant, condition and trial.
+        means: Expected mean of each condition.
     """
     rows: list[Row] = []
     for index, (condition, mean) in enumerate(means.items()):
@@ -612,7 +653,13 @@ def _list_rows(values: Array, means: Mapping[str, float]) -> list[Row]:
 
 
 def _count_significant(runs: Sequence[Comparison], d_z: float, alpha: float) -> SimulatedPower:
-    """Returns the share of comparisons of two conditions whose p is below alpha."""
+    """Returns the share of comparisons of two conditions whose p is below alpha.
+
+    Args:
+        runs: Comparison of the two conditions in each simulated experiment.
+        d_z: Size of the simulated effect.
+        alpha: Significance level.
+    """
     significant = sum(run.p is not None and run.p < alpha for run in runs)
     significant_holm = sum(run.p_holm is not None and run.p_holm < alpha for run in runs)
     return SimulatedPower(
@@ -663,10 +710,10 @@ _OPTIONAL = (
 
 
 def write_methods(facts: Mapping[str, Any]) -> str:
-    """Returns the methods paragraph of a paper, which states every number of the facts.
+    """Writes the methods paragraph of a paper, which states every number of the facts.
 
     Args:
-        facts: facts by name; keys of numbers end in their unit.
+        facts: Facts by name. Keys of numbers end in their unit.
             `participants`: number of participants whose data count.
             `excluded`: number of further participants; `exclusions`: the reasons.
             `pairs`, `design`, `blocks`: number of pairs, the design, number of blocks.
@@ -683,7 +730,7 @@ def write_methods(facts: Mapping[str, Any]) -> str:
             answers.
 
     Raises:
-        UsageError: a fact is missing or unknown, or a condition has no delay.
+        UsageError: A fact is missing or unknown, or a condition has no delay.
     """
     _check_facts(facts)
     texts = {key: _format_fact(value, key) for key, value in facts.items()}
@@ -710,7 +757,7 @@ def _check_facts(facts: Mapping[str, Any]) -> None:
     """Checks that the facts of a methods paragraph are known and complete.
 
     Raises:
-        UsageError: a fact is missing or unknown, or a condition has no delay.
+        UsageError: A fact is missing or unknown, or a condition has no delay.
     """
     known = [*(key for key, _ in _METHODS), *_ENDING]
     missing = [key for key in known if key not in facts and key not in _OPTIONAL]
@@ -733,7 +780,11 @@ def _check_facts(facts: Mapping[str, Any]) -> None:
 def _describe_computed(computed: frozenset[str], texts: Mapping[str, str]) -> Iterator[str]:
     """Yields a sentence for each analysis that was computed.
 
-    If the conditions were not compared by any test, a sentence says this.
+    If the conditions were not compared by any test, a sentence says so.
+
+    Args:
+        computed: Names of the analyses that were computed.
+        texts: Facts of the paragraph as texts.
     """
     correction = f"with p corrected by {texts['correction']} over all comparisons of a measure"
     level = f", at alpha = {texts['alpha']}" if texts.get("alpha") else ""
@@ -764,12 +815,12 @@ def _describe_computed(computed: frozenset[str], texts: Mapping[str, str]) -> It
 
 
 def _capitalise(sentence: str) -> str:
-    """Returns a sentence with a capital first letter; other letters are unchanged."""
+    """Returns a sentence with a capital first letter. Other letters are unchanged."""
     return sentence[0].upper() + sentence[1:]
 
 
 def _format_fact(value: Any, key: str = "") -> str:
-    """Returns a fact as text, its numbers with all their digits and the unit of their key."""
+    """Returns a fact as text, with all digits of its numbers and the unit of its key."""
     if isinstance(value, str):
         return value
     if isinstance(value, Mapping):
