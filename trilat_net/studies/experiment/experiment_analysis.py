@@ -193,7 +193,7 @@ class ExperimentAnalysis(Result):
         return sorted(rows, key=lambda row: conditions.index(row["condition"]))
 
     def _list_unit_measures(self) -> list[str]:
-        """Lists the measures that each unit has once under a condition: gains and thresholds."""
+        """Lists the measures that each unit has once per condition: gains, thresholds."""
         keys = [key for row in (*self.gain_rows[:1], *self.threshold_rows[:1]) for key in row]
         return [key for key in keys if key.startswith(("gain_", "threshold_"))]
 
@@ -222,7 +222,7 @@ class ExperimentAnalysis(Result):
         return self._experiment.plan.protocol.task.description.startswith("reaching")
 
     def _summarise_times(self) -> None:
-        """Summarises the completion times, and compares them if some trials were not completed."""
+        """Summarises the completion times, and compares them if some are missing."""
         self.times = summarise_times(self.rows, self._limit_s, unit=self.unit)
         if self._has_censored_times():
             self.time_comparisons = compare_times(self.rows, unit=self.unit)
@@ -334,7 +334,7 @@ class ExperimentAnalysis(Result):
                 yield {self.unit: unit, "condition": condition, **gains}
 
     def _is_censored(self, measure: str) -> bool:
-        """Returns True if a measure is the completion time and some trials were not completed."""
+        """Returns True if a measure is the completion time and some of them are missing."""
         has_limit = self._experiment.plan.protocol.task.has_limit
         if measure != COMPLETION or not has_limit:
             return False
@@ -811,7 +811,7 @@ class PowerOfExperiment(Result):
         }
 
     def blocks(self) -> Iterator[Block]:
-        """Yields the text: the number of participants for each power, and the power as planned."""
+        """Yields the text: participants for each power, and the power as planned."""
         yield (
             "paired comparison of two conditions, two-sided, alpha 0.05, "
             f"effect d_z {self.d_z:g}"

@@ -159,8 +159,8 @@ class TrialGoal:
 
     def compute_measures(
         self,
-        after_s: Array,
-        position_m: Array,
+        after_s: Array,  # noqa: ARG002
+        position_m: Array,  # noqa: ARG002
         force_n: Array,  # noqa: ARG002
     ) -> dict[str, float]:
         """Computes the measures that only this task has.
@@ -424,8 +424,8 @@ class _ContactGoal(_DwellGoal):
     def compute_measures(
         self,
         after_s: Array,
-        position_m: Array,
-        force_n: Array,  # noqa: ARG002
+        position_m: Array,  # noqa: ARG002
+        force_n: Array,
     ) -> dict[str, float]:
         """Returns the mean of the force that had to be held, and the RMS of its error, in N.
 

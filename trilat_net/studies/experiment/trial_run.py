@@ -197,7 +197,7 @@ class ExperimentTrial:
         sum_of_shares = row[first] + row[second]
 
         def divide_shares(lead: float) -> dict[str, float]:
-            """Returns the slave's dominance factors, given the first user's part from 0 to 1."""
+            """Returns the dominance factors, given the first user's part from 0 to 1."""
             first_share = sum_of_shares * lead
             return {**row, first: first_share, second: sum_of_shares - first_share}
 
