@@ -1,4 +1,4 @@
-"""Entry point of `trilat` and `python -m trilat_net`.
+"""Starts the program `trilat`, also as `python -m trilat_net`.
 
 `trilat stop` runs before the other commands are loaded, so that arms stop without delay.
 
@@ -17,8 +17,8 @@ from contextlib import suppress
 
 
 def main() -> None:
-    """Runs `trilat`."""
-    # with Python's default thresholds, collections take a ninth of the start
+    """Prepares the process, and runs the command of the command line."""
+    # With Python's default thresholds, garbage collection takes a ninth of the start.
     gc.set_threshold(100_000, 20, 20)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
@@ -26,7 +26,7 @@ def main() -> None:
                 stream.reconfigure(encoding="utf-8", newline="\n")
             stream.reconfigure(errors="backslashreplace")
     code: int | None = None
-    # registered first, and therefore called last
+    # The function is registered first, and therefore called last.
     atexit.register(lambda: _exit_before_zenoh(code))
     try:
         _run()
@@ -38,10 +38,14 @@ def main() -> None:
 
 
 def _run() -> None:
-    """Runs the command of the command line; starters of processes load their modules first."""
+    """Runs the command of the command line.
+
+    Two commands are handled before the others are loaded: `stop`, and `start-processes`, which
+    starts the processes of a session.
+    """
     if sys.argv[1:2] == ["stop"]:
         if sys.platform == "linux":
-            # ahead of other programs on a busy machine, if permitted
+            # The process runs ahead of other programs on a busy machine, if permitted.
             with suppress(OSError):
                 os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
         from .net.known_sites import stop_at_once
@@ -54,7 +58,7 @@ def _run() -> None:
 
     match sys.argv[1:]:
         case ["start-processes", number, scenario_file] if number.isdecimal():
-            # loaded once here, instead of in each process that is forked
+            # These modules are loaded once here, instead of in each process that is forked.
             from recorder import record_process  # noqa: F401
             from sites import site_process  # noqa: F401
             from sites.demo_session import run_starter
@@ -67,10 +71,10 @@ def _run() -> None:
 
 
 def _exit_before_zenoh(code: int | None) -> None:
-    """Exits at once if Zenoh is loaded: its threads abort a process without Python.
+    """Exits at once if Zenoh is loaded, whose threads would abort the process at Python's end.
 
     Args:
-        code: the exit code; None: the process ends by an exception.
+        code: Exit code. None if the process ends by an exception.
     """
     if code is not None and "zenoh" in sys.modules:
         with suppress(OSError):  # Python reports this error itself

@@ -1,10 +1,13 @@
-"""The Python interface: one function per command, for logs, virtual time and studies.
+"""Offers one Python function per command, for logs, simulation and studies.
 
-A scenario is a name, a path, a TOML text, its tables or a `Scenario`; a log is a path or a
-`Log`. Functions that need a network are in the package `sites`.
+`import trilat_net as tn` makes these functions available as `tn.simulate` and so on. A
+scenario, the description of an experiment with robot arms, is given as a name, a path, a TOML
+text, its tables or a `Scenario`. A log, the recording of a run, is given as a path or a `Log`.
+Functions that need a network are in the package `sites`.
 
 Invariant:
-    - These functions only convert arguments and call the packages that do the work.
+    - These functions only convert arguments and call the packages that do the work, so that
+      Python and the command line give the same results.
 """
 
 from collections.abc import Mapping, Sequence
@@ -38,12 +41,17 @@ Axes = str | Sequence[str] | Mapping[str, Any]
 
 
 def _open(log: AnyLog) -> Log:
-    """Returns an opened log."""
+    """Returns a log, which is opened if it is given as a path."""
     return log if isinstance(log, Log) else open_log(log)
 
 
 def _list_override_texts(overrides: Overrides, duration_s: float | None) -> list[str]:
-    """Returns overrides and a duration, s, as texts KEY=VALUE."""
+    """Returns overrides of scenario keys as texts KEY=VALUE.
+
+    Args:
+        overrides: The overrides, as a mapping or as texts.
+        duration_s: Duration of the run, in s, which is added as an override. None to add none.
+    """
     from .studies.trials import list_assignments
 
     texts: list[Any]
@@ -65,23 +73,22 @@ def simulate(
     duration_s: float | None = None,
     seed: int | None = None,
 ) -> SimulatedLog:
-    """Runs a scenario in virtual time and returns its log; the command is `trilat sim`.
+    """Runs a scenario in virtual time and returns its log. The command is `trilat sim`.
 
-    It warns if the run diverged; `log.diverged_s` is the time of divergence.
+    A warning is issued if the run diverged. `log.diverged_s` is the time of divergence.
 
     >>> log = tn.simulate("two_sites", duration_s=0.1)
     >>> log["m"].q.shape
     (100, 2)
 
     Args:
-        scenario: the name of a shipped scenario, a path, a TOML text, its tables, or a
-            scenario.
-        set: overrides, as in `{"control.Kd": 5}` or `["control.Kd=5"]`.
-        duration_s: the duration of the run, s; by default the scenario's.
-        seed: the seed; by default the scenario's.
+        scenario: Name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
+        set: Overrides, as in `{"control.Kd": 5}` or `["control.Kd=5"]`.
+        duration_s: Duration of the run, in s. By default the scenario's.
+        seed: Seed of the random numbers. By default the scenario's.
 
     Raises:
-        ScenarioError: the scenario or an override is not valid.
+        ScenarioError: The scenario or an override is not valid.
     """
     log = simulate_scenario(load_scenario(scenario, set, duration_s=duration_s, seed=seed))
     log.warn_if_diverged()
@@ -96,23 +103,24 @@ def export(
     force: bool = False,
     **settings: Any,
 ) -> Path:
-    """Exports a log to files for other tools and returns the path.
-
-    The command is `trilat log export`.
+    """Exports a log to files for other tools. The command is `trilat log export`.
 
     >>> tn.export(tn.simulate("two_sites", duration_s=0.1), "npz", "run.npz").name
     'run.npz'
 
     Args:
-        log: the log, or its path; for lerobot also several logs, or a folder of logs.
-        to: ros2, parquet, csv, npz, mat or lerobot.
-        out: path of the file, or of the folder for parquet, csv and lerobot.
-        force: replace an existing file or folder.
-        settings: settings of the format, as `fps=30`, `program="m2"` and `actions="tip"` of
-            lerobot.
+        log: The log, or its path. For lerobot also several logs, or a folder of logs.
+        to: Format: ros2, parquet, csv, npz, mat or lerobot.
+        out: Path of the file, or of the folder for parquet, csv and lerobot.
+        force: True to replace an existing file or folder.
+        settings: Settings of the format, such as `fps=30`, `program="m2"` and `actions="tip"`
+            of lerobot.
+
+    Returns:
+        The path of the export.
 
     Raises:
-        UsageError: there is no such format or setting, a package is missing, or the path
+        UsageError: There is no such format or setting, a package is missing, or the path
             exists.
     """
     from .reporting.export import Exporter
@@ -132,20 +140,22 @@ def verify(
     min_coverage: float = MIN_COVERAGE,
     resume_every: int = 0,
 ) -> LogCheckReport:
-    """Executes a log again and compares all computed fields; the command is `trilat verify`.
+    """Checks a log by executing its sites again. The command is `trilat verify`.
+
+    All fields that a site computes are compared with the records, bit for bit.
 
     >>> tn.verify(tn.simulate("two_sites", duration_s=0.1)).passed
     True
 
     Args:
-        log: the log, or its path.
-        virtual: compare with virtual time too.
-        min_coverage: least share of each site's ticks that must be judged to pass.
-        resume_every: restart sites from the records every so many ticks, which reveals state
-            of a user-written law that the records lack; 0: never.
+        log: The log, or its path.
+        virtual: True to compare also with a simulation in virtual time.
+        min_coverage: Smallest share of each site's ticks that must be judged to pass.
+        resume_every: Restart sites from the records after each such number of ticks. This
+            reveals state of a user's control law that the records lack. 0 never restarts them.
 
     Raises:
-        LogError: the log cannot be read.
+        LogError: The log cannot be read.
     """
     return run_log_checks(
         _open(log), virtual=virtual, min_coverage=min_coverage, resume_every=resume_every
@@ -159,20 +169,23 @@ def certify(
     own_laws: bool = False,
     twins: int = TWINS,
 ) -> Certificate:
-    """Judges a run: stable, not stable or open, and why; the command is `trilat certify`.
+    """Judges whether a run was stable, and why. The command is `trilat certify`.
+
+    The judgement is stable, not stable or open.
 
     >>> print(tn.certify(tn.simulate("free")).stability)
     stable
 
     Args:
-        log: the log, or its path.
-        min_coverage: least share of each site's ticks that must be judged for a stable run.
-        own_laws: code of imported laws may be executed, for the energies that they declare and
-            for twins.
-        twins: number of twins of the run with a small push.
+        log: The log, or its path.
+        min_coverage: Smallest share of each site's ticks that must be judged for a stable run.
+        own_laws: True if code of users' control laws may be executed, for the energies that
+            they declare and for twins.
+        twins: Number of twins, which are second executions of the run with a small push. They
+            show whether disturbances grow.
 
     Raises:
-        LogError: the log cannot be read.
+        LogError: The log cannot be read.
     """
     from .theory.linear_analysis import certify_run
 
@@ -189,7 +202,7 @@ def metrics(log: AnyLog) -> LogMetrics:
     True
 
     Raises:
-        LogError: the log cannot be read.
+        LogError: The log cannot be read.
     """
     return compute_log_metrics(_open(log))
 
@@ -197,20 +210,20 @@ def metrics(log: AnyLog) -> LogMetrics:
 def report(
     log: AnyLog, out: str | Path | None = None, *, force: bool = False, png: bool = False
 ) -> "Conclusion":
-    """Writes the page and the summary of a log in a file; the command is `trilat report`.
+    """Writes the page and the summary of a log. The command is `trilat report`.
 
     >>> path = tn.simulate("two_sites", duration_s=0.1).save("run.mcap")
     >>> tn.report(path, "report").passed
     True
 
     Args:
-        log: the log's path, or a log that was opened from a file.
-        out: the folder; by default the file's name without .mcap.
-        force: use a folder that is not empty.
-        png: write every figure as a PNG file too.
+        log: Path of the log, or a log that was opened from a file.
+        out: Folder of the report. By default the log's path without .mcap.
+        force: True to use a folder that is not empty.
+        png: True to write every figure as a PNG file too.
 
     Raises:
-        UsageError: the folder is not empty, or the log is not in a file.
+        UsageError: The folder is not empty, or the log is not in a file.
     """
     from .reporting.conclude import conclude
 
@@ -234,7 +247,7 @@ def linear(
     ports: bool = True,
     operators: Sequence[str | Path] = (),
 ) -> "LinearAnalysis":
-    """Linearises the loop about its equilibrium: roots, margins, ports.
+    """Linearises the arms and their controllers about an equilibrium: roots, margins, ports.
 
     The command is `trilat linear`.
 
@@ -242,19 +255,18 @@ def linear(
     'unstable'
 
     Args:
-        scenario: the name of a shipped scenario, a path, a TOML text, its tables, or a
-            scenario.
-        set: overrides, as in `{"control.d": 0.9}`.
-        pose: joint angles of all sites, rad; by default those at the end of a run.
-        roots: number of roots.
-        over: ranges of keys in which edges of stability are searched, as in
+        scenario: Name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
+        set: Overrides, as in `{"control.d": 0.9}`.
+        pose: Joint angles of all sites, in rad. By default those at the end of a run.
+        roots: Number of characteristic roots to compute.
+        over: Ranges of keys in which edges of stability are searched, as in
             `["control.d=0.1:3"]`.
-        ports: analyse passivity and the impedances that operators feel.
-        operators: files of measured operators, from `trilat identify hand --json`.
+        ports: True to analyse passivity and the impedances that operators feel.
+        operators: Files of measured operators, from `trilat identify hand --json`.
 
     Raises:
-        ScenarioError: the scenario is not valid, or has no linear loop.
-        UsageError: another argument is not valid.
+        ScenarioError: The scenario is not valid, or has no linear loop.
+        UsageError: Another argument is not valid.
     """
     from .studies.hand_impedance import read_hands
     from .theory.linear_analysis import analyse_linear_loop
@@ -290,7 +302,7 @@ def sweep(
     jobs: int | None = None,
     on: "Workers" = None,
 ) -> "SweepResults":
-    """Runs a scenario over a grid of its keys and classifies stability.
+    """Runs a scenario over a grid of its keys and judges the stability of each run.
 
     The command is `trilat sweep`.
 
@@ -300,27 +312,28 @@ def sweep(
     2
 
     Args:
-        scenario: the name of a shipped scenario, a path, a TOML text, its tables, or a
-            scenario.
-        over: the axes, as in `{"link.delay_ms": range(0, 1601, 50)}`: lists or arrays of values
-            by key; or as texts, `["link.delay_ms=0:1600:50"]`.
-        set: overrides of all cells, as in `{"control.Kd": 5}`.
-        seeds: number of seeds, or the seeds.
-        laws: names or classes of laws to sweep as well.
-        duration_s: first duration of a cell's run, s.
-        longest_s: longest duration of an undecided cell's run, s; by default eight times
+        scenario: Name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
+        over: Axes of the grid, as lists or arrays of values by key,
+            `{"link.delay_ms": range(0, 1601, 50)}`, or as texts, `["link.delay_ms=0:1600:50"]`.
+        set: Overrides of all runs, as in `{"control.Kd": 5}`.
+        seeds: Number of seeds, or the seeds.
+        laws: Names or classes of control laws, as a further axis.
+        duration_s: First duration of a run, in s.
+        longest_s: Longest duration of an undecided run, in s. By default eight times
             `duration_s`, or `duration_s` if twins judge.
-        judge: "twins" measures the growth exponent of each cell in addition to its verdict.
-        metrics: keys of docs/metrics.md that are measured of each run; they become columns of
+        judge: "twins" measures the growth of small disturbances in each run in addition to its
+            verdict.
+        metrics: Keys of docs/metrics.md that are measured in each run. They become columns of
             the rows.
-        out: folder of the results; a sweep in it is continued. By default the next free
+        out: Folder of the results. A sweep in it is continued. By default the next free
             runs/sweep-NAME-N.
-        jobs: number of processes; None: one per core.
-        on: runs the cells instead of processes: a Dask scheduler's address, or an executor.
+        jobs: Number of processes. None for one per core.
+        on: Address of a Dask scheduler, or an executor, that runs the grid instead of
+            processes.
 
     Raises:
-        ScenarioError: the scenario, an axis or one of its values is not valid.
-        UsageError: the folder contains something else.
+        ScenarioError: The scenario, an axis or one of its values is not valid.
+        UsageError: The folder contains something else.
     """
     from .studies.sweep import plan_sweep, prepare_sweep_folder, run_sweep
 
@@ -351,29 +364,29 @@ def margin(
     jobs: int | None = None,
     on: "Workers" = None,
 ) -> "SweepMargins":
-    """Searches the edge of stability along a key; the command is `trilat sweep --margin`.
+    """Searches the edge of stability along a key. The command is `trilat sweep --margin`.
 
     >>> found = tn.margin("p_d_margin", "control.d=0.2:3", tolerance=0.2, duration_s=4, jobs=1)
     >>> [search.margin.spans[0].stable_below for search in found.found]
     [False]
 
     Args:
-        scenario: the name of a shipped scenario, a path, a TOML text, its tables, or a
-            scenario.
-        along: the key and its range, as in "control.d=0.2:3".
-        over: axes of a grid at whose points the edge is searched, as in `sweep`:
+        scenario: Name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
+        along: The key and its range, as in "control.d=0.2:3".
+        over: Axes of a grid at whose points the edge is searched, as in `sweep`:
             `{"link.delay_ms": [100, 200]}`.
-        set: overrides of all runs.
-        tolerance: largest width of an edge, relative to its value.
-        seeds: number of seeds, or the seeds.
-        laws: names or classes of laws to search as well.
-        duration_s: first duration of a run, s.
-        jobs: number of processes; None: one per core.
-        on: runs the cells instead of processes: a Dask scheduler's address, or an executor.
+        set: Overrides of all runs.
+        tolerance: Largest width of an edge, relative to its value.
+        seeds: Number of seeds, or the seeds.
+        laws: Names or classes of control laws, for each of which the edge is searched.
+        duration_s: First duration of a run, in s.
+        jobs: Number of processes. None for one per core.
+        on: Address of a Dask scheduler, or an executor, that runs the search instead of
+            processes.
 
     Raises:
-        ScenarioError: the scenario or one of the values is not valid.
-        UsageError: the range is not of the form KEY=LOW:HIGH.
+        ScenarioError: The scenario or one of the values is not valid.
+        UsageError: The range is not of the form KEY=LOW:HIGH.
     """
     from .studies.sweep import plan_sweep
     from .studies.sweep.margin_search import (
@@ -406,30 +419,32 @@ def tune(
     jobs: int | None = None,
     on: "Workers" = None,
 ) -> "TuningResult":
-    """Compares control laws that one procedure tunes; the command is `trilat compare --tune`.
+    """Compares control laws after tuning each of them by the same procedure.
+
+    The command is `trilat compare --tune`.
 
     >>> found = tn.tune("free", ["p_d"], budget=2, duration_s=2, jobs=1)
     >>> [law.space.law for law in found.found]
     ['p_d']
 
     Args:
-        scenario: the name of a shipped scenario, a path, a TOML text, its tables, or a
-            scenario.
-        laws: names or classes of the laws; empty: all laws for any number of sites.
-        set: overrides, as in `{"link.delay_ms": 100}`.
-        budget: number of candidates per law.
-        seed: the seed of the search.
-        seeds: number of seeds of the scenario over which each candidate is averaged.
+        scenario: Name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
+        laws: Names or classes of the laws. Empty for all laws that work with any number of
+            sites.
+        set: Overrides, as in `{"link.delay_ms": 100}`.
+        budget: Number of candidates per law.
+        seed: Seed of the search.
+        seeds: Number of seeds of the scenario over which each candidate is averaged.
         objective: "error" or "settling", in addition to effort.
-        gravity_percent: gravity that all laws assume, in % of the true gravity.
-        duration_s: duration of a run, s.
-        jobs: number of processes; None: one per core.
-        on: runs the candidates instead of processes: a Dask scheduler's address, or an
-            executor.
+        gravity_percent: Gravity that all laws assume, in % of the true gravity.
+        duration_s: Duration of a run, in s.
+        jobs: Number of processes. None for one per core.
+        on: Address of a Dask scheduler, or an executor, that runs the candidates instead of
+            processes.
 
     Raises:
-        ScenarioError: the scenario is not valid, or laws cannot be compared in it.
-        UsageError: another argument is not valid.
+        ScenarioError: The scenario is not valid, or laws cannot be compared in it.
+        UsageError: Another argument is not valid.
     """
     from .studies.tuning import plan_tuning
 
@@ -468,18 +483,20 @@ def bench(
     1
 
     Args:
-        study: full, small or round-trips.
-        tasks: only these tasks; empty: all.
-        laws: only these laws; empty: all.
-        links: other links, as in "rtt68-loss10" or "4g".
-        seeds: number of seeds; by default the study's.
-        confirm: run unstable cells again for 100 s, which refutes or confirms the verdict.
-        out: folder; a suite in it is continued. By default runs/bench-STUDY.
-        jobs: number of processes; None: one per core.
-        on: runs the cells instead of processes: a Dask scheduler's address, or an executor.
+        study: Name of the study: full, small or round-trips.
+        tasks: Only these tasks. Empty for all.
+        laws: Only these laws. Empty for all.
+        links: Other links than the study's, as in "rtt68-loss10" or "4g".
+        seeds: Number of seeds. By default the study's.
+        confirm: True to run unstable cells again for 100 s, which confirms or refutes the
+            verdict.
+        out: Folder of the results. A suite in it is continued. By default runs/bench-STUDY.
+        jobs: Number of processes. None for one per core.
+        on: Address of a Dask scheduler, or an executor, that runs the suite instead of
+            processes.
 
     Raises:
-        UsageError: there is no such study, task, law or link, or the folder contains something
+        UsageError: There is no such study, task, law or link, or the folder contains something
             else.
     """
     from .studies.bench import plan_bench, prepare_bench_folder, run_bench
@@ -490,18 +507,18 @@ def bench(
 
 
 def view(*files: str | Path, full: bool = False, save: str | Path | None = None) -> None:
-    """Opens a log in Rerun, until it is closed; the command is `trilat log view`.
+    """Shows a log in the Rerun viewer, until it is closed. The command is `trilat log view`.
 
     >>> tn.view("run.mcap")  # doctest: +SKIP
 
     Args:
-        files: the log, or its parts.
-        full: show every record instead of the decimated channels.
-        save: path of a file for Rerun to write instead of opening the viewer.
+        files: The log, or its parts.
+        full: True to show every record instead of the decimated channels.
+        save: Path of a file for Rerun to write instead of opening the viewer.
 
     Raises:
         UsageError: Rerun is not installed, or there is no display.
-        LogError: the log cannot be read.
+        LogError: The log cannot be read.
     """
     from .reporting.rerun_viewer import ViewerOptions, open_rerun
 

@@ -1,12 +1,14 @@
-"""A LeRobot robot that lets a policy drive one master of a trilat-net session.
+"""Drives one master arm of a trilat-net session from a LeRobot policy.
 
-The policy shares the slave with another user, who drives another master. Each action of the
-policy commands the live hand that the scenario allows at the policy's master. Each observation
-holds the newest records of the slave and of that master, and the state of the hand.
+LeRobot is a library for robot learning. A policy is a trained program that commands a robot. In
+a session, two master arms lead one slave arm. The policy drives one master, and another user,
+usually a person, drives the other one. Each action of the policy commands its master, if the
+scenario allows this. Each observation has the newest records of the slave and of that master,
+and the state of the hand, which is the connection through which a program holds an arm.
 
 Invariant:
-    - An action moves the arm within the hand's limits of force and speed.
-    - The slave follows all of its users by their dominance factors.
+    - An action moves the arm within the limits of force and speed that the scenario sets.
+    - The slave follows all of its users, weighted by their dominance factors.
     - The features of actions and observations follow from the scenario alone.
 """
 
@@ -27,16 +29,16 @@ _HAND_COMMANDS = {"tip": ("move", "pos"), "joint": ("turn", "pos"), "force": ("p
 @RobotConfig.register_subclass("trilat")
 @dataclass(kw_only=True)
 class TrilatRobotConfig(RobotConfig):
-    """The session and the site of the policy.
+    """The session and the site that the policy drives. A site is a process that runs one arm.
 
     Attributes:
-        session: name of the session.
-        scenario: name or path of the session's scenario; "": the session's name.
-        site: the master that the policy drives.
-        slave: the site that the policy also observes.
-        connect: endpoints of the session; by default the endpoints on this machine.
-        keys: folder of the operator's keys; "" for a session without keys.
-        timeout_s: longest wait for the session, in s.
+        session: Name of the session.
+        scenario: Name or path of the session's scenario. Empty for the session's name.
+        site: Name of the master that the policy drives.
+        slave: Name of the site that the policy also observes.
+        connect: Network addresses of the session. By default those on this machine.
+        keys: Folder of the operator's keys. Empty for a session without keys.
+        timeout_s: Longest wait for the session, in s.
     """
 
     session: str = "play"
@@ -49,7 +51,13 @@ class TrilatRobotConfig(RobotConfig):
 
 
 class TrilatRobot(Robot):
-    """The slave and one master of a session; the policy observes both and drives the master."""
+    """A robot for LeRobot that consists of the slave and one master of a session.
+
+    The policy observes both arms and drives the master.
+
+    Args:
+        config: The session and the site.
+    """
 
     config_class = TrilatRobotConfig
     name = "trilat"
@@ -78,39 +86,49 @@ class TrilatRobot(Robot):
 
     @property
     def observation_features(self) -> dict[str, type]:
-        """Joint states of the slave and the master, and position and force of the hand.
+        """Names and types of the numbers of an observation.
 
-        A joint has angle in rad, speed in rad/s and external torque in N m. The hand has its
-        position in m and the force that it feels in N; a hand in mode `joint` has angles in rad
-        and torques in N m.
+        These are the joint states of the slave and of the master, and the position and force of
+        the hand. A joint has angle in rad, speed in rad/s and external torque in N m. The hand
+        has its position in m and the force that it feels in N. A hand in mode `joint` has
+        angles in rad and torques in N m.
         """
         return dict.fromkeys([*self._joint_keys, *self._position_keys, *self._felt_keys], float)
 
     @property
     def action_features(self) -> dict[str, type]:
-        """Command of the hand, by its mode in the scenario.
+        """Names and types of the numbers of an action, which commands the hand.
 
         The command is a position in m (mode `tip`), angles in rad (`joint`) or a force in N
-        (`force`).
+        (`force`). The scenario determines the mode.
         """
         return dict.fromkeys(self._action_keys, float)
 
     @property
     def is_connected(self) -> bool:
+        """True while the robot takes part in the session."""
         return self._hand is not None and not self._hand.over
 
     @property
     def is_calibrated(self) -> bool:
+        """True: the arms need no calibration."""
         return True
 
     def calibrate(self) -> None:
+        """Does nothing: the arms need no calibration."""
         pass
 
     def configure(self) -> None:
+        """Does nothing: the scenario has all settings."""
         pass
 
     def connect(self, calibrate: bool = True) -> None:  # noqa: ARG002 - there is nothing to calibrate
-        """Joins the session and waits for the first record of both sites."""
+        """Joins the session, and waits for the first record of both sites.
+
+        Raises:
+            DeviceAlreadyConnectedError: The robot is connected already.
+            DeviceNotConnectedError: A site publishes no record in time.
+        """
         if self._hand is not None:
             raise DeviceAlreadyConnectedError(f"{self} is already connected.")
         config = self.config
@@ -134,7 +152,8 @@ class TrilatRobot(Robot):
         """Waits until both sites have published a record.
 
         Raises:
-            DeviceNotConnectedError: a site has published none for `timeout_s` seconds.
+            DeviceNotConnectedError: A site has not published a record within `timeout_s`
+                seconds.
         """
         deadline_s = time.monotonic() + timeout_s
         while set(self._sites) - self._records.keys():
@@ -145,7 +164,7 @@ class TrilatRobot(Robot):
             self._receive_newest()
 
     def _receive_newest(self) -> None:
-        """Receives the new records and keeps the newest record of each site."""
+        """Receives the new records, and keeps the newest record of each site."""
         for record in self._receive_records():
             self._records[record.site] = record
 
@@ -163,7 +182,14 @@ class TrilatRobot(Robot):
         return dict(zip(self.observation_features, values, strict=True))
 
     def send_action(self, action: dict[str, Any]) -> dict[str, float]:
-        """Commands the hand; the site enforces the limits of force and speed."""
+        """Commands the hand. The site enforces the limits of force and speed.
+
+        Args:
+            action: Numbers with the names of `action_features`.
+
+        Returns:
+            The numbers that were sent.
+        """
         goal = {key: float(action[key]) for key in self._action_keys}
         command = getattr(self._require_hand(), self._command)
         command(*goal.values())
@@ -176,17 +202,21 @@ class TrilatRobot(Robot):
         self._stack.close()
 
     def _require_hand(self) -> Any:
-        """Returns the hand; raises DeviceNotConnectedError before `connect`."""
+        """Returns the hand.
+
+        Raises:
+            DeviceNotConnectedError: The robot is not connected.
+        """
         if self._hand is None:
             raise DeviceNotConnectedError(f"{self} is not connected.")
         return self._hand
 
 
 def _find_hand_mode(scenario: Any, site: str) -> str:
-    """Returns the mode of the live hand at a site.
+    """Returns the mode in which a program may hold the arm of a site.
 
     Raises:
-        ValueError: the scenario allows no live hand at the site.
+        ValueError: The scenario does not allow programs to hold this arm.
     """
     for hand in scenario.sites[site].hands:
         mode: str = getattr(hand, "mode", "")
@@ -196,9 +226,9 @@ def _find_hand_mode(scenario: Any, site: str) -> str:
 
 
 def _list_hand_axes(scenario: Any, site: str, mode: str) -> list[str]:
-    """Returns the names of the axes along which a hand of this mode moves the arm.
+    """Returns the names of the axes along which a hand moves the arm.
 
-    A hand in mode `joint` turns the joints; a hand in another mode moves the end effector.
+    A hand in mode `joint` turns the joints. A hand in another mode moves the end effector.
     """
     arm = scenario.arms[site]
     if mode == "joint":

@@ -1,14 +1,16 @@
-"""A LeRobot teleoperator for a person's master in a trilat-net session.
+"""Lets LeRobot read and move the master arm of a person in a trilat-net session.
 
-The person shares the slave with a policy, which drives another master. An action of the person
-is the position of the person's arm. Feedback lets LeRobot move that arm, for example to the
-policy's position before the person intervenes.
+LeRobot is a library for robot learning. In a session, two master arms lead one slave arm. A
+person drives one master, and a policy, a trained program, drives the other one. An action of
+the person is the position of the person's arm. Feedback lets LeRobot move this arm, for example
+to the policy's position before the person intervenes.
 
 Invariant:
-    - The slave follows both users by their dominance factors, also while the person intervenes.
+    - The slave follows both users, weighted by their dominance factors, also while the person
+      intervenes.
     - The person intervenes if the person's dominance factor is greater than the policy's.
     - Feedback moves the arm only while torque is enabled and no other user holds the arm.
-    - Feedback pulls the arm with the spring and the limits of the arm's live hand.
+    - Feedback pulls the arm with the spring and within the limits that the scenario sets.
 """
 
 from contextlib import ExitStack
@@ -28,17 +30,17 @@ _HAND_COMMANDS = {"tip": ("move", "pos"), "joint": ("turn", "pos"), "force": ("p
 @TeleoperatorConfig.register_subclass("trilat")
 @dataclass(kw_only=True)
 class TrilatTeleoperatorConfig(TeleoperatorConfig):
-    """The session and the sites of the person and the policy.
+    """The session, and the sites of the person and the policy. A site is a process with one arm.
 
     Attributes:
-        session: name of the session.
-        scenario: name or path of the session's scenario; "": the session's name.
-        site: the person's master.
-        program: the policy's master.
-        slave: the site that both masters lead.
-        connect: endpoints of the session; by default the endpoints on this machine.
-        keys: folder of the operator's keys; "" for a session without keys.
-        timeout_s: longest wait for the session, in s.
+        session: Name of the session.
+        scenario: Name or path of the session's scenario. Empty for the session's name.
+        site: Name of the person's master.
+        program: Name of the policy's master.
+        slave: Name of the site that both masters lead.
+        connect: Network addresses of the session. By default those on this machine.
+        keys: Folder of the operator's keys. Empty for a session without keys.
+        timeout_s: Longest wait for the session, in s.
     """
 
     session: str = "play"
@@ -52,7 +54,11 @@ class TrilatTeleoperatorConfig(TeleoperatorConfig):
 
 
 class TrilatTeleoperator(Teleoperator):
-    """The person's master in a session."""
+    """A teleoperator for LeRobot that consists of the person's master in a session.
+
+    Args:
+        config: The session and the sites.
+    """
 
     config_class = TrilatTeleoperatorConfig
     name = "trilat"
@@ -73,37 +79,46 @@ class TrilatTeleoperator(Teleoperator):
 
     @property
     def action_features(self) -> dict[str, type]:
-        """Position of the arm in m, or angles in rad for a hand in mode `joint`.
+        """Names and types of the numbers of an action: the position of the arm in m.
 
-        The keys are those of the actions of `TrilatRobot`.
+        A hand in mode `joint` has angles in rad. The names are those of the actions of
+        `TrilatRobot`.
         """
         return dict.fromkeys(self._position_keys, float)
 
     @property
     def feedback_features(self) -> dict[str, type]:
-        """Command of the hand at the arm, by the hand's mode in the scenario.
+        """Names and types of the numbers of feedback, which commands the hand at the arm.
 
         The command is a position in m (mode `tip`), angles in rad (`joint`) or a force in N
-        (`force`).
+        (`force`). The scenario determines the mode.
         """
         return dict.fromkeys(self._feedback_keys, float)
 
     @property
     def is_connected(self) -> bool:
+        """True while the teleoperator takes part in the session."""
         return self._hand is not None and not self._hand.over
 
     @property
     def is_calibrated(self) -> bool:
+        """True: the arms need no calibration."""
         return True
 
     def calibrate(self) -> None:
+        """Does nothing: the arms need no calibration."""
         pass
 
     def configure(self) -> None:
+        """Does nothing: the scenario has all settings."""
         pass
 
     def connect(self, calibrate: bool = True) -> None:  # noqa: ARG002 - there is nothing to calibrate
-        """Joins the session without holding the arm."""
+        """Joins the session without holding the arm.
+
+        Raises:
+            DeviceAlreadyConnectedError: The teleoperator is connected already.
+        """
         if self._hand is not None:
             raise DeviceAlreadyConnectedError(f"{self} is already connected.")
         config = self.config
@@ -128,7 +143,7 @@ class TrilatTeleoperator(Teleoperator):
         return dict(zip(self._position_keys, position, strict=True))
 
     def get_felt(self) -> dict[str, float]:
-        """Returns the force of the arm on the hand that holds it, in N.
+        """Returns the force that the arm exerts on the hand that holds it, in N.
 
         A hand in mode `joint` feels torques in N m.
         """
@@ -140,7 +155,9 @@ class TrilatTeleoperator(Teleoperator):
     def send_feedback(self, feedback: dict[str, Any]) -> None:
         """Pulls or pushes the arm if torque is enabled.
 
-        Unknown keys are ignored. Feedback that lacks a key moves nothing.
+        Args:
+            feedback: Numbers with the names of `feedback_features`. Unknown names are ignored.
+                If a name is missing, nothing moves.
         """
         hand = self._require_hand()
         is_complete = all(key in feedback for key in self._feedback_keys)
@@ -159,7 +176,7 @@ class TrilatTeleoperator(Teleoperator):
         self._require_hand().release()
 
     def get_teleop_events(self) -> dict[TeleopEvents, bool]:
-        """Returns whether the person intervenes and whether the session is over."""
+        """Returns whether the person intervenes, and whether the session is over."""
         hand = self._require_hand()
         shares = self._get_shares()
         person_leads = shares[self.config.site] > shares[self.config.program]
@@ -177,17 +194,21 @@ class TrilatTeleoperator(Teleoperator):
         self._stack.close()
 
     def _require_hand(self) -> Any:
-        """Returns the hand; raises DeviceNotConnectedError before `connect`."""
+        """Returns the hand, which is the connection through which a program holds an arm.
+
+        Raises:
+            DeviceNotConnectedError: The teleoperator is not connected.
+        """
         if self._hand is None:
             raise DeviceNotConnectedError(f"{self} is not connected.")
         return self._hand
 
 
 def _find_hand_mode(scenario: Any, site: str) -> str:
-    """Returns the mode of the live hand at a site.
+    """Returns the mode in which a program may hold the arm of a site.
 
     Raises:
-        ValueError: the scenario allows no live hand at the site.
+        ValueError: The scenario does not allow programs to hold this arm.
     """
     for hand in scenario.sites[site].hands:
         mode: str = getattr(hand, "mode", "")
@@ -197,9 +218,9 @@ def _find_hand_mode(scenario: Any, site: str) -> str:
 
 
 def _list_hand_axes(scenario: Any, site: str, mode: str) -> list[str]:
-    """Returns the names of the axes along which a hand of this mode moves the arm.
+    """Returns the names of the axes along which a hand moves the arm.
 
-    A hand in mode `joint` turns the joints; a hand in another mode moves the end effector.
+    A hand in mode `joint` turns the joints. A hand in another mode moves the end effector.
     """
     arm = scenario.arms[site]
     if mode == "joint":
