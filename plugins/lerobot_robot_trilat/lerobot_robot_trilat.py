@@ -116,11 +116,9 @@ class TrilatRobot(Robot):
 
     def calibrate(self) -> None:
         """Does nothing: the arms need no calibration."""
-        pass
 
     def configure(self) -> None:
         """Does nothing: the scenario has all settings."""
-        pass
 
     def connect(self, calibrate: bool = True) -> None:  # noqa: ARG002 - there is nothing to calibrate
         """Joins the session, and waits for the first record of both sites.

@@ -30,7 +30,7 @@ _HAND_COMMANDS = {"tip": ("move", "pos"), "joint": ("turn", "pos"), "force": ("p
 @TeleoperatorConfig.register_subclass("trilat")
 @dataclass(kw_only=True)
 class TrilatTeleoperatorConfig(TeleoperatorConfig):
-    """The session, and the sites of the person and the policy. A site is a process with one arm.
+    """The session, and the sites of person and policy. A site is a process with one arm.
 
     Attributes:
         session: Name of the session.
@@ -107,11 +107,9 @@ class TrilatTeleoperator(Teleoperator):
 
     def calibrate(self) -> None:
         """Does nothing: the arms need no calibration."""
-        pass
 
     def configure(self) -> None:
         """Does nothing: the scenario has all settings."""
-        pass
 
     def connect(self, calibrate: bool = True) -> None:  # noqa: ARG002 - there is nothing to calibrate
         """Joins the session without holding the arm.

@@ -1,9 +1,13 @@
-"""The `trilat` command: registers all commands and maps errors to exit codes.
+"""Defines the `trilat` command: registers all commands and maps errors to exit codes.
+
+Each command is a function `..._command` in a module of this folder, with the decorator
+`options.command`. Its docstring is its help.
 
 Invariant:
     - A command parses its options, calls one function of the library and prints the result.
     - The exit code is 0 on success, 1 for a failed run or comparison, 2 for bad input, 4 if a
-      law of a log may not run, 5 if a disk is full, and 128 + n if signal n ended the command.
+      control law of a log may not run, 5 if a disk is full, and 128 + n if signal n ended the
+      command.
     - An error is printed as one sentence.
 """
 
@@ -28,10 +32,10 @@ from .options import flag
 
 
 class _Commands(TyperGroup):
-    """The group of all commands; Ctrl-C ends any of them with exit code 130.
+    """The group of all commands, which Ctrl-C ends with exit code 130.
 
-    The framework alone would exit with 1. KeyboardInterrupt is lost if Python raises it inside
-    a `__del__`, so that `Interrupt` remembers the signal.
+    The framework Typer alone would exit with 1. KeyboardInterrupt is lost if Python raises it
+    inside a `__del__`. Therefore `Interrupt` remembers the signal.
     """
 
     def list_commands(self, ctx: Any) -> list[str]:
@@ -40,7 +44,7 @@ class _Commands(TyperGroup):
         return sorted(super().list_commands(ctx), key=lambda name: rank.get(name, len(rank)))
 
     def invoke(self, ctx: Any) -> Any:
-        """Runs a command; Ctrl-C ends it with the exit code of the signal."""
+        """Runs a command. Ctrl-C ends it with the exit code of the signal."""
         with Interrupt() as interrupt:
             try:
                 with interrupt.raising():
@@ -86,7 +90,7 @@ _FIRST_COMMANDS = (
     "doctor", "router", "ros2", "sim", "verify", "certify", "twin", "metrics", "compare",
     "figure", "report", "replay", "rerun", "log", "test", "sweep", "bench", "linear", "tune",
 )  # fmt: skip
-"""The first commands of the help, in their order; the others follow."""
+"""First commands of the help, in their order. The others follow."""
 _GROUPS: dict[str, dict[str, Any]] = {
     "log": {"help": "Inspects, checks, signs, recovers, exports or views a log."},
     "scenario": {"help": "Lists, shows, checks and creates scenarios."},
@@ -107,15 +111,15 @@ def _add_command(group: typer.Typer, command_line: str, run: Any) -> None:
     """Adds a command to a group.
 
     Args:
-        group: the group.
-        command_line: the command as in its examples, as "log info".
-        run: the function of the command, see `options.command`.
+        group: The group.
+        command_line: The command as in its examples, such as "log info".
+        run: Function of the command, see `options.command`.
     """
     examples = [
         f"Example: trilat {command_line} {example}".rstrip() for example in run.examples
     ]
     text = run.__doc__ or "(Its help is left out by python -OO: start it as python -O.)"
-    # joined into one line per paragraph, because the help keeps line breaks
+    # Each paragraph is joined into one line, because the help keeps line breaks.
     paragraphs = inspect.cleandoc(text).split("\n\n")
     text = "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)
     name = command_line.split()[-1]
@@ -124,7 +128,10 @@ def _add_command(group: typer.Typer, command_line: str, run: Any) -> None:
 
 
 def _add_commands() -> None:
-    """Adds the commands of this folder's files: `log_info_command` is `trilat log info`."""
+    """Adds the commands that the modules of this folder define.
+
+    For example, the function `log_info_command` becomes the command `trilat log info`.
+    """
     groups = {
         name: typer.Typer(no_args_is_help=True, **settings)
         for name, settings in _GROUPS.items()
@@ -161,7 +168,7 @@ _MEMORY_ERRORS = (
 
 
 def _run() -> None:
-    """Runs `trilat`; the error for a library that `trilat-net-core` lacks says so."""
+    """Runs `trilat`. The error for a library that `trilat-net-core` lacks names the remedy."""
     try:
         app()
     except ModuleNotFoundError as error:
@@ -172,7 +179,7 @@ def _run() -> None:
 
 
 def main() -> None:
-    """Runs `trilat`; errors become one sentence and an exit code."""
+    """Runs `trilat`. Errors become one sentence and an exit code."""
     TrilatError.in_command = True
     try:
         _run()
@@ -189,20 +196,23 @@ def main() -> None:
 
 
 def _report_system_error(error: Exception) -> int:
-    """Prints an error of the operating system and returns the exit code.
+    """Prints an error of the operating system.
+
+    Returns:
+        The exit code.
 
     Raises:
-        Exception: the error itself, if it is a bug of the program.
+        Exception: The error itself, if it is a bug of the program.
     """
     lacks_memory = any(text in str(error) for text in _MEMORY_ERRORS)
     if isinstance(error, MemoryError) or lacks_memory:
-        # written directly: laying the text out needs memory, too
+        # The text is written directly, because the usual functions need more memory.
         sys.stderr.write(f"error: {_TOO_LITTLE_MEMORY}\n")
         return 1
-    # an OSError is a full disk or a vanished folder; other errors are bugs
+    # An OSError is a full disk or a folder that has vanished. Other errors are bugs.
     if not isinstance(error, OSError):
         raise error
-    # Windows reports a refused name and a closed pipe by the same error
+    # Windows reports a refused name and a closed pipe by the same error.
     is_invalid = os.name == "nt" and error.errno == errno.EINVAL
     if isinstance(error, BrokenPipeError) or (is_invalid and not error.filename):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -1,4 +1,4 @@
-"""Commands for the inputs of a run: scenarios, user-written code, measured delays, keys."""
+"""Defines the commands for the inputs of a run: scenarios, code, measured delays, keys."""
 
 import sys
 from pathlib import Path
@@ -92,9 +92,9 @@ def _print_skeleton(kind: str, written: list[Path], key: str, check: str) -> Non
 
     Args:
         kind: "law", "hand" or "plant".
-        written: the file and its test.
-        key: override of the scenario that uses the class, with {} for the class.
-        check: the command that examines the log of the run.
+        written: The file and its test.
+        key: Override of the scenario that uses the class, with {} for the class.
+        check: Command that examines the log of the run.
     """
     from ..scenario.skeletons import name_skeleton_class
 

@@ -1,7 +1,7 @@
-"""`trilat log`: info, check, sign, recover, export, view.
+"""Defines `trilat log`: info, check, sign, recover, export, view.
 
 Invariant:
-    - No command of this file executes a log.
+    - No command of this file executes a log, so that they are safe for logs of others.
 """
 
 from contextlib import nullcontext
@@ -200,7 +200,7 @@ def log_view_command(
 
 
 def _open_page(files: list[Path]) -> None:
-    """Opens the page of a log; writes it first, as `trilat report` does, if it is missing."""
+    """Opens the page of a log in a browser. If it is missing, it is written first."""
     import webbrowser
     from contextlib import suppress
 

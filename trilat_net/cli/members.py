@@ -1,4 +1,4 @@
-"""Commands for the processes of a session: site, hand, recorder, replay, router, ROS 2."""
+"""Defines the commands that start a process of a session: site, recorder, replay, ROS."""
 
 import math
 import os
@@ -172,14 +172,14 @@ def hand_command(
 def _lead_by_device(
     device: str, name: str, session: str | None, reach: options.Reach, timeout_s: float
 ) -> None:
-    """Leads an arm of a running session by a device, until the session ends or Ctrl-C.
+    """Leads an arm of a running session with a device, until the session ends or Ctrl-C.
 
     Args:
-        device: name of the device, and its address if needed.
-        name: name of the site.
-        session: name of the session.
-        reach: the options by which the command reaches the session.
-        timeout_s: longest wait for the site, s.
+        device: Name of the device, and its address if needed.
+        name: Name of the site of the arm.
+        session: Name of the session.
+        reach: Options with which the command reaches the session.
+        timeout_s: Longest wait for the site, in s.
     """
     from sites.devices import open_device
     from sites.running_session import RunningSession
@@ -199,10 +199,15 @@ def _lead_by_device(
 
 
 def _check_without(scenario: "Scenario", name: str, without: list[str]) -> tuple[str, ...]:
-    """Returns the sites without which a session may begin.
+    """Checks and returns the sites without which a session may begin.
+
+    Args:
+        scenario: Scenario of the session.
+        name: Name of the site of this process.
+        without: Names of the sites that may join later.
 
     Raises:
-        UsageError: the site is not the first, or sites cannot join later.
+        UsageError: This site is not the first one, or sites cannot join later.
     """
     from ..scenario import find_site
 
@@ -316,7 +321,13 @@ def record_command(
 
 
 def _choose_path(output: Path | None, session: str, *, concluded: bool) -> Path:
-    """Returns the path of the log of a session; creates the folder of a report."""
+    """Returns the path of the log of a session. The folder of a report is created.
+
+    Args:
+        output: Path of the log. None for a default.
+        session: Name of the session.
+        concluded: True if a report is written after the session.
+    """
     from ..files import make_folder, make_results_folder, require_libraries
 
     if not concluded:
@@ -329,11 +340,11 @@ def _choose_path(output: Path | None, session: str, *, concluded: bool) -> Path:
 
 
 def _conclude(parts: list[Path], *, png: bool) -> None:
-    """Verifies a log and writes its report.
+    """Checks a log and writes its report.
 
     Raises:
-        CodeWithheld: code from outside was not executed, so that not all was judged.
-        RunFailed: the log failed a check, or the session ended by a failure.
+        CodeWithheld: Code from outside was not executed, so that not all was judged.
+        RunFailed: The log failed a check, or the session ended by a failure.
     """
     log, conclusion = terminal.conclude_files(parts, parts[0].parent, png=png)
     if conclusion.exit_code == CodeWithheld.exit_code:
@@ -475,7 +486,11 @@ def _announce_playback(
 
 
 def _make_progress_line(clock: Clock) -> Callable[["PlayProgress"], None]:
-    """Returns a function that shows the progress of a replay in one line of the terminal."""
+    """Returns a function that shows the progress of a replay in one line of the terminal.
+
+    The line has the position in the log, the present speed, the number of messages and the
+    lateness. Without a terminal the function does nothing.
+    """
     previous: list[tuple[int, int]] = []
 
     def show(progress: "PlayProgress") -> None:
@@ -498,7 +513,7 @@ def _make_progress_line(clock: Clock) -> Callable[["PlayProgress"], None]:
 
 
 def _describe_playback(outcome: "PlaybackSummary", rate: float) -> dict[str, Any]:
-    """Returns the outcome of a replay as plain values."""
+    """Returns the result of a replay as plain values, for JSON."""
     lateness = outcome.lateness
     late_us = None
     if lateness is not None:
@@ -550,7 +565,7 @@ def _show_playback(outcome: "PlaybackSummary") -> None:
 
 
 def _warn_torn(torn: dict[Path, str]) -> None:
-    """Warns of files of a log that were not finished."""
+    """Prints which files of a log were not finished, and how to recover them."""
     for path, text in torn.items():
         terminal.print_note(
             f"{path}: {text}; the intact part is played; "
@@ -559,11 +574,11 @@ def _warn_torn(torn: dict[Path, str]) -> None:
 
 
 def _warn_about_playback(outcome: "PlaybackSummary", reported: set[Path]) -> None:
-    """Warns of torn files, of subscribers that were cut off, and of late messages.
+    """Prints warnings of torn files, of subscribers that were cut off, and of late messages.
 
     Args:
-        outcome: the outcome of the replay.
-        reported: torn files of which the user has been warned already.
+        outcome: Result of the replay.
+        reported: Torn files about which the user was warned already.
     """
     _warn_torn({path: text for path, text in outcome.torn.items() if path not in reported})
     if outcome.cut:

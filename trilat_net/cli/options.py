@@ -1,4 +1,9 @@
-"""Options that several commands share, and the scenario, connection or log that they name."""
+"""Defines the options that several commands share, and opens what they name.
+
+Options that belong together, such as those that reach a session over the network, form a tuple
+(`MemberOptions`, `Reach`, ...). A command declares one parameter of this type, which
+`expand_option_tuples` replaces by the single options.
+"""
 
 import inspect
 import re
@@ -25,15 +30,16 @@ Runs = TypeVar("Runs", bound=Callable[..., None])
 def check_range(
     low: float, high: float, noun: str
 ) -> Callable[[typer.CallbackParam, float | None], Any]:
-    """Returns a callback of an option that refuses a number out of a range.
+    """Returns a callback of an option that refuses a number outside of a range.
 
     Args:
-        low: the smallest number.
-        high: the largest number.
-        noun: what the number is, for the error message, as "a share".
+        low: The smallest number.
+        high: The largest number.
+        noun: What the number is, for the error message, as in "a share".
     """
 
     def check(param: typer.CallbackParam, value: float | None) -> float | None:
+        """Returns the value of the option if it is in the range."""
         if value is not None and not low <= value <= high:
             raise UsageError(
                 f"{param.opts[0]} is {noun} from {low:.7g} to {high:.7g}, not {value:g}"
@@ -47,21 +53,32 @@ def value(names: str, metavar: str, text: str = "", **settings: Any) -> Any:
     """Returns an option that takes a value.
 
     Args:
-        names: names of the option, separated by spaces, as "-o --out".
-        metavar: placeholder of the value in the help.
-        text: the help.
-        settings: further arguments of `typer.Option`.
+        names: Names of the option, separated by spaces, as in "-o --out".
+        metavar: Placeholder of the value in the help.
+        text: Help of the option.
+        settings: Further arguments of `typer.Option`.
     """
     return typer.Option(*names.split(), metavar=metavar, help=text, **settings)
 
 
 def flag(names: str, text: str = "", **settings: Any) -> Any:
-    """Returns an option without a value, with its help."""
+    """Returns an option without a value.
+
+    Args:
+        names: Names of the option.
+        text: Help of the option.
+        settings: Further arguments of `typer.Option`.
+    """
     return typer.Option(names, help=text, **settings)
 
 
 def seconds(name: str, text: str = "") -> Any:
-    """Returns an option that takes a waiting time in s, with its help."""
+    """Returns an option that takes a waiting time in s.
+
+    Args:
+        name: Name of the option.
+        text: Help of the option.
+    """
     return value(name, "S", text, callback=check_range(0.0, 86_400.0, "a number of seconds"))
 
 
@@ -76,10 +93,11 @@ def command(*examples: str) -> Callable[[Runs], Runs]:
     function's docstring.
 
     Args:
-        examples: arguments of the examples in the help.
+        examples: Arguments of the examples in the help.
     """
 
     def declare(run: Runs) -> Runs:
+        """Stores the examples, and moves the help of options from docstring to options."""
         run.examples = examples  # type: ignore[attr-defined]
         docstring = inspect.getdoc(run) or ""
         head, _, option_entries = docstring.partition("\n\nOptions:\n")
@@ -92,7 +110,7 @@ def command(*examples: str) -> Callable[[Runs], Runs]:
 
 
 def complete_scenarios(incomplete: str) -> list[str]:
-    """Returns the scenarios that a shell may complete: shipped names and TOML files here."""
+    """Lists the scenarios that may complete an argument: shipped ones and files."""
     shipped = (entry.name.removesuffix(".toml") for entry in _SCENARIOS.iterdir())
     names = [name for name in shipped if "." not in name and not name.startswith("_")]
     folder = Path(incomplete).parent if "/" in incomplete else Path()
@@ -101,19 +119,22 @@ def complete_scenarios(incomplete: str) -> list[str]:
 
 
 def complete_figures(incomplete: str) -> list[str]:
-    """Returns the figures that a shell may complete."""
+    """Lists the figures with which a shell may complete an argument."""
     from ..reporting.figures.registry import FIGURES
 
     return [name for name in FIGURES if name.startswith(incomplete)]
 
 
 def complete_sites(context: typer.Context, incomplete: str) -> list[str]:
-    """Returns the sites that a shell may complete: those of the named scenario or log."""
+    """Lists the sites with which a shell may complete an argument.
+
+    They are the sites of the scenario or log that the command line names.
+    """
     from ..log.log_reader import open_log
     from ..scenario import load_scenario
 
     files = context.params.get("files") or []
-    # arguments before an option without a value are not parsed yet
+    # The arguments before an option without a value are not parsed yet.
     if "files" in context.params and not files:
         files = [Path(argument) for argument in context.args]
     try:
@@ -174,17 +195,17 @@ InsecureOption = Annotated[
 
 
 MOST_LETTERS = 80
-"""Largest length of a session's name; that of a scenario's name is 64."""
+"""Largest length of a session's name. That of a scenario's name is 64."""
 
 
 def check_session_name(name: str) -> str:
     """Returns a session's name, or refuses it if it cannot be part of a Zenoh key.
 
     Raises:
-        UsageError: the name is too long or has other characters.
+        UsageError: The name is too long or has other characters.
     """
     if len(name) > MOST_LETTERS or not re.fullmatch("[A-Za-z0-9_.-]+", name):
-        # letters of other alphabets may look the same
+        # Letters of other alphabets may look the same.
         letters = "" if name.isascii() else "; its letters are a to z and A to Z"
         raise UsageError(
             f"a session's name is at most {MOST_LETTERS} letters, digits, _, - and ., "
@@ -266,7 +287,15 @@ JsonOption = Annotated[bool, flag("--json", "Print everything as JSON.")]
 
 
 def check_picture(path: Path | None, *, force: bool) -> None:
-    """Refuses the path of a figure that cannot be written."""
+    """Checks that a figure can be written to a path, before the command computes it.
+
+    Args:
+        path: Path of the figure. None if no figure is requested.
+        force: True if an existing file may be replaced.
+
+    Raises:
+        UsageError: The suffix is not that of a figure, the file exists, or its folder does not.
+    """
     if path is None:
         return
     from ..files import refuse_existing
@@ -285,11 +314,11 @@ def print_and_draw(
     """Prints a result, and writes a figure of it if a path is given.
 
     Args:
-        result: the result.
-        picture: path of the figure; None: no figure.
-        figure: module and function that draw the figure, as "twin_differences:draw_twins".
-        drawn: argument of that function.
-        as_json: print the result as JSON.
+        result: The result.
+        picture: Path of the figure. None for no figure.
+        figure: Module and function that draw the figure, as in "twin_differences:draw_twins".
+        drawn: Argument of this function.
+        as_json: True to print the result as JSON.
     """
     if picture is not None:
         from ..reporting.style import REPORT_DPI, write_figure
@@ -306,7 +335,7 @@ def print_and_draw(
 def load_chosen_scenario(
     source: str, overrides: list[str] | None, duration: float | None, seed: int | None
 ) -> "Scenario":
-    """Returns the scenario that a command's options describe."""
+    """Returns the scenario that the options of a command describe."""
     from ..scenario import load_scenario
 
     return load_scenario(source, overrides or [], duration_s=duration, seed=seed)
@@ -321,14 +350,14 @@ def list_overrides(overrides: list[str] | None, duration: float | None) -> list[
 
 
 def split_names(text: str | None) -> list[str]:
-    """Returns the names of a text such as adaptive,p_d; an empty list for None."""
+    """Returns the names in a text such as adaptive,p_d. Empty for None."""
     return [] if text is None else [name.strip() for name in text.split(",")]
 
 
 def list_used_options(context: typer.Context) -> list[str]:
-    """Returns the options and arguments on the command line, in the order of declaration.
+    """Lists the options and arguments on the command line, in the order of declaration.
 
-    An option appears by its first name.
+    An option appears under its first name.
     """
     used = []
     for param in context.command.params:
@@ -339,7 +368,7 @@ def list_used_options(context: typer.Context) -> list[str]:
 
 
 class MemberOptions(NamedTuple):
-    """The options by which a process takes part in a session."""
+    """Options of a process that takes part in a session."""
 
     listen: ListenOption = None
     connect: ConnectOption = None
@@ -351,11 +380,11 @@ class MemberOptions(NamedTuple):
     def find_endpoints(
         self, listen_else: Sequence[str] = (), connect_else: Sequence[str] | None = None
     ) -> "Connection":
-        """Returns the endpoints of the process, without its keys.
+        """Returns the network addresses of the process, without its keys.
 
         Args:
-            listen_else: endpoints to listen at if the options name none.
-            connect_else: endpoints to connect to if the options name none.
+            listen_else: Addresses at which to listen if the options name none.
+            connect_else: Addresses to which to connect if the options name none.
         """
         from ..net.connection import resolve_member_connection
         from ..net.zenoh_bus import read_zenoh_file
@@ -377,12 +406,12 @@ class MemberOptions(NamedTuple):
         *,
         stops: bool = False,
     ) -> "Connection":
-        """Returns the connection of the process, with its keys.
+        """Returns the network addresses of the process with its keys.
 
         Args:
-            listen_else: endpoints to listen at if the options name none.
-            connect_else: endpoints to connect to if the options name none.
-            stops: the connection only stops arms, so that expired keys are accepted.
+            listen_else: Addresses at which to listen if the options name none.
+            connect_else: Addresses to which to connect if the options name none.
+            stops: True if the connection only stops arms. Then expired keys are accepted.
         """
         from ..net.connection import secure_connection
 
@@ -394,14 +423,14 @@ class MemberOptions(NamedTuple):
             keys = read_member_keys(keys, stops=True)
         secured = secure_connection(connection, keys, insecure=self.insecure)
         expiry = secured.describe_end()
-        # somebody who stops an arm does not read notes
+        # Somebody who stops an arm has no time to read notes.
         if expiry and not stops:
             terminal.print_note(expiry)
         return secured
 
 
 class Reach(NamedTuple):
-    """The options by which a command that is not a member reaches a session."""
+    """Options of a command that reaches a session without taking part in it."""
 
     connect: ConnectOption = None
     router: RouterOption = None
@@ -409,11 +438,11 @@ class Reach(NamedTuple):
     keys: KeysOption = None
 
     def resolve(self, *, operates: bool = True, stops: bool = False) -> "Connection":
-        """Returns the connection.
+        """Returns the network addresses and keys.
 
         Args:
-            operates: the keys must be the operator's.
-            stops: the connection only stops arms, so that expired keys are accepted.
+            operates: True if the keys must be the operator's.
+            stops: True if the connection only stops arms. Then expired keys are accepted.
         """
         from ..net.zenoh_config import OPERATOR
 
@@ -422,7 +451,7 @@ class Reach(NamedTuple):
 
 
 class LawFiles(NamedTuple):
-    """The options that allow files to run as the laws that a log names."""
+    """Options that allow files to run as the control laws that a log names."""
 
     law: Annotated[
         list[Path] | None,
@@ -441,11 +470,12 @@ class LawFiles(NamedTuple):
     ] = False
 
     def open(self, *files: Path, runs_them: bool = True) -> "Log":
-        """Returns a log, with a warning about code from outside.
+        """Opens a log, with a warning if its code comes from outside.
 
         Args:
-            files: the log, or its parts.
-            runs_them: the command executes the laws of the log, so that a warning is due.
+            files: The log, or its parts.
+            runs_them: True if the command executes the laws of the log, so that a warning is
+                due.
         """
         allowed: dict[str, Any] = {**self._asdict(), "law": self.law or ()}
         log = terminal.open_with_progress(*files, **allowed)
@@ -455,7 +485,7 @@ class LawFiles(NamedTuple):
 
 
 class RunOptions(NamedTuple):
-    """The options of a live run on this machine, and of its results."""
+    """Options of a live run on this machine, and of its results."""
 
     duration: DurationOption = None
     folder: Annotated[
@@ -471,15 +501,16 @@ class RunOptions(NamedTuple):
         """Returns the scenario of the run.
 
         Args:
-            source: a shipped name, or the path of a TOML file.
-            longest_s: duration of the run if --duration is not given, s; None: the scenario's.
+            source: Name of a shipped scenario, or path of a TOML file.
+            longest_s: Duration of the run if --duration is not given, in s. None for the
+                scenario's.
         """
         duration_s = longest_s if self.duration is None else self.duration
         return load_chosen_scenario(source, self.overrides, duration_s, self.seed)
 
 
 class PageServing(NamedTuple):
-    """The options of a command that serves a page."""
+    """Options of a command that serves a page."""
 
     host: Annotated[
         str,
@@ -510,7 +541,7 @@ def expand_option_tuples(run: Callable[..., Any]) -> Callable[..., Any]:
     """Returns a command with one option for each field of its option tuples.
 
     Args:
-        run: function of the command, whose parameters may be tuples of options such as `Reach`.
+        run: Function of the command. Its parameters may be tuples of options such as `Reach`.
     """
     declared = inspect.signature(run).parameters
     tuples = {
@@ -527,6 +558,7 @@ def expand_option_tuples(run: Callable[..., Any]) -> Callable[..., Any]:
 
     @wraps(run)
     def run_with_tuples(**arguments: Any) -> Any:
+        """Runs the command, with the single options collected in tuples."""
         for name, option_tuple in tuples.items():
             values = [arguments.pop(field) for field in option_tuple._fields]
             arguments[name] = option_tuple(*values)

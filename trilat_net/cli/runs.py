@@ -1,4 +1,4 @@
-"""Commands that run a scenario in virtual time, or judge, measure, draw or rerun a log."""
+"""Defines the commands that run a scenario in virtual time, or judge, draw or rerun a log."""
 
 from dataclasses import replace
 from enum import StrEnum
@@ -289,7 +289,7 @@ def figure_command(
 
 
 def _list_figures(log: "Log", *, as_json: bool) -> None:
-    """Prints all figures, and why a log lacks some of them."""
+    """Prints the names of all figures, and the reasons why a log lacks some of them."""
     from ..reporting.figures.registry import FIGURES
 
     reasons = {name: plate.absent(log) for name, plate in FIGURES.items()}
@@ -459,10 +459,10 @@ def linear_command(
 
 
 def _parse_pose(text: str | None) -> tuple[float, ...] | None:
-    """Returns the angles of a text such as "0.1,0.3"; None for None.
+    """Returns the joint angles in a text such as "0.1,0.3". Returns None for None.
 
     Raises:
-        UsageError: a part of the text is not a number.
+        UsageError: A part of the text is not a number.
     """
     if text is None:
         return None

@@ -1,4 +1,8 @@
-"""Commands that start, show, measure, change or stop sessions, or check this machine."""
+"""Defines the commands that start, show, measure, change or stop sessions.
+
+A session is a run in which several processes ("sites") each control one robot arm, and exchange
+their states over a network. Further commands check this machine.
+"""
 
 import re
 from contextlib import suppress
@@ -35,7 +39,7 @@ def demo_command(
 
 
 def _describe_log(path: Path) -> str:
-    """Returns the contents of an interrupted session's log; "" if it cannot be read."""
+    """Returns the contents of an interrupted session's log. Empty if it cannot be read."""
     from ..errors import LogError
     from ..log.log_reader import open_log
 
@@ -278,14 +282,14 @@ _OPTIONS_WITH_MODE = {
 
 
 def _refuse_options_of_other_modes(context: typer.Context, mode: str) -> None:
-    """Refuses options that do not belong to a mode of `trilat ping`.
+    """Checks that all options belong to the chosen mode of `trilat ping`.
 
     Args:
-        context: the command line.
-        mode: the option that selects the mode; "": a session is measured.
+        context: The command line.
+        mode: Option that selects the mode. Empty if a session is measured.
 
     Raises:
-        UsageError: an option belongs to another mode.
+        UsageError: An option belongs to another mode.
     """
     used = set(options.list_used_options(context))
     if mode:
@@ -308,7 +312,11 @@ def _benchmark(
     force: bool,
     as_json: bool,
 ) -> None:
-    """Measures whether the network is good enough for a scenario, and prints the result."""
+    """Measures whether the network is good enough for a scenario, and prints the result.
+
+    Raises:
+        typer.Exit: The network is not good enough.
+    """
     options.check_picture(picture, force=force)
     from sites.network_benchmark import DEFAULT_S, ping_benchmark
 
@@ -358,7 +366,7 @@ def _ping_topic(
 def _run_far_end(
     endpoints: list[str], keys: Path | None, seconds: float | None, *, insecure: bool
 ) -> None:
-    """Answers benchmarks from other machines, for a time in s or until Ctrl-C."""
+    """Replies to benchmarks of other machines, for a time in s or until Ctrl-C."""
     from math import inf
 
     from sites.network_benchmark import run_far_end
@@ -419,9 +427,9 @@ def _connect(session: str, reach: options.Reach, *, stops: bool = False) -> "Run
     """Returns the connection to a running session.
 
     Args:
-        session: name of the session.
-        reach: the options by which the command reaches the session.
-        stops: the command only stops arms, so that expired keys are accepted.
+        session: Name of the session.
+        reach: Options with which the command reaches the session.
+        stops: True if the command only stops arms. Then expired keys are accepted.
     """
     from sites.running_session import RunningSession
 
@@ -601,7 +609,7 @@ def _send_change(context: typer.Context, site: str, change: dict[str, Any]) -> N
     """Requests a change from a site of the running session, and prints its reply.
 
     Raises:
-        UsageError: the session is not named, or the site refuses the change.
+        UsageError: The command line does not name the session, or the site refuses the change.
     """
     from sites.running_session import RunningSession
 

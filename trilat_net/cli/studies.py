@@ -1,8 +1,8 @@
-"""Commands that study several runs: tests, comparisons, tuning, benchmarks, experiments.
+"""Defines the commands that study several runs: tests, comparisons, benchmarks, experiments.
 
 Invariant:
     - Numbers are printed, and nothing is ranked.
-    - The same command continues an interrupted suite.
+    - If a suite of runs is interrupted, the same command continues it.
 """
 
 import os
@@ -111,7 +111,14 @@ def parse_seeds(text: str | None) -> list[int]:
 def _list_trials(
     sources: list[str], seeds: list[int], overrides: list[str], *, live: bool
 ) -> "list[Trial]":
-    """Returns all trials; without sources, those of each shipped scenario with expectations."""
+    """Lists the trials of a test: each scenario with each seed.
+
+    Args:
+        sources: Names or paths of scenarios. Empty for all shipped scenarios with expectations.
+        seeds: The seeds.
+        overrides: Overrides of scenario keys.
+        live: True if the trials are run live.
+    """
     from ..scenario import list_shipped, load_scenario
     from ..studies.trials import trials
 
@@ -144,7 +151,7 @@ def _run_virtual(trials: "list[Trial]", jobs: int | None, on: str | None) -> "Tr
 
 
 def _run_live(trials: "list[Trial]") -> "TrialReport":
-    """Runs trials live, one after the other."""
+    """Runs trials live, one after the other, so that they do not slow each other down."""
     from ..studies.trials import TrialReport, evaluate_live_log
 
     clock = SystemClock()
@@ -237,12 +244,12 @@ def _run_tuning(
     """Tunes control laws, prints the comparison and writes its files.
 
     Args:
-        plan: the laws and the procedure.
-        folder: folder of the results; None: the next free one.
-        jobs: number of processes.
-        on: address of a Dask scheduler.
-        force: replace existing files.
-        as_json: print the result as JSON.
+        plan: The laws and the procedure.
+        folder: Folder of the results. None for the next free one.
+        jobs: Number of processes. None for one per core.
+        on: Address of a Dask scheduler. None for processes on this machine.
+        force: True to replace existing files.
+        as_json: True to print the result as JSON.
     """
     from ..files import make_results_folder
     from ..studies.executor import count_workers
@@ -402,10 +409,14 @@ def tune_command(
 
 
 def _measure_delay(text: str, reach: options.Reach) -> str:
-    """Returns the text of a delay, measured if it names a running session.
+    """Returns a delay as text, which is measured if the text names a running session.
 
-    For a session it is the delay of the slowest link, or half of the longest round trip if no
-    link is measured.
+    The delay of a session is that of its slowest link, or half of the longest round trip if no
+    link has a measured delay.
+
+    Args:
+        text: A delay, a log, or "measured:" and the name of a session.
+        reach: Options with which the command reaches the session.
     """
     name = text.removeprefix("measured:")
     if name == text or name.endswith(".mcap"):
@@ -432,13 +443,13 @@ def _tune_bench(laws: list[str], study: str, jobs: int | None, on: str | None) -
     """Tunes the laws of a study of the benchmark, and stores their gains with the suite.
 
     Args:
-        laws: names of the laws; empty: all laws of the study.
-        study: name of the study.
-        jobs: number of processes.
-        on: address of a Dask scheduler.
+        laws: Names of the laws. Empty for all laws of the study.
+        study: Name of the study.
+        jobs: Number of processes. None for one per core.
+        on: Address of a Dask scheduler. None for processes on this machine.
 
     Raises:
-        UsageError: a law is not part of the study.
+        UsageError: A law is not part of the study.
     """
     from ..studies.bench.bench_plan import GAINS_FILE, STUDIES, tune_laws, write_gains
 
@@ -461,7 +472,7 @@ def _tune_bench(laws: list[str], study: str, jobs: int | None, on: str | None) -
 def _run_bench(
     folder: "BenchFolder", jobs: int | None, on: str | None, *, confirm: bool
 ) -> "BenchResults":
-    """Runs the benchmark in its folder; on Ctrl-C, says how to continue."""
+    """Runs the benchmark in its folder. On Ctrl-C, a note says how to continue."""
     from ..studies.bench import run_bench
 
     try:

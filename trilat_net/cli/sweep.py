@@ -1,7 +1,10 @@
-"""`trilat sweep`: runs a scenario over a grid of its keys, maps stability and finds edges.
+"""Defines `trilat sweep`, which runs a scenario over a grid of its keys.
+
+The command judges the stability of each run, draws a map of stability, and searches the edges
+between stable and unstable values.
 
 Invariant:
-    - Everything printed is also in the result files, except live runs, which have logs.
+    - Everything that is printed is also in the result files, except live runs, which have logs.
     - An interrupted sweep prints the command that resumes it.
 """
 
@@ -32,11 +35,11 @@ _option = partial(typer.Option, rich_help_panel="Maps and edges")
 
 
 def _check_modes(used_options: Sequence[str]) -> None:
-    """Refuses options that exclude each other.
+    """Checks that the options on the command line can be combined.
 
     Raises:
-        UsageError: two options exclude each other, or an option lacks the one that it belongs
-            to.
+        UsageError: Two options exclude each other, or an option lacks the one to which it
+            belongs.
     """
     modes = [
         name for name in ("--map", "--margin", "--confirm", "--cell") if name in used_options
@@ -95,15 +98,15 @@ def _search_margins(
     on: str | None,
     as_json: bool,
 ) -> None:
-    """Searches edges along one key, prints them with theory, and writes the result files.
+    """Searches edges of stability along one key, prints them, and writes the result files.
 
     Args:
-        plan: the sweep; its last axis is the two ends of the range.
-        search_range: the range.
-        folder: folder of margin.json and margin.md; None: the next free one.
-        jobs: number of processes.
-        on: address of a Dask scheduler.
-        as_json: print the result as JSON.
+        plan: The sweep. Its last axis consists of the two ends of the range.
+        search_range: The key and its range.
+        folder: Folder of margin.json and margin.md. None for the next free one.
+        jobs: Number of processes. None for one per core.
+        on: Address of a Dask scheduler. None for processes on this machine.
+        as_json: True to print the result as JSON.
     """
     from ..files import make_results_folder
     from ..studies.sweep.margin_search import SweepMargins, search_margins
@@ -127,12 +130,14 @@ def _search_margins(
 def _confirm_cells(results: "SweepResults", count: int) -> None:
     """Runs cells next to the edges live, and prints whether their verdicts agree.
 
+    A cell is a point of the grid.
+
     Args:
-        results: the finished sweep.
-        count: number of cells on each side of the edges.
+        results: The finished sweep.
+        count: Number of cells on each side of the edges.
 
     Raises:
-        typer.Exit: a verdict differs.
+        typer.Exit: A verdict differs.
     """
     from ..studies.sweep.live_confirmation import (
         choose_cells_near_edges,
@@ -170,11 +175,11 @@ def _run_sweep(
     A sweep that is too large is refused before its folder is created.
 
     Args:
-        new_plan: the sweep; None: that of the folder.
-        path: folder of a sweep to continue, or of a new one; None: the next free folder.
-        jobs: number of processes.
-        on: address of a Dask scheduler.
-        yes: run a sweep even if it is too large.
+        new_plan: The sweep. None for that of the folder.
+        path: Folder of a sweep to continue, or of a new one. None for the next free folder.
+        jobs: Number of processes. None for one per core.
+        on: Address of a Dask scheduler. None for processes on this machine.
+        yes: True to run a sweep even if it is too large.
     """
     from ..studies.executor import count_workers
     from ..studies.sweep import sweep_results, sweep_run
@@ -210,7 +215,7 @@ def _run_sweep(
 def _run_in_folder(
     folder: "SweepFolder", jobs: int | None, on: str | None, estimate: "DurationEstimate"
 ) -> "FinishedSweep":
-    """Runs a sweep in its folder; on Ctrl-C, prints the command that resumes it."""
+    """Runs a sweep in its folder. On Ctrl-C, the command that resumes it is printed."""
     from ..studies.sweep import run_sweep
 
     try:
@@ -228,7 +233,7 @@ def _run_in_folder(
 
 
 def _print_results(results: "SweepResults", remarks: list[str], path: Path) -> None:
-    """Prints the summary of a sweep, remarks, and the next commands."""
+    """Prints the summary of a sweep, remarks, and the commands that the user may need next."""
     from ..studies.sweep.sweep_results import list_next_commands, summarize_sweep
 
     terminal.print_texts(summarize_sweep(results))
@@ -237,7 +242,7 @@ def _print_results(results: "SweepResults", remarks: list[str], path: Path) -> N
 
 
 def _print_cell_commands(path: Path, number: int, *, as_json: bool) -> None:
-    """Prints the commands that write logs of a cell, or its rows as JSON."""
+    """Prints the commands that write logs of one cell of the grid, or its rows as JSON."""
     from ..studies.sweep import read_results
     from ..studies.sweep.sweep_results import build_reproduce_command
 
@@ -377,10 +382,10 @@ def _show_results(
     """Confirms cells of a finished sweep, draws its map, or prints its summary.
 
     Args:
-        path: the results.
-        confirm: number of cells on each side of the edges to run live; None: none.
-        draw: function that draws the map; None: no map.
-        as_json: print the results as JSON.
+        path: Path of the results.
+        confirm: Number of cells on each side of the edges to run live. None to run none.
+        draw: Function that draws the map. None for no map.
+        as_json: True to print the results as JSON.
     """
     from ..studies.sweep.sweep_results import describe_sweep_plan, read_results
 
@@ -412,7 +417,11 @@ _PLAN_OPTIONS = (
 
 
 def _refuse_plan_options(used_options: Sequence[str]) -> None:
-    """Refuses options that define a sweep, if its results are given."""
+    """Checks that no option defines a sweep whose results are given already.
+
+    Raises:
+        UsageError: An option does.
+    """
     for name in _PLAN_OPTIONS:
         if name in used_options:
             raise UsageError(f"{name} belongs to the sweep already: leave it out")
@@ -421,9 +430,10 @@ def _refuse_plan_options(used_options: Sequence[str]) -> None:
 
 
 def parse_seed_count(text: str | None) -> int | list[int]:
-    """Returns the number of seeds of a text such as 10, or the seeds of 1..20, 1,5,9 or 7,.
+    """Returns the number of seeds, or the seeds, that a text describes.
 
-    It is 1 for None.
+    Args:
+        text: A number such as 10, or seeds such as 1..20, 1,5,9 or 7,. None stands for 1.
     """
     if text is None:
         return 1
@@ -433,7 +443,7 @@ def parse_seed_count(text: str | None) -> int | list[int]:
 
 
 def _is_results(source: str) -> bool:
-    """True if a source names the results of a sweep; names of shipped scenarios never do."""
+    """Returns True if a source names the results of a sweep. A shipped scenario never does."""
     from ..scenario import list_shipped
     from ..studies.sweep.sweep_results import PLAN_FILE
 
