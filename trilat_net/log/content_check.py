@@ -1,19 +1,22 @@
-"""Check of messages by their content, for messages that no checksum covers.
+"""Checks messages by their content, if no checksum covers them.
 
-No checksum covers the messages of a chunk that was cut off or has no CRC. Instead, a log
-identifies each message in four ways: by its position in the file, by its channel, by its
-sequence number and by its content. Damage that keeps all four consistent can only change
-numbers inside a single message, and is shorter than that message.
+If a recording was interrupted, the checksum of the last chunk of messages is missing. The
+recovery still wants to use the messages of this chunk. A log states the identity of each
+message in four ways: by its position in the file, by its channel, by its sequence number, and
+in the message itself. If all four agree, damage can only have changed numbers inside that one
+message.
 
 Invariant:
-    - An accepted message decodes by the schema of its channel.
-    - It comes from the member of its channel, and from the same boot as the message before.
-    - It has the next number of its channel, and is stored with that number and with its time
-      of sending.
-    - It was logged within its chunk, and not before the preceding message.
-    - No message is accepted after the first message that fails.
-    - In virtual time, the boot of every message identifies the scenario, including its seed. A
-      chunk from a run of another scenario is refused even if a checksum covers the chunk.
+    - An accepted message can be decoded with the schema of its channel.
+    - It comes from the member of its channel, and from the same start of that member as the
+      previous message.
+    - It has the next number of its channel, and is stored with that number and its sending
+      time.
+    - Its arrival time is within that of its chunk, and not before the previous message.
+    - After the first message that fails, no message is accepted.
+    - In virtual time, the scenario determines the number (boot) that identifies the start of
+      each site. Therefore every message identifies its scenario, including the seed. A chunk
+      of another run is refused, even if a checksum covers the chunk.
 """
 
 import re
@@ -38,10 +41,10 @@ from .message_identity import (
 )
 
 CDR_HEAD = b"\x00\x01"
-"""First bytes of a message of a channel for viewers."""
+"""First bytes of a message that was written for viewers, in the encoding of ROS 2."""
 
 VIRTUAL_DRIVER = "virtual"
-"""Driver of a session in virtual time."""
+"""Value of the metadata `driver` for a session in virtual time."""
 _SAMPLED_MESSAGES = 200
 """Number of messages of a chunk that are decoded to find their origins."""
 _CHECKED_MESSAGES = 20
@@ -52,8 +55,8 @@ class MessageOrigins(NamedTuple):
     """Sessions and senders of a set of messages.
 
     Attributes:
-        epochs_ns: epochs of the sessions, in Unix ns.
-        boots: pairs of sender and boot number of that sender.
+        epochs_ns: Start times of the sessions, in Unix time, in ns.
+        boots: Pairs of a sender and the number that identifies its start.
     """
 
     epochs_ns: set[int]
@@ -61,15 +64,15 @@ class MessageOrigins(NamedTuple):
 
 
 def find_origins(data: bytes, most: int = _SAMPLED_MESSAGES) -> MessageOrigins:
-    """Returns the origins of the first messages of an unpacked chunk.
+    """Finds out from which sessions and senders the first messages of a chunk come.
 
-    An event that announces an epoch contains the epoch itself. Records and statistics contain
-    their time of sending since the epoch and are stored with the Unix time of sending, so the
-    difference is the epoch. The epoch of a session in virtual time is 0.
+    An event that announces the start of a session contains the start time. Records and
+    statistics contain their sending time after the start, and are stored with the Unix time of
+    sending. The difference is the start time. Sessions in virtual time start at 0.
 
     Args:
-        data: records of the chunk.
-        most: largest number of messages to decode.
+        data: The unpacked chunk.
+        most: Largest number of messages to decode.
     """
     epochs_ns: set[int] = set()
     boots: set[tuple[str, int]] = set()
@@ -82,6 +85,7 @@ def find_origins(data: bytes, most: int = _SAMPLED_MESSAGES) -> MessageOrigins:
         decoded += 1
         publish_ns = MESSAGE_HEAD.unpack_from(data, begin)[3]
         payload = data[begin + MESSAGE_HEAD.size : end]
+        # The type of the message is unknown: a payload can be decoded as its own type only.
         kinds: tuple[Any, ...] = (messages.State, messages.LinkStats, messages.Event)
         for kind in kinds:
             with suppress(WireError):
@@ -98,30 +102,33 @@ def find_origins(data: bytes, most: int = _SAMPLED_MESSAGES) -> MessageOrigins:
 
 
 def has_foreign_boots(about: Mapping[str, str], boots: set[tuple[str, int]]) -> bool:
-    """Returns True if all messages are from another session than the given one.
+    """Returns True if all messages come from another run than the session.
 
-    Only in virtual time do the boots follow from the scenario. In real time, and without
+    The scenario determines the boots in virtual time only. Otherwise, and if there are no
     messages, the result is False.
 
     Args:
-        about: metadata of the session.
-        boots: pairs of sender and boot number of that sender.
+        about: Metadata of the session.
+        boots: Pairs of a sender and the number that identifies its start, from the messages.
     """
     if about.get("driver") != VIRTUAL_DRIVER:
         return False
     digest = about.get("scenario_sha256", "")
-    own_boots = [boot == compute_virtual_boot(digest, sender) for sender, boot in boots]
-    return bool(boots) and not any(own_boots)
+    matches = [boot == compute_virtual_boot(digest, sender) for sender, boot in boots]
+    return bool(boots) and not any(matches)
 
 
 class ContentCheck:
-    """Check of a session's messages against its scenario, metadata and earlier messages.
+    """Checks a session's messages against its scenario, its metadata and its earlier messages.
+
+    The recovery passes the messages in the order of the file: those that a checksum covers to
+    `accept`, the others to `check`.
 
     Args:
-        scenario: scenario of the session.
-        about: metadata of the session.
-        is_continued: True for a later part of a log, where the channels continue with numbers
-            greater than 0.
+        scenario: Scenario of the session.
+        about: Metadata of the session.
+        is_continued: True for a later part of a log, in which the numbers of the messages do
+            not start at 0.
     """
 
     def __init__(
@@ -135,16 +142,23 @@ class ContentCheck:
         self._is_continued = is_continued
         # Sequence number and payload of the latest accepted message, by topic.
         self._latest: dict[str, tuple[int, bytes]] = {}
-        # Latest log time of an accepted message, in Unix ns.
+        # Latest arrival time of an accepted message, in Unix time, in ns.
         self._log_ns = 0
 
     def accept(self, topic: str, sequence: int, log_ns: int, payload: bytes) -> None:
-        """Accepts a message that a checksum covers; the channel must continue from there."""
+        """Accepts a message that a checksum covers. The next message must continue from there.
+
+        Args:
+            topic: Topic of the channel.
+            sequence: Sequence number that the file stores with the message.
+            log_ns: Arrival time, in Unix time, in ns.
+            payload: Bytes of the message.
+        """
         self._latest[topic] = sequence, payload
         self._log_ns = max(self._log_ns, log_ns)
 
     def owns_channel(self, topic: str) -> bool:
-        """Returns True for a channel of a member of the session."""
+        """Returns True if the topic is that of a member of the session."""
         key = topics.parse_key(topic.removeprefix("/"))
         if key is None or key.session != self._session or key.boot:
             return False
@@ -153,9 +167,10 @@ class ContentCheck:
         return key.member in self._scenario.sites and key.channel in SITE_CHANNELS
 
     def identify(self, payload: bytes) -> str:
-        """Returns the topic of a message as its content states.
+        """Returns the topic of a message, as its content states it.
 
-        Returns "" if the message is not from a member of the session.
+        The topic is empty if the message is not from a member of the session, or cannot be
+        decoded.
         """
         kinds: tuple[Any, ...] = tuple(CHANNEL_TYPES.values())
         for kind in kinds:
@@ -169,7 +184,7 @@ class ContentCheck:
         return ""
 
     def describe_channel(self, topic: str) -> dict[str, str]:
-        """Returns the metadata that `LogWriter` gives to a channel of the session."""
+        """Returns the metadata that `LogWriter` writes for a channel of the session."""
         member, channel = topic.split("/")[-2:]
         about = {"member": member}
         if channel == topics.STATE:
@@ -185,19 +200,19 @@ class ContentCheck:
         payload: bytes,
         span_ns: tuple[int, int],
     ) -> None:
-        """Accepts a message without a checksum if the message continues its channel.
+        """Accepts a message without a checksum, if it continues its channel.
 
         Args:
-            topic: topic of the channel.
-            sequence: sequence number that the file stores with the message.
-            log_ns: log time, in Unix ns.
-            publish_ns: time of sending, in Unix ns.
-            payload: bytes of the message.
-            span_ns: first and last log time of the chunk, in Unix ns.
+            topic: Topic of the channel.
+            sequence: Sequence number that the file stores with the message.
+            log_ns: Arrival time, in Unix time, in ns.
+            publish_ns: Sending time, in Unix time, in ns.
+            payload: Bytes of the message.
+            span_ns: First and last arrival time of the chunk, in Unix time, in ns.
 
         Raises:
-            UnreadableRecord: the content does not prove that the message is the next of its
-                channel.
+            UnreadableRecord: The content does not prove that this is the channel's next
+                message.
         """
         first_ns, last_ns = span_ns
         if not max(first_ns, self._log_ns) <= log_ns <= last_ns:
@@ -214,7 +229,15 @@ class ContentCheck:
         self.accept(topic, sequence, log_ns, payload)
 
     def _decode(self, topic: str, payload: bytes) -> tuple[AnyMessage, MessageIdentity]:
-        """Returns the decoded message of a topic, and the identity that its content states."""
+        """Decodes a message, and returns it with the identity that its content states.
+
+        Args:
+            topic: Topic of the message.
+            payload: Bytes of the message.
+
+        Raises:
+            UnreadableRecord: The message cannot be decoded.
+        """
         member, channel = topic.split("/")[-2:]
         kind: Any = CHANNEL_TYPES[channel]
         layout = None
@@ -231,7 +254,17 @@ class ContentCheck:
     def _check_session_message(
         self, topic: str, sequence: int, publish_ns: int, payload: bytes
     ) -> None:
-        """Raises UnreadableRecord unless a member's message is the next of its channel."""
+        """Checks that a message of a member is the next one of its channel.
+
+        Args:
+            topic: Topic of the channel.
+            sequence: Sequence number that the file stores with the message.
+            publish_ns: Sending time that the file stores with the message, in Unix time, in ns.
+            payload: Bytes of the message.
+
+        Raises:
+            UnreadableRecord: It is not the next message, or contradicts the file.
+        """
         message, identity = self._decode(topic, payload)
         member = topic.split("/")[-2]
         if identity.sender != member:
@@ -241,6 +274,8 @@ class ContentCheck:
         boot = self._find_boot(member)
         if boot is not None and message.boot != boot:
             raise UnreadableRecord(f"a message of {topic} is of another boot of {member}")
+
+        # A file stores the sequence number in 32 bits.
         if identity.sequence >= 0 and sequence != identity.sequence & 0xFFFFFFFF:
             raise UnreadableRecord(
                 f"number {identity.sequence} of {topic} is stored as {sequence}"
@@ -255,12 +290,15 @@ class ContentCheck:
                 raise UnreadableRecord(f"number {number} of {topic} was sent at another time")
 
     def check_origin(self, data: bytes) -> None:
-        """Raises UnreadableRecord if a chunk is from another run in virtual time.
+        """Checks that a chunk is not from another run in virtual time.
 
         Args:
-            data: records of the unpacked chunk.
+            data: The unpacked chunk.
+
+        Raises:
+            UnreadableRecord: All examined messages are from another run.
         """
-        # Decoding messages is slow, and in real time the boots prove nothing.
+        # The decoding of messages is slow, and the boots of live sessions prove nothing.
         if self._about.get("driver") != VIRTUAL_DRIVER:
             return
         origins = find_origins(data, _CHECKED_MESSAGES)
@@ -268,7 +306,11 @@ class ContentCheck:
             raise UnreadableRecord("a chunk of another run")
 
     def _find_boot(self, member: str) -> int | None:
-        """Returns the boot number of a member; None in real time before its first message."""
+        """Returns the number that identifies the present start of a member.
+
+        In virtual time, it follows from the scenario. Otherwise it is that of the latest
+        accepted message. None if there is no such message.
+        """
         if self._about.get("driver") == VIRTUAL_DRIVER:
             return compute_virtual_boot(self._about.get("scenario_sha256", ""), member)
         channels = RECORDER_CHANNELS if member == topics.RECORDER else SITE_CHANNELS
@@ -281,29 +323,46 @@ class ContentCheck:
         return None
 
     def _check_number(self, topic: str, message: AnyMessage, number: int) -> None:
-        """Raises UnreadableRecord unless a message has the next number of its channel."""
+        """Checks that a message has the next number of its channel.
+
+        Args:
+            topic: Topic of the channel.
+            message: The message.
+            number: Number of the message in its channel.
+
+        Raises:
+            UnreadableRecord: The number is not the next one.
+        """
         member, channel = topic.split("/")[-2:]
-        # Events of old logs have no number.
         if isinstance(message, messages.Event) and message.n < 0:
-            return
+            return  # events of old logs have no number
         if topic not in self._latest:
             may_continue = self._is_continued or self._scenario.sites_may_return
             if number and not may_continue:
                 raise UnreadableRecord(f"the first message of {topic} has number {number}")
             return
-        sequence_before, _ = self._latest[topic]
+
+        previous_sequence, _ = self._latest[topic]
         rate_hz = self._scenario.sites[member].rate_hz if member in self._scenario.sites else 1
-        expected = number_message(channel, sequence_before, rate_hz) + 1
+        expected = number_message(channel, previous_sequence, rate_hz) + 1
         if isinstance(message, messages.State):
+            # The changes in a record state how many ticks the site skipped before it.
             expected += count_skipped_ticks(message.cmd)
         if number != expected:
             raise UnreadableRecord(f"number {number} of {topic} follows number {expected - 1}")
 
     def _check_tick(self, topic: str, record: messages.State) -> None:
-        """Raises UnreadableRecord unless the content of a record is possible in the run.
+        """Checks that the content of a record is possible in a run of the scenario.
 
-        The tick must exist in the run and have its nominal time, the peers must exist, and the
-        mode must be known.
+        The tick must exist and have its nominal time, the peers must exist, and the mode must
+        be known.
+
+        Args:
+            topic: Topic of the record, for the error message.
+            record: The record.
+
+        Raises:
+            UnreadableRecord: The content is not possible.
         """
         site = record.site
         if not 0 <= record.tick < self._scenario.ticks(site):

@@ -1,15 +1,16 @@
-"""Writer of a session's log into one MCAP file or into several parts.
+"""Writes the log of a session into one MCAP file or into several parts.
 
-Parts have numbered names: `run-001.mcap`, `run-002.mcap` and so on.
+The parts of run.mcap are called run-001.mcap, run-002.mcap and so on. A part ends when it
+reaches a size or a duration that the user has set.
 
 Invariant (L5):
-    - A file explains itself from its first bytes on: session, scenario and schemas precede the
-      first message.
-    - Payloads are stored byte for byte as published.
-    - The accounts are at the end of the file.
-    - Each part repeats session, scenario and schemas, and names the part before it.
-    - Each message is in exactly one part: a new part begins between two messages, on the
-      writing thread.
+    - Every file can be understood without other files: the session, the scenario and the
+      schemas precede the first message.
+    - The messages are stored byte for byte as they were published.
+    - The numbers of received and missing messages (the accounts) are at the end of the file.
+    - Each part repeats the session, the scenario and the schemas, and names the previous part.
+    - Each message is in exactly one part: a new part begins between two messages, in the thread
+      that writes.
 """
 
 import json
@@ -32,29 +33,32 @@ from .ros2.viz_channels import ReceiveMessage, VizChannels
 from .running_digest import ALGORITHM, DIGESTS_KEY, PREVIOUS_DIGEST_KEY
 
 Decoded = State | TickRecord | LinkStats | Event | None
-"""A decoded message for the channels for viewers; None if the log has no such channels."""
+"""Decoded message, from which messages for viewers are derived. None if there are none."""
 
 
 class LogWriter:
-    """Writer of one log file, from its header to its accounts.
+    """Writer of one log file.
+
+    Besides the messages as they were published, it can write the same data as standard messages
+    of ROS 2 for viewers (`VizChannels`).
 
     Args:
-        stream: receives the bytes.
-        scenario: the resolved scenario.
-        session: the session's name.
-        driver: "live" or "virtual".
-        epoch_unix_ns: Unix time of tick 0; 0 in virtual time.
-        facts: further metadata of the session.
-        part: metadata of the part, for a log in parts.
-        choice: the channels that the log stores.
-        views_hz: rate of the channels for viewers, in messages per second, see `VizChannels`; 0
-            for a log without such channels.
+        stream: File or buffer that receives the bytes.
+        scenario: Scenario of the session.
+        session: Name of the session.
+        driver: "live" or "virtual", the session's kind of time.
+        epoch_unix_ns: Unix time of tick 0, in ns. It is 0 in virtual time.
+        facts: Further metadata of the session.
+        part: Metadata of the part, if the log has several files.
+        choice: Filter of the channels that the log contains.
+        views_hz: Rate of the messages for viewers, in Hz, see `VizChannels`. With 0, the log
+            contains none.
 
     Attributes:
-        records_digest: digest of the messages of a finished log; "" before the end.
+        records_digest: Digest of the messages of a finished log. Empty before the end.
 
     Raises:
-        LogRefused: the disk refused a write.
+        LogRefused: The disk refused the data.
     """
 
     def __init__(
@@ -72,7 +76,7 @@ class LogWriter:
     ) -> None:
         self._epoch_unix_ns = epoch_unix_ns
         self.records_digest = ""
-        # Why no message can be added any more; "" while the log is open.
+        # Reason why no message can be added any more. Empty while the log is open.
         self._end_reason = ""
         self._views = None
         if views_hz:
@@ -121,10 +125,15 @@ class LogWriter:
     def _register_channels(
         self, scenario: Scenario, session: str, choice: log_layout.ChannelFilter
     ) -> dict[str, int | None]:
-        """Registers schemas and channels of the session.
+        """Registers the schemas and channels of the session.
+
+        Args:
+            scenario: Scenario of the session.
+            session: Name of the session.
+            choice: Filter of the channels that the log contains.
 
         Returns:
-            Channel numbers by key; None for the channels that `choice` excludes.
+            The numbers of the channels in the file, by key. None for excluded channels.
         """
         schemas = {
             name: self._file.register_schema(
@@ -152,7 +161,7 @@ class LogWriter:
 
     @property
     def ended(self) -> bool:
-        """True if no message can be added: the log is finished, or the disk refused a write."""
+        """True if no message can be added: the log is finished, or the disk refused data."""
         return bool(self._end_reason)
 
     @property
@@ -167,7 +176,7 @@ class LogWriter:
 
     @property
     def most_bytes(self) -> int:
-        """Upper bound of the file's length without accounts, if the log were finished now."""
+        """Upper bound of the file's length if it were finished now, without the accounts."""
         views = self._views.most_bytes if self._views is not None else 0
         return self._file.position + self._file.open_chunk_bytes + self._file.end_bytes + views
 
@@ -180,18 +189,18 @@ class LogWriter:
         number: int,
         message: Decoded = None,
     ) -> None:
-        """Writes one message, unless the log excludes its channel.
+        """Adds one message, unless the filter excludes its channel.
 
         Args:
-            key: key of the channel.
-            payload: bytes of the message.
-            t_ns: time of sending, in ns since the epoch.
-            log_time_ns: time of arrival, in Unix ns.
-            number: sequence number.
-            message: the decoded message, for the channels for viewers.
+            key: Key of the channel.
+            payload: Bytes of the message.
+            t_ns: Sending time after the start of the session, in ns.
+            log_time_ns: Arrival time, in Unix time, in ns.
+            number: Sequence number.
+            message: The decoded message, if the log contains messages for viewers.
 
         Raises:
-            LogRefused: the disk refused this write or an earlier write, or the log is finished.
+            LogRefused: The disk refused these or earlier data, or the log is finished.
         """
         if self._end_reason:
             raise LogRefused(self._end_reason)
@@ -215,32 +224,39 @@ class LogWriter:
             raise self._end_with_error(error) from None
 
     def _add_view_message(self, topic: str, data: bytes, publish_ns: int, log_ns: int) -> None:
-        """Writes a message of a channel for viewers."""
+        """Adds a message for viewers.
+
+        Args:
+            topic: Topic of the message.
+            data: Bytes of the message.
+            publish_ns: Sending time, in Unix time, in ns.
+            log_ns: Arrival time, in Unix time, in ns.
+        """
         publish_ns = min(publish_ns, log_layout.MAX_TIME_NS)
         self._file.add_message(self._view_channels[topic], log_ns, data, publish_ns)
 
     def flush(self) -> None:
-        """Closes the open chunk and hands its bytes to the operating system.
+        """Passes all messages so far to the operating system.
 
-        A later crash of the process loses none of these messages.
+        They are not lost if the process crashes afterwards.
 
         Raises:
-            LogRefused: the disk refused a write.
+            LogRefused: The disk refused the data.
         """
         with self._translate_disk_errors():
             self._file.flush()
 
     def finish(self, accounts: Mapping[str, str]) -> None:
-        """Writes the accounts, the index and the end mark; the stream stays open.
+        """Completes the file with the accounts, the index and the end mark.
 
-        Further calls have no effect.
+        The stream stays open. Further calls have no effect.
 
         Args:
-            accounts: accounts by topic, and other counts by name. Accounts of excluded channels
-                are left out.
+            accounts: Numbers of received and missing messages as a text, by topic, and other
+                counts by name. Those of excluded channels are left out.
 
         Raises:
-            LogRefused: the disk refused a write.
+            LogRefused: The disk refused the data.
         """
         if self._end_reason == _FINISHED:
             return
@@ -259,43 +275,44 @@ class LogWriter:
 
     @contextmanager
     def _translate_disk_errors(self) -> Iterator[None]:
-        """Turns an OSError of the `with` block into LogRefused and ends the log."""
+        """Converts an OSError in the `with` block to a LogRefused, and ends the log."""
         try:
             yield
         except OSError as error:
             raise self._end_with_error(error) from None
 
     def _end_with_error(self, error: OSError) -> LogRefused:
-        """Ends the log after a failed write; returns the error to raise."""
+        """Ends the log after an error of the disk, and returns the error to raise."""
         text = f"the log cannot be written: {error.strerror}; flushed messages are intact"
         self._end_reason = self._end_reason or text
         return LogRefused(text)
 
 
 _FINISHED = "the log is finished"
+"""Reason why no message can be added to a finished log."""
 
 ACCOUNTS_BYTES = 16 << 10
-"""Space that a part keeps free, in bytes.
+"""Space that is left free in a part of limited size, in bytes.
 
-The space is for the accounts and for the messages for viewers that one message causes.
+It is used for the accounts, and for the messages for viewers that follow from one message.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class LogStorage:
-    """Path and division into parts of a log.
+    """Place where a log is stored, and its division into parts.
 
     Attributes:
-        path: path of the log; parts add their number to this name.
-        force: True if the log may replace an existing file.
+        path: Name of the log. Parts add their number to it.
+        force: True if the log may replace an existing one.
         durable: True if every flush also syncs the file to the disk.
-        split_bytes: largest length of a part, in bytes; None for no limit.
-        split_ns: longest duration of a part, in ns; None for no limit.
-        carry_on: True to continue an existing log of this name, finished or not, with a new
-            part.
-        choice: the channels that the log stores.
-        views_hz: rate of the channels for viewers, in messages per second, see `VizChannels`; 0
-            for a log without such channels.
+        split_bytes: Largest size of a part, in bytes. None if it is not limited.
+        split_ns: Longest duration of a part, in ns. None if it is not limited.
+        carry_on: True to continue an existing log of this name with a new part. The existing
+            log may be finished or not.
+        choice: Filter of the channels that the log contains.
+        views_hz: Rate of the messages for viewers, in Hz, see `VizChannels`. With 0, the log
+            contains none.
     """
 
     path: Path
@@ -309,19 +326,19 @@ class LogStorage:
 
     @property
     def splits(self) -> bool:
-        """True if the log has parts from the start."""
+        """True if the log is divided into parts from the start."""
         return self.split_bytes is not None or self.split_ns is not None
 
     def find_first_part(self) -> tuple[int, str]:
-        """Finds the first part to write.
+        """Finds out which part to write first, and checks that its name is free.
 
         Returns:
-            Number of the part, 0 for a log without parts, and name of the part before it, "" if
-            there is no such part.
+            The number of the part, which is 0 for a log in a single file, and the name of the
+            previous part, which is empty if there is none.
 
         Raises:
-            UsageError: a log of this name exists and neither `force` nor `carry_on` is set, or
-                both are set.
+            UsageError: A log of this name exists, and neither `force` nor `carry_on` is set.
+                Also raised if both are set.
         """
         if self.carry_on and self.force:
             raise UsageError(
@@ -331,6 +348,7 @@ class LogStorage:
         if self.carry_on and parts:
             last = max(parts)
             return last + 1, parts[last].name.removesuffix(log_layout.ACTIVE_SUFFIX)
+
         refuse_existing(
             self.path, force=self.force, unfinished=log_layout.active_path(self.path)
         )
@@ -343,16 +361,19 @@ class LogStorage:
 
 
 def parse_split(option: str, unit: str, number: float | None, scale: int) -> int | None:
-    """Returns the limit of a part that an option of a command sets, in ns or bytes.
+    """Parses an option of a command that limits the parts of a log.
 
     Args:
-        option: name of the option, for the error text.
-        unit: name of the option's unit, for the error text.
-        number: value of the option; None, and thus no limit, if the option is absent.
-        scale: ns or bytes per unit.
+        option: Name of the option, for the error message.
+        unit: Name of the option's unit, for the error message.
+        number: Value of the option. None if the option is absent.
+        scale: Bytes or ns per unit.
+
+    Returns:
+        The limit in bytes or ns. None if the option is absent.
 
     Raises:
-        UsageError: the number is not from 1 to 1e6.
+        UsageError: The number is not from 1 to 1e6.
     """
     if number is None:
         return None
@@ -362,20 +383,20 @@ def parse_split(option: str, unit: str, number: float | None, scale: int) -> int
 
 
 class LogParts:
-    """Writer of a log in as many files as its limits require; for use in a `with` statement.
+    """Writer of a log in as many files as its limits require; a context manager.
 
     Args:
-        storage: path of the log and its division into parts.
-        begin: creates the `LogWriter` of a file, with the metadata of the part ({} for a log
-            without parts).
-        opened: opens a file by path; by default `LogFile`.
+        storage: Place of the log, and its division into parts.
+        begin: Function that creates the `LogWriter` of a file, with the metadata of the part.
+            The metadata are empty for a log in a single file.
+        opened: Function that opens a file by its path. None uses `LogFile`.
 
     Attributes:
-        current_accounts: returns the accounts to write at the end of a full part.
+        current_accounts: Function that returns the accounts to write at the end of a full part.
 
     Raises:
-        UsageError: the name is in use, or the file cannot be created.
-        LogRefused: the disk refused a write.
+        UsageError: The name is in use, or the file cannot be created.
+        LogRefused: The disk refused the data.
     """
 
     def __init__(
@@ -392,7 +413,8 @@ class LogParts:
         self._begin_writer = begin
         self._number, self._previous = storage.find_first_part()
         self._previous_digest = ""
-        # Remaining parts of a replaced log would seem to belong to the new log.
+        # All parts of a replaced log are removed. Those that remained would seem to belong to
+        # the new log.
         if storage.force and storage.splits:
             for number in (0, *log_layout.find_parts(storage.path)):
                 path = log_layout.part_path(storage.path, number)
@@ -403,7 +425,14 @@ class LogParts:
         self._begin_part()
 
     def _begin_part(self) -> None:
-        """Opens the file of the current part and writes its header."""
+        """Opens the file of the current part, and writes its beginning.
+
+        If that fails, the file is removed.
+
+        Raises:
+            UsageError: The file cannot be created.
+            LogRefused: The disk refused the data.
+        """
         path = log_layout.part_path(self._storage.path, self._number)
         part: dict[str, str] = {}
         if self._number:
@@ -422,7 +451,11 @@ class LogParts:
         self._previous = path.name
 
     def _begin_next_part(self) -> None:
-        """Finishes the current part and begins the next part."""
+        """Finishes the current part, and begins the next one.
+
+        Raises:
+            LogRefused: The file cannot be created, or the disk refused the data.
+        """
         self._writer.finish(self.current_accounts())
         self._previous_digest = self._writer.records_digest
         self._previous_bytes += self._writer.written_bytes
@@ -431,16 +464,21 @@ class LogParts:
         try:
             self._begin_part()
         except UsageError as error:
-            # After a first part this is no longer an error of the caller.
+            # The name was checked at the start, so that this is no error of the user.
             raise LogRefused(f"{error}; the log ends with {self._previous}") from None
 
     def _is_part_full(self, payload_bytes: int, duration_ns: int) -> bool:
-        """Returns True if the next message exceeds a limit of the current part."""
+        """Returns True if the next message would exceed a limit of the current part.
+
+        Args:
+            payload_bytes: Size of the next message, in bytes.
+            duration_ns: Time from the first message of the part to the next message, in ns.
+        """
         limits = self._storage
         writer = self._writer
         if limits.split_ns is not None and duration_ns >= limits.split_ns:
             return True
-        # A part holds at least one message, however small the limit is.
+        # A part contains at least one message, however small the limit is.
         if limits.split_bytes is None or not writer.messages:
             return False
         size = writer.most_bytes + payload_bytes + ACCOUNTS_BYTES
@@ -448,7 +486,7 @@ class LogParts:
 
     @property
     def path(self) -> Path:
-        """Final path of the file that is being written."""
+        """Final name of the file that is being written."""
         return self._file.path
 
     @property
@@ -465,7 +503,7 @@ class LogParts:
         number: int,
         message: Decoded = None,
     ) -> None:
-        """Writes one message; see `LogWriter.add`."""
+        """Adds one message, and begins a new part before it if necessary, see `LogWriter.add`."""
         if self._storage.splits and not self._writer.ended:
             if self._part_start_ns is None:
                 self._part_start_ns = log_time_ns
@@ -476,11 +514,11 @@ class LogParts:
         self._writer.add(key, payload, t_ns, log_time_ns, number, message)
 
     def flush(self) -> None:
-        """Hands all bytes so far to the operating system; see `LogWriter.flush`."""
+        """Passes all messages so far to the operating system, see `LogWriter.flush`."""
         self._writer.flush()
 
     def finish(self, accounts: Mapping[str, str]) -> None:
-        """Ends the last part; see `LogWriter.finish`."""
+        """Completes the last part, see `LogWriter.finish`."""
         self._writer.finish(accounts)
 
     def __enter__(self) -> "LogParts":

@@ -1,20 +1,22 @@
-"""Orientations as time series without jumps: unit quaternions, or six numbers.
+"""Converts orientations to time series without jumps: unit quaternions, or six numbers.
 
-A record stores an orientation as a rotation vector, axis times angle, at most half a turn long.
-When the angle passes half a turn, as for a tool that points down, the vector jumps by a whole
-turn, although the orientation does not jump. Near half a turn the vector moves up to pi / 2
-times as far as the orientation. No choice of branches is continuous for every motion of several
-turns. Time series that leave the program therefore have one of these forms:
+A record contains an orientation as a rotation vector, the axis times the angle, at most half a
+turn long. When the angle passes half a turn, as it does for a tool that points down, the vector
+jumps by a whole turn, although the orientation does not jump. Near half a turn, the vector
+moves up to pi / 2 times as far as the orientation. No rule that adds whole turns to the vector
+makes it continuous for every motion of several turns. Time series that leave the program
+therefore have one of these forms:
 
-- Unit quaternions w, x, y, z. Each quaternion is nearest to the quaternion before, and the
-  first has w >= 0. A turn by a small angle moves the quaternion by half of that angle.
-- Six numbers: the first and the second column of the rotation matrix. They depend on the
-  orientation alone and not on the past, as observations and actions of a policy must (Y. Zhou
-  et al., "On the continuity of rotation representations in neural networks", CVPR 2019). A turn
-  by a small angle moves them by at most sqrt(2) times that angle.
+- Unit quaternions w, x, y, z. A quaternion and its negative are the same orientation, and the
+  sign is chosen so that each quaternion is nearest to the previous one, and the first has
+  w >= 0. A turn by a small angle moves the quaternion by half of that angle.
+- Six numbers: the first and the second column of the rotation matrix. They depend only on the
+  present orientation and not on the past, as observations and actions of a learned policy must
+  (Y. Zhou et al., "On the continuity of rotation representations in neural networks", CVPR
+  2019). A turn by a small angle moves them by at most sqrt(2) times that angle.
 
 Invariant:
-    - The rotation is that of the record, to rounding. Only its representation differs.
+    - The rotation is that of the record, except for rounding. Only its representation differs.
     - Rotation vectors of any length are accepted.
 """
 
@@ -27,51 +29,57 @@ from ..core.vectors import Array
 from ..scenario.arms import TASK_AXES
 
 QUATERNION_AXES = ("qw", "qx", "qy", "qz")
-"""Names of the four numbers of an orientation in a table."""
+"""Names of the four numbers of a quaternion, in tables."""
 MATRIX_ENTRIES = ("r11", "r21", "r31", "r12", "r22", "r32")
-"""Names of the six numbers of an orientation: row and column of the rotation matrix."""
+"""Names of the six numbers of an orientation, with row and column of the rotation matrix."""
 SIX_AXES = (*TASK_AXES[:POSITION], *MATRIX_ENTRIES)
-"""Names of the numbers of a pose with six numbers for its orientation."""
+"""Names of the nine numbers of a pose: the position, and six numbers for the orientation."""
 
 
 def compute_quaternion_parts(turns: Array) -> tuple[Array, Array]:
-    """Returns unit quaternions of rotation vectors, as scalar and vector parts.
+    """Computes the unit quaternions of rotation vectors, as scalar and vector parts.
 
     The quaternion of a rotation vector r with the angle a = |r| is
 
         w = cos(a / 2),  (x, y, z) = r sin(a / 2) / a
 
     Args:
-        turns: rotation vectors, shape (K, 3), rad.
+        turns: Rotation vectors, shape (K, 3), in rad.
 
     Returns:
-        w, shape (K, 1), and (x, y, z), shape (K, 3).
+        The scalar parts w, shape (K, 1), and the vector parts (x, y, z), shape (K, 3).
     """
     angle = np.linalg.norm(turns, axis=1, keepdims=True)
     w = np.cos(0.5 * angle)
-    # sin(a / 2) / a, also for a = 0: sinc(x) = sin(pi x) / (pi x)
+    # This is sin(a / 2) / a, also for a = 0, because sinc(x) = sin(pi x) / (pi x).
     sine_by_angle = 0.5 * np.sinc(angle / (2.0 * np.pi))
     return w, sine_by_angle * turns
 
 
 def compute_quaternions(turns: Array) -> Array:
-    """Returns unit quaternions w, x, y, z of consistent sign, shape (K, 4).
+    """Computes the unit quaternions of rotation vectors as a time series without jumps.
 
     Args:
-        turns: rotation vectors, shape (K, 3), rad.
+        turns: Rotation vectors in the order of time, shape (K, 3), in rad.
+
+    Returns:
+        The quaternions w, x, y, z, shape (K, 4).
     """
     w, v = compute_quaternion_parts(turns)
     return align_signs(np.hstack([w, v]))
 
 
 def align_signs(quaternions: Array) -> Array:
-    """Returns quaternions with signs such that each is nearest to the quaternion before.
+    """Chooses the signs of quaternions so that each one is nearest to the previous one.
+
+    The sign of the first quaternion stays.
 
     Args:
-        quaternions: the quaternions, shape (K, 4), in order of time.
+        quaternions: The quaternions in the order of time, shape (K, 4).
     """
     dots = np.einsum("ki,ki->k", quaternions[1:], quaternions[:-1])
     changes = np.where(dots < 0.0, -1.0, 1.0)
+    # A change of sign applies to all later quaternions as well.
     signs = np.cumprod(changes)
     aligned = quaternions.copy()
     aligned[1:] *= signs[:, np.newaxis]
@@ -79,17 +87,22 @@ def align_signs(quaternions: Array) -> Array:
 
 
 def compute_matrix_columns(turns: Array) -> Array:
-    """Returns the first two columns of the rotation matrices of rotation vectors.
+    """Computes the first two columns of the rotation matrices of rotation vectors.
+
+    With the unit quaternion (w, x, y, z) of the rotation, they are
+
+        (1 - 2 y y - 2 z z,  2 x y + 2 w z,  2 x z - 2 w y)
+        (2 x y - 2 w z,  1 - 2 x x - 2 z z,  2 y z + 2 w x)
 
     Args:
-        turns: rotation vectors, shape (..., 3), rad.
+        turns: Rotation vectors, shape (..., 3), in rad.
 
     Returns:
         The entries `MATRIX_ENTRIES`, shape (..., 6).
     """
     rows = np.reshape(turns, (-1, 3))
     w, v = compute_quaternion_parts(rows)
-    # twice the products of the components of the quaternion
+    # In the following, xy is twice the product of the components x and y, and so on.
     double = 2.0 * v
     wx, wy, wz = (w * double).T
     xx, yy, zz = (v * double).T
@@ -106,10 +119,10 @@ def compute_matrix_columns(turns: Array) -> Array:
 
 
 def expand_poses(x: Array) -> Array:
-    """Returns poses with six numbers in place of their rotation vectors.
+    """Replaces the rotation vectors of poses by six numbers.
 
-    An environment observes poses in this form, and a user's hand gets the same numbers from
-    `HandView`:
+    An environment for training observes poses in this form, and a user's hand gets the same
+    numbers from `HandView`:
 
     >>> import numpy as np
     >>> quarter_turn = np.array([0.5, 0.0, 0.2, 0.0, 0.0, np.pi / 2])
@@ -117,12 +130,12 @@ def expand_poses(x: Array) -> Array:
     [5, 0, 2, 0, 10, 0, -10, 0, 0]
 
     Args:
-        x: positions, shape (..., 3), m; or poses, which are positions and rotation vectors,
-            shape (..., 6), m and rad.
+        x: Positions, shape (..., 3), in m, or poses, which are positions and rotation vectors,
+            shape (..., 6), in m and rad.
 
     Returns:
-        Positions and the first two columns of the rotation matrices, shape (..., 9). Positions
-        without rotation vectors are returned as they are.
+        The positions and the first two columns of the rotation matrices, shape (..., 9).
+        Positions without rotation vectors are returned unchanged.
     """
     if x.shape[-1] != POSE:
         return x
@@ -132,17 +145,21 @@ def expand_poses(x: Array) -> Array:
 
 
 def choose_nearest_vectors(turns: Array, references: Array) -> Array:
-    """Returns the rotation vectors of the same rotations that are nearest to references.
+    """Adds whole turns to rotation vectors so that they are nearest to references.
 
-    The vectors differ from `turns` by whole turns about the same axis, and may be longer than
-    half a turn.
+    The results are the same rotations. They may be longer than half a turn.
 
     Args:
-        turns: rotation vectors, shape (K, 3), rad.
-        references: the references, shape (K, 3), rad.
+        turns: Rotation vectors, shape (K, 3), in rad.
+        references: The references, shape (K, 3), in rad.
+
+    Returns:
+        The rotation vectors, shape (K, 3), in rad.
     """
     angle = np.linalg.norm(turns, axis=1, keepdims=True)
     axis = np.divide(turns, angle, out=np.zeros_like(turns), where=angle > 0.0)
+    # All vectors of the same rotation are on a line along the axis. The nearest one to the
+    # reference is nearest to the projection of the reference on this line.
     projection = np.einsum("ki,ki->k", axis, references)[:, np.newaxis]
     turn_counts = np.round((projection - angle) / (2.0 * np.pi))
     whole_turns = 2.0 * np.pi * turn_counts * axis
@@ -150,31 +167,34 @@ def choose_nearest_vectors(turns: Array, references: Array) -> Array:
 
 
 def compute_continuous_vectors(turns: Array) -> Array:
-    """Returns rotation vectors of the same rotations without jumps at half a turn.
+    """Returns rotation vectors of the same rotations that do not jump at half a turn.
 
-    The vectors may be up to a whole turn long, and jump at a whole turn.
+    The vectors may be up to a whole turn long. They jump at a whole turn instead.
 
     Args:
-        turns: rotation vectors, shape (K, 3), rad, in order of time.
+        turns: Rotation vectors in the order of time, shape (K, 3), in rad.
+
+    Returns:
+        The rotation vectors, shape (K, 3), in rad.
     """
     quaternions = compute_quaternions(turns)
     w = quaternions[:, :1]
     v = quaternions[:, 1:]
     sine = np.linalg.norm(v, axis=1, keepdims=True)
     angle = 2.0 * np.arctan2(sine, w)
-    # the limit of angle / sine for small angles is 2
+    # The limit of angle / sine for small angles is 2.
     limit = np.full_like(w, 2.0)
     angle_by_sine = np.divide(angle, sine, out=limit, where=sine > 0.0)
     return np.asarray(angle_by_sine * v)
 
 
 class QuaternionSigns:
-    """Choice of the signs of the quaternions of a stream.
+    """Chooses the signs of quaternions that arrive one after another.
 
-    Each quaternion is nearest to the quaternion before, and the first has w >= 0.
+    Each quaternion is nearest to the previous one, and the first has w >= 0.
 
     Args:
-        w: index of w among the four numbers of a quaternion.
+        w: Index of w among the four numbers of a quaternion, since ROS 2 has w at the end.
     """
 
     def __init__(self, w: int = 3) -> None:
@@ -182,7 +202,7 @@ class QuaternionSigns:
         self._last: tuple[float, ...] = ()
 
     def align(self, quaternion: Sequence[float]) -> tuple[float, ...]:
-        """Returns the next quaternion or its negative, which is the same rotation."""
+        """Returns the next quaternion, or its negative, which is the same rotation."""
         dot = quaternion[self._w]
         if self._last:
             dot = sum(a * b for a, b in zip(quaternion, self._last, strict=True))

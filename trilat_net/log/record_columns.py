@@ -1,11 +1,14 @@
-"""Fields of many records, decoded into arrays.
+"""Decodes single fields of many records into arrays.
+
+A record is the encoded result of one tick of a site's control loop. To decode only the fields
+that are needed is much faster than to decode whole records.
 
 Every function raises `WireError` for the first payload that is not a valid record.
 
 Invariant:
     - Only the requested fields are decoded.
-    - Each field is checked as in a complete record: its type, its length, and that its numbers
-      are finite.
+    - Each field is checked as in a whole record: its type, its length, and that its numbers are
+      finite.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -33,15 +36,21 @@ _TYPES: dict[str, Any] = {
     "mode": _MODE,
     "rx": list[Stamp],
 }
-"""Types of fields that `State` declares more widely, for the check of their values."""
+"""Types of fields for which `State` declares a wider type. They restrict the values."""
 _DEFAULTS = {"sent_ns": 0}
-"""Values of fields that records of older versions do not have."""
+"""Values of fields that records of older versions do not contain."""
 
 
 def decode_ticks(payloads: Sequence[bytes]) -> Ints:
-    """Returns the tick of every record, shape (K,).
+    """Decodes the tick of every record.
 
     Records of every readable version are accepted.
+
+    Args:
+        payloads: K encoded records.
+
+    Returns:
+        The ticks, shape (K,).
     """
     if any(len(payload) > MAX_BYTES for payload in payloads):
         raise _find_error(payloads)
@@ -53,28 +62,34 @@ def decode_ticks(payloads: Sequence[bytes]) -> Ints:
 
 
 def decode_ints(payloads: Sequence[bytes], *fields: str) -> Ints:
-    """Returns integer fields of every record, shape (K times number of fields,).
+    """Decodes integer fields of every record.
 
-    The values of one record follow each other, in the order of `fields`.
+    Args:
+        payloads: K encoded records.
+        fields: Names of F fields.
+
+    Returns:
+        The values, shape (K F,). The values of a record follow each other, in the order of
+        `fields`.
     """
     values = _decode_fields(payloads, *fields)
     if len(fields) > 1:
-        # each value is a tuple with one number per field
+        # Each value is a tuple with one number per field.
         values = chain.from_iterable(values)
     return _to_array(payloads, values, np.int64, len(fields) * len(payloads))
 
 
 def decode_vectors(payloads: Sequence[bytes], layout: Layout, *fields: str) -> dict[str, Array]:
-    """Returns vectors of every record, by field.
+    """Decodes vectors of every record.
 
     Args:
-        payloads: K records.
-        layout: the lengths of the vectors.
-        fields: names of the fields.
+        payloads: K encoded records.
+        layout: Lengths of the vectors.
+        fields: Names of the fields.
 
     Returns:
-        Per field an array of shape (K, length of the vector). A field that the layout does not
-        have gets an array of shape (K, 0).
+        For each field an array of shape (K, length of the vector). The shape is (K, 0) for a
+        field that these records do not have.
     """
     lengths = layout.lengths()
     present = [field for field in fields if field in lengths]
@@ -82,10 +97,11 @@ def decode_vectors(payloads: Sequence[bytes], layout: Layout, *fields: str) -> d
     vectors = {field: np.zeros((len(payloads), 0)) for field in absent}
     if not present:
         return vectors
+
     row_length = sum(lengths[field] for field in present)
     values = chain.from_iterable(_decode_fields(payloads, *present, layout=layout))
     if len(present) > 1:
-        # each value is a vector of one field
+        # Each value is a whole vector of one field, instead of a number.
         values = chain.from_iterable(values)
     numbers: Array = _to_array(
         payloads=payloads,
@@ -96,9 +112,10 @@ def decode_vectors(payloads: Sequence[bytes], layout: Layout, *fields: str) -> d
     )
     if not np.isfinite(numbers).all():
         raise _find_error(payloads, layout=layout)
+
     rows = numbers.reshape(-1, row_length)
     if len(present) == 1:
-        vectors[present[0]] = rows
+        vectors[present[0]] = rows  # no copy is needed
         return vectors
     start = 0
     for field in present:
@@ -109,7 +126,15 @@ def decode_vectors(payloads: Sequence[bytes], layout: Layout, *fields: str) -> d
 
 
 def decode_strings(payloads: Sequence[bytes], field: str) -> NDArray[np.object_]:
-    """Returns a field of every record as an array of objects, such as strings, shape (K,)."""
+    """Decodes a field of every record as Python objects, such as strings or lists.
+
+    Args:
+        payloads: K encoded records.
+        field: Name of the field.
+
+    Returns:
+        The values, shape (K,).
+    """
     values = _decode_fields(payloads, field)
     return _to_array(payloads, values, np.object_, len(payloads))
 
@@ -117,19 +142,19 @@ def decode_strings(payloads: Sequence[bytes], field: str) -> NDArray[np.object_]
 def decode_per_peer(
     payloads: Sequence[bytes], field: str, peers: Sequence[str], absent: int
 ) -> dict[str, Ints]:
-    """Returns a field that has an integer for each peer, as the field `used`.
+    """Decodes a field that maps peers to integers, such as `used`.
 
     Args:
-        payloads: K records.
-        field: name of the field, a map from peers to integers.
-        peers: names of the peers.
-        absent: the number for a peer that the map of a record does not have.
+        payloads: K encoded records.
+        field: Name of the field.
+        peers: Names of the peers.
+        absent: Number for a peer that the map of a record does not contain.
 
     Returns:
-        Per peer the integers of all records, shape (K,).
+        For each peer the integers of all records, shape (K,).
     """
-    # A struct with an attribute per peer decodes faster than a dict. The name of a peer may be
-    # no identifier, so the attributes have names of their own.
+    # A struct with an attribute per peer is decoded faster than a dict. The name of a peer need
+    # not be a valid identifier, so that the attributes have other names.
     attributes = [f"peer{n}" for n in range(len(peers))]
     peer_struct = msgspec.defstruct(
         "Peers",
@@ -143,7 +168,7 @@ def decode_per_peer(
     records = map(decoder.decode, payloads)
     values: Iterator[Any] = map(get_numbers, records)
     if len(peers) > 1:
-        # each value is a tuple with one number per peer
+        # Each value is a tuple with one number per peer.
         values = chain.from_iterable(values)
     numbers = _to_array(payloads, values, np.int64, len(peers) * len(payloads))
     rows = numbers.reshape(-1, len(peers))
@@ -151,15 +176,19 @@ def decode_per_peer(
 
 
 def decode_arrivals(payloads: Sequence[bytes]) -> tuple[Ints, Ints]:
-    """Returns the arrivals of all records.
+    """Decodes the samples that arrived in each record.
+
+    Args:
+        payloads: K encoded records.
 
     Returns:
-        The number of arrivals of each record, shape (K,), and all arrivals in order, as in
-        `rx`, shape (N, 3).
+        The number of arrivals of each record, shape (K,), and all arrivals in order, shape (N,
+        3), with the columns of `rx`: index of the peer, tick of the sample, delay in us.
     """
     counts = np.zeros(len(payloads), dtype=np.int64)
 
     def iterate_numbers() -> Iterator[int]:
+        """Yields the numbers of all arrivals, and counts the arrivals of each record."""
         for row, arrivals in enumerate(_decode_fields(payloads, "rx")):
             counts[row] = len(arrivals)
             for entry in arrivals:
@@ -172,7 +201,13 @@ def decode_arrivals(payloads: Sequence[bytes]) -> tuple[Ints, Ints]:
 def _decode_fields(
     payloads: Sequence[bytes], *fields: str, layout: Layout | None = None
 ) -> Iterator[Any]:
-    """Yields the value of a field of every record; of several fields a tuple of values."""
+    """Yields the value of a field for every record, or a tuple of values for several fields.
+
+    Args:
+        payloads: The encoded records.
+        fields: Names of the fields.
+        layout: Lengths of the vectors. None accepts all lengths.
+    """
     get_values: Callable[[Any], Any] = attrgetter(*fields)
     decoder = _find_decoder(fields, layout)
     records = map(decoder.decode, payloads)
@@ -183,17 +218,27 @@ def _decode_fields(
 def _find_decoder(
     fields: tuple[str, ...], layout: Layout | None
 ) -> msgspec.msgpack.Decoder[Any]:
-    """Returns a decoder of some fields; with a layout, vectors must have its lengths."""
+    """Returns a decoder that decodes only some fields of a record.
+
+    Args:
+        fields: Names of the fields.
+        layout: Lengths that vectors must have. None accepts all lengths.
+    """
     types = {field.name: field.type for field in msgspec.structs.fields(State)}
     types.update(_TYPES)
     if layout is not None:
         for field, length in layout.lengths().items():
+            # The type of a tuple with that number of floats.
             types[field] = tuple.__class_getitem__((float,) * length)
     return _make_decoder({field: types[field] for field in fields})
 
 
 def _make_decoder(types: dict[str, Any]) -> msgspec.msgpack.Decoder[Any]:
-    """Returns a decoder of fields with these types, by name."""
+    """Returns a decoder of structs with some fields. Other fields of a payload are skipped.
+
+    Args:
+        types: Types of the fields, by name.
+    """
     fields: list[Any] = []
     for name, kind in types.items():
         if name in _DEFAULTS:
@@ -211,17 +256,17 @@ def _to_array(
     count: int,
     layout: Layout | None = None,
 ) -> NDArray[Any]:
-    """Returns decoded values as an array.
+    """Converts decoded values to an array.
 
     Args:
-        payloads: the records, for the error.
-        values: the values; they are decoded while they are iterated.
-        kind: data type of the array.
-        count: number of values; -1: unknown.
-        layout: the lengths of the vectors, for the error.
+        payloads: The encoded records, from which the error is found.
+        values: The values. They are decoded while they are iterated.
+        kind: Data type of the array.
+        count: Number of values. It is -1 if the number is unknown.
+        layout: Lengths of the vectors, with which the error is found.
 
     Raises:
-        WireError: a record is not valid.
+        WireError: A record is not valid.
     """
     try:
         return np.fromiter(values, kind, count)
@@ -234,10 +279,15 @@ def _find_error(
     default: str = "a number is out of range",
     layout: Layout | None = None,
 ) -> WireError:
-    """Returns the error of the first payload that is not a valid record.
+    """Finds the first payload that is not a valid record.
 
-    The error is the same as if that record were decoded alone. `default` is its text if every
-    record is valid.
+    Args:
+        payloads: The encoded records.
+        default: Text of the error if every record is valid.
+        layout: Lengths of the vectors. None accepts all lengths.
+
+    Returns:
+        The error that occurs if that record is decoded alone.
     """
     for payload in payloads:
         try:

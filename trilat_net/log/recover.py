@@ -1,18 +1,18 @@
-"""Recovery of a torn or damaged MCAP file into a new, finished file.
+"""Recovers a damaged or unfinished MCAP file into a new, finished file.
 
-Any MCAP file is accepted. The accounts of a trilat-net log are rebuilt from its messages.
+Any MCAP file is accepted. For a log of trilat-net, the numbers of received and missing messages
+(the accounts) are computed again from its messages.
 
 Invariant:
-    - Everything readable is copied byte for byte: messages with their times and numbers,
-      metadata and attachments.
-    - Everything unreadable is left out and reported.
-    - Nothing is invented: a message of a trilat-net log is copied only if a valid checksum
-      covers the message or if its content proves the message (`content_check`), and only from
-      a chunk at the position where the chunk was written (`recovery_survey`).
-    - An output file is never empty: if nothing can be saved, no file is created.
-    - The output is read once more, and an output that no trilat-net command can open is
-      reported as such.
-    - The source file is not modified.
+    - Everything that can be read is copied byte for byte: messages with their times and
+      numbers, metadata and attachments.
+    - Everything that cannot be read is left out and reported.
+    - Nothing is invented. A message of a trilat-net log is copied only if a valid checksum
+      covers it or if its content proves it (`content_check`), and only from a chunk that is in
+      its original place (`recovery_survey`).
+    - The new file is never empty: if nothing can be saved, no file is created.
+    - The new file is read once more. If no command of trilat-net can open it, this is reported.
+    - The source file is not changed.
 """
 
 import hashlib
@@ -57,19 +57,20 @@ _UNOPENED = "other MCAP programs open the new file, commands of trilat-net do no
 _UNPROVEN = "has no checksum, and the log has no scenario by which to check messages"
 _NO_SCENARIO = "the log has no scenario, without which no message can be checked"
 _MAX_REASONS = 3
-"""Number of losses that the error message names if nothing can be saved."""
+"""Number of losses that the error message lists if nothing can be saved."""
 MAX_LISTED_LOSSES = 20
 """Number of losses that the metadata of the new file list one by one."""
 DAMAGED_SUFFIX = ".damaged"
-"""Suffix of the name of an attachment whose checksum does not agree."""
+"""Suffix of the name of an attachment whose checksum is wrong."""
 _MAX_SCENARIO_BYTES = 64 << 20
+"""Largest size of a scenario file beside the log, in bytes."""
 _MAX_NUMBERS = 65_535
-"""Largest number of channels in a file, and of schemas: their numbers have 16 bits."""
+"""Largest number of channels in a file, because the format numbers them with 16 bits."""
 _REGENERATED = frozenset(
     {Opcode.MESSAGE_INDEX, Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.STATISTICS}
     | {Opcode.METADATA_INDEX, Opcode.SUMMARY_OFFSET, Opcode.DATA_END, Opcode.FOOTER}
 )
-"""Records that the writer generates from the content: losing them loses no data."""
+"""Kinds of records that the writer computes from the content, so that their loss is no loss."""
 
 
 @dataclass(repr=False)
@@ -77,20 +78,20 @@ class Recovery(Result):
     """Result of a recovery.
 
     Attributes:
-        path: the source file.
-        output: the new file.
+        path: The source file.
+        output: The new file.
         finished: True if the source file had been finished.
-        messages: number of messages in the new file.
-        duration_s: time from the first message to the last, by their log times, in s.
-        salvaged: number of messages that were saved from a last chunk that was cut off.
-        lost: a sentence for each loss.
-        lost_bytes: number of bytes that could not be read.
-        missing: for each site, the records that the new file lacks, whether they were lost in
-            the source file or never recorded.
-        coverage: records in the new file and ticks of the run, per site; empty if the source
-            is not a trilat-net log.
-        chain: agreement of the source with its digest chain; "" if the source is not a
-            trilat-net log.
+        messages: Number of messages in the new file.
+        duration_s: Time from the first to the last message, by their arrival, in s.
+        salvaged: Number of messages that were saved from a last chunk that was cut off.
+        lost: A sentence for each loss.
+        lost_bytes: Number of bytes that could not be read.
+        missing: A line for each site whose records are incomplete in the new file, either
+            because they were lost in the source file or because they were never recorded.
+        coverage: Numbers of records in the new file and of ticks in the run, by site. Empty if
+            the source is not a log of trilat-net.
+        chain: Result of comparing the source with its digests. Empty if the source is not a log
+            of trilat-net.
     """
 
     path: Path
@@ -107,11 +108,11 @@ class Recovery(Result):
 
     @property
     def lossless(self) -> bool:
-        """True if the new file holds all the content of the source file."""
+        """True if the new file contains everything that the source file contains."""
         return not self.lost
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns plain values, with the keys of `trilat log recover --json`."""
+        """Returns the result as plain values, with the keys of `trilat log recover --json`."""
         return {
             "file": self.path.as_posix(),
             "output": self.output.as_posix(),
@@ -132,12 +133,18 @@ class Recovery(Result):
         }
 
     def add_loss(self, text: str, size: int = 0) -> None:
-        """Adds a loss of `size` bytes, described by `text`."""
+        """Adds a loss.
+
+        Args:
+            text: Sentence that describes the loss.
+            size: Size of the part that cannot be read, in bytes. 0 if it is another kind of
+                loss.
+        """
         self.lost.append(text)
         self.lost_bytes += size
 
     def facts(self) -> dict[str, str]:
-        """Returns the metadata of the new file that describe the recovery."""
+        """Returns the result as metadata for the new file."""
         losses = self.lost[:MAX_LISTED_LOSSES]
         unlisted = len(self.lost) - len(losses)
         if unlisted:
@@ -155,7 +162,11 @@ class Recovery(Result):
 
 
 def recovered_path(path: Path) -> Path:
-    """Returns the default name of the new file for the source file at `path`."""
+    """Returns the default name of the new file.
+
+    For an unfinished log run.mcap.active it is run.mcap, and for run.mcap it is
+    run.recovered.mcap.
+    """
     if path.name.endswith(ACTIVE_SUFFIX) and path.name != ACTIVE_SUFFIX:
         return path.with_name(path.name.removesuffix(ACTIVE_SUFFIX))
     return path.with_name(f"{path.stem}.recovered{path.suffix or '.mcap'}")
@@ -168,23 +179,24 @@ def recover(
     force: bool = False,
     progress: Progress | None = None,
 ) -> Recovery:
-    """Recovers a torn or damaged file into a new file, like `trilat log recover`.
+    """Recovers a damaged or unfinished file into a new file, as `trilat log recover` does.
 
     >>> path = tn.simulate("two_sites", duration_s=0.1).save("torn.mcap")
     >>> tn.recover(path, "whole.mcap").lossless
     True
 
     Args:
-        file: the source file.
-        out: the new file; by default `recovered_path`.
+        file: The source file.
+        out: The new file. By default, its name is derived from the source, see
+            `recovered_path`.
         force: True if the new file may replace an existing file.
-        progress: called after every record of the source file.
+        progress: Function that is called after every record of the source file.
 
     Raises:
-        LogError: the source file cannot be read.
-        NothingSaved: nothing could be recovered.
-        UsageError: the new file exists already or cannot be created.
-        LogRefused: the disk refused a write; no file was created.
+        LogError: The source file cannot be read.
+        NothingSaved: Nothing could be recovered.
+        UsageError: The new file exists already or cannot be created.
+        LogRefused: The disk refused the data. No file was created.
     """
     path = Path(file)
     if not path.name:
@@ -210,7 +222,24 @@ def recover(
 def _recover(
     stream: BinaryIO, result: Recovery, force: bool, progress: Progress | None
 ) -> Recovery:
-    """Recovers an open source file, and completes its result; see `recover`."""
+    """Recovers an opened source file.
+
+    The new file has a working name until it is complete. If the recovery fails, it is removed.
+
+    Args:
+        stream: The source file, opened for reading.
+        result: The result, with the names of the files. It is completed.
+        force: True if the new file may replace an existing file.
+        progress: Function that is called after every record of the source file.
+
+    Returns:
+        The completed result.
+
+    Raises:
+        NothingSaved: Nothing could be recovered.
+        UsageError: The new file exists already or cannot be created.
+        LogRefused: The disk refused the data.
+    """
     reader = McapReader(stream, str(result.path), progress, kept=False)
     survey = RecoverySurvey(reader.scanner)
     if survey.why_empty:
@@ -236,7 +265,12 @@ def _recover(
 
 
 def _check_output(working: Path, result: Recovery) -> None:
-    """Adds a loss to `result` if no trilat-net command can open the new file."""
+    """Adds a loss to the result if no command of trilat-net can open the new file.
+
+    Args:
+        working: The new file, under its working name.
+        result: The result.
+    """
     with working.open("rb") as stream:
         try:
             check_log(stream, str(result.output))
@@ -245,11 +279,18 @@ def _check_output(working: Path, result: Recovery) -> None:
 
 
 def _restore_scenario(survey: RecoverySurvey, path: Path) -> bytes:
-    """Restores a lost scenario from the scenario file next to the log.
+    """Looks for a lost scenario in a file beside the log.
+
+    The metadata of the session contain the hash of the scenario, by which the file is
+    recognised. The text is added to the survey.
+
+    Args:
+        survey: Survey of the source file.
+        path: The source file.
 
     Returns:
-        The text of the scenario file if its hash is the one in the session's metadata; b"" if
-        the log still has its scenario or the file does not match.
+        The text of the file. Empty if the log contains its scenario, or if there is no such
+        file.
     """
     digest = survey.metadata.get(SESSION, {}).get("scenario_sha256", "")
     attached = survey.attachments.get(SCENARIO)
@@ -264,12 +305,19 @@ def _restore_scenario(survey: RecoverySurvey, path: Path) -> bytes:
 
 
 class _FileCopy:
-    """Copy of the source file into the new file.
+    """Copy of the contents of the source file into the new file.
 
-    If the source defines a schema or channel number twice, the first definition holds.
+    If the source defines the same number of a schema or channel twice, the first definition
+    counts.
+
+    Args:
+        reader: Reader of the source file.
+        file: The new file.
+        survey: Survey of the source file.
+        result: Result of the recovery, to which losses are added.
 
     Attributes:
-        is_session_log: True if any evidence says that the source is a log of a session.
+        is_session_log: True if anything shows that the source is the log of a session.
     """
 
     def __init__(
@@ -287,9 +335,9 @@ class _FileCopy:
         self._content = _create_content_check(survey, self._accounts)
         self._data_end = reader.size + 1
         self.is_session_log = survey.is_session_log
-        # True until a message, a metadata record or an attachment is copied.
+        # True until a message, metadata or an attachment is copied.
         self._is_empty = True
-        # Number of damaged parts that are among the losses already.
+        # Number of damaged parts that were added to the losses already.
         self._reported = 0
         # Schemas and channels of the source, by opcode and number.
         self._definitions: dict[tuple[int, int], Any] = {}
@@ -297,9 +345,9 @@ class _FileCopy:
         self._contradicted: set[int] = set()
         # Schema number in the new file, by the number in the source.
         self._new_schemas: dict[int, int] = {}
-        # Schemas that recovery defines itself, by schema name.
+        # Number of each schema that the recovery defines itself, by the schema's name.
         self._session_schemas: dict[str, int] = {}
-        # Channel number in the new file and topic, by the number in the source.
+        # Channel number in the new file, and topic, by the number in the source.
         self._new_channels: dict[int, tuple[int, str]] = {}
         # The same by topic, for the channels of the session's members.
         self._new_topics: dict[str, tuple[int, str]] = {}
@@ -324,14 +372,14 @@ class _FileCopy:
                 self._open_channel(number)
 
     def run(self, restored: bytes) -> None:
-        """Copies all readable content of the source and finishes the new file.
+        """Copies everything that can be read, and finishes the new file.
 
         Args:
-            restored: the scenario from the file next to the log, written first; b"" if the log
-                has its scenario.
+            restored: Text of the scenario from the file beside the log, which is written first.
+                Empty if the log contains its scenario.
 
         Raises:
-            NothingSaved: all content of the source is lost.
+            NothingSaved: Nothing could be copied.
         """
         if restored:
             self._out.add_attachment(
@@ -349,7 +397,7 @@ class _FileCopy:
             self._copy_torn_chunk(self._scanner.torn)
         self._out.flush()
         self._report_final_losses()
-        # This check precedes the end mark, which would turn an empty output into a valid file.
+        # This check precedes the end mark, which would make an empty file a valid one.
         if self._is_empty and self._result.lost:
             losses = [text for text in self._result.lost if _UNOPENED not in text]
             reasons = "; ".join(losses[:_MAX_REASONS])
@@ -359,7 +407,10 @@ class _FileCopy:
         self._finish()
 
     def _on_record(self, frame: mcap_records.RecordFrame, content: bytes, data: bytes) -> None:
-        """Copies one record of the source, or adds it to the losses if it is unreadable."""
+        """Copies one record of the source, or adds it to the losses if it cannot be read.
+
+        The arguments are those of `_copy_record`.
+        """
         self._report_damaged()
         try:
             self._copy_record(frame, content, data)
@@ -369,7 +420,10 @@ class _FileCopy:
             )
 
     def _report_damaged(self) -> None:
-        """Adds the damaged parts that the reader has passed since the last call."""
+        """Adds the damaged parts to the losses that the reader has passed since the last call.
+
+        Parts after the end of the data contain only the index, and are no loss.
+        """
         for damage in self._scanner.damaged[self._reported :]:
             if damage.offset <= self._data_end:
                 self._result.add_loss(str(damage), damage.length)
@@ -381,17 +435,17 @@ class _FileCopy:
         """Copies one record of the source.
 
         Args:
-            frame: position and opcode of the record.
-            content: bytes of the record.
-            data: unpacked records of a chunk; empty for other records and for a chunk that
+            frame: Kind and place of the record.
+            content: Content of the record.
+            data: Unpacked records of a chunk. Empty for other records, and for a chunk that
                 cannot be unpacked.
 
         Raises:
-            UnreadableRecord: the record cannot be trusted; it was not copied.
+            UnreadableRecord: The record cannot be trusted and was not copied.
         """
         opcode = frame.opcode
         if opcode == Opcode.HEADER or opcode in mcap_records.DEFINITIONS:
-            return
+            return  # the survey has read them already
         if opcode in _REGENERATED:
             self._check_regenerated(frame, content)
         elif opcode == Opcode.CHUNK:
@@ -406,7 +460,11 @@ class _FileCopy:
             raise UnreadableRecord(f"the kind {opcode} of this record is unknown")
 
     def _copy_metadata(self, content: bytes) -> None:
-        """Copies a metadata record, unless the recovery writes that record itself."""
+        """Copies a metadata record, unless the recovery writes this record itself.
+
+        Raises:
+            UnreadableRecord: The metadata are those of another session.
+        """
         entry = mcap_records.parse_record(Opcode.METADATA, content)
         is_regenerated = self._accounts is not None and entry.name in (ACCOUNTS, DIGESTS)
         if entry.name == RECOVERED or is_regenerated:
@@ -417,9 +475,12 @@ class _FileCopy:
         self._is_empty = False
 
     def _copy_attachment(self, content: bytes) -> None:
-        """Copies an attachment; a damaged attachment gets the suffix `DAMAGED_SUFFIX`.
+        """Copies an attachment.
 
-        Under its own name, the damaged attachment would get a valid checksum in the new file.
+        A damaged attachment is renamed with the suffix `DAMAGED_SUFFIX`.
+
+        Under its own name, nobody would notice the damage, because the writer adds a valid
+        checksum.
         """
         entry = mcap_records.parse_record(Opcode.ATTACHMENT, content)
         name = entry.name
@@ -439,10 +500,17 @@ class _FileCopy:
         self._is_empty = False
 
     def _check_regenerated(self, frame: mcap_records.RecordFrame, content: bytes) -> None:
-        """Raises unless a record whose opcode is in `_REGENERATED` is plausible as such.
+        """Checks that a record that will be left out is really part of an index.
 
-        A damaged opcode can turn a record with data into an apparent index record, which would
-        be left out without being reported.
+        If the opcode of a record is damaged, a record with data may look like one of an index,
+        and its loss would not be reported.
+
+        Args:
+            frame: Kind and place of the record. The kind is one of `_REGENERATED`.
+            content: Content of the record.
+
+        Raises:
+            UnreadableRecord: The record is not plausible.
         """
         if frame.opcode == Opcode.DATA_END and len(content) == 4:
             self._data_end = frame.offset
@@ -456,8 +524,18 @@ class _FileCopy:
             )
 
     def _copy_chunk(self, frame: mcap_records.RecordFrame, data: bytes) -> None:
-        """Copies the records of an unpacked chunk whose checksum, if any, is right."""
-        if problem := self._survey.misplaced.get(frame.offset):
+        """Copies the records of an unpacked chunk, if a checksum or its content proves them.
+
+        Args:
+            frame: Place of the chunk.
+            data: The unpacked records, whose checksum is valid if there is one.
+
+        Raises:
+            UnreadableRecord: The chunk is not in its original place, is from another run, or
+                cannot be proved.
+        """
+        problem = self._survey.misplaced.get(frame.offset)
+        if problem:
             raise UnreadableRecord(problem)
         head = self._scanner.head(frame)
         records = [
@@ -475,7 +553,12 @@ class _FileCopy:
             self._copy_chunk_record(opcode, content)
 
     def _copy_single_message(self, content: bytes) -> None:
-        """Copies a message outside of chunks, which no checksum covers."""
+        """Copies a message that is not in a chunk, so that no checksum covers it.
+
+        Raises:
+            UnreadableRecord: The content does not prove the message, or the file has chunks, so
+                that a message outside of them is the result of damage.
+        """
         if self._content is not None:
             self._copy_unproven([(mcap_records.OP_MESSAGE, content)], (0, _LAST_NS))
         elif self.is_session_log:
@@ -486,41 +569,52 @@ class _FileCopy:
             self._copy_chunk_record(mcap_records.OP_MESSAGE, content)
 
     def _copy_chunk_record(self, opcode: int, content: bytes) -> None:
-        """Copies a message or takes over a definition; other records of a chunk are ignored."""
+        """Copies a message, or notes a definition. Other records of a chunk are ignored.
+
+        Args:
+            opcode: Kind of the record.
+            content: Content of the record.
+
+        Raises:
+            UnreadableRecord: The record makes no sense.
+        """
         if opcode in mcap_records.DEFINITIONS:
             self._define(opcode, content)
-        elif opcode == mcap_records.OP_MESSAGE:
-            number, sequence, log_ns, publish_ns = _parse_message_head(content)
-            payload = content[mcap_records.MESSAGE_HEAD.size :]
-            channel = self._find_channel(number, payload)
-            if channel is None:
-                self._unnamed[number] += 1
-                return
-            new_number, topic = channel
-            self._out.add_message(
-                channel_id=new_number,
-                log_time=log_ns,
-                data=payload,
-                publish_time=publish_ns,
-                sequence=sequence,
-            )
-            self._is_empty = False
-            if self._content is not None:
-                self._content.accept(topic, sequence, log_ns, payload)
-            if self._accounts is not None:
-                self._accounts.receive(topic, sequence, payload)
+            return
+        if opcode != mcap_records.OP_MESSAGE:
+            return
+
+        number, sequence, log_ns, publish_ns = _parse_message_head(content)
+        payload = content[mcap_records.MESSAGE_HEAD.size :]
+        channel = self._find_channel(number, payload)
+        if channel is None:
+            self._unnamed[number] += 1
+            return
+        new_number, topic = channel
+        self._out.add_message(
+            channel_id=new_number,
+            log_time=log_ns,
+            data=payload,
+            publish_time=publish_ns,
+            sequence=sequence,
+        )
+        self._is_empty = False
+        if self._content is not None:
+            self._content.accept(topic, sequence, log_ns, payload)
+        if self._accounts is not None:
+            self._accounts.receive(topic, sequence, payload)
 
     def _copy_unproven(
         self, records: Iterable[tuple[int, bytes]], span_ns: tuple[int, int]
     ) -> None:
-        """Copies records without a checksum, if the content of every record proves it.
+        """Copies records that no checksum covers, if the content of every record proves it.
 
         Args:
-            records: opcode and content of the records of a chunk.
-            span_ns: first and last log time of the chunk, Unix ns.
+            records: Kinds and contents of the records of a chunk.
+            span_ns: First and last arrival time of the chunk, in Unix time, in ns.
 
         Raises:
-            UnreadableRecord: a record fails; nothing was copied.
+            UnreadableRecord: A record is not proved. No record was copied.
         """
         records = list(records)
         for opcode, content in records:
@@ -529,21 +623,22 @@ class _FileCopy:
             self._copy_chunk_record(opcode, content)
 
     def _check_unproven(self, opcode: int, content: bytes, span_ns: tuple[int, int]) -> None:
-        """Raises UnreadableRecord unless the content of a record proves the record."""
+        """Checks that the content of a record proves the record.
+
+        Args:
+            opcode: Kind of the record.
+            content: Content of the record.
+            span_ns: First and last arrival time of the chunk, in Unix time, in ns.
+
+        Raises:
+            UnreadableRecord: The record is not proved.
+        """
         if opcode in mcap_records.DEFINITIONS:
-            entry = mcap_records.parse_record(opcode, content)
-            is_session_topic = opcode == Opcode.CHANNEL and entry.topic.startswith(
-                f"/{topics.ROOT}/"
-            )
-            if is_session_topic and self._content is None:
-                self.is_session_log = True
-                raise UnreadableRecord(_NO_SCENARIO)
-            if opcode == Opcode.CHANNEL and not self._is_plausible(entry.topic):
-                raise UnreadableRecord("a channel belongs to no member of this session")
-            self._define(opcode, content)
+            self._check_unproven_definition(opcode, content)
             return
         if opcode != mcap_records.OP_MESSAGE:
             raise UnreadableRecord(f"a chunk holds a record of kind {opcode}")
+
         number, sequence, log_ns, publish_ns = _parse_message_head(content)
         payload = content[mcap_records.MESSAGE_HEAD.size :]
         channel = self._find_channel(number, payload)
@@ -561,17 +656,37 @@ class _FileCopy:
         elif not span_ns[0] <= log_ns <= span_ns[1]:
             raise UnreadableRecord("a message was logged outside of its chunk")
 
+    def _check_unproven_definition(self, opcode: int, content: bytes) -> None:
+        """Checks a schema or channel that no checksum covers, and notes it.
+
+        Raises:
+            UnreadableRecord: A channel cannot belong to this session.
+        """
+        entry = mcap_records.parse_record(opcode, content)
+        if opcode == Opcode.CHANNEL:
+            is_session_topic = entry.topic.startswith(f"/{topics.ROOT}/")
+            if is_session_topic and self._content is None:
+                self.is_session_log = True
+                raise UnreadableRecord(_NO_SCENARIO)
+            if not self._is_plausible(entry.topic):
+                raise UnreadableRecord("a channel belongs to no member of this session")
+        self._define(opcode, content)
+
     def _define(self, opcode: int, content: bytes) -> None:
-        """Notes the definition of a schema or channel; the first definition holds."""
+        """Notes the definition of a schema or channel. The first definition of a number counts.
+
+        Raises:
+            UnreadableRecord: The definition cannot be decoded.
+        """
         entry = mcap_records.parse_record(opcode, content)
         known = self._definitions.setdefault((opcode, entry.id), entry)
         if known != entry:
             self._contradicted.add(entry.id)
 
     def _is_plausible(self, topic: str) -> bool:
-        """Returns True for a topic that can occur in the source.
+        """Returns True if a topic can occur in the source.
 
-        A session's log has no topics of another session's members.
+        The log of a session contains no topics of members of other sessions.
         """
         if self._content is None or not topic.startswith(f"/{topics.ROOT}/"):
             return True
@@ -580,21 +695,23 @@ class _FileCopy:
     def _find_channel(self, number: int, payload: bytes) -> tuple[int, str] | None:
         """Finds the channel of the new file for a message of the source.
 
-        In a session's log, the first message of a channel decides: the message names its sender
-        and its kind. The definition of the channel is less reliable, because definitions have
-        no checksum in a file that was not finished.
+        In the log of a session, the first message of a channel decides, because a message names
+        its sender and its kind. The definition of the channel is less reliable, because no
+        checksum covers it in a file that was not finished.
 
         Args:
-            number: channel number in the source.
-            payload: the message.
+            number: Channel number in the source.
+            payload: The message.
 
         Returns:
-            Channel number in the new file and topic; None if neither the message nor a
+            The channel number in the new file, and the topic. None if neither the message nor a
             definition names the channel.
         """
         known = self._new_channels.get(number)
-        if known is not None and (self._content is None or number in self._identified):
+        is_certain = self._content is None or number in self._identified
+        if known is not None and is_certain:
             return known
+
         self._identified.add(number)
         topic = self._content.identify(payload) if self._content is not None else ""
         if not topic or (known is not None and known[1] == topic):
@@ -605,14 +722,14 @@ class _FileCopy:
         return channel
 
     def _open_channel(self, number: int) -> tuple[int, str] | None:
-        """Registers a channel that the source defines.
+        """Registers a channel in the new file, with the definition of the source.
 
         Args:
-            number: channel number in the source.
+            number: Channel number in the source.
 
         Returns:
-            Channel number in the new file and topic; None if the source has no plausible
-            definition of the channel.
+            The channel number in the new file, and the topic. None if the source has no
+            plausible definition of the channel.
         """
         definition = self._definitions.get((Opcode.CHANNEL, number))
         if definition is None or len(self._new_channels) >= _MAX_NUMBERS:
@@ -635,10 +752,13 @@ class _FileCopy:
         return self._register_copy(number, new_number, definition.topic)
 
     def _open_session_channel(self, topic: str) -> tuple[int, str]:
-        """Registers a channel of the session with the definition that `LogWriter` gives it.
+        """Registers a channel of the session in the new file, as `LogWriter` would define it.
+
+        Args:
+            topic: Topic of the channel.
 
         Returns:
-            Channel number in the new file and topic.
+            The channel number in the new file, and the topic.
         """
         assert self._content is not None
         kind = CHANNEL_TYPES[topic.rpartition("/")[2]]
@@ -655,7 +775,17 @@ class _FileCopy:
     def _register_copy(
         self, number: int | None, new_number: int, topic: str
     ) -> tuple[int, str]:
-        """Records the channel number in the new file; returns that number and the topic."""
+        """Notes a channel that was registered in the new file.
+
+        Args:
+            number: Channel number in the source. None if the source does not define the
+                channel.
+            new_number: Channel number in the new file.
+            topic: Topic of the channel.
+
+        Returns:
+            The channel number in the new file, and the topic.
+        """
         channel = new_number, topic
         if number is not None:
             self._new_channels[number] = channel
@@ -666,7 +796,14 @@ class _FileCopy:
         return channel
 
     def _copy_torn_chunk(self, torn: mcap_records.Damage) -> None:
-        """Copies the readable messages of the record at which the source is cut off."""
+        """Copies the messages that can be read from the last chunk, if it is incomplete.
+
+        The rest of the chunk is added to the losses, or the whole record if it is not a chunk.
+        An incomplete index is no loss.
+
+        Args:
+            torn: The part from which the end of the file is missing.
+        """
         opcode = int.from_bytes(self._scanner.read(torn.offset, 1), "little")
         if not torn.length or opcode in _REGENERATED or torn.offset > self._data_end:
             return
@@ -686,10 +823,13 @@ class _FileCopy:
         )
 
     def _salvage(self, offset: int) -> str:
-        """Copies the records of a chunk that was cut off, block by block.
+        """Copies the records of an incomplete chunk, block by block.
+
+        Args:
+            offset: Offset of the chunk.
 
         Returns:
-            The problem that ended the copy; "" if all blocks were copied.
+            The problem that ended the copy. Empty if all blocks were copied.
         """
         if self._content is None and self.is_session_log:
             return _NO_SCENARIO
@@ -702,7 +842,7 @@ class _FileCopy:
         return ""
 
     def _report_final_losses(self) -> None:
-        """Adds the losses that show only after all records were read."""
+        """Adds the losses that are known only after all records were read."""
         result = self._result
         for number, count in self._unnamed.items():
             result.add_loss(
@@ -725,7 +865,7 @@ class _FileCopy:
             )
 
     def _report_missing_head(self) -> None:
-        """Adds a loss if a session's log lacks its metadata or its scenario."""
+        """Adds a loss if the log of a session lacks its metadata or its scenario."""
         survey = self._survey
         has_metadata = SESSION in survey.metadata
         if not self.is_session_log or (has_metadata and SCENARIO in survey.attachments):
@@ -734,7 +874,7 @@ class _FileCopy:
         if survey.is_foreign_session:
             loss += ", in whose place are those of another session"
         advice = ""
-        # Only the metadata name the hash by which a scenario file can be recognized.
+        # Only the metadata state the hash by which a scenario file can be recognised.
         if has_metadata:
             advice = (
                 f". If the scenario file of the run lies beside the log as {SCENARIO}, recover "
@@ -744,7 +884,7 @@ class _FileCopy:
         self._result.lost.insert(0, f"{loss}; {_UNOPENED}{advice}")
 
     def _finish(self) -> None:
-        """Completes the result; writes accounts, recovery metadata and the end mark."""
+        """Completes the result, and writes the accounts, the recovery's facts and the end."""
         result = self._result
         accounts = self._accounts
         result.finished = self._scanner.finished
@@ -773,10 +913,14 @@ class _FileCopy:
     def _contradicts_accounts(
         self, accounts: SessionAccounts, source_accounts: Mapping[str, str]
     ) -> bool:
-        """Returns True if the source's accounts of records differ from the rebuilt accounts.
+        """Returns True if the message counts in the source differ from those of its records.
 
-        Only a finished, lossless log in one file can be compared: elsewhere the accounts may
-        cover records that the new file lacks.
+        They can be compared only if the source is a finished log in one file without losses.
+        Otherwise they may include records that the new file lacks.
+
+        Args:
+            accounts: Counts that were computed from the copied messages.
+            source_accounts: Counts that the source states, by topic.
         """
         is_complete = self._scanner.finished and self._result.lossless
         if not is_complete or PART in self._survey.metadata:
@@ -790,10 +934,10 @@ class _FileCopy:
         return False
 
     def _judge_source_chain(self) -> DigestState:
-        """Returns the agreement of the source with its digest chain.
+        """Returns the result of comparing the source with its digests.
 
-        A definition that is damaged among the data, but present in the index with a checksum,
-        changes no message.
+        If a definition is damaged among the data, but intact in the index, the digests differ,
+        although no message was changed. This does not count as a change.
         """
         if not self._scanner.begins:
             return DigestState.OPEN
@@ -809,7 +953,11 @@ _LAST_NS = (1 << 64) - 1
 
 
 def _parse_message_head(content: bytes) -> tuple[int, int, int, int]:
-    """Returns channel number, sequence number, log time and publish time of a message."""
+    """Returns the channel number, sequence number, arrival time and sending time of a message.
+
+    Raises:
+        UnreadableRecord: The message is too short.
+    """
     if len(content) < mcap_records.MESSAGE_HEAD.size:
         raise UnreadableRecord("a message is too short")
     number, sequence, log_ns, publish_ns = mcap_records.MESSAGE_HEAD.unpack_from(content)
@@ -819,9 +967,14 @@ def _parse_message_head(content: bytes) -> tuple[int, int, int, int]:
 def _create_content_check(
     survey: RecoverySurvey, accounts: SessionAccounts | None
 ) -> ContentCheck | None:
-    """Returns the content check of a session's log.
+    """Creates the check that proves messages by their content.
 
-    Returns None for a file of another program and for a log without a scenario.
+    Args:
+        survey: Survey of the source file.
+        accounts: Accounts of the source. None if the source has no session or no scenario.
+
+    Returns:
+        The check. None if there are no accounts.
     """
     if accounts is None:
         return None
