@@ -1,6 +1,13 @@
-"""The paper's adaptive law, which learns the arm's parameters: Eq. (13) and (15).
+"""Implements the paper's adaptive law, which learns the arm's parameters: Eq. (13) and (15).
 
-The kernel computes this law (`core.control.adaptive_torque` and `update_estimate`);
+The law needs no model of the arm. It estimates the parameters theta (masses and inertias) from
+the motion while it controls the arm. Its symbols are
+
+    e        synchronisation error: position less the reference by the peers
+    r        filtered error, qd + Lambda e
+    Y        regressor: the matrix for which Y theta is the torque of the arm's dynamics
+
+The simulation kernel computes this law (`core.control.adaptive_torque` and `update_estimate`);
 `Adaptive.compute_torque` and `Adaptive.advance_estimate` state the same law in plain Python,
 and `tests/control_laws/test_plain_torques.py` compares the two.
 """
@@ -34,11 +41,11 @@ class Adaptive(ControlLaw):
     damping of the error.
 
     Attributes:
-        Lambda: rate at which errors decay, per joint, 1/s.
-        Kp: damping of r = qd + Lambda e, per joint, N m s/rad.
-        Kd: damping of the error's velocity, per joint, N m s/rad.
-        Gamma: adaptation gain per parameter.
-        theta_hat0: first estimate of theta, Eq. (24).
+        Lambda: Rate at which errors decay, per joint, 1/s.
+        Kp: Damping of r = qd + Lambda e, per joint, N m s/rad.
+        Kd: Damping of the error's velocity, per joint, N m s/rad.
+        Gamma: Adaptation gain per parameter.
+        theta_hat0: First estimate of theta, Eq. (24).
     """
 
     Lambda: PositiveCoordinates = (1.0,)
@@ -62,10 +69,10 @@ class Adaptive(ControlLaw):
             tau = Y(q, qd, -Lambda e, -Lambda ed) theta_hat - Kp r - Kd ed
 
         Args:
-            Y: the regressor of Eq. (12), shape (n, P).
-            theta_hat: the estimate of the parameters, shape (P,).
-            r: qd + Lambda e, Eq. (10), shape (n,), rad/s.
-            ed: derivative of the error, shape (n,), rad/s.
+            Y: Regressor of Eq. (12), shape (n, P).
+            theta_hat: Estimate of the parameters, shape (P,).
+            r: Filtered error qd + Lambda e, Eq. (10), shape (n,), rad/s.
+            ed: Derivative of the error, shape (n,), rad/s.
         """
         Kp = np.array(self.Kp)
         Kd = np.array(self.Kd)
@@ -81,14 +88,18 @@ class Adaptive(ControlLaw):
             theta_hat - gain_s Gamma Y' r
 
         Args:
-            theta_hat: the estimate before the step, shape (P,).
+            theta_hat: Estimate before the step, shape (P,).
             Yr: Y' r, shape (P,); the trapezoid rule passes the sum of two ticks.
-            gain_s: duration of the step, s; the trapezoid rule passes half of the period.
+            gain_s: Duration of the step, s; the trapezoid rule passes half of the period.
         """
         return theta_hat - gain_s * np.array(self.Gamma) * Yr
 
     def gains(self, theta: Array) -> Gains:  # noqa: ARG002 - as the other laws
-        """Returns the gains for the kernel, for an arm with parameters theta."""
+        """Returns the gains with which the kernel computes the law.
+
+        Args:
+            theta: Parameters of the arm, which this law does not use.
+        """
         return Gains(
             law=Law.ADAPTIVE,
             Lambda=self.Lambda,
@@ -99,10 +110,15 @@ class Adaptive(ControlLaw):
         )
 
     def exchanges_positions(self) -> bool:
-        """True if the law does not learn (Gamma = 0)."""
+        """Returns True if the law does not learn (Gamma = 0): it is a spring between poses."""
         return not any(self.Gamma)
 
     @classmethod
-    def write_control(cls, gains: Mapping[str, float], at: TuningSite) -> dict[str, Any]:
-        """Returns the [control] table of a site: tuned gains and the first estimate."""
-        return {**gains, "theta_hat0": at.estimate}
+    def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
+        """Returns the [control] table of a site: the tuned gains and the first estimate.
+
+        Args:
+            gains: The tuned gains by name.
+            site: The site whose table is written.
+        """
+        return {**gains, "theta_hat0": site.estimate}

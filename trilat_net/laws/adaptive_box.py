@@ -1,8 +1,9 @@
-"""The paper's adaptive law with each estimated parameter kept in an interval (a box).
+"""Implements the paper's adaptive law with each estimate kept in an interval (a box).
 
-The torque is that of `Adaptive`, Eq. (13). The kernel computes the law
-(`core.control.project_estimate`). `AdaptiveBox.advance_estimate` states the projection in plain
-Python, and `tests/control_laws/test_plain_torques.py` compares the two.
+Without bounds, an estimate may drift as long as the errors are not zero. The torque is that of
+`Adaptive`, Eq. (13). The simulation kernel computes the law (`core.control.project_estimate`).
+`AdaptiveBox.advance_estimate` states the projection in plain Python, and
+`tests/control_laws/test_plain_torques.py` compares the two.
 """
 
 from collections.abc import Mapping
@@ -21,16 +22,17 @@ from .interface import TuningSite
 class AdaptiveBox(Adaptive):
     """The paper's law with each estimate kept within its bounds.
 
-    If the box contains the true parameters, also on its edge, V' <= 0 still holds. An estimate
-    that learns gravity acts like a spring that ties the arms to a pose; if the true parameters
-    lie strictly inside the box, the box removes this effect.
+    If the box contains the true parameters, also on its edge, V' <= 0 still holds, where V is
+    the energy function of the stability proof. An estimate that learns gravity acts like a
+    spring that ties the arms to a pose; if the true parameters lie strictly inside the box, the
+    box removes this effect.
 
     Source: Ioannou and Sun, "Robust Adaptive Control" (1996), 4.4, for the projection.
 
     Attributes:
-        Lambda, Kp, Kd, Gamma, theta_hat0: as of `Adaptive`.
-        theta_low: lower bound of each estimate.
-        theta_high: upper bound of each estimate.
+        Lambda, Kp, Kd, Gamma, theta_hat0: As of `Adaptive`.
+        theta_low: Lower bound of each estimate.
+        theta_high: Upper bound of each estimate.
     """
 
     theta_low: Parameters = (-MAX_QUANTITY,)
@@ -44,24 +46,32 @@ class AdaptiveBox(Adaptive):
             min(max(theta_hat - gain_s Gamma Y' r, theta_low), theta_high)
 
         Args:
-            theta_hat: the estimate before the step, shape (P,).
+            theta_hat: Estimate before the step, shape (P,).
             Yr: Y' r, shape (P,).
-            gain_s: duration of the step, s.
+            gain_s: Duration of the step, s.
         """
         estimate = Adaptive.advance_estimate(self, theta_hat, Yr, gain_s)
         above_low = np.maximum(estimate, self.theta_low)
         return np.minimum(above_low, self.theta_high)
 
     def gains(self, theta: Array) -> Gains:
-        """Returns the gains for the kernel."""
+        """Returns the gains with which the kernel computes the law, the bounds included.
+
+        Args:
+            theta: Parameters of the arm, which this law does not use.
+        """
         gains = Adaptive.gains(self, theta)
         return gains._replace(low=self.theta_low, high=self.theta_high)
 
     def check(self, path: str, sites: int) -> None:  # noqa: ARG002 - as the other laws
         """Refuses an empty box, and a first estimate outside the box.
 
+        Args:
+            path: Path of the law's table in the scenario, for errors.
+            sites: Number of sites, which this law does not use.
+
         Raises:
-            ScenarioError: with the path of the key.
+            ScenarioError: A bound or an estimate is refused; the error names the key.
         """
         bounds = zip(self.theta_low, self.theta_hat0, self.theta_high, strict=True)
         for n, (low, first, high) in enumerate(bounds):
@@ -73,8 +83,13 @@ class AdaptiveBox(Adaptive):
                 raise ScenarioError(problem, path=f"{path}.theta_hat0[{n}]")
 
     @classmethod
-    def write_control(cls, gains: Mapping[str, float], at: TuningSite) -> dict[str, Any]:
-        """Returns the [control] table of a site: gains, first estimate, and its box."""
-        control = Adaptive.write_control(gains, at)
-        low, high = at.box
+    def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
+        """Returns the [control] table of a site: the gains, the first estimate and its box.
+
+        Args:
+            gains: The tuned gains by name.
+            site: The site whose table is written.
+        """
+        control = Adaptive.write_control(gains, site)
+        low, high = site.box
         return {**control, "theta_low": low, "theta_high": high}

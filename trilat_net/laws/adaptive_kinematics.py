@@ -1,11 +1,14 @@
-"""The paper's law for end-effector positions, with unknown masses and link lengths.
+"""Implements the paper's law for end-effector positions, with unknown masses and link lengths.
 
-The position x of the end effector and its velocity are measured. The Jacobian is computed from
-estimated lengths, J_hat = J + J~. With
+The position x of the end effector and its velocity are measured. The Jacobian J is computed
+from estimated link lengths l_hat, J_hat = J + J~. With the dominance factors alpha_ij, the
+weights with which site i follows its peers j, and the delay T, let
 
     e = x - sum_j alpha_ij x_j(t - T),    v = -J_hat^-1 Lambda e,    a = v',    r = qd - v
 
-the law and its estimates are
+where e is the error, v the reference velocity of the joints, a its derivative and r the
+filtered error. With the regressor Y, for which Y theta is the torque of the arm's dynamics, the
+law and its estimates are
 
     tau        = Y(q, qd, v, a) theta_hat - Kp r - J_hat' Kd ed
     theta_hat' = -Gamma Y' r
@@ -43,7 +46,16 @@ LEAST_SINE = 0.1
 
 @leaf
 def _solve_jacobian(lengths: Pair, q: Pair, b: Pair) -> Pair:
-    """Returns the solution of J y = b for the planar arm with these link lengths, m."""
+    """Returns the solution y of J y = b, where J is the Jacobian of the planar arm.
+
+    A stretched elbow makes J singular. Then the sine of the elbow's angle is replaced by
+    `LEAST_SINE`.
+
+    Args:
+        lengths: Lengths of the two links, m.
+        q: Joint angles, rad.
+        b: The right-hand side, along x and y.
+    """
     l1, l2 = lengths
     q1, q2 = q
     b_x, b_y = b
@@ -63,7 +75,13 @@ def _solve_jacobian(lengths: Pair, q: Pair, b: Pair) -> Pair:
 
 @leaf
 def _end_effector_motion(lengths: Pair, q: Pair, qd: Pair) -> tuple[float, float, float, float]:
-    """Returns x, y, x' and y' of the end effector, m and m/s."""
+    """Returns x, y, x' and y' of the end effector, m and m/s.
+
+    Args:
+        lengths: Lengths of the two links, m.
+        q: Joint angles, rad.
+        qd: Joint velocities, rad/s.
+    """
     l1, l2 = lengths
     q1, q2 = q
     qd1, qd2 = qd
@@ -117,15 +135,15 @@ class AdaptiveKinematics(ControlLaw):
     unknown kinematic and dynamic properties", Int. J. Robotics Research 25(3), 283-296, 2006.
 
     Attributes:
-        Lambda: rate at which errors decay, per coordinate x and y, 1/s.
-        Kp: damping of r, per joint, N m s/rad.
-        Kd: damping of the error's velocity, per coordinate, N s/m.
-        Gamma: adaptation gain per parameter.
-        theta_hat0: first estimate of theta, Eq. (24).
-        length_gain_m_n: adaptation gain of the lengths, m/N.
-        lengths0_m: first estimate of the two lengths.
-        least_m: lower bound of both lengths, m.
-        most_m: upper bound of both lengths, m.
+        Lambda: Rate at which errors decay, per coordinate x and y, 1/s.
+        Kp: Damping of r, per joint, N m s/rad.
+        Kd: Damping of the error's velocity, per coordinate, N s/m.
+        Gamma: Adaptation gain per parameter.
+        theta_hat0: First estimate of theta, Eq. (24).
+        length_gain_m_n: Adaptation gain of the lengths, m/N.
+        lengths0_m: First estimate of the two lengths.
+        least_m: Lower bound of both lengths, m.
+        most_m: Upper bound of both lengths, m.
     """
 
     Lambda: PositiveJoints = (1.0,)
@@ -154,7 +172,7 @@ class AdaptiveKinematics(ControlLaw):
     known_facts: ClassVar = "gravity, as its first estimate, and no length"
 
     def begin(self, facts: LawContext) -> None:
-        """Creates both estimates and their rates."""
+        """Creates both estimates and their rates, at the first estimates."""
         self.theta_hat = list(self.theta_hat0)
         self.lengths_m = list(self.lengths0_m)
         self.Yr = [0.0] * len(self.theta_hat)
@@ -164,7 +182,12 @@ class AdaptiveKinematics(ControlLaw):
         self.g_m_s2 = facts.g_m_s2
 
     def torque(self, now: LawInput) -> None:
-        """Writes the torque and the estimate, and sends the end effector's motion."""
+        """Writes the torque and the estimate of theta, and sends the end effector's motion.
+
+        The steps are: measure the end effector; compute the error e and its derivative; advance
+        the estimate of the lengths; compute v, a and r; compute the torque and advance
+        theta_hat. All symbols are defined at the top of this module.
+        """
         q = (now.q[0], now.q[1])
         qd = (now.qd[0], now.qd[1])
         true_lengths = (self.true_lengths_m[0], self.true_lengths_m[1])
@@ -238,7 +261,13 @@ class AdaptiveKinematics(ControlLaw):
             now.tau[1] += second[p] * estimate
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns the condition: constant delays, bent elbows, lengths within their bounds."""
+        """Returns the condition: constant delays, bent elbows, lengths within their bounds.
+
+        It stays undecided, because only the run shows whether the elbows stay bent.
+
+        Args:
+            situation: The site, its peers and the delays between them.
+        """
         if np.isnan(situation.longest_s):
             return StabilityCondition(
                 None, "proved for constant delays, and a delay here varies"
@@ -251,9 +280,13 @@ class AdaptiveKinematics(ControlLaw):
         return StabilityCondition(None, text)
 
     @classmethod
-    def write_control(cls, gains: Mapping[str, float], at: TuningSite) -> dict[str, Any]:
+    def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
         """Returns the [control] table of a site: tuned gains and the first estimate.
 
         The lengths are learnt, starting from the law's default.
+
+        Args:
+            gains: The tuned gains by name.
+            site: The site whose table is written.
         """
-        return {**gains, "theta_hat0": at.estimate}
+        return {**gains, "theta_hat0": site.estimate}

@@ -1,8 +1,9 @@
-"""The adaptive law in a box, with a bounded term against torque that no estimate explains.
+"""Implements the adaptive law in a box with a bounded term against unmodelled torque.
 
-The kernel computes this law (`core.control.robust_torque`). `AdaptiveRobust.compute_torque`
-states the same law in plain Python, and `tests/control_laws/test_plain_torques.py` compares the
-two.
+The additional term opposes torque that no estimate of the parameters explains, such as friction
+or an operator. The simulation kernel computes this law (`core.control.robust_torque`).
+`AdaptiveRobust.compute_torque` states the same law in plain Python, and
+`tests/control_laws/test_plain_torques.py` compares the two.
 """
 
 from collections.abc import Mapping
@@ -23,17 +24,17 @@ class AdaptiveRobust(AdaptiveBox):
     """The law with a box, and the robust term -rho r / sqrt(r^2 + width^2).
 
     Premises: constant delays, no operator, theta in its box, and a disturbance of at most rho
-    at each joint. Then the mean over time of the power that V dissipates is at most 0.3003
-    sum_i beta_i sum rho width, and no stronger statement is proved; docs/laws.md derives the
-    bound.
+    at each joint. Then the mean over time of the power that V, the energy function of the
+    stability proof, dissipates is at most 0.3003 sum_i beta_i sum rho width, and no stronger
+    statement is proved; docs/laws.md derives the bound.
 
     Source: Slotine and Li, "Applied Nonlinear Control" (1991), 7.1, for the smooth term.
 
     Attributes:
-        Lambda, Kp, Kd, Gamma, theta_hat0, theta_low, theta_high: as of `AdaptiveBox`.
-        rho_nm: bound of the disturbance per joint, N m (N for a sliding joint).
-        width_rad_s: value of r at which 0.71 rho opposes r, per joint, rad/s (m/s).
-        friction: share of the joints' own friction that the law compensates, 0: no friction.
+        Lambda, Kp, Kd, Gamma, theta_hat0, theta_low, theta_high: As of `AdaptiveBox`.
+        rho_nm: Bound of the disturbance per joint, N m (N for a sliding joint).
+        width_rad_s: Value of r at which 0.71 rho opposes r, per joint, rad/s (m/s).
+        friction: Factor of the joints' own friction that the law compensates; 0: no friction.
     """
 
     rho_nm: NotNegativeJoints = (1.0,)
@@ -55,10 +56,10 @@ class AdaptiveRobust(AdaptiveBox):
             tau = Y theta_hat - Kp r - Kd ed - (1 - friction) f(v) - rho r / sqrt(r^2 + width^2)
 
         Args:
-            Y: the regressor of Eq. (12), shape (n, P).
-            theta_hat: the estimate of the parameters, shape (P,).
-            r: qd + Lambda e, Eq. (10), shape (n,), rad/s.
-            ed: derivative of the error, shape (n,), rad/s.
+            Y: Regressor of Eq. (12), shape (n, P).
+            theta_hat: Estimate of the parameters, shape (P,).
+            r: Filtered error qd + Lambda e, Eq. (10), shape (n,), rad/s.
+            ed: Derivative of the error, shape (n,), rad/s.
             joint_friction: f(v), friction of a chain's joints at the reference velocity, shape
                 (n,), N m. Y theta_hat of a chain contains f(v) in full. The planar arm has no
                 friction.
@@ -72,12 +73,20 @@ class AdaptiveRobust(AdaptiveBox):
         return torque
 
     def gains(self, theta: Array) -> Gains:
-        """Returns the gains for the kernel."""
+        """Returns the gains with which the kernel computes the law, the robust term included.
+
+        Args:
+            theta: Parameters of the arm, which this law does not use.
+        """
         box = AdaptiveBox.gains(self, theta)
         return box._replace(rho=self.rho_nm, width=self.width_rad_s, friction=(self.friction,))
 
     def condition(self, situation: LawSituation) -> StabilityCondition:
-        """Returns the mean-square bound on this site's part of the dissipated power, W."""
+        """Returns the condition: a bound on this site's part of the mean dissipated power, W.
+
+        Args:
+            situation: The site, its peers and the delays between them.
+        """
         pairs = zip(self.rho_nm, self.width_rad_s, strict=True)
         joint_bounds = [rho * width for rho, width in pairs]
         bound_w = ROBUST_RESIDUE * sum(joint_bounds)
@@ -91,11 +100,11 @@ class AdaptiveRobust(AdaptiveBox):
         return StabilityCondition(None if delays_vary else True, text)
 
     @classmethod
-    def write_control(cls, gains: Mapping[str, float], at: TuningSite) -> dict[str, Any]:
+    def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
         """Returns the [control] table of a site for tuned gains.
 
         Near r = 0 the robust term acts like a damping of rho / width. The width is chosen so
         that this damping is a tenth of Kp.
         """
         width_rad_s = 10.0 * gains["rho_nm"] / gains["Kp"]
-        return {**AdaptiveBox.write_control(gains, at), "width_rad_s": width_rad_s}
+        return {**AdaptiveBox.write_control(gains, site), "width_rad_s": width_rad_s}

@@ -1,10 +1,15 @@
-"""Shared authority of two users over a slave, without feedback of the environment's force.
+"""Shares the authority over one slave arm between two users.
+
+A user is a person at a master arm. Each user feels the other user, but not the force of the
+environment on the slave:
 
     slave    tau = G + K (sum_j alpha_j q_j - q) - d qd
     user i   tau = G + K alpha_ij (q_j - q_i) - d qd_i,    j: the other user
 
-A user i with the share a of the authority has alpha_ij = 1 - a, so the user with less authority
-is guided more. A user's torque does not depend on the slave.
+where tau is the torque of an arm, G its gravity torque, q its position, K a stiffness, d a
+damping, and alpha_j are the dominance factors, the weights with which an arm follows the
+others. A user i with the share a of the authority has alpha_ij = 1 - a, so the user with less
+authority is guided more. A user's torque does not depend on the slave.
 """
 
 from collections.abc import Mapping
@@ -35,10 +40,10 @@ class Authority(ControlLaw):
     design for minimally invasive telesurgical training", IEEE T-CST, 2005.
 
     Attributes:
-        K: stiffness per joint, N m/rad.
-        d: damping of the arm's velocity, per joint, N m s/rad.
-        leads: true for a user, false for the slave.
-        gravity: share of the true gravity that the law compensates; 1 is exact.
+        K: Stiffness per joint, N m/rad.
+        d: Damping of the arm's velocity, per joint, N m s/rad.
+        leads: True for a user, false for the slave.
+        gravity: Factor of the true gravity that the law compensates; 1 is exact.
     """
 
     K: PositiveJoints = (10.0,)
@@ -51,7 +56,10 @@ class Authority(ControlLaw):
     needs_theta: ClassVar = True
 
     def torque(self, now: LawInput) -> None:
-        """Writes the torque, and sends to the peers whether this site leads."""
+        """Writes the torque of each joint, and sends to the peers whether this site leads.
+
+        The springs pull only towards sites that lead.
+        """
         now.to_all.leads[0] = 1.0 if self.leads else 0.0
         for i in range(now.joints):
             K = self.K[i]
@@ -65,26 +73,43 @@ class Authority(ControlLaw):
             now.tau[i] = tau
 
     def linear_gains(self, theta: Array) -> Gains | None:
-        """Returns the law of known gravity with the damping alone."""
+        """Returns the kernel's law of known gravity with the damping alone.
+
+        The springs are described by `linear_form`.
+
+        Args:
+            theta: Parameters of the arm, shape (P,).
+        """
         known = (theta * self.gravity).tolist()
         return Gains(Law.KNOWN, d=self.d, known=known)
 
-    def linear_form(self, at: LinearSituation) -> LinearForm | None:
-        """Returns the springs towards the users."""
-        form = LinearForm(len(at.inertia))
-        for j in at.peers:
-            leads = float(getattr(at.laws[j], "leads", False))
-            share = at.alpha[at.site, j] * leads
+    def linear_form(self, situation: LinearSituation) -> LinearForm | None:
+        """Returns the springs towards the users for small motions.
+
+        Args:
+            situation: The site, its peers and their laws.
+        """
+        form = LinearForm(len(situation.inertia))
+        for j in situation.peers:
+            leads = float(getattr(situation.laws[j], "leads", False))
+            share = situation.alpha[situation.site, j] * leads
             stiffness = share * np.array(self.K)
             form.add("tau", "q", -stiffness)
             form.add("tau", ("from", j), stiffness)
             form.add(("to", j), "q", 1.0)
         return form
 
-    def explain_idle_shares(self, at: LawSituation) -> str:
-        """Returns which sites a user does not feel, because they do not lead, or ""."""
+    def explain_idle_shares(self, situation: LawSituation) -> str:
+        """Explains which sites a user does not feel, because these sites do not lead.
+
+        Args:
+            situation: The site, and the laws of all sites.
+
+        Returns:
+            The sentence. Empty for the slave, and if all sites lead.
+        """
         idle = []
-        for name, law in zip(at.names, at.laws, strict=True):
+        for name, law in zip(situation.names, situation.laws, strict=True):
             if not getattr(law, "leads", False):
                 idle.append(name)
         if not self.leads or not idle:
@@ -92,9 +117,12 @@ class Authority(ControlLaw):
         return f"users feel only sites that lead, not {', '.join(idle)}"
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns the condition of P+d among the users.
+        """Returns the stability condition: that of P+d among the users.
 
-        The slave follows the users and closes no loop.
+        The slave follows the users and closes no loop, so that it is stable for every delay.
+
+        Args:
+            situation: The site, its peers and the delays between them.
         """
         users = [n for n, law in enumerate(situation.laws) if getattr(law, "leads", False)]
         if situation.site not in users:
@@ -103,6 +131,11 @@ class Authority(ControlLaw):
         return judge_position_exchange(situation.restrict(users), "K", "d")
 
     @classmethod
-    def write_control(cls, gains: Mapping[str, float], at: TuningSite) -> dict[str, Any]:
-        """Returns the [control] table of a site for tuned gains; users lead."""
-        return {**gains, "leads": at.role == "master", "gravity": at.gravity}
+    def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
+        """Returns the [control] table of a site for tuned gains; master sites lead.
+
+        Args:
+            gains: The tuned gains by name.
+            site: The site whose table is written.
+        """
+        return {**gains, "leads": site.role == "master", "gravity": site.gravity}

@@ -1,7 +1,9 @@
-"""The stability condition of a control law at a site, and its linearised form.
+"""Defines what a control law states about itself: its stability condition and its linear form.
 
-`trilat scenario check` and `trilat linear` print the condition. The linear analysis of a
-session assembles the linearised forms of its laws.
+The stability condition of a law tells the user for which gains and delays the law is stable.
+`trilat scenario check` and `trilat linear` print it. The linear form of a law describes the law
+for small motions around a pose at rest. The linear analysis of a session assembles the linear
+forms of all sites to one linear system with delays.
 
 Invariant:
     - A law states both once, as methods of its `Settings`.
@@ -20,28 +22,29 @@ from ..core.dominance import find_balancing_weights
 from ..core.vectors import Array
 
 PASSIVE_OUTSIDE = "operators and environments are passive (*sufficient*)"
-"""The premise of each law that balances energy."""
+"""The premise of each law that balances energy, as part of a sentence."""
 COMMON_MOTION_SHARE = 0.21723362821
-"""-min sin x / x: the ratio d / (K T) that the common motion of all sites needs at its most
-critical mass.
+"""-min sin x / x: the ratio d / (K T) of damping to stiffness times delay that the common
+motion of all sites needs at its most critical mass.
 """
 
 
 class LawSituation(NamedTuple):
-    """The facts on which a law's stability condition may depend.
+    """Facts about a session on which the stability condition of one site's law may depend.
 
     Attributes:
-        site: the index of the site.
-        names: the names of the sites.
-        laws: the control of each site.
-        alpha: dominance matrix, shape (N, N).
-        delay_s: delay of the link from j to i, row i, column j, at least one tick, s; NaN if it
+        site: Index of the site.
+        names: Names of the sites.
+        laws: Settings of the control law of each site.
+        alpha: Dominance matrix, shape (N, N): row i contains the weights with which site i
+            follows the other sites.
+        delay_s: Delay of the link from j to i, row i, column j, at least one tick, s; NaN if it
             varies.
-        tau_limit_nm: largest torques of the site's joints, N m.
-        rate_hz: tick rate of the site, Hz.
-        gravity_nm: largest gravity torque of the site's planar arm, N m per joint; () for a
+        tau_limit_nm: Largest torques of the site's joints, N m.
+        rate_hz: Tick rate of the site, Hz.
+        gravity_nm: Largest gravity torque of the site's planar arm, N m per joint; () for a
             chain.
-        hold_s: duration for which a torque is held, s: one tick with the scheme `digital`, NaN
+        hold_s: Duration for which a torque is held, s: one tick with the scheme `digital`, NaN
             if sites have several rates, otherwise 0 as in continuous time.
     """
 
@@ -57,11 +60,15 @@ class LawSituation(NamedTuple):
 
     @property
     def longest_s(self) -> float:
-        """The longest delay of links with a dominance factor, s; NaN if any of them varies."""
+        """Longest delay of the links that a site follows, s; NaN if any of them varies."""
         return float(np.max(self.delay_s[self.alpha > 0.0], initial=0.0))
 
     def restrict(self, sites: Sequence[int]) -> "LawSituation":
-        """Returns the situation of the same site among only some of the sites."""
+        """Returns the situation of the same site as if only some of the sites existed.
+
+        Args:
+            sites: Indices of the sites that remain, including this site.
+        """
         part = np.ix_(sites, sites)
         return self._replace(
             site=list(sites).index(self.site),
@@ -73,12 +80,12 @@ class LawSituation(NamedTuple):
 
 
 class StabilityCondition(NamedTuple):
-    """The stability condition of a law at a site.
+    """Stability condition of a law at a site, evaluated for a scenario.
 
     Attributes:
-        holds: None if it cannot be decided.
-        text: the condition with its numbers, its premises, and whether it is sufficient or
-            sharp.
+        holds: True if the condition is met, False if not, None if it cannot be decided.
+        text: Sentence with the condition, its numbers, its premises, and whether it is
+            sufficient or sharp.
     """
 
     holds: bool | None
@@ -86,9 +93,17 @@ class StabilityCondition(NamedTuple):
 
 
 def find_least_reversible(alpha: Array) -> float | None:
-    """Returns the least eigenvalue of reversible shares, or None if they are not reversible.
+    """Returns the least eigenvalue of a reversible dominance matrix.
 
-    Its negative is a lower bound of d / (K T), see `judge_position_exchange`.
+    A dominance matrix alpha is reversible if positive weights D_i exist with D_i alpha_ij = D_j
+    alpha_ji. Then all eigenvalues are real. The negative of the least one is a lower bound of d
+    / (K T), see `judge_position_exchange`.
+
+    Args:
+        alpha: Dominance matrix, shape (N, N).
+
+    Returns:
+        The eigenvalue. None if the matrix is not reversible.
     """
     if find_balancing_weights(alpha) is None:
         return None
@@ -99,28 +114,36 @@ def find_least_reversible(alpha: Array) -> float | None:
 def judge_position_exchange(
     situation: LawSituation, stiffness: str, damping: str
 ) -> StabilityCondition:
-    """Returns the condition of P+d, for arms of any mass.
+    """Returns the condition of P+d, a spring to the peers and a damper, for any masses.
 
-    Two sites: Nuno, Basanez, Ortega and Spong, IJRR 28, 2009. More than two sites need
-    reversible shares, one K, one d and one delay T (docs/errata.md, 13). A torque that is held
-    for h acts h / 2 later: d is reduced by K h / 2 and T increased by h / 2, for arms whose
-    least inertia is above d h / 2 (docs/laws.md).
+    For two sites, the condition is due to Nuno, Basanez, Ortega and Spong, IJRR 28, 2009. More
+    than two sites need reversible dominance factors, and the same stiffness K, damping d and
+    delay T at all sites (docs/errata.md, 13). A torque that is held for the period h acts h / 2
+    later: d is reduced by K h / 2 and T increased by h / 2, for arms whose least inertia is
+    above d h / 2 (docs/laws.md).
 
     Args:
-        situation: the situation of the site.
-        stiffness: the name of the law's attribute with K.
-        damping: the name of the law's attribute with d.
+        situation: The situation of the site.
+        stiffness: Name of the law's attribute with K.
+        damping: Name of the law's attribute with d.
+
+    Returns:
+        The condition. It is undecided for delays that vary, for several tick rates, and if the
+        sites have different laws.
     """
     laws = situation.laws
     hold_s = situation.hold_s
     K = np.array([getattr(law, stiffness, [np.nan]) for law in laws])
     d = np.array([getattr(law, damping, [np.nan]) for law in laws])
+
+    # Cases in which no condition is known. A law without K has NaN here.
     if np.isnan(situation.longest_s) or np.isnan(K).any():
         text = "known for constant delays, and with this law at all sites"
         return StabilityCondition(None, text)
     if np.isnan(hold_s):
         text = "known of held torques for sites of one tick rate"
         return StabilityCondition(None, text)
+
     scope = "sufficient whatever the masses"
     if hold_s:
         damps_error = any(np.any(getattr(law, "Kd", 0.0)) for law in laws)
@@ -128,6 +151,7 @@ def judge_position_exchange(
         scope = f"sufficient for arms above d h / 2 = {least_inertia:.3g} kg m^2"
         if damps_error:
             scope = "sufficient for heavy arms"
+
     if len(laws) == 2:
         return _judge_two_sites(situation, K, d, scope)
     return _judge_several_sites(situation, K, d, scope)
@@ -136,7 +160,14 @@ def judge_position_exchange(
 def _judge_two_sites(
     situation: LawSituation, K: Array, d: Array, scope: str
 ) -> StabilityCondition:
-    """Returns the condition of two sites, 4 d1 d2 >= (T1 + T2)^2 K1 K2."""
+    """Returns the condition of two sites, 4 d1 d2 >= (T1 + T2)^2 K1 K2.
+
+    Args:
+        situation: The situation of the site.
+        K: Stiffness of each site per joint, shape (2, n).
+        d: Damping of each site per joint, shape (2, n).
+        scope: Sentence on the arms for which the condition is sufficient.
+    """
     hold_s = situation.hold_s
     alpha = situation.alpha
     effective_d = d - 0.5 * K * hold_s
@@ -149,6 +180,7 @@ def _judge_two_sites(
     tolerance = 1e-9 * float(d.max()) ** 2
     is_damped = bool((effective_d >= 0.0).all())
     holds = excess >= -tolerance and is_damped
+
     round_trip_ms = f"{1e3 * round_trip_s:.4g} ms"
     text = f"4 d1 d2 >= (T1 + T2)^2 K1 K2, T1 + T2 = {round_trip_ms}"
     if hold_s:
@@ -162,7 +194,18 @@ def _judge_two_sites(
 def _judge_several_sites(
     situation: LawSituation, K: Array, d: Array, scope: str
 ) -> StabilityCondition:
-    """Returns the condition of more than two sites, d > share K T."""
+    """Returns the condition of more than two sites, d > share K T.
+
+    The factor `share` is the larger one of two needs: that of the differences between the
+    sites, which is the negative of the least eigenvalue of the dominance matrix, and that of
+    the common motion of all sites.
+
+    Args:
+        situation: The situation of the site.
+        K: Stiffness of each site per joint, shape (N, n).
+        d: Damping of each site per joint, shape (N, n).
+        scope: Sentence on the arms for which the condition is sufficient.
+    """
     T = situation.longest_s
     hold_s = situation.hold_s
     delays_s = situation.delay_s[situation.alpha > 0.0]
@@ -174,6 +217,7 @@ def _judge_several_sites(
     if least is None:
         text = "shares that are not reversible: some heavy arms are unstable at any d"
         return StabilityCondition(False, text)
+
     common_share = COMMON_MOTION_SHARE
     if hold_s:
         common_share = _find_common_motion_share(2.0 * T / hold_s + 1.0)
@@ -182,6 +226,7 @@ def _judge_several_sites(
     delay_term = share * K[0] * (T + 0.5 * hold_s)
     bound = hold_term + delay_term
     holds = bool((d[0] > bound).all())
+
     formula = f"{share:.4g} K T"
     if hold_s:
         formula = f"K h / 2 + {share:.4g} K (T + h / 2)"
@@ -189,12 +234,14 @@ def _judge_several_sites(
 
 
 def _find_common_motion_share(count: float) -> float:
-    """Returns the damping per K T that the common motion needs when torques are held.
+    """Returns the damping per K T that the common motion of all sites needs for held torques.
+
+    With n = 2 T / h + 1, the delay in halves of a tick, this is
 
         -min sin(n x) / (n sin x)
 
     Args:
-        count: n = 2 T / h + 1, the delay in halves of a tick.
+        count: The number n.
     """
     x = np.linspace(np.pi, 2.0 * np.pi, 1001)[1:-1] / count
     ratio = np.sin(count * x) / (count * np.sin(x))
@@ -211,14 +258,15 @@ and "tau_h" for the torque ON the arm.
 
 
 class LinearSituation(NamedTuple):
-    """The facts on which a law's linear form may depend.
+    """Facts about a session on which the linear form of one site's law may depend.
 
     Attributes:
-        site: the index of the site.
-        names: the names of the sites.
-        laws: the control of each site.
-        alpha: dominance matrix in force, shape (N, N).
-        inertia: M(q) of the site's arm, shape (n, n), kg m^2.
+        site: Index of the site.
+        names: Names of the sites.
+        laws: Settings of the control law of each site.
+        alpha: Dominance matrix in force, shape (N, N): row i contains the weights with which
+            site i follows the other sites.
+        inertia: Inertia matrix M(q) of the site's arm, shape (n, n), kg m^2.
     """
 
     site: int
@@ -234,16 +282,20 @@ class LinearSituation(NamedTuple):
 
 
 class LinearForm:
-    """A law, linearised for small motions of a site with n joints, as blocks of n x n numbers.
+    """Control law, linearised for small motions of a site, as a matrix of blocks.
+
+    For a site with n joints, each block is a matrix of n x n numbers. It says how a quantity
+    (the row) depends on another (the column): for example the block ("tau", "q") is the
+    derivative of the torque with respect to the position.
 
     Args:
         joints: n, the number of joints.
-        states: the names of the law's states.
+        states: Names of the law's states.
         sends_acceleration: True if the law sends the acceleration of its arm; then the rows
             ("to", j) only name the receivers.
 
     Attributes:
-        blocks: the blocks by row and column, shape (n, n) each.
+        blocks: Blocks by row and column, shape (n, n) each. A block that is missing is zero.
     """
 
     def __init__(
@@ -258,9 +310,9 @@ class LinearForm:
         """Adds a gain to a block.
 
         Args:
-            row: the row of the block.
-            column: the column of the block.
-            gain: one number for all joints, a number per joint, or a matrix, shape (n, n).
+            row: Row of the block.
+            column: Column of the block.
+            gain: A number for all joints, a number per joint, or a matrix of shape (n, n).
         """
         block = np.asarray(gain, dtype=np.float64)
         if block.ndim < 2:

@@ -1,8 +1,10 @@
-"""The four-channel law, which exchanges positions and forces in both directions.
+"""Implements the four-channel law, which exchanges positions and forces in both directions.
 
-The quantities q_des, qd_des, qdd_des and felt are the peers' motion and torque, weighted by
-dominance; tau_h is the torque ON an arm. In Lawrence's symbols, for two sites, C2 and C6 are
-gains of the master, and C3 and C5 gains of the slave. A gain of zero removes a channel.
+The quantities q_des, qd_des, qdd_des and felt are the peers' position, velocity, acceleration
+and external torque, weighted by the dominance factors, the weights with which a site follows
+its peers; tau_h is the torque ON the site's arm by its operator or environment. In Lawrence's
+symbols, for two sites, C2 and C6 are gains of the master, and C3 and C5 gains of the slave. A
+gain of zero removes a channel.
 
 Invariant:
     - The law sends the acceleration that the arm's model has under the torques of the tick.
@@ -34,7 +36,16 @@ _NEUTRAL = (
 
 @compiled
 def send_acceleration(law: Any, now: LawInput) -> None:
-    """Sends the solution qdd of M qdd = tau - tau_x - bias, with tau within the limits."""
+    """Sends the acceleration of the arm to the peers.
+
+    It is the solution qdd of M qdd = tau - tau_x - bias, with tau within its limits, where M is
+    the inertia matrix, tau_x the exogenous torque and bias the torque of gravity and of
+    Coriolis forces. The method is Gaussian elimination.
+
+    Args:
+        law: The law, whose `rows` are the work space.
+        now: Inputs and outputs of the law in this tick.
+    """
     n = now.joints
     rows = law.rows
     qdd = now.to_all.qdd
@@ -65,7 +76,7 @@ def send_acceleration(law: Any, now: LawInput) -> None:
 
 @compiled
 class FourChannel(ControlLaw):
-    """Positions and forces both ways, with known gravity.
+    """Positions and forces in both directions, with known gravity.
 
         tau = G + K (q_des - q) + B (qd_des - qd) + acceleration M qdd_des
               + force_peer felt + force_own tau_h
@@ -77,12 +88,12 @@ class FourChannel(ControlLaw):
     Salcudean, IEEE T-RA 18, 2002.
 
     Attributes:
-        K: stiffness per joint, N m/rad.
-        B: damping of the error, per joint, N m s/rad.
-        force_peer: gain of the peers' torque, C2 or C3, per joint, dimensionless.
-        force_own: gain of the torque on the arm itself, C6 or C5, per joint, dimensionless.
-        acceleration: share of the peers' acceleration that is fed forward.
-        gravity: share of the true gravity that the law compensates; 1 is exact.
+        K: Stiffness per joint, N m/rad.
+        B: Damping of the error, per joint, N m s/rad.
+        force_peer: Gain of the peers' torque, C2 or C3, per joint, dimensionless.
+        force_own: Gain of the torque on the arm itself, C6 or C5, per joint, dimensionless.
+        acceleration: Factor of the peers' acceleration that is fed forward.
+        gravity: Factor of the true gravity that the law compensates; 1 is exact.
     """
 
     K: PositiveJoints = (100.0,)
@@ -104,7 +115,7 @@ class FourChannel(ControlLaw):
         self.rows = [0.0] * (facts.joints * (facts.joints + 1))
 
     def torque(self, now: LawInput) -> None:
-        """Writes the torque, and sends the acceleration that the torque causes."""
+        """Writes the torque of each joint, and sends the acceleration that it causes."""
         n = now.joints
         for i in range(n):
             gravity = self.gravity * now.gravity[i]
@@ -128,7 +139,13 @@ class FourChannel(ControlLaw):
             send_acceleration(self, now)
 
     def linear_gains(self, theta: Array) -> Gains | None:
-        """Returns the law of known gravity without the terms in qdd_des and tau_h."""
+        """Returns the kernel's law of known gravity without the terms in qdd_des and tau_h.
+
+        These terms are described by `linear_form`.
+
+        Args:
+            theta: Parameters of the arm, shape (P,).
+        """
         known = (theta * self.gravity).tolist()
         return Gains(
             law=Law.KNOWN,
@@ -139,20 +156,27 @@ class FourChannel(ControlLaw):
             known=known,
         )
 
-    def linear_form(self, at: LinearSituation) -> LinearForm | None:
-        """Returns the terms in qdd_des and tau_h, or None if both gains are zero."""
+    def linear_form(self, situation: LinearSituation) -> LinearForm | None:
+        """Returns the terms in qdd_des and tau_h for small motions.
+
+        Args:
+            situation: The site and its arm.
+
+        Returns:
+            The linear form. None if both gains are zero.
+        """
         if not self.acceleration and not any(self.force_own):
             return None
-        form = LinearForm(len(at.inertia), sends_acceleration=self.acceleration > 0.0)
+        form = LinearForm(len(situation.inertia), sends_acceleration=self.acceleration > 0.0)
         form.add("tau", "tau_h", self.force_own)
-        for j in at.peers:
-            gain = self.acceleration * at.alpha[at.site, j]
-            form.add("tau", ("from", j), gain * at.inertia)
+        for j in situation.peers:
+            gain = self.acceleration * situation.alpha[situation.site, j]
+            form.add("tau", ("from", j), gain * situation.inertia)
             form.add(("to", j), "q", 0.0)
         return form
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:  # noqa: ARG002
-        """Returns an unmet condition for acceleration = 1, otherwise an undecided one.
+        """Returns an unmet condition for acceleration = 1, otherwise an undecided condition.
 
         Llewellyn's condition, which `trilat ports` evaluates, decides the other cases.
         """

@@ -1,7 +1,12 @@
-"""Impedance control: each arm moves like a mass on a spring and a damper.
+"""Implements impedance control: each arm moves like a mass on a spring and a damper.
 
     impedance     M qdd + B (qd - qd_ref) + K (q - q_ref) = tau_h + sum_j f_j(t - T)
     inner loop    tau = M(q) qdd + C qd + G - tau_h
+
+Here M, B and K are the inertia, damping and stiffness that the user chooses, q_ref is the
+reference, tau_h is the torque of the operator or environment on the arm, and f_j is the force
+that peer j sends. The inner loop computes with the arm's model M(q), C and G which torque gives
+the arm the acceleration qdd of the impedance.
 
 The reference of a master is its start pose at rest. The reference of the slave is the pose of
 the masters, weighted by the slave's dominance factors alpha_j. The slave sends f_j = alpha_j
@@ -32,10 +37,10 @@ class Impedance(ControlLaw):
     Source: Shahbazi, Atashzar, Talebi and Patel, IEEE/ASME T-Mech 20(4), 2015.
 
     Attributes:
-        M: inertia of the impedance, per joint, kg m^2.
-        B: damping, per joint, N m s/rad.
-        K: stiffness, per joint, N m/rad.
-        follows: true for the slave; a master's reference stays at its start pose.
+        M: Inertia of the impedance, per joint, kg m^2.
+        B: Damping, per joint, N m s/rad.
+        K: Stiffness, per joint, N m/rad.
+        follows: True for the slave; a master's reference stays at its start pose.
     """
 
     M: PositiveJoints = (1.0,)
@@ -53,12 +58,16 @@ class Impedance(ControlLaw):
     needs_model: ClassVar = True
 
     def begin(self, facts: LawContext) -> None:
-        """Creates the start pose and the acceleration of the impedance."""
+        """Creates the start pose, which tick 0 sets, and the acceleration of the impedance."""
         self.start = [0.0] * facts.joints
         self.qdd = [0.0] * facts.joints
 
     def torque(self, now: LawInput) -> None:
-        """Writes the torque; the slave also sends the torque on its arm."""
+        """Writes the torque of each joint; the slave also sends the torque on its arm.
+
+        The first loop computes the acceleration of the impedance, the second the torque that
+        gives the arm this acceleration.
+        """
         follows = 1.0 if self.follows else 0.0
         for i in range(now.joints):
             q = now.q[i]
@@ -84,15 +93,25 @@ class Impedance(ControlLaw):
             now.tau[i] = tau
 
     def linear_gains(self, theta: Array) -> Gains | None:
-        """Returns the law of known gravity without gains."""
+        """Returns the kernel's law of known gravity without gains.
+
+        The impedance is described by `linear_form`.
+
+        Args:
+            theta: Parameters of the arm, shape (P,).
+        """
         return Gains(Law.KNOWN, known=theta.tolist())
 
-    def linear_form(self, at: LinearSituation) -> LinearForm | None:
-        """Returns the impedance, scaled by M(q) M^-1, and the force that the slave sends."""
-        n = len(at.inertia)
+    def linear_form(self, situation: LinearSituation) -> LinearForm | None:
+        """Returns the impedance, scaled by M(q) M^-1, and the force that the slave sends.
+
+        Args:
+            situation: The site and its arm.
+        """
+        n = len(situation.inertia)
         form = LinearForm(n)
         inverse_M = np.broadcast_to(1.0 / np.array(self.M), n)
-        inertia_ratio = at.inertia @ np.diag(inverse_M)
+        inertia_ratio = situation.inertia @ np.diag(inverse_M)
         stiffness = inertia_ratio * np.array(self.K)
         damping = inertia_ratio * np.array(self.B)
         form.add("tau", "tau_h", inertia_ratio - np.eye(n))
@@ -102,17 +121,25 @@ class Impedance(ControlLaw):
         form.add("tau", "qd", -damping)
         if self.follows:
             form.add("tau", "qd_des", damping)
-        for j in at.peers:
+        for j in situation.peers:
             form.add("tau", ("from", j), inertia_ratio)
-            form.add(("to", j), "tau_h", self.follows * at.alpha[at.site, j])
+            form.add(("to", j), "tau_h", self.follows * situation.alpha[situation.site, j])
         return form
 
-    def explain_idle_shares(self, at: LawSituation) -> str:  # noqa: ARG002
-        """Returns the reason for a master, which stays at its start pose, or ""."""
+    def explain_idle_shares(self, situation: LawSituation) -> str:  # noqa: ARG002
+        """Explains that a master stays at its start pose and follows nobody.
+
+        Returns:
+            The sentence. Empty for the slave.
+        """
         return "" if self.follows else "follows = false stays at its start pose"
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns the condition with the stiffest wall that the small-gain theorem allows."""
+        """Returns the condition, with the stiffest wall that the small-gain theorem allows.
+
+        Args:
+            situation: The sites and their laws.
+        """
         laws = situation.laws
         followers = [n for n, law in enumerate(laws) if getattr(law, "follows", False)]
         have_this_law = all(law.kind is Impedance for law in laws)
@@ -132,32 +159,45 @@ class Impedance(ControlLaw):
         return StabilityCondition(True, text)
 
     @classmethod
-    def write_control(cls, gains: Mapping[str, float], at: TuningSite) -> dict[str, Any]:
-        """Returns the [control] table of a site for tuned gains; the slave follows."""
-        return {**gains, "follows": at.role == "slave"}
+    def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
+        """Returns the [control] table of a site for tuned gains; the slave follows.
+
+        Args:
+            gains: The tuned gains by name.
+            site: The site whose table is written.
+        """
+        return {**gains, "follows": site.role == "slave"}
 
 
-def find_stiffest_wall(laws: Sequence[Any], shares: Array, slave: int) -> float:
+def find_stiffest_wall(laws: Sequence[Any], dominance_factors: Array, slave: int) -> float:
     """Returns the largest wall stiffness with loop gain below 1 at all frequencies, N m/rad.
 
-    The loop from the slave's force to itself has, for any delays, the gain
+    A loop whose gain is below 1 at every frequency is stable for any delays (small-gain
+    theorem). The loop from the slave's force to itself has the gain
 
         sum_i a_i^2 K_e (K_s + B_s s)
               / ((M_s s^2 + B_s s + K_s + K_e) (M_i s^2 + B_i s + K_i))
 
-    The result is inf if any stiffness is allowed, and 0 if not even free motion decays.
+    where K_e is the stiffness of the wall, the index s denotes the slave, i runs over the
+    masters and s is the Laplace variable. The gain is evaluated on a grid of frequencies and
+    stiffnesses.
 
     Args:
-        laws: the control of each site.
-        shares: a_i, the slave's dominance factors, shape (N,).
-        slave: the index of the slave.
+        laws: Settings of the law of each site.
+        dominance_factors: a_i, those of the slave, shape (N,).
+        slave: Index of the slave.
+
+    Returns:
+        The stiffness. It is inf if any stiffness is allowed, and 0 if not even free motion
+            decays.
     """
     s = 1j * np.geomspace(1e-2, 1e4, 4000)
     stiffnesses = np.geomspace(1e-2, 1e6, 400)
     K_e = stiffnesses[:, None]
     gains = [np.array([law.M, law.B, law.K]) for law in laws]
     if any((gain[1] <= 0.0).any() for gain in gains):
-        return 0.0
+        return 0.0  # without damping, free motion does not decay
+
     stiffest = np.inf
     for joint in range(len(laws[0].K)):
         masters: Any = 0.0
@@ -166,7 +206,8 @@ def find_stiffest_wall(laws: Sequence[Any], shares: Array, slave: int) -> float:
                 continue
             M, B, K = gain[:, joint]
             impedance = M * s * s + B * s + K
-            masters = masters + shares[n] ** 2 / impedance
+            masters = masters + dominance_factors[n] ** 2 / impedance
+
         M, B, K = gains[slave][:, joint]
         impedance = M * s * s + B * s + K
         slave_gain = K_e * (K + B * s) / (impedance + K_e)

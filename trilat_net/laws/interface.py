@@ -1,11 +1,16 @@
-"""The base classes of built-in control laws, and the gains of a law as a scenario holds them.
+"""Defines the base classes of the built-in control laws, and how a scenario stores their gains.
+
+A control law computes the torque of an arm from the motion of the arm and of its peers. A law
+is written as one class whose annotated attributes are its gains. From this class a second
+class, its `Settings`, is derived: a frozen record of gains that a scenario file contains and
+that is checked when the file is read.
 
 Invariant:
     - A law is one class. The annotations of the class are its gains, with ranges and defaults.
-    - The frozen `Settings` of a scenario are derived from these annotations. They take over the
-      methods of the class that depend on gains alone.
-    - At a site, an instance of the class computes torques. The laws that the kernel computes
-      have `gains` instead of `torque`.
+    - The `Settings` of a law are derived from these annotations. They take over the methods of
+      the class that depend on gains alone, such as the stability condition.
+    - At a site, an instance of the class computes torques. The laws that the simulation kernel
+      computes have a method `gains` instead of `torque`.
 """
 
 import ast
@@ -41,14 +46,15 @@ INERTIA = (0.1, 10.0, "kg m^2")
 
 
 class TuningSite(NamedTuple):
-    """The facts about a site that each law gets when its gains are tuned.
+    """Facts about a site that a law receives when its gains are tuned for that site.
 
     Attributes:
         role: "master" or "slave".
-        gravity: share of the true gravity that the law compensates.
-        estimate: first estimate of theta, shape (P,): that share of gravity, no inertia.
-        box: lower and upper bounds around the estimate, shape (P,) each.
-        longest_ms: half of the longest mean round trip, ms.
+        gravity: Factor of the true gravity that the law compensates; 1 is exact.
+        estimate: First estimate of the arm's parameters theta, shape (P,). It contains this
+            factor of gravity and no inertia.
+        box: Lower and upper bounds around the estimate, shape (P,) each.
+        longest_ms: Half of the longest mean round trip, ms.
     """
 
     role: str
@@ -59,19 +65,20 @@ class TuningSite(NamedTuple):
 
 
 class LawSettings(Frozen, frozen=True):
-    """The gains of a law in a scenario, and the properties of the law that follow from them.
+    """Gains of a law as a scenario stores them, and the properties that follow from the gains.
 
-    A law may override each of these methods.
+    Each law has a subclass, which is derived from the class of the law. A law may override each
+    of these methods.
     """
 
     kind: ClassVar[Any] = None
-    """The class of the law; None for an imported law."""
+    """The class of the law; None for a law that is imported from a user's file."""
     linear_note: ClassVar[str] = ""
-    """The effect that the law's linear form leaves out."""
+    """The effect that the law's linear form leaves out, as a sentence for the user."""
     fixed_shares: ClassVar[bool] = False
-    """True if the law uses only the dominance factors at the start."""
+    """True if the law uses only the dominance factors at the start of the session."""
     has_functional: ClassVar[bool] = False
-    """True if the paper's functional V applies to the law."""
+    """True if the energy function V of the paper's stability proof applies to the law."""
     planar: ClassVar[bool] = False
     """True if the law uses the planar arm's regressor and cannot control a chain."""
     compares_positions: ClassVar[bool] = False
@@ -84,58 +91,87 @@ class LawSettings(Frozen, frozen=True):
 
     @property
     def books_energy(self) -> bool:
-        """True if the law balances energy together with its peers; then all sites have it."""
+        """True if the law balances energy with its peers, so that all sites must have it."""
         return self.plugged and issubclass(self.kind, EnergyLaw)
 
     @property
     def tag(self) -> str:
-        """The law's name in a scenario."""
+        """Name of the law in a scenario."""
         return str(self.__struct_config__.tag)
 
     def check(self, path: str, sites: int) -> None:
         """Refuses gains that contradict each other, and an unsuitable number of sites.
 
         Args:
-            path: the path of the law's table, for errors.
-            sites: the number of sites in the scenario.
+            path: Path of the law's table in the scenario, for errors.
+            sites: Number of sites in the scenario.
 
         Raises:
-            ScenarioError: with the path of the key.
+            ScenarioError: A gain or the number of sites is refused; the error names the key.
         """
 
     def find_problem(self, rates_hz: Mapping[str, int]) -> KeyProblem | None:  # noqa: ARG002
-        """Returns the key that is unsuitable for these tick rates of the sites, or None."""
+        """Returns the setting that does not suit the tick rates of the sites, or None.
+
+        Args:
+            rates_hz: Tick rate of each site, by name.
+        """
         return None
 
     def gains(self, theta: Array) -> Gains:  # noqa: ARG002 - as the laws of the kernel
-        """Returns the gains for the kernel, for an arm with parameters theta."""
+        """Returns the gains with which the kernel computes the law.
+
+        Args:
+            theta: Parameters of the arm, shape (P,).
+        """
         return Gains(Law.USER)
 
     def linear_gains(self, theta: Array) -> Gains | None:
-        """Returns gains of a kernel law with the same small motions, or None.
+        """Returns the gains of a kernel law that has the same small motions as this law.
 
         The blocks of `linear_form`, if there are any, are added to these small motions.
+
+        Args:
+            theta: Parameters of the arm, shape (P,).
+
+        Returns:
+            The gains. None if the law cannot be linearised.
         """
         if self.kind is None or self.plugged:
             return None
         return self.gains(theta)
 
-    def linear_form(self, at: LinearSituation) -> LinearForm | None:  # noqa: ARG002
-        """Returns the law's small motions beyond those of `linear_gains`, or None."""
+    def linear_form(self, situation: LinearSituation) -> LinearForm | None:  # noqa: ARG002
+        """Returns the part of the law's small motions that `linear_gains` does not describe.
+
+        Args:
+            situation: The site and its arm.
+
+        Returns:
+            The linear form. None if `linear_gains` describes the law completely.
+        """
         return None
 
     def explain_no_linear_form(self) -> str:
-        """Returns why the law cannot be linearised if `linear_gains` returns None."""
+        """Returns the reason why the law cannot be linearised, for the user.
+
+        The reason is shown if `linear_gains` returns None.
+        """
         return ""
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:  # noqa: ARG002
-        """Returns the stability condition of the law at a site, or None if it is not known."""
+        """Returns the stability condition of the law at a site, or None if none is known.
+
+        Args:
+            situation: The site, its peers and the delays between them.
+        """
         return None
 
     def exchanges_positions(self) -> bool:
-        """True if the law is a spring between poses with exactly known gravity.
+        """Returns True if the law is a spring between poses, with exactly known gravity.
 
-        The shares have to be reversible for such a law.
+        Such a law needs reversible dominance factors: positive weights D_i must exist with
+        D_i alpha_ij = D_j alpha_ji.
         """
         return False
 
@@ -143,31 +179,39 @@ class LawSettings(Frozen, frozen=True):
         """Returns the law with the settings filled in that follow from the dominance matrix.
 
         Args:
-            names: the names of the sites.
-            alpha: the dominance matrix at the start, shape (N, N).
+            names: Names of the sites.
+            alpha: Dominance matrix at the start, shape (N, N): row i contains the weights with
+                which site i follows the other sites.
         """
         return self
 
-    def explain_idle_shares(self, at: LawSituation) -> str:  # noqa: ARG002
-        """Returns why a site's dominance factors have no effect, or "" if they have one."""
+    def explain_idle_shares(self, situation: LawSituation) -> str:  # noqa: ARG002
+        """Explains to the user why the dominance factors of a site have no effect.
+
+        Args:
+            situation: The site, and the laws of all sites.
+
+        Returns:
+            A sentence. Empty if the dominance factors have an effect.
+        """
         return ""
 
     @property
     def sends(self) -> SentVectorSpecs:
-        """The vectors that the law sends to its peers."""
+        """Vectors that the law sends to its peers, by name."""
         return convert_sends(getattr(self.kind, "sends", {}), self.kind.__name__, "control")
 
     def build_factory(self, sites: int, scheme: str) -> UserLawFactory | None:
-        """Returns the factory of the law, or None if the kernel computes the law.
+        """Returns a function that creates the law at a site. None if the kernel computes it.
 
         Args:
-            sites: the number of sites in the scenario.
-            scheme: the scenario's scheme, "second_order" or "digital".
+            sites: Number of sites in the scenario.
+            scheme: The scenario's integration scheme, "second_order" or "digital".
         """
         if not self.plugged:
             return None
 
-        def make(context: LawContext) -> UserLaw:
+        def make_law(context: LawContext) -> UserLaw:
             check_law_class(
                 kind=self.kind, code=self.tag, context=context, sites=sites, scheme=scheme
             )
@@ -175,24 +219,26 @@ class LawSettings(Frozen, frozen=True):
             law: UserLaw = make_instance(self.kind, self.tag, context, gains)
             return law
 
-        return make
+        return make_law
 
 
 def format_class_name(tag: str) -> str:
-    """Returns the class name that belongs to a law's file: FourChannel for four_channel."""
+    """Returns the name of the class in a law's file: "FourChannel" for "four_channel"."""
     return "".join(word.capitalize() for word in tag.split("_"))
 
 
 class ControlLaw:
     """Base class of the built-in control laws.
 
-    A law may also define the methods of `LawSettings`, which its `Settings` then have.
+    A law may also define the methods of `LawSettings`, which its `Settings` then have. Python
+    runs `__init_subclass__` for each law and derives the `Settings` there.
 
     Attributes:
-        Settings: the gains as a scenario holds them.
-        sends, remembers, schemes, sites, needs_theta, needs_model: see docs/own-controller.md.
-        tune: ranges of the gains that are tuned, by name.
-        known_facts: which of the facts that every law gets this law uses, in words.
+        Settings: Class that stores the gains in a scenario.
+        sends, remembers, schemes, sites, needs_theta, needs_model: See docs/own-controller.md.
+        tune: Ranges of the gains that are tuned, by name.
+        known_facts: Sentence for the user: which of the facts that every law receives this law
+            uses.
     """
 
     Settings: ClassVar[type[LawSettings]] = LawSettings
@@ -209,11 +255,11 @@ class ControlLaw:
         """Creates the law of a site.
 
         Args:
-            facts: the facts that are known before the run.
-            gains: the gains by name.
+            facts: Facts about the site that are known before the run.
+            gains: Gains by name. Gains that are left out keep their default.
 
         Raises:
-            TypeError: the law has no gain of that name.
+            TypeError: The law has no gain of that name.
         """
         for name, value in gains.items():
             default = getattr(type(self), name, None)
@@ -224,11 +270,22 @@ class ControlLaw:
         self.begin(facts)
 
     def begin(self, facts: LawContext) -> None:
-        """Creates the attributes that `torque` uses besides the gains."""
+        """Creates the attributes that `torque` uses besides the gains.
+
+        Args:
+            facts: Facts about the site that are known before the run.
+        """
 
     @classmethod
     def explain_misfit(cls, roles: Sequence[str]) -> str:
-        """Returns why the law does not fit sites with these roles, or ""."""
+        """Explains to the user why the law cannot be used for the sites of a scenario.
+
+        Args:
+            roles: Role of each site, "master" or "slave".
+
+        Returns:
+            The sentence. Empty if the law fits.
+        """
         required = getattr(cls, "sites", None)
         if required in (None, len(roles)):
             return ""
@@ -236,18 +293,24 @@ class ControlLaw:
         return f"is for {sites}, and this has {len(roles)}: leave it out"
 
     @classmethod
-    def write_control(cls, gains: Mapping[str, float], at: TuningSite) -> dict[str, Any]:
-        """Returns the [control] table of a site for tuned gains."""
+    def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
+        """Returns the [control] table of a site for tuned gains.
+
+        Args:
+            gains: The tuned gains by name.
+            site: The site whose table is written.
+        """
         if "gravity" in cls.Settings.__struct_fields__:
-            return {**gains, "gravity": at.gravity}
+            return {**gains, "gravity": site.gravity}
         return {**gains}
 
 
 class EnergyLaw(ControlLaw):
-    """Base class of the laws that balance energy.
+    """Base class of the laws that balance energy between the sites.
 
-    The energy that one end sends is accounted for at the other end, so all sites must have the
-    same law.
+    The energy that one end of a coupling sends is accounted for at the other end, so all sites
+    must have the same law. These laws are computed with the scheme `digital`, in which a torque
+    is held during a period, because only then is the work of a torque known exactly.
     """
 
     gravity: NotNegative = 1.0
@@ -255,11 +318,14 @@ class EnergyLaw(ControlLaw):
 
 
 def _derive_settings(kind: type[ControlLaw], tag: str) -> type[LawSettings]:
-    """Returns the type that holds the gains of a law in a scenario.
+    """Returns the class that stores the gains of a law in a scenario.
+
+    Annotations of the law and its base classes become fields. Methods and class variables that
+    depend on gains alone are taken over.
 
     Args:
-        kind: the class of the law.
-        tag: the name of the law in a scenario.
+        kind: The class of the law.
+        tag: Name of the law in a scenario.
     """
     hints: dict[str, Any] = {}
     namespace: dict[str, Any] = {}
@@ -290,13 +356,20 @@ def _derive_settings(kind: type[ControlLaw], tag: str) -> type[LawSettings]:
 
 
 def _is_class_variable(hint: Any) -> bool:
-    """True for the annotations `ClassVar` and `ClassVar[...]`."""
+    """Returns True for the annotations `ClassVar` and `ClassVar[...]`, which are not gains."""
     origin: Any = get_origin(hint) or hint
     return origin is ClassVar
 
 
 def _depends_on_gains(name: str, value: Any) -> bool:
-    """True for an attribute of a law's class that its `Settings` take over."""
+    """Returns True for an attribute of a law's class that its `Settings` take over.
+
+    Methods that need an instance at a site are not taken over.
+
+    Args:
+        name: Name of the attribute.
+        value: The function, property or class variable.
+    """
     if inspect.isfunction(value) or isinstance(value, property):
         is_of_instance = name in ("begin", "torque", "energies") or name.startswith("__")
         return not is_of_instance
@@ -310,23 +383,25 @@ def check_law_class(kind: Any, code: str, context: LawContext, sites: int, schem
     `needs_theta = True`.
 
     Args:
-        kind: the class.
-        code: the law's name for errors, as in "mylaws:Spring".
-        context: the facts about the site.
-        sites: the number of sites in the scenario.
-        scheme: the scenario's scheme.
+        kind: The class.
+        code: Name of the law for errors, as in "mylaws:Spring".
+        context: Facts about the site.
+        sites: Number of sites in the scenario.
+        scheme: Integration scheme of the scenario.
 
     Raises:
-        ScenarioError: with the path of the key.
+        ScenarioError: The class is refused; the error has the path of the key.
     """
     path = f"sites.{context.site}.control.law"
     _check_methods(kind, code, path)
     _check_site_count(kind, code, path, sites)
+
     schemes = getattr(kind, "schemes", None) or (scheme,)
     if scheme not in schemes:
         allowed = " or ".join(map(repr, schemes))
         problem = f"{code} is for scheme = {allowed}, and here it is {scheme!r}"
         raise ScenarioError(problem, path=path)
+
     needs_theta = getattr(kind, "needs_theta", False)
     if needs_theta and not context.theta:
         problem = (
@@ -337,7 +412,20 @@ def check_law_class(kind: Any, code: str, context: LawContext, sites: int, schem
 
 
 def _check_methods(kind: Any, code: str, path: str) -> None:
-    """Refuses a class without `torque`, or one whose memory is not declared."""
+    """Refuses a class without `torque`, and a class that does not declare its memory.
+
+    The memory of a law is everything that it must know in the next tick. It is recorded, so
+    that a run can be verified from any record. A class declares it by `remembers`, or by the
+    methods `memory` and `recall`.
+
+    Args:
+        kind: The class.
+        code: Name of the law for errors.
+        path: Path of the key for errors.
+
+    Raises:
+        ScenarioError: The class is refused.
+    """
     is_declared = hasattr(kind, "remembers")
     has_memory_methods = any(hasattr(kind, name) for name in ("memory", "recall"))
     required = ["torque"]
@@ -347,6 +435,7 @@ def _check_methods(kind: Any, code: str, path: str) -> None:
     page = find_page("own-controller.md")
     if missing:
         raise ScenarioError(f"{code} has no {', '.join(missing)}; see {page}", path=path)
+
     if is_declared or has_memory_methods:
         return
     written = _find_written_attributes(kind)
@@ -360,7 +449,17 @@ def _check_methods(kind: Any, code: str, path: str) -> None:
 
 
 def _check_site_count(kind: Any, code: str, path: str, sites: int) -> None:
-    """Refuses a number of sites outside of the range that the class states."""
+    """Refuses a number of sites outside of the range that the class states in `sites`.
+
+    Args:
+        kind: The class.
+        code: Name of the law for errors.
+        path: Path of the key for errors.
+        sites: Number of sites in the scenario.
+
+    Raises:
+        ScenarioError: The number is refused, or `sites` is not a number or a pair of numbers.
+    """
     stated = getattr(kind, "sites", None)
     bounds: Any = stated
     if stated is None:
@@ -380,9 +479,10 @@ def _check_site_count(kind: Any, code: str, path: str, sites: int) -> None:
 
 
 def _find_written_attributes(kind: Any) -> list[str]:
-    """Returns the attributes that a class assigns to itself outside of `__init__`.
+    """Returns the names of the attributes that a class assigns to itself outside of `__init__`.
 
-    Changes by method calls, as of a list's `append`, are not found.
+    The source of each method is searched for assignments to `self`. Changes by method calls, as
+    of a list's `append`, are not found.
     """
     written = []
     for base in kind.__mro__:
@@ -391,7 +491,8 @@ def _find_written_attributes(kind: Any) -> list[str]:
                 continue
             source = textwrap.dedent(inspect.getsource(function))
             for node in ast.walk(ast.parse(source)):
-                if not isinstance(getattr(node, "ctx", None), ast.Store):
+                is_assigned = isinstance(getattr(node, "ctx", None), ast.Store)
+                if not is_assigned:
                     continue
                 match = re.match(r"self\.(\w+)", ast.unparse(node))
                 if match:
@@ -402,17 +503,17 @@ def _find_written_attributes(kind: Any) -> list[str]:
 def make_instance(
     kind: Any, code: str, context: Any, settings: dict[str, Any], path: str = ""
 ) -> Any:
-    """Returns an instance of a user's class, made from its context and settings.
+    """Returns an instance of a user's class, created from its context and settings.
 
     Args:
-        kind: the class.
-        code: the class's name for errors.
-        context: the first argument of the class.
-        settings: its keyword arguments.
-        path: the path of the key for errors; by default the site's [control] table.
+        kind: The class.
+        code: Name of the class for errors.
+        context: First argument of the class: the facts about the site.
+        settings: Keyword arguments of the class.
+        path: Path of the key for errors. By default the site's [control] table.
 
     Raises:
-        ScenarioError: the class raised an exception.
+        ScenarioError: The class raised an exception. The user's code may raise any.
     """
     try:
         return kind(context, **settings)

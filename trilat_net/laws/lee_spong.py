@@ -1,7 +1,9 @@
-"""PD+d whose damping follows from a published bound on the delay.
+"""Implements PD+d whose damping follows from a bound on the delay.
 
-The kernel computes this law (`core.control.damped_torque`). `LeeSpong.compute_torque` states
-the same law in plain Python, and `tests/control_laws/test_plain_torques.py` compares the two.
+PD+d is a spring (P) and a damper (D) to the peers, and a damper of the arm itself (d). The
+simulation kernel computes this law (`core.control.damped_torque`). `LeeSpong.compute_torque`
+states the same law in plain Python, and `tests/control_laws/test_plain_torques.py` compares the
+two.
 """
 
 from collections.abc import Mapping
@@ -17,17 +19,17 @@ from .interface import DAMPING, ERROR_DAMPING, STIFFNESS, ControlLaw, TuningSite
 
 
 class LeeSpong(ControlLaw):
-    """PD+d with the damping d = K T_max + P_e, for delays up to T_max.
+    """A spring to the peers with the damping d = K T_max + P_e, for delays up to T_max.
 
     Source: Lee and Spong, "Passive bilateral teleoperation with constant time delay", IEEE T-RO
     22, 2006.
 
     Attributes:
-        K: stiffness per joint, N m/rad.
-        Kd: damping of the error's velocity, per joint, N m s/rad.
-        T_max_ms: half of the longest round trip, ms.
-        P_e: damping beyond the amount that the delay needs, per joint, N m s/rad.
-        gravity: share of the true gravity that the law compensates; 1 is exact.
+        K: Stiffness per joint, N m/rad.
+        Kd: Damping of the error's velocity, per joint, N m s/rad.
+        T_max_ms: Half of the longest round trip, ms.
+        P_e: Damping beyond the amount that the delay needs, per joint, N m s/rad.
+        gravity: Factor of the true gravity that the law compensates; 1 is exact.
     """
 
     K: PositiveCoordinates = (10.0,)
@@ -53,10 +55,10 @@ class LeeSpong(ControlLaw):
             tau = G(q) - K e - (K T_max + P_e) qd - Kd ed
 
         Args:
-            G: torque of the known gravity, shape (n,), N m.
-            e: position error q - q_des, Eq. (9), shape (n,), rad.
-            ed: derivative of the error, shape (n,), rad/s.
-            qd: joint velocities, shape (n,), rad/s.
+            G: Torque of the known gravity, shape (n,), N m.
+            e: Position error q - q_des, Eq. (9), shape (n,), rad.
+            ed: Derivative of the error, shape (n,), rad/s.
+            qd: Joint velocities, shape (n,), rad/s.
         """
         spring = np.array(self.K) * e
         damper = np.array(self.damping) * qd
@@ -65,25 +67,37 @@ class LeeSpong(ControlLaw):
         return G - spring - damper - error_damper
 
     def gains(self, theta: Array) -> Gains:
-        """Returns the gains for the kernel, those of PD+d, for an arm with parameters theta."""
+        """Returns the gains with which the kernel computes the law as PD+d.
+
+        Args:
+            theta: Parameters of the arm, shape (P,).
+        """
         known = (theta * self.gravity).tolist()
         return Gains(Law.KNOWN, K=self.K, Kd=self.Kd, d=self.damping, known=known)
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns the condition of P+d on K and d."""
+        """Returns the stability condition of P+d on K and d.
+
+        Args:
+            situation: The site, its peers and the delays between them.
+        """
         return judge_position_exchange(situation, "K", "damping")
 
     @classmethod
-    def write_control(cls, gains: Mapping[str, float], at: TuningSite) -> dict[str, Any]:
+    def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
         """Returns the [control] table of a site for tuned gains.
 
         T_max is half of the longest mean round trip. For delays that vary, the bound is not
         proved.
+
+        Args:
+            gains: The tuned gains by name.
+            site: The site whose table is written.
         """
         return {
             "K": gains["K"],
             "Kd": gains["Kd"],
             "P_e": gains["d_extra"],
-            "T_max_ms": at.longest_ms,
-            "gravity": at.gravity,
+            "T_max_ms": site.longest_ms,
+            "gravity": site.gravity,
         }

@@ -1,7 +1,8 @@
-"""P+d: a spring to the peers and a damper, with known gravity.
+"""Implements P+d: a spring to the peers and a damper, with known gravity.
 
-The kernel computes this law (`core.control.damped_torque`). `PD.compute_torque` states the same
-law in plain Python, and `tests/control_laws/test_plain_torques.py` compares the two.
+The simulation kernel computes this law (`core.control.damped_torque`). `PD.compute_torque`
+states the same law in plain Python, and `tests/control_laws/test_plain_torques.py` compares the
+two.
 """
 
 from typing import ClassVar
@@ -17,16 +18,18 @@ from .interface import DAMPING, STIFFNESS, ControlLaw
 class PD(ControlLaw):
     """P+d with known gravity: tau = G(q) - K e - d qd.
 
-    For reversible shares, equal gains and one constant delay T, the linearised loop of N sites
-    is stable for all masses if d > max(abs(lambda_min(alpha)), 0.2172) K T. For some masses
-    this bound is also necessary. Two sites need 4 d_1 d_2 > (T_1 + T_2)^2 K_1 K_2. For other
-    shares some heavy arms are unstable at any d. These bounds hold in continuous time: torques
-    that are held over a period need more damping (docs/laws.md).
+    The error e is the position less the reference, which is the position of the peers, weighted
+    by the dominance factors alpha. For reversible dominance factors, equal gains and one
+    constant delay T, the linearised loop of N sites is stable for all masses if d >
+    max(abs(lambda_min(alpha)), 0.2172) K T. For some masses this bound is also necessary. Two
+    sites need 4 d_1 d_2 > (T_1 + T_2)^2 K_1 K_2. For other dominance factors some heavy arms
+    are unstable at any d. These bounds hold in continuous time: torques that are held over a
+    period need more damping (docs/laws.md).
 
     Attributes:
-        K: stiffness per joint, N m/rad.
-        d: damping per joint, N m s/rad.
-        gravity: share of the true gravity that the law compensates; 1 is exact.
+        K: Stiffness per joint, N m/rad.
+        d: Damping per joint, N m s/rad.
+        gravity: Factor of the true gravity that the law compensates; 1 is exact.
     """
 
     K: PositiveCoordinates = (10.0,)
@@ -41,19 +44,23 @@ class PD(ControlLaw):
             tau = G(q) - K e - d qd
 
         Args:
-            G: torque of the known gravity, shape (n,), N m.
-            e: position error q - q_des, Eq. (9), shape (n,), rad.
-            qd: joint velocities, shape (n,), rad/s.
+            G: Torque of the known gravity, shape (n,), N m.
+            e: Position error q - q_des, Eq. (9), shape (n,), rad.
+            qd: Joint velocities, shape (n,), rad/s.
         """
         spring = np.array(self.K) * e
         damper = np.array(self.d) * qd
         return G - spring - damper
 
     def gains(self, theta: Array) -> Gains:
-        """Returns the gains for the kernel, for an arm with parameters theta."""
+        """Returns the gains with which the kernel computes the law.
+
+        Args:
+            theta: Parameters of the arm, shape (P,).
+        """
         known = (theta * self.gravity).tolist()
         return Gains(Law.KNOWN, K=self.K, d=self.d, known=known)
 
     def exchanges_positions(self) -> bool:
-        """True if the law compensates gravity exactly."""
+        """Returns True if gravity is compensated exactly: the law is a spring between poses."""
         return self.gravity == 1.0

@@ -1,7 +1,8 @@
-"""Direct force reflection: the master feels the external torque on the slave's arm.
+"""Implements direct force reflection: the master feels the external torque on the slave's arm.
 
-The kernel computes this law (`core.control.damped_torque`). `PF.compute_torque` states the same
-law in plain Python, and `tests/control_laws/test_plain_torques.py` compares the two.
+The simulation kernel computes this law (`core.control.damped_torque`). `PF.compute_torque`
+states the same law in plain Python, and `tests/control_laws/test_plain_torques.py` compares the
+two.
 """
 
 from collections.abc import Mapping, Sequence
@@ -50,10 +51,10 @@ class PF(ControlLaw):
             tau = G(q) - K e - d qd + k_f felt
 
         Args:
-            G: torque of the known gravity, shape (n,), N m.
-            e: position error q - q_des, Eq. (9), shape (n,), rad.
-            qd: joint velocities, shape (n,), rad/s.
-            felt: torque on the peers' arms as received, weighted by dominance, shape (n,), N m.
+            G: Torque of the known gravity, shape (n,), N m.
+            e: Position error q - q_des, Eq. (9), shape (n,), rad.
+            qd: Joint velocities, shape (n,), rad/s.
+            felt: Torque on the peers' arms as received, weighted by dominance, shape (n,), N m.
         """
         spring = np.array(self.K) * e
         damper = np.array(self.d) * qd
@@ -61,15 +62,23 @@ class PF(ControlLaw):
         return G - spring - damper + reflected
 
     def gains(self, theta: Array) -> Gains:
-        """Returns the gains for the kernel, for an arm with parameters theta."""
+        """Returns the gains with which the kernel computes the law.
+
+        Args:
+            theta: Parameters of the arm, shape (P,).
+        """
         known = (theta * self.gravity).tolist()
         return Gains(Law.KNOWN, K=self.K, d=self.d, k_f=self.k_f, known=known)
 
     def check(self, path: str, sites: int) -> None:
-        """Refuses more or less than two sites, because the felt contact is ambiguous then.
+        """Refuses more or fewer than two sites: the contact that is felt would be ambiguous.
+
+        Args:
+            path: Path of the law's table in the scenario, for errors.
+            sites: Number of sites in the scenario.
 
         Raises:
-            ScenarioError: with the path of the key.
+            ScenarioError: The number of sites is not two.
         """
         if sites != 2:
             raise ScenarioError(
@@ -79,15 +88,26 @@ class PF(ControlLaw):
                 path=f"{path}.law",
             )
 
-    def explain_idle_shares(self, at: LawSituation) -> str:  # noqa: ARG002 - as the other laws
-        """Returns why the dominance factors have no effect if both gains are zero, else ""."""
+    def explain_idle_shares(self, situation: LawSituation) -> str:  # noqa: ARG002 - as the other laws
+        """Explains that a site whose gains K and k_f are both zero follows nobody.
+
+        Returns:
+            The sentence. Empty if a gain is not zero.
+        """
         if any(self.K) or any(self.k_f):
             return ""
         return "K = 0 and k_f = 0 follow nobody"
 
     @classmethod
     def explain_misfit(cls, roles: Sequence[str]) -> str:
-        """Returns why the law does not fit sites with these roles, or ""."""
+        """Explains to the user why the law cannot be used for the sites of a scenario.
+
+        Args:
+            roles: Role of each site, "master" or "slave".
+
+        Returns:
+            The sentence. Empty for one master and one slave.
+        """
         if sorted(roles) == ["master", "slave"]:
             return ""
         sites = count_nouns(len(roles), "site")
@@ -98,13 +118,18 @@ class PF(ControlLaw):
         )
 
     @classmethod
-    def write_control(cls, gains: Mapping[str, float], at: TuningSite) -> dict[str, Any]:
-        """Returns the [control] table of a site for tuned gains, by the role of the site."""
-        if at.role == "master":
+    def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
+        """Returns the [control] table of a site for tuned gains, by the role of the site.
+
+        Args:
+            gains: The tuned gains by name.
+            site: The site whose table is written.
+        """
+        if site.role == "master":
             return {
                 "K": 0.0,
                 "d": gains["d_master"],
                 "k_f": gains["k_f"],
-                "gravity": at.gravity,
+                "gravity": site.gravity,
             }
-        return {"K": gains["K"], "d": gains["d_slave"], "k_f": 0.0, "gravity": at.gravity}
+        return {"K": gains["K"], "d": gains["d_slave"], "k_f": 0.0, "gravity": site.gravity}

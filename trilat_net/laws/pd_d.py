@@ -1,7 +1,8 @@
-"""PD+d: a spring and a damper to the peers and a damper of the arm, with known gravity.
+"""Implements PD+d: spring and damper to the peers and a damper of the arm, with known gravity.
 
-The kernel computes this law (`core.control.damped_torque`). `PdD.compute_torque` states the
-same law in plain Python, and `tests/control_laws/test_plain_torques.py` compares the two.
+The simulation kernel computes this law (`core.control.damped_torque`). `PdD.compute_torque`
+states the same law in plain Python, and `tests/control_laws/test_plain_torques.py` compares the
+two.
 """
 
 from typing import ClassVar
@@ -40,10 +41,10 @@ class PdD(ControlLaw):
             tau = G(q) - K e - d qd - Kd ed
 
         Args:
-            G: torque of the known gravity, shape (n,), N m.
-            e: position error q - q_des, Eq. (9), shape (n,), rad.
-            ed: derivative of the error, shape (n,), rad/s.
-            qd: joint velocities, shape (n,), rad/s.
+            G: Torque of the known gravity, shape (n,), N m.
+            e: Position error q - q_des, Eq. (9), shape (n,), rad.
+            ed: Derivative of the error, shape (n,), rad/s.
+            qd: Joint velocities, shape (n,), rad/s.
         """
         spring = np.array(self.K) * e
         damper = np.array(self.d) * qd
@@ -52,10 +53,14 @@ class PdD(ControlLaw):
         return G - spring - damper - error_damper
 
     def gains(self, theta: Array) -> Gains:
-        """Returns the gains for the kernel, for an arm with parameters theta."""
+        """Returns the gains with which the kernel computes the law.
+
+        Args:
+            theta: Parameters of the arm, shape (P,).
+        """
         known = (theta * self.gravity).tolist()
         return Gains(Law.KNOWN, K=self.K, Kd=self.Kd, d=self.d, known=known)
 
     def exchanges_positions(self) -> bool:
-        """True if the law compensates gravity exactly."""
+        """Returns True if gravity is compensated exactly: the law is a spring between poses."""
         return self.gravity == 1.0

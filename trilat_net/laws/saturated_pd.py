@@ -1,7 +1,11 @@
-"""P+d whose coupling torque saturates separately for each peer.
+"""Implements P+d whose coupling torque saturates separately for each peer.
+
+P+d is a spring to the peers and a damper. A peer that is far away would pull strongly; here its
+pull approaches a largest value instead.
 
 Invariant:
-    - No peer pulls with more than alpha_ij P, at any distance.
+    - No peer pulls with more than alpha_ij P, at any distance, where alpha_ij is the dominance
+      factor, the weight with which site i follows peer j.
 """
 
 from typing import ClassVar
@@ -60,7 +64,11 @@ class SaturatedPd(ControlLaw):
             now.tau[i] = tau
 
     def linear_gains(self, theta: Array) -> Gains | None:
-        """Returns the gains of P+d, with the stiffness of small errors."""
+        """Returns the gains of the kernel's P+d, with the stiffness of small errors.
+
+        Args:
+            theta: Parameters of the arm, shape (P,).
+        """
         known = (theta * self.gravity).tolist()
         return Gains(Law.KNOWN, K=self.K, d=self.d, known=known)
 
@@ -68,7 +76,10 @@ class SaturatedPd(ControlLaw):
         """Returns the condition of P+d, and the speed up to which torques stay within limits.
 
         The condition of P+d applies because the slope of the saturated spring is nowhere above
-        K.
+        K. The torque limits must leave room for gravity and the largest pull.
+
+        Args:
+            situation: The site, its peers, its torque limits and the delays.
         """
         condition = judge_position_exchange(situation, "K", "d")
         if not situation.gravity_nm:

@@ -1,4 +1,7 @@
-"""The vectors that a control law sends to its peers, as the law's class declares them.
+"""Reads and checks which vectors a control law sends to its peers.
+
+A law may send more than the motion of its arm, for example waves or energies. Its class
+declares these vectors in the class variable `sends`.
 
 Invariant:
     - A declaration is a literal in the class of the law, so reading it runs no user code.
@@ -24,12 +27,12 @@ from ..fields import Frozen, reword_problem, split_refusal
 
 
 class SentVectorSpec(Frozen, frozen=True):
-    """A vector that a law sends at every tick, as the law declares it, see `core.law_channel`.
+    """Declaration of a vector that a law sends at every tick, see `core.law_channel`.
 
     Attributes:
-        unit: unit of its numbers, as in "J"; "" for dimensionless numbers.
-        length: count of its numbers: "joints", "coordinates" (that sites share), or a number.
-        per_peer: true: each peer gets its own vector; false: all peers get the same vector.
+        unit: Unit of its numbers, as in "J"; "" for dimensionless numbers.
+        length: Count of its numbers: "joints", "coordinates" (that sites share), or a number.
+        per_peer: True: each peer gets its own vector; false: all peers get the same vector.
     """
 
     unit: Annotated[str, Meta(max_length=24, pattern=r"^[ -~]*$")] = ""
@@ -45,12 +48,12 @@ SentVectorSpecs = dict[str, SentVectorSpec]
 def build_channel(
     sends: Mapping[str, SentVectorSpec], layout: Layout, peers: int
 ) -> LawChannel:
-    """Returns the channel of a law at a site.
+    """Returns the channel of a law at a site: its vectors with their lengths, in their order.
 
     Args:
-        sends: the declared vectors by name.
-        layout: the counts of the site's joints and coordinates.
-        peers: the number of the site's peers.
+        sends: Declared vectors by name.
+        layout: Counts of the site's joints and coordinates.
+        peers: Number of the site's peers.
     """
     counts = {"joints": layout.joints, "coordinates": layout.shared}
     vectors = []
@@ -65,23 +68,24 @@ def check_sends(channel: LawChannel, joints: int, path: str) -> None:
     """Refuses unsuitable names of vectors, and more numbers than a sample or record can hold.
 
     Args:
-        channel: all that the law sends.
-        joints: the number of the site's joints.
-        path: the path of the law's table, for errors.
+        channel: All vectors that the law sends.
+        joints: Number of the site's joints.
+        path: Path of the law's table, for errors.
 
     Raises:
-        ScenarioError: with the path of the key.
+        ScenarioError: A name or a count is refused; the error has the path of the key.
     """
     sends_path = f"{path}.sends"
     for vector in channel.vectors:
         problem = _find_name_problem(vector.name)
         if problem:
             raise ScenarioError(problem, path=f"{sends_path}.{vector.name}")
-    most = MAX_SENT * joints
-    if channel.received_size > most:
+    largest_count = MAX_SENT * joints
+    if channel.received_size > largest_count:
         count = count_nouns(channel.received_size, "number")
         problem = (
-            f"sends {count} to each peer, and at most {most} are accepted, {MAX_SENT} per joint"
+            f"sends {count} to each peer, and at most {largest_count} are accepted, "
+            f"{MAX_SENT} per joint"
         )
         raise ScenarioError(problem, path=sends_path)
     if channel.record_size > MAX_RECORD_SENT:
@@ -95,7 +99,14 @@ def check_sends(channel: LawChannel, joints: int, path: str) -> None:
 
 
 def _find_name_problem(name: str) -> str:
-    """Returns why a name is unsuitable for a vector, or ""."""
+    """Returns the reason why a name is unsuitable for a vector.
+
+    A law reads the vector as an attribute of its input, so the name must be an identifier, and
+    must not be an attribute that the input has already.
+
+    Returns:
+        The reason. Empty if the name is suitable.
+    """
     is_identifier = name.isidentifier() and not keyword.iskeyword(name)
     is_public = not name.startswith("_") and len(name) <= 24
     if not (is_identifier and is_public):
@@ -112,12 +123,12 @@ def parse_classes(source: bytes, file: Path, path: str) -> dict[str, ast.ClassDe
     """Returns the classes at the top level of a file, by name, without running the file.
 
     Args:
-        source: the content of the file.
-        file: the file, for errors.
-        path: the path of the key, for errors.
+        source: Content of the file.
+        file: The file, for errors.
+        path: Path of the key, for errors.
 
     Raises:
-        ScenarioError: the file is not valid Python.
+        ScenarioError: The file is not valid Python.
     """
     try:
         tree = ast.parse(source)
@@ -130,13 +141,13 @@ def read_sends(source: bytes, file: Path, code: str, path: str) -> SentVectorSpe
     """Returns the vectors that a law's class declares in a file, without running the file.
 
     Args:
-        source: the content of the file.
-        file: the file, for errors.
-        code: the law's name, as in "mylaws:Line".
-        path: the path of the key, for errors.
+        source: Content of the file.
+        file: The file, for errors.
+        code: Name of the law, as in "mylaws:Line".
+        path: Path of the key, for errors.
 
     Raises:
-        ScenarioError: the file is not valid Python, or the declaration is not a literal that
+        ScenarioError: The file is not valid Python, or the declaration is not a literal that
             describes vectors.
     """
     sends: Any = {}

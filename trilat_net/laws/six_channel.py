@@ -1,7 +1,8 @@
-"""The four-channel law of two users and a slave whose dominance is given by one factor a.
+"""Implements the four-channel law of two users and a slave with a single dominance factor a.
 
-The law changes nothing in the torque of `FourChannel`; it only requires the shares of this
-factor.
+The torque is that of `FourChannel`. The law only requires that the dominance matrix of the
+scenario, whose rows are the weights with which the sites follow each other, is that of the
+factor a.
 """
 
 from typing import ClassVar
@@ -26,7 +27,13 @@ class SixChannel(FourChannel):
     sites: ClassVar = 3
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns the factor, the weights at rest, and the four-channel condition."""
+        """Returns the four-channel condition, preceded by the factor and the weights at rest.
+
+        If the dominance matrix is not that of a factor, the condition is not met.
+
+        Args:
+            situation: The sites and their dominance matrix.
+        """
         a = float(situation.alpha[2, 0])
         if not np.allclose(situation.alpha, complementary_shares(a)):
             text = "the shares are not those of one factor: see six_channel in docs/laws.md"
@@ -40,7 +47,14 @@ class SixChannel(FourChannel):
 
 
 def complementary_shares(a: float) -> Array:
-    """Returns the dominance matrix of user 1, user 2 and the slave for the factor a."""
+    """Returns the dominance matrix of user 1, user 2 and the slave for the factor a.
+
+    Args:
+        a: Weight of user 1, from 0 to 1.
+
+    Returns:
+        The matrix, shape (3, 3).
+    """
     user_1 = (0.0, 1.0 - a, a)
     user_2 = (a, 0.0, 1.0 - a)
     slave = (a, 1.0 - a, 0.0)
@@ -48,7 +62,13 @@ def complementary_shares(a: float) -> Array:
 
 
 def complementary_weights(a: float) -> tuple[float, float, float]:
-    """Returns beta of user 1, user 2 and the slave: at rest, sum beta_i tau_h,i = 0."""
+    """Returns the weights beta of user 1, user 2 and the slave for the factor a.
+
+    At rest the weighted sum of the operators' torques is zero: sum beta_i tau_h,i = 0.
+
+    Args:
+        a: Weight of user 1, from 0 to 1.
+    """
     user_1 = 1.0 - (1.0 - a) ** 2
     user_2 = 1.0 - a**2
     slave = 1.0 - a * (1.0 - a)

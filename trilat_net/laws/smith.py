@@ -1,16 +1,20 @@
-"""P+d of a master and a slave with a Smith predictor at the master.
+"""Implements P+d of a master and a slave with a Smith predictor at the master.
+
+A Smith predictor removes a delay from a control loop: the controller follows a model of the
+remote side that has no delay, and corrects it by the delayed difference from the true motion.
 
     slave    tau = G - K (q_s - q_m(t - T)) - d qd_s
              sends w = q_s - x, where the model x is driven by q_m(t - T)
     master   tau = G - K (q_m - x - w(t - T)) - d qd_m, where the model x is driven by q_m
     model    inertia x'' = K (q_m - x) - d x'
 
-Both ends run the same model, so the law stores no past values, however long the delay is. The
-signal w is the part of the slave's motion that the model misses, for example in contact. The
-master is the site with `predicts` = true.
+Here q_m and q_s are the positions of master and slave, T is the delay, K a stiffness and d a
+damping. Both ends run the same model, so the law stores no past values, however long the delay
+is. The signal w is the part of the slave's motion that the model misses, for example in
+contact. The master is the site with `predicts` = true.
 
 Invariant:
-    - The model moves like an arm whose torque is held over a tick (`digital`).
+    - The model moves like an arm whose torque is held over a tick (scheme `digital`).
 """
 
 from collections.abc import Mapping
@@ -56,12 +60,12 @@ class Smith(ControlLaw):
     needs_theta: ClassVar = True
 
     def begin(self, facts: LawContext) -> None:
-        """Creates the model's position x and velocity xd."""
+        """Creates the model's position x and velocity xd, which start at tick 0."""
         self.x = [0.0] * facts.joints
         self.xd = [0.0] * facts.joints
 
     def torque(self, now: LawInput) -> None:
-        """Writes the torque, sends w, and advances the model by a tick."""
+        """Writes the torque of each joint, sends w, and advances the model by a tick."""
         h = now.h_s
         for i in range(now.joints):
             K = self.K[i]
@@ -90,22 +94,29 @@ class Smith(ControlLaw):
             self.xd[i] += h * acceleration
 
     def linear_gains(self, theta: Array) -> Gains | None:
-        """Returns the law of known gravity with d, and at the slave also with K."""
+        """Returns the kernel's law of known gravity with d, and at the slave also with K.
+
+        Args:
+            theta: Parameters of the arm, shape (P,).
+        """
         K = (0.0,) if self.predicts else self.K
         known = (theta * self.gravity).tolist()
         return Gains(Law.KNOWN, K=K, d=self.d, known=known)
 
-    def linear_form(self, at: LinearSituation) -> LinearForm | None:
-        """Returns the motion of the model, and the blocks of the torque or of w.
+    def linear_form(self, situation: LinearSituation) -> LinearForm | None:
+        """Returns the small motions of the model, and its part of the torque or of w.
 
         The model is driven by the position of the master, which the slave receives.
+
+        Args:
+            situation: The site and its arm.
         """
-        (peer,) = at.peers
+        (peer,) = situation.peers
         K = np.array(self.K)
         d = np.array(self.d)
         inertia = np.array(self.inertia)
         master_q = "q" if self.predicts else "q_des"
-        form = LinearForm(len(at.inertia), ("x", "xd"))
+        form = LinearForm(len(situation.inertia), ("x", "xd"))
         form.add("x", "xd", 1.0)
         form.add("xd", "x", -K / inertia)
         form.add("xd", "xd", -d / inertia)
@@ -120,7 +131,14 @@ class Smith(ControlLaw):
         return form
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns the condition for the predictor to remove the delay from the loop."""
+        """Returns the condition under which the predictor removes the delay from the loop.
+
+        One site must predict, and both must have the same K, d and inertia. Then the condition
+        is undecided, because the model knows no contact.
+
+        Args:
+            situation: The two sites and their laws.
+        """
         laws = situation.laws
         predicting = [law for law in laws if getattr(law, "predicts", False)]
         if len(predicting) != 1:
@@ -137,6 +155,11 @@ class Smith(ControlLaw):
         return StabilityCondition(None, text)
 
     @classmethod
-    def write_control(cls, gains: Mapping[str, float], at: TuningSite) -> dict[str, Any]:
-        """Returns the [control] table of a site for tuned gains; the master predicts."""
-        return {**gains, "predicts": at.role == "master", "gravity": at.gravity}
+    def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
+        """Returns the [control] table of a site for tuned gains; the master predicts.
+
+        Args:
+            gains: The tuned gains by name.
+            site: The site whose table is written.
+        """
+        return {**gains, "predicts": site.role == "master", "gravity": site.gravity}

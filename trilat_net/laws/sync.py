@@ -1,7 +1,9 @@
-"""Adaptive synchronisation of outputs r = qd + Lambda q, with its defect under gravity.
+"""Implements adaptive synchronisation of outputs, with its defect under gravity.
 
-The output r contains the absolute pose. Under gravity every equilibrium satisfies Y_G' r = 0,
-where Y_G is the regressor of gravity, so the arms end at q = 0.
+Each site compares its output r = qd + Lambda q with the outputs of its peers, and learns the
+parameters theta of its arm. The output contains the absolute pose. Under gravity every
+equilibrium satisfies Y_G' r = 0, where Y_G is the regressor of gravity, so the arms end at q =
+0.
 
 Invariant:
     - The estimate advances by the trapezoid rule, like the estimate of the adaptive law.
@@ -59,7 +61,10 @@ class Sync(ControlLaw):
         self.g_m_s2 = facts.g_m_s2
 
     def torque(self, now: LawInput) -> None:
-        """Writes the torque and the estimate."""
+        """Writes the torque of each joint and the estimate.
+
+        The regressor Y of the planar arm is evaluated once for the torque and for the estimate.
+        """
         half_h = 0.5 * now.h_s
         Lambda_1 = self.Lambda[0]
         Lambda_2 = self.Lambda[1]
@@ -84,7 +89,11 @@ class Sync(ControlLaw):
             now.tau[1] += second[p] * estimate
 
     def linear_gains(self, theta: Array) -> Gains | None:  # noqa: ARG002
-        """Returns the adaptive law with r = qd + Lambda q instead of qd + Lambda e."""
+        """Returns the kernel's adaptive law with r = qd + Lambda q instead of qd + Lambda e.
+
+        Args:
+            theta: Parameters of the arm, which this law does not use.
+        """
         return Gains(
             law=Law.ADAPTIVE,
             Lambda=self.Lambda,
@@ -95,7 +104,11 @@ class Sync(ControlLaw):
         )
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns the condition, constant delays, and the pose where gravity moves the arms."""
+        """Returns the condition: constant delays. The text names the pose under gravity.
+
+        Args:
+            situation: The site, its peers and the delays between them.
+        """
         if np.isnan(situation.longest_s):
             text = "proved for constant delays, and a delay here varies"
             return StabilityCondition(None, text)
@@ -106,14 +119,18 @@ class Sync(ControlLaw):
         return StabilityCondition(True, text)
 
     @classmethod
-    def write_control(cls, gains: Mapping[str, float], at: TuningSite) -> dict[str, Any]:
+    def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
         """Returns the [control] table of a site for tuned gains.
 
         The tuned gain is called Kp, as in the other adaptive laws, and is this law's K.
+
+        Args:
+            gains: The tuned gains by name.
+            site: The site whose table is written.
         """
         return {
             "Lambda": gains["Lambda"],
             "K": gains["Kp"],
             "Gamma": gains["Gamma"],
-            "theta_hat0": at.estimate,
+            "theta_hat0": site.estimate,
         }

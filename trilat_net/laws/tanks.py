@@ -1,13 +1,14 @@
-"""Two-layer control: a transparency layer whose torque is paid for by a tank of energy.
+"""Couples sites by springs whose work is paid for by a tank of energy at each site.
 
-The transparency layer is a spring and dampers. The passivity layer below it keeps the tank, and
-reduces the torque of the transparency layer to the energy in the tank.
+The controller of a site has two layers. The transparency layer is a spring and dampers, which
+couple the arm to its peers. The passivity layer below it keeps a tank, an account of the energy
+that the site may spend, and reduces the torque of the transparency layer to that energy.
 
 Invariant:
     - The work that the arm does on its controller and the energy packets of the peers fill the
       tank. The work of the torque on the arm, tau times the step in q, empties it.
     - While the tank is empty, the transparency layer has no torque.
-    - Packets are cumulative sums, so no energy is lost with a lost sample.
+    - Packets are sent as cumulative sums, so no energy is lost with a lost sample.
 """
 
 from typing import Any, ClassVar
@@ -26,21 +27,23 @@ from .interface import ERROR_DAMPING, STIFFNESS, EnergyLaw
 class Tanks(EnergyLaw):
     """Springs to the reference, whose work is paid for by one tank of energy per site.
 
-    The tanks are passive for any shares and any delays.
+    Tanks are passive for any dominance factors (the weights with which a site follows its
+    peers) and any delays.
 
     Source: Franken, Stramigioli, Misra, Secchi and Macchelli, IEEE Transactions on Robotics 27
     (4), 2011.
 
     Attributes:
-        K: stiffness of the transparency layer per joint, N m/rad.
-        Kd: its damping of the error's velocity per joint, N m s/rad.
-        d: its damping of the arm's velocity per joint, N m s/rad.
-        level_J: level to which a tank is refilled, J.
-        fill_nm_s_rad_J: damping of the arm per energy that the tank lacks, N m s/rad/J.
-        packet_1_s: rate at which a tank is emptied towards the peers, 1/s.
-        by_shares: true: the peers' packets are weighted by this site's dominance factors;
+        K: Stiffness of the transparency layer per joint, N m/rad.
+        Kd: Its damping of the error's velocity per joint, N m s/rad.
+        d: Its damping of the arm's velocity per joint, N m s/rad.
+        level_J: Level to which a tank is refilled, J.
+        fill_nm_s_rad_J: Damping of the arm per energy that the tank lacks, N m s/rad/J. It
+            refills the tank from the motion of the arm.
+        packet_1_s: Rate at which a tank is emptied towards the peers, 1/s.
+        by_shares: True: the peers' packets are weighted by this site's dominance factors;
             false: they are equal.
-        acceleration_rad_s2: largest acceleration a of a joint for which the tank reserves
+        acceleration_rad_s2: Largest acceleration a of a joint for which the tank reserves
             energy: in the coming period h the joint moves by up to qd h + a h^2 / 2.
     """
 
@@ -64,7 +67,7 @@ class Tanks(EnergyLaw):
     """False leaves the transparency layer without a tank, for comparison."""
 
     def begin(self, facts: LawContext) -> None:
-        """Creates the energies received so far, the gravity torque, and the rates per tick."""
+        """Creates the sums of energy received, the gravity torque, and the rates per tick."""
         self.guarded = bool(self.guarded)
         self.packet = float(self.packet_1_s) / facts.rate_hz
         self.extra_step = 0.5 * self.acceleration_rad_s2 / facts.rate_hz**2
@@ -72,7 +75,12 @@ class Tanks(EnergyLaw):
         self.carried = [0.0] * facts.joints
 
     def torque(self, now: LawInput) -> None:
-        """Writes the torque, and sends the energy packets."""
+        """Writes the torque of each joint, and sends an energy packet to each peer.
+
+        The steps of a tick are: book the work of the previous period and the packets that have
+        arrived; send packets; compute the torque of the transparency layer; reduce it to the
+        energy in the tank, and add damping while the tank is below its level.
+        """
         n = now.joints
         peers = len(now.peers)
         H = now.to_all.H[0]
@@ -85,6 +93,7 @@ class Tanks(EnergyLaw):
             E = now.received[j].E[0]
             H += E - self.E_seen[j]
             self.E_seen[j] = E
+
         packet = self.packet * max(H, 0.0)
         H -= packet
         for j in range(peers):
@@ -107,17 +116,25 @@ class Tanks(EnergyLaw):
         affordable = 1.0
         damping = 0.0
         if self.guarded:
-            # The largest work of the layer's torque in the coming period.
+            # The largest work of the transparency layer's torque in the coming period.
             cost = abs(power) * now.h_s + torque_sum * self.extra_step
             affordable = 0.0 if H <= 0.0 else min(1.0, H / max(cost, H))
             damping = self.fill_nm_s_rad_J * max(self.level_J - H, 0.0)
+
         for i in range(n):
             carried = self.gravity * now.gravity[i]
             self.carried[i] = carried
             now.tau[i] = carried + affordable * now.tau[i] - damping * now.qd[i]
 
     def energies(self, seen: LawRecords) -> LawEnergies:
-        """Returns the packets and the energy in the tank; a tank dissipates nothing."""
+        """Returns the energies by which the records of a run show that the law was passive.
+
+        Energy is put into the lines by the packets sent, and taken out by the packets received.
+        The tank itself dissipates nothing.
+
+        Args:
+            seen: Records of the site in the run.
+        """
         gave = [peer.sent["E"] for peer in seen.peers]
         E_seen = seen.memory["E_seen"]
         took = [E_seen[:, j : j + 1] for j in range(len(gave))]
@@ -133,14 +150,17 @@ class Tanks(EnergyLaw):
         )
 
     def explain_no_linear_form(self) -> str:
-        """Returns why the law cannot be linearised."""
+        """Returns the reason why the law cannot be linearised, for the user."""
         return "the energy in the tank switches its torque on and off"
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns the condition: a tank sends no more energy per tick than it contains."""
-        share = self.packet_1_s / situation.rate_hz
-        if share > 1.0:
-            text = f"a tank sends {share:.3g} of its energy a tick, more than it has"
+        """Returns the condition: a tank must not send more energy per tick than it contains.
+
+        If this holds, the session is passive with passive operators and environments.
+        """
+        part_per_tick = self.packet_1_s / situation.rate_hz
+        if part_per_tick > 1.0:
+            text = f"a tank sends {part_per_tick:.3g} of its energy a tick, more than it has"
             return StabilityCondition(False, text)
         text = (
             f"tanks are passive for any shares, delays and loss, where {PASSIVE_OUTSIDE}, and "

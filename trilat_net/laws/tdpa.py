@@ -1,17 +1,23 @@
-"""Time-domain passivity control: each end of a coupling limits the energy that it takes.
+"""Couples sites by time-domain passivity control (TDPA).
 
-A follower is moved by the force of a spring and a damper towards a goal,
+Each end of a coupling observes the energy that has passed through it. If an end would take out
+more energy than it knows the other end to have put in, its controller reduces the torque or
+the velocity. Delays and lost messages therefore cannot create energy.
+
+A follower is moved by the force F of a spring K and a damper B towards a moving goal,
 
     F = K (goal - q) + B (v - qd),    goal' = v,    v = sum_j alpha_j v_j
 
-where v_j are the velocities of the peers and alpha_j are the dominance factors. Peer j feels
--alpha_j F. If all sites follow, there is one coupling in each direction. While a site waits,
-aligns or holds, the difference between its reference and its peers is added to the goal without
-an energy cost.
+where q and qd are the position and velocity of the follower, v_j are the velocities of its
+peers and alpha_j its dominance factors, the weights with which it follows them. Peer j is the
+leader in this coupling and feels -alpha_j F. If all sites follow, there is one coupling in each
+direction between two sites. While a site waits, aligns or holds, the difference between its
+reference and its peers is added to the goal without an energy cost.
 
 In the names below, E is a sum of energy that an end has put in or taken out, and W is an energy
 that an end observes. Names with "led" belong to the leader's end of a coupling, and names with
-"followed" to the follower's end.
+"followed" to the follower's end. Accounts of energy are kept "by step", from the motion of the
+arm, or "by velocity", as in the publication (`Tdpa.energy`).
 
 Invariant:
     - In each directed coupling of a follower to a leader, each end accounts cumulatively, per
@@ -47,14 +53,15 @@ _SLACK_NM = 1e-9
 
 @compiled
 def book_leader_work(now: LawInput, j: int, i: int, torque: float, step: float) -> float:
-    """Books the energy that a leader's arm puts into a coupling.
+    """Books the energy that a leader's arm puts into a coupling in one period.
 
     Args:
-        now: the law's input; E_led of peer j is increased by positive work.
-        j: the peer that follows.
-        i: the joint.
-        torque: torque of the coupling, N m.
-        step: motion of the joint, rad.
+        now: Inputs and outputs of the law in this tick. Its sum E_led of peer j is increased by
+            positive work.
+        j: The peer that follows.
+        i: The joint.
+        torque: Torque of the coupling, N m.
+        step: Motion of the joint, rad.
 
     Returns:
         The energy that the arm takes out of the coupling, J, zero or negative.
@@ -67,23 +74,37 @@ def book_leader_work(now: LawInput, j: int, i: int, torque: float, step: float) 
 
 @compiled
 def observe_leader(law: Any, now: LawInput, j: int, i: int) -> None:
-    """Updates the energy W_led that the leader's end knows in its coupling to follower j."""
+    """Updates the energy W_led that is known at the leader's end of its coupling to follower j.
+
+    The new energy is the part of E_followed that has arrived since the previous tick, plus,
+    with energies by step, the work of the arm in the previous period.
+
+    Args:
+        law: The law.
+        now: Inputs and outputs of the law in this tick.
+        j: The peer that follows.
+        i: The joint.
+    """
     index = j * now.joints + i
     sent = now.sent[j]
     received = now.received[j]
-    observed = sent.W_led[i] if now.k > 0 else law.reserve_J
-    observed += received.E_followed[i] - law.E_known[index]
+    known_energy = sent.W_led[i] if now.k > 0 else law.reserve_J
+    known_energy += received.E_followed[i] - law.E_known[index]
     law.E_known[index] = received.E_followed[i]
     if law.by_step:
         # The step of the previous period, which is known now.
         step = now.q[i] - now.q_before[i]
-        observed += book_leader_work(now=now, j=j, i=i, torque=law.F_led[index], step=step)
-    sent.W_led[i] = observed
+        known_energy += book_leader_work(now=now, j=j, i=i, torque=law.F_led[index], step=step)
+    sent.W_led[i] = known_energy
 
 
 @compiled
 def invert_inertia(law: Any, now: LawInput) -> None:
-    """Writes M^-1 by Gauss-Jordan elimination; zeros if the arm's parameters are unknown."""
+    """Writes the inverse M^-1 of the arm's inertia matrix to `law.inverse`, row by row.
+
+    The method is Gauss-Jordan elimination. If the arm's parameters are unknown, M is zero,
+    and so is the result.
+    """
     n = now.joints
     inverse = law.inverse
     for i in range(n):
@@ -115,6 +136,18 @@ def limit_leader_torque(law: Any, now: LawInput, j: int, i: int) -> None:
     during the next `AHEAD` ticks. The prediction assumes that the joint continues its motion,
     and adds the effect of the torques that change in this tick, the coupling's own torque
     included. An energy deficit is repaid by damping.
+
+    With m the magnitude of the torque, the predicted cost is
+
+        m (free_step + step_per_torque m)
+
+    where free_step is the motion against the torque that the joint would make without it.
+
+    Args:
+        law: The law, whose torque F_now of the coupling is written.
+        now: Inputs and outputs of the law in this tick.
+        j: The peer that follows.
+        i: The joint.
     """
     n = now.joints
     h = now.h_s
@@ -125,6 +158,8 @@ def limit_leader_torque(law: Any, now: LawInput, j: int, i: int) -> None:
     available_J = max(known_J - law.floor, 0.0)
     sign = 1.0 if requested > 0.0 else -1.0
     magnitude = abs(requested)
+
+    # Predict the motion of the joint.
     step = qd * h
     step_per_torque = 0.0
     half = 0.5 * h * h
@@ -151,15 +186,17 @@ def limit_leader_torque(law: Any, now: LawInput, j: int, i: int) -> None:
             magnitude = available_J / free_step
     torque = requested if not law.controlled else sign * magnitude
 
+    # Repay a deficit by damping.
     deficit_J = law.floor - known_J
     if law.controlled and step_per_torque > 0.0 and deficit_J > 0.0:
         # Damping dissipates its coefficient times qd times the step.
         squared_step = qd * law.predicted_step[i]
         if squared_step > 0.0:
             couplings = n * len(now.peers)
-            most = 0.25 * h * AHEAD**2 / (couplings * step_per_torque)
-            damping = min(0.1 * deficit_J / squared_step, most)
+            largest_damping = 0.25 * h * AHEAD**2 / (couplings * step_per_torque)
+            damping = min(0.1 * deficit_J / squared_step, largest_damping)
             torque += qd * damping
+
     law.torque_change[i] -= (torque - current) / law.beta
     law.F_now[index] = torque
 
@@ -168,7 +205,15 @@ def limit_leader_torque(law: Any, now: LawInput, j: int, i: int) -> None:
 def find_known_energy(law: Any, now: LawInput, j: int, i: int) -> float:
     """Returns the energy that the follower's end of a coupling may still take out, J.
 
-    Half of the reserve is kept for steps that cost more than planned.
+    This is the energy that the leader has put in, less the energy that moved the follower, plus
+    the energy that the controller gave up. Half of the reserve is kept for steps that cost more
+    than planned.
+
+    Args:
+        law: The law.
+        now: Inputs and outputs of the law in this tick.
+        j: The peer that is followed.
+        i: The joint.
     """
     index = j * now.joints + i
     moved_J = law.E_moved[index]
@@ -185,12 +230,12 @@ def limit_follower_velocity(
     """Writes the velocity by which peer j is followed: its own, reduced to the known energy.
 
     Args:
-        law: the law.
-        now: its input.
-        j: the peer that is followed.
-        i: the joint.
-        force: the part of the following force that belongs to the peer, N m.
-        price: expected cost of the period beyond the work of the peer's velocity, J.
+        law: The law, whose velocity v_led of the coupling is written.
+        now: Inputs and outputs of the law in this tick.
+        j: The peer that is followed.
+        i: The joint.
+        force: Part of the following force that belongs to the peer, N m.
+        price: Expected cost of the period beyond the work of the peer's velocity, J.
 
     Returns:
         The energy that remains, J; negative if the peer's velocity costs more than is known.
@@ -215,16 +260,20 @@ def compute_drift_velocity(
 ) -> float:
     """Returns the velocity that moves the goal back to the peers, as far as energy allows.
 
-    The goal moves for all peers together, so the work of the torque counts. With energies by
+    Limited velocities let the goal drift away from the peers' position. The correction moves
+    the goal for all peers together, so the work of the whole torque counts. With energies by
     step, the reactions of the damper and the spring count too, also in connection with the
-    peers' velocities.
+    peers' velocities. The power of a correction with speed v is linear v + square v^2.
 
     Args:
-        law: the law.
-        now: its input.
-        i: the joint.
-        error: difference between the peers' position and the goal, rad.
-        available_J: the energy that remains in all couplings together, J.
+        law: The law.
+        now: Inputs and outputs of the law in this tick.
+        i: The joint.
+        error: Difference between the peers' position and the goal, rad.
+        available_J: Energy that remains in all couplings together, J.
+
+    Returns:
+        The velocity, rad/s.
     """
     h = now.h_s
     velocity = max(-law.drift_rad_s, min(law.drift_rad_s, error / h))
@@ -250,7 +299,15 @@ def compute_drift_velocity(
 
 @compiled
 def find_affordable_velocity(law: Any, now: LawInput, j: int, i: int, force: float) -> float:
-    """Returns the goal's velocity by peer j, reduced where it costs more than is known."""
+    """Returns the velocity by which peer j moves the goal, reduced to the known energy, rad/s.
+
+    Args:
+        law: The law.
+        now: Inputs and outputs of the law in this tick.
+        j: The peer that is followed.
+        i: The joint.
+        force: The following force of the joint, N m.
+    """
     index = j * now.joints + i
     # The work of the force per velocity of the goal in a period.
     work = now.peers[j].alpha * force * now.h_s
@@ -270,12 +327,12 @@ def book_follower(law: Any, now: LawInput, j: int, i: int, force: float, drift: 
     controller is booked separately.
 
     Args:
-        law: the law.
-        now: its input.
-        j: the peer that is followed.
-        i: the joint.
-        force: the part of the following force that belongs to the peer, N m.
-        drift: the coupling's part of the energy that drift compensation takes, J. Energy that
+        law: The law.
+        now: Inputs and outputs of the law in this tick.
+        j: The peer that is followed.
+        i: The joint.
+        force: Part of the following force that belongs to the peer, N m.
+        drift: The coupling's part of the energy that drift compensation takes, J. Energy that
             drift compensation returns stays at this end.
     """
     index = j * now.joints + i
@@ -302,14 +359,14 @@ def charge_unpaid_energy(law: Any, now: LawInput, i: int, spring: float) -> None
     that the damper takes in other periods repays the charge, up to its amount.
 
     Args:
-        law: the law.
-        now: its input.
-        i: the joint.
-        spring: energy of the joint's spring now, J.
+        law: The law.
+        now: Inputs and outputs of the law in this tick.
+        i: The joint.
+        spring: Energy of the joint's spring now, J.
     """
-    moved = now.q[i] - now.q_before[i] - law.alignment_step[i]
-    work = law.force[i] * moved
-    unpaid = work + spring - law.spring[i] - law.paid[i]
+    arm_step = now.q[i] - now.q_before[i] - law.alignment_step[i]
+    arm_work = law.force[i] * arm_step
+    unpaid = arm_work + spring - law.spring[i] - law.paid[i]
     for j in range(len(now.peers)):
         index = j * now.joints + i
         if law.by_step and now.k > 0:
@@ -328,15 +385,16 @@ def settle_follower(
     """Settles the torque and the velocities of a joint that follows, and books the energies.
 
     With energies by step, the torque results from velocities that pay for it. Since several
-    peers share one torque, torque and velocities are computed in a few sweeps.
+    peers share one torque, torque and velocities depend on each other. They are computed by a
+    fixed number of sweeps (`SWEEPS`).
 
     Args:
-        law: the law.
-        now: its input.
-        i: the joint.
-        stretch: elongation of the spring, rad.
-        drift_velocity: velocity of drift compensation, rad/s.
-        available_J: the energy that remains in all couplings together, J.
+        law: The law.
+        now: Inputs and outputs of the law in this tick.
+        i: The joint.
+        stretch: Elongation of the spring, rad.
+        drift_velocity: Velocity of drift compensation, rad/s.
+        available_J: Energy that remains in all couplings together, J.
     """
     n = now.joints
     h = now.h_s
@@ -359,12 +417,14 @@ def settle_follower(
                     law=law, now=now, j=j, i=i, force=force
                 )
             velocity += now.peers[j].alpha * law.v_led[index]
+
     for j in range(peers):
         # Each coupling pays for drift compensation in proportion to its remaining energy.
         share = law.left_J[j * n + i] / available_J if available_J > 0.0 else 0.0
         drift = share * force * drift_velocity * h
         peer_force = now.peers[j].alpha * force
         book_follower(law=law, now=now, j=j, i=i, force=peer_force, drift=drift)
+
     law.goal[i] += h * velocity
     law.force[i] = force
     goal_work = force * velocity * h
@@ -374,7 +434,17 @@ def settle_follower(
 
 @compiled
 def follow_peers(law: Any, now: LawInput, i: int) -> None:
-    """Moves the goal of a joint with the peers' velocities, and writes the following torque."""
+    """Moves the goal of a joint with the peers' velocities, and writes the following torque.
+
+    The steps are: compute the force of spring and damper; charge the couplings for the previous
+    period; reduce the velocities of the peers to the energy that is known; add drift
+    compensation from the energy that remains; settle torque and goal.
+
+    Args:
+        law: The law.
+        now: Inputs and outputs of the law in this tick.
+        i: The joint.
+    """
     n = now.joints
     h = now.h_s
     K = law.K[i]
@@ -388,6 +458,8 @@ def follow_peers(law: Any, now: LawInput, i: int) -> None:
         velocity += peer.alpha * peer.qd[i]
     if now.k == 0:
         law.goal[i] = target
+
+    # The reference differs from the peers while the site waits, aligns or holds.
     offset = now.q_des[i] - target
     # The motion of the offset in half a period.
     law.alignment_step[i] = 0.0
@@ -446,26 +518,26 @@ def follow_peers(law: Any, now: LawInput, i: int) -> None:
 
 @compiled
 class Tdpa(EnergyLaw):
-    """Time-domain passivity control with delay: each end monitors its coupling, and damps.
+    """Time-domain passivity control: each end observes and limits the energy it takes out.
 
     A spring K and a damper B move each site towards the integral of its peers' velocities,
-    weighted by dominance, and the peers feel the torque of K and B. With K = 0 and B = 0 a site
-    only leads.
+    weighted by the dominance factors, and the peers feel the torque of K and B. With K = 0 and
+    B = 0 a site only leads.
 
     Source: Ryu, Artigas and Preusche (2010); for several sites Panzirsch and others (2012).
 
     Attributes:
-        K: spring by which the site follows, per joint, N m/rad; 0: the site follows nobody.
-        B: damper by which the site follows, per joint, N m s/rad.
-        acceleration_rad_s2: largest change per tick of a joint's acceleration by torques other
+        K: Spring by which the site follows, per joint, N m/rad; 0: the site follows nobody.
+        B: Damper by which the site follows, per joint, N m s/rad.
+        acceleration_rad_s2: Largest change per tick of a joint's acceleration by torques other
             than the law's that the leaders' controllers plan for. Half of the reserve pays for
             larger changes.
-        drift_rad_s: largest velocity by which positions that have drifted apart are brought
+        drift_rad_s: Largest velocity by which positions that have drifted apart are brought
             together again; 0: positions drift.
-        reserve_J: initial energy of an end per joint and peer, J.
-        energy: "step": energy that the arm receives, torque times the step in q; "velocity":
-            torque times velocity times period, as published.
-        beta: divisor of the site's torque, dimensionless; it scales the forces that the users
+        reserve_J: Initial energy of an end per joint and peer, J.
+        energy: How work is computed. "step": energy that the arm receives, torque times the
+            step in q; "velocity": torque times velocity times period, as published.
+        beta: Divisor of the site's torque, dimensionless; it scales the forces that the users
             feel relative to each other.
     """
 
@@ -505,7 +577,10 @@ class Tdpa(EnergyLaw):
     """False switches the controllers off, for comparison: energies are only observed."""
 
     def begin(self, facts: LawContext) -> None:
-        """Creates the energy accounts of both ends of each coupling, and the work space."""
+        """Creates the energy accounts of both ends of each coupling, and the work space.
+
+        Lists per coupling and joint are flat: joint i of peer j has the index j n + i.
+        """
         n = facts.joints
         couplings = n * len(facts.peers)
         self.by_step = self.energy == "step"
@@ -534,7 +609,11 @@ class Tdpa(EnergyLaw):
         self.inverse = [0.0] * (n * n)
 
     def torque(self, now: LawInput) -> None:
-        """Writes the torque, and sends torques and energies."""
+        """Writes the torque of each joint, and sends torques and energies to the peers.
+
+        The site first acts as a follower, then as a leader. The torque that the site feels as a
+        leader is reduced if the torque of a joint would otherwise exceed its limit.
+        """
         n = now.joints
         peers = len(now.peers)
         invert_inertia(self, now)
@@ -549,15 +628,18 @@ class Tdpa(EnergyLaw):
                 self.predicted_step[i] += self.predicted_step[i] - last_step
             follow_peers(self, now, i)
             self.torque_change[i] += self.force[i] / self.beta
+
             for j in range(peers):
                 index = j * n + i
                 observe_leader(self, now, j, i)
                 self.F_now[index] = self.F_led[index]
                 self.torque_change[i] -= self.F_now[index] / self.beta
+
         for _ in range(SWEEPS):
             for i in range(n):
                 for j in range(peers):
                     limit_leader_torque(self, now, j, i)
+
         for i in range(n):
             felt = 0.0
             force = self.force[i]
@@ -567,11 +649,11 @@ class Tdpa(EnergyLaw):
             least_felt = force - self.high[i]
             most_felt = force - self.low[i]
             applied = max(least_felt, min(most_felt, felt))
-            share = 1.0 if applied == felt else applied / felt
+            reduction = 1.0 if applied == felt else applied / felt
             step = now.qd[i] * now.h_s
             for j in range(peers):
                 index = j * n + i
-                torque = share * self.F_now[index]
+                torque = reduction * self.F_now[index]
                 self.F_led[index] = torque
                 if not self.by_step:
                     taken = book_leader_work(now=now, j=j, i=i, torque=torque, step=step)
@@ -579,9 +661,14 @@ class Tdpa(EnergyLaw):
             now.tau[i] = self.carried[i] + (force - applied) / self.beta
 
     def energies(self, seen: LawRecords) -> LawEnergies:
-        """Returns the energies of both ends of all couplings.
+        """Returns the energies by which the records of a run show that the law was passive.
 
-        The follower's energies are those up to the previous period.
+        In each coupling both ends put energy in and take energy out. The follower's energies
+        are those up to the previous period, because the work of a period is known only at its
+        end.
+
+        Args:
+            seen: Records of the site in the run.
         """
         gave = []
         took = []
@@ -610,15 +697,23 @@ class Tdpa(EnergyLaw):
         )
 
     def explain_no_linear_form(self) -> str:
-        """Returns why the law cannot be linearised."""
+        """Returns the reason why the law cannot be linearised, for the user."""
         return "its controllers act by energies, which are of second order in the motion"
 
-    def explain_idle_shares(self, at: LawSituation) -> str:  # noqa: ARG002
-        """Returns the reason for a site without K and B, which follows nobody, or ""."""
+    def explain_idle_shares(self, situation: LawSituation) -> str:  # noqa: ARG002
+        """Explains that a site without K and B follows nobody.
+
+        Returns:
+            The sentence. Empty if the dominance factors have an effect.
+        """
         return "" if any(self.K) or any(self.B) else "K = 0 and B = 0 follow nobody"
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:  # noqa: ARG002
-        """Returns the condition: passive surroundings, and motion that can be predicted."""
+        """Returns the stability condition: operators and environments must be passive.
+
+        In addition, the motion of the arms must be predictable, because the controllers plan
+        ahead. The version by velocity misses a small energy, which the text states.
+        """
         text = (
             "couplings are passive for any delays, jitter, loss and shares, where "
             f"{PASSIVE_OUTSIDE}"

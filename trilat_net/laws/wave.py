@@ -1,6 +1,17 @@
-"""Wave variables: lines with an impedance b join the sites and carry waves.
+"""Couples sites by wave variables, so that delays and lost messages cannot create energy.
 
-For one line and one joint, with c = sqrt(2 b) and v the wave that an end plays, the force F is
+Two sites are joined by a wave line. Instead of force and velocity, its ends exchange waves: a
+wave is a signal whose square is a power, so that a delayed wave is stored energy. The line has
+an impedance b, in N m s/rad, per joint. For one line and one joint, let
+
+    q, qd       position and velocity of the arm
+    h           period of the control loop
+    v           the wave that the end plays, which is the received wave or a substitute for it
+    c           sqrt(2 b)
+    step        motion of the joint in the period that has just ended
+    q_sd        position of the end's spring on the side of the line
+
+The force F of an end then is
 
     without a spring (K = 0)    F = b qd - c v, the arm gets -F,
                                 sends c step / h - v one tick later
@@ -8,16 +19,19 @@ For one line and one joint, with c = sqrt(2 b) and v the wave that an end plays,
                                 F = K (q_sd - q) + B (qd_sd - qd), the arm gets F,
                                 sends v - (c / b) F
 
-Each end has an account H of its energy: the energy that it took out of its lines, less the work
-of its torque on the arm, tau times the step in q. An end without a spring sends the motion of
-the period that has just ended. Therefore its waves add up to the steps of its arm, and their
+Each end keeps an account H of its energy: the energy that it took out of its lines, less the
+work of its torque on the arm, tau times the step in q. An end without a spring sends the motion
+of the period that has just ended. Therefore its waves add up to the steps of its arm, and their
 energy is b h qd^2 / 4 larger than the work of the arm. H lends this energy until the arm slows
 down.
+
+Each end also keeps an account W per line: the energy that is known to have arrived and has not
+been played yet.
 
 Invariant:
     - An end takes no more energy out of a line than it knows the other end to have put in, for
       any delay or loss of samples (except with the reception `hold`).
-    - An end puts no more energy into its lines than H.
+    - An end puts no more energy into its lines than its account H contains.
 """
 
 import math
@@ -62,30 +76,37 @@ STAMP_FILTER_TICKS = 20.0
 def replay_wave(law: Any, index: int, fresh: float, energy: float, h: float) -> float:
     """Returns the wave to play so that lost waves are made up for, as far as energy allows.
 
-    The integral of the lost waves is owed. It is played at its mean rate or slower. The energy
-    is divided evenly over the owed integral: a unit of the integral may cost only its part.
+    The waves that were lost are known only by the integral of their sum, which later samples
+    contain. The line owes this integral to the arm. It is played in addition to the wave of the
+    tick, at the mean rate of the lost waves or slower. The known energy is divided evenly over
+    the owed integral: each unit of the integral may cost only its part of the energy.
 
     Args:
-        law: the law.
-        index: the line and joint.
-        fresh: the wave that is played anyway, sqrt(W).
-        energy: the known energy, J.
-        h: the period, s.
+        law: The law, whose owed integral and owed time are reduced by the part that is played.
+        index: Index of the line and joint in the law's lists.
+        fresh: The wave that is played anyway, sqrt(W).
+        energy: The known energy that has not been played, J.
+        h: The period, s.
+
+    Returns:
+        The sum of `fresh` and the additional wave, sqrt(W).
     """
-    owed_U = law.owed_U[index]
+    owed_integral = law.owed_U[index]
     owed_s = law.owed_s[index]
-    owed = abs(owed_U)
+    owed = abs(owed_integral)
     if owed == 0.0:
         return fresh
-    sign = 1.0 if owed_U > 0.0 else -1.0
-    mean = owed / max(owed_s, CONCEALED_S, h)
-    # The other half of the reserve is for waves that are concealed.
+
+    sign = 1.0 if owed_integral > 0.0 else -1.0
+    mean_wave = owed / max(owed_s, CONCEALED_S, h)
+    # The other half of the reserve is for the ticks without a sample (`conceal_wave`).
     available = max(energy - 0.5 * law.reserve, 0.0)
     # Beside the wave f, an extra wave e costs f + e / 2 per unit of the integral.
     affordable = 2.0 * (available / owed - sign * fresh)
-    extra: float = max(0.0, min(affordable, mean))
-    law.owed_U[index] = owed_U - sign * extra * h
-    law.owed_s[index] = max(owed_s - extra / mean * h, 0.0)
+    extra: float = max(0.0, min(affordable, mean_wave))
+
+    law.owed_U[index] = owed_integral - sign * extra * h
+    law.owed_s[index] = max(owed_s - extra / mean_wave * h, 0.0)
     return fresh + sign * extra
 
 
@@ -93,19 +114,24 @@ def replay_wave(law: Any, index: int, fresh: float, energy: float, h: float) -> 
 def conceal_wave(law: Any, index: int, energy: float, h: float) -> float:
     """Returns the wave of a tick without a new sample: the last wave, limited by known energy.
 
-    The wave anticipates the next sample, so its integral is subtracted from the owed integral.
+    The energy limits the wave so that it could be held for `CONCEALED_S`. The wave anticipates
+    the next sample, so its integral is subtracted from the owed integral.
 
     Args:
-        law: the law.
-        index: the line and joint.
-        energy: the known energy, J.
-        h: the period, s.
+        law: The law.
+        index: Index of the line and joint in the law's lists.
+        energy: The known energy that has not been played, J.
+        h: The period, s.
+
+    Returns:
+        The wave to play, sqrt(W).
     """
     duration_s = max(CONCEALED_S, h)
-    most = math.sqrt(2.0 * max(energy, 0.0) / duration_s)
-    held = max(-most, min(most, law.wave[index]))
+    largest_wave = math.sqrt(2.0 * max(energy, 0.0) / duration_s)
+    held = max(-largest_wave, min(largest_wave, law.wave[index]))
     played: float = held
     if law.owed_U[index] * held > 0.0:
+        # Earlier waves are owed in the same direction.
         spent = 0.5 * held * held * h
         remaining = energy - spent
         played = replay_wave(law=law, index=index, fresh=held, energy=remaining, h=h)
@@ -116,15 +142,22 @@ def conceal_wave(law: Any, index: int, energy: float, h: float) -> float:
 
 @compiled
 def receive_wave(law: Any, now: LawInput, j: int, i: int, missed: float) -> float:
-    """Returns the wave of line j that an end plays at a tick, and books its energy.
+    """Returns the wave of one line that an end plays in a tick, and books its energy.
+
+    The energy of a new sample is added to the line's account W of known energy, and the energy
+    of the wave that is played moves from W to the account H of the end. The setting `reception`
+    decides which wave is played if a sample is late or lost.
 
     Args:
-        law: the law.
-        now: its input.
-        j: the line's peer.
-        i: the joint.
-        missed: number of samples between the sample in use and the previous one; -1 without a
-            new sample.
+        law: The law.
+        now: Inputs and outputs of the law in this tick.
+        j: Index of the peer at the other end of the line.
+        i: The joint.
+        missed: Number of samples between the sample in use and the previous one; -1 if there
+            is no new sample.
+
+    Returns:
+        The wave to play, sqrt(W).
     """
     received = now.received[j]
     sent = now.sent[j]
@@ -132,6 +165,8 @@ def receive_wave(law: Any, now: LawInput, j: int, i: int, missed: float) -> floa
     h = now.h_s
     if now.k == 0 and law.playing == _REPLAY:
         sent.W[i] = law.reserve
+
+    # Receive the wave of a new sample, and the energy of the samples that were missed.
     fresh = 0.0
     fresh_energy = 0.0
     played = 0.0
@@ -154,15 +189,18 @@ def receive_wave(law: Any, now: LawInput, j: int, i: int, missed: float) -> floa
         law.U_seen[index] = received.U[i]
         law.E_seen[index] = received.E[i]
         played = fresh
+
+    # Choose the wave to play.
     if law.playing == _REPLAY and missed >= 0.0:
         played = replay_wave(law=law, index=index, fresh=fresh, energy=sent.W[i], h=h)
     elif law.playing == _SCALED:
         known_energy = max(sent.W[i] + fresh_energy, 0.0)
-        most = math.sqrt(2.0 * known_energy / h)
+        largest_wave = math.sqrt(2.0 * known_energy / h)
         scaled = math.sqrt(law.rate[j]) * law.wave[index]
-        played = max(-most, min(most, scaled))
+        played = max(-largest_wave, min(largest_wave, scaled))
     elif law.playing == _HOLD:
         played = law.wave[index]
+
     played_energy = 0.5 * played * played * h
     sent.W[i] += fresh_energy - played_energy
     now.to_all.H[i] += played_energy
@@ -171,7 +209,16 @@ def receive_wave(law: Any, now: LawInput, j: int, i: int, missed: float) -> floa
 
 @compiled
 def follow_wave(law: Any, now: LawInput, j: int, i: int, v: float) -> float:
-    """Moves the spring of an end by a wave v, and sends the reflected wave.
+    """Moves the spring of an end by a wave, and sends the reflected wave.
+
+    The equations are those of the end with K and B at the top of this module.
+
+    Args:
+        law: The law.
+        now: Inputs and outputs of the law in this tick.
+        j: Index of the peer at the other end of the line.
+        i: The joint.
+        v: The wave that the end plays, sqrt(W).
 
     Returns:
         The torque ON the arm, N m.
@@ -197,9 +244,16 @@ def follow_wave(law: Any, now: LawInput, j: int, i: int, v: float) -> float:
 
 @compiled
 def close_wave_period(law: Any, now: LawInput, i: int) -> None:
-    """Books in H the work of the torque on the arm in the previous period.
+    """Books the work of the torque on the arm in the previous period in the account H.
 
-    The energy of an end's springs is part of H.
+    The energy of an end's springs is part of H. If H contains more than the springs and the
+    reserve, the damper of the end has dissipated the difference. In tick 0, this function
+    initialises the springs and H.
+
+    Args:
+        law: The law.
+        now: Inputs and outputs of the law in this tick.
+        i: The joint.
     """
     H = now.to_all.H
     spring = 0.0
@@ -212,26 +266,28 @@ def close_wave_period(law: Any, now: LawInput, i: int) -> None:
             spring += 0.5 * law.K[i] * stretch * stretch
     if now.k == 0:
         H[i] = law.reserve + spring
+
     coupling_torque = now.tau_before[i] - law.carried[i]
     step = now.q[i] - now.q_before[i]
     H[i] -= law.beta * coupling_torque * step
     law.spring[i] = spring
-    most = law.reserve + spring
-    if law.K[i] > 0.0 and H[i] > most:
+    largest_H = law.reserve + spring
+    if law.K[i] > 0.0 and H[i] > largest_H:
         # The damper of the end has dissipated the excess.
-        law.damped[i] += H[i] - most
-        H[i] = most
+        law.damped[i] += H[i] - largest_H
+        H[i] = largest_H
 
 
 @compiled
 def send_waves(law: Any, now: LawInput, i: int, committed: float) -> None:
-    """Reduces the waves of a joint to the energy that H can pay for, and books them.
+    """Reduces the waves of a joint to the energy in the account H, and books their energy.
 
     Args:
-        law: the law.
-        now: its input.
-        i: the joint.
-        committed: energy that the coming period needs besides the waves, J.
+        law: The law.
+        now: Inputs and outputs of the law in this tick, with the waves that the end would like
+            to send.
+        i: The joint.
+        committed: Energy that the coming period needs besides the waves, J.
     """
     h = now.h_s
     requested = 0.0
@@ -240,12 +296,13 @@ def send_waves(law: Any, now: LawInput, i: int, committed: float) -> None:
         requested += 0.5 * wave * wave * h
     free = now.to_all.H[i] - law.spring[i] - committed - 0.5 * law.reserve
     available = max(free, 0.0)
-    share = 1.0
+    scale = 1.0
     if requested > available:
-        share = math.sqrt(available / requested)
+        scale = math.sqrt(available / requested)
+
     for j in range(len(now.peers)):
         sent = now.sent[j]
-        wave = sent.u[i] * share
+        wave = sent.u[i] * scale
         energy = 0.5 * wave * wave * h
         sent.u[i] = wave
         sent.U[i] += wave * h
@@ -254,42 +311,47 @@ def send_waves(law: Any, now: LawInput, i: int, committed: float) -> None:
 
 
 def find_line_impedance(lines: Mapping[str, Any], site: str, peer: str) -> Any:
-    """Returns the impedance of a line: one number, a number per joint, or None.
+    """Returns the impedance that the settings state for a line, whichever end is named first.
 
     Args:
-        lines: impedances by line, as in {"m1-s": 18.0}.
-        site: the site at one end of the line.
-        peer: the site at the other end.
+        lines: Impedances by line, as in {"m1-s": 18.0}.
+        site: The site at one end of the line.
+        peer: The site at the other end.
+
+    Returns:
+        A number for all joints, or a number per joint. None if the line is not named.
     """
     return lines.get(f"{site}-{peer}", lines.get(f"{peer}-{site}"))
 
 
 @compiled
 class Wave(EnergyLaw):
-    """Wave variables: waves carry energy along a line of impedance b between two sites.
+    """Couples sites by waves, which carry energy along a line of impedance b between two sites.
 
     At an end without a spring, F = b qd - c v and u = c qd - v with c = sqrt(2 b), where v is
-    the received wave and u the sent wave. An end with K and B follows by this spring and
-    damper; with B = b it reflects no waves. Site i follows site j with the share
-    b_ij / sum_k b_ik.
+    the received wave and u the sent wave. An end with K and B follows the line by this spring
+    and damper; with B = b it reflects no waves. Site i follows site j with the weight
+    b_ij / sum_k b_ik, where b_ij is the impedance of the line between them.
 
     Source: Anderson and Spong (1989); Niemeyer and Slotine (1991).
 
     Attributes:
-        b: impedance per joint, N m s/rad.
-        K: spring of an end that moves its arm by a spring, per joint, N m/rad; 0: no spring.
-        B: damper of such an end, per joint, N m s/rad; b matches it to the line.
-        lines: impedances of single lines, for all joints, as in { "m1-s" = 18.0 }, N m s/rad; 0
+        b: Impedance per joint, N m s/rad.
+        K: Spring of an end that moves its arm by a spring, per joint, N m/rad; 0: no spring.
+        B: Damper of such an end, per joint, N m s/rad; b matches it to the line.
+        lines: Impedances of single lines, for all joints, as in { "m1-s" = 18.0 }, N m s/rad; 0
             removes a line, and lines that are not named have b. "shares": impedances that give
             the dominance factors at the start, b on average, if these factors are reversible;
-            otherwise b.
-        beta: divisor of the site's torque, dimensionless; it scales the forces that the users
+            otherwise b. Dominance factors are the weights with which an arm follows its peers.
+            They are reversible if positive weights D_i exist with D_i alpha_ij = D_j alpha_ji.
+        beta: Divisor of the site's torque, dimensionless; it scales the forces that the users
             feel relative to each other.
-        reception: how waves are played if samples are late or lost. "replay": the last wave is
+        reception: Which wave is played if samples are late or lost. "replay": the last wave is
             held, and missed waves are made up for, as far as the known energy allows; "zero":
             missed waves are dropped, and positions drift; "scaled": the last wave continues,
-            times sqrt(1 - T'), for delays that vary continuously.
-        reserve_J: initial energy of an end per joint, J, and the same energy again for playing
+            times sqrt(1 - T'), where T' is the rate of change of the delay, for delays that
+            vary continuously.
+        reserve_J: Initial energy of an end per joint, J, and the same energy again for playing
             the waves of each line. An end that has less than half of the reserve sends smaller
             waves.
     """
@@ -328,7 +390,10 @@ class Wave(EnergyLaw):
     tune: ClassVar = {"b": DAMPING, "K": STIFFNESS}
 
     def begin(self, facts: LawContext) -> None:
-        """Creates the state of the lines at this end."""
+        """Creates the state of the lines at this end, all of it at rest and without energy.
+
+        Lists per line and joint are flat: joint i of peer j has the index j n + i.
+        """
         n = facts.joints
         peers = len(facts.peers)
         lines = {} if self.lines == "shares" else self.lines
@@ -355,7 +420,12 @@ class Wave(EnergyLaw):
         self.damped = [0.0] * n
 
     def torque(self, now: LawInput) -> None:
-        """Writes the torque, and sends the waves."""
+        """Writes the torque of each joint, and sends the waves.
+
+        The steps of a tick are: book the work of the previous period; send the waves of joints
+        without a spring; play the waves that have arrived; send the waves of joints with a
+        spring, which depend on the waves that were played.
+        """
         n = now.joints
         for i in range(n):
             close_wave_period(self, now, i)
@@ -370,6 +440,7 @@ class Wave(EnergyLaw):
             self.carried[i] = self.gravity * now.gravity[i]
             now.tau[i] = self.carried[i]
             self.spring_gain_J[i] = 0.0
+
         for j in range(len(now.peers)):
             peer = now.peers[j]
             missed = -1.0
@@ -391,6 +462,7 @@ class Wave(EnergyLaw):
                 else:
                     force = follow_wave(law=self, now=now, j=j, i=i, v=played)
                 now.tau[i] += force / self.beta
+
         for i in range(n):
             if self.K[i] > 0.0:
                 limit = self.tau_limit[i]
@@ -399,7 +471,14 @@ class Wave(EnergyLaw):
                 send_waves(self, now, i, work + self.spring_gain_J[i])
 
     def energies(self, seen: LawRecords) -> LawEnergies:
-        """Returns the energies of the waves, of the end, and of its dampers."""
+        """Returns the energies by which the records of a run show that the law was passive.
+
+        Energy is put into a line by its sent waves, and taken out by the waves that are played.
+        The account H contains the energy of the springs. The dampers dissipate energy for good.
+
+        Args:
+            seen: Records of the site in the run.
+        """
         coupling_torque = seen.tau - seen.memory["carried"]
         return LawEnergies(
             gave=[peer.sent["E"] for peer in seen.peers],
@@ -413,9 +492,13 @@ class Wave(EnergyLaw):
         )
 
     def find_problem(self, rates_hz: Mapping[str, int]) -> KeyProblem | None:
-        """Returns the problem of a line that joins no two sites, or of unequal rates, or None.
+        """Returns the setting that prevents the use of this law, or None.
 
-        The rates must be equal because a wave lasts for a tick.
+        Each named line must join two sites of the scenario. All sites must have the same tick
+        rate, because a wave lasts for one tick.
+
+        Args:
+            rates_hz: Tick rate of each site, by name.
         """
         pairs = [sorted(pair) for pair in permutations(rates_hz, 2)]
         lines = () if self.lines == "shares" else self.lines
@@ -435,14 +518,21 @@ class Wave(EnergyLaw):
     def resolve_shares(self, names: Sequence[str], alpha: Array) -> Any:
         """Returns the law with the impedances of its lines as numbers.
 
+        The impedances reproduce the dominance factors alpha of the start, if positive weights D
+        exist that make D_i alpha_ij symmetric:
+
             b_ij = D_i alpha_ij b / mean,    where D_i alpha_ij = D_j alpha_ji
 
+        and `mean` is the mean of D_i alpha_ij over all pairs of sites. Otherwise all lines keep
+        b.
+
         Args:
-            names: the names of the sites.
-            alpha: the dominance matrix at the start, shape (N, N).
+            names: The names of the sites.
+            alpha: Dominance matrix at the start, shape (N, N).
         """
         if self.lines != "shares":
-            return self
+            return self  # the user has stated the impedances
+
         lines: dict[str, Any] = {}
         pairs = list(combinations(range(len(names)), 2))
         D = find_balancing_weights(alpha)
@@ -456,24 +546,43 @@ class Wave(EnergyLaw):
                 lines[f"{names[i]}-{names[j]}"] = tuple(share * b for b in self.b)
         return replace(cast(Any, self), lines=lines)
 
-    def explain_idle_shares(self, at: LawSituation) -> str:
-        """Returns how the lines share, if they do not realise the dominance factors, or ""."""
-        site = at.names[at.site]
-        impedances = np.zeros(len(at.names))
-        for n, peer in enumerate(at.names):
+    def explain_idle_shares(self, situation: LawSituation) -> str:
+        """Explains that the wave lines decide how strongly a site follows each peer.
+
+        With this law, site i follows peer j with the weight b_ij / sum_k b_ik, where b_ij is
+        the impedance of the line between them. The dominance factors of the scenario have an
+        effect only if the impedances were chosen to reproduce them.
+
+        Args:
+            situation: The site, and the dominance factors of the scenario.
+
+        Returns:
+            A sentence for the user. Empty if the weights equal the dominance factors.
+        """
+        site = situation.names[situation.site]
+        impedances = np.zeros(len(situation.names))
+        for index, peer in enumerate(situation.names):
             if peer != site:
-                impedances[n] = self.find_impedances(site, peer)[0]
-        total = impedances.sum()
-        shares = at.alpha[at.site]
-        if np.allclose(impedances, shares * total, atol=1e-6 * total):
+                impedances[index] = self.find_impedances(site, peer)[0]
+        total_impedance = impedances.sum()
+        dominance_factors = situation.alpha[situation.site]
+        expected_impedances = dominance_factors * total_impedance
+        if np.allclose(impedances, expected_impedances, atol=1e-6 * total_impedance):
             return ""
-        text = "lines share as b_ij / sum b_ik"
-        if self.lines or find_balancing_weights(at.alpha) is not None:
-            return text
-        return f"{text}, as the shares of sites are not reversible"
+
+        explanation = "lines share as b_ij / sum b_ik"
+        are_chosen_by_user = bool(self.lines)
+        if are_chosen_by_user or find_balancing_weights(situation.alpha) is not None:
+            return explanation
+        return f"{explanation}, as the shares of sites are not reversible"
 
     def find_impedances(self, site: str, peer: str) -> tuple[float, ...]:
-        """Returns the impedance of a line at each joint, after `resolve_shares`, N m s/rad."""
+        """Returns the impedance of a line at each joint, after `resolve_shares`, N m s/rad.
+
+        Args:
+            site: The site at one end of the line.
+            peer: The site at the other end.
+        """
         lines = {} if self.lines == "shares" else self.lines
         line = find_line_impedance(lines, site, peer)
         if line is None:
@@ -481,23 +590,38 @@ class Wave(EnergyLaw):
         return tuple(np.broadcast_to(line, len(self.b)).tolist())
 
     def linear_gains(self, theta: Array) -> Gains | None:
-        """Returns the law of known gravity without gains."""
+        """Returns the kernel's law of known gravity without gains.
+
+        The coupling itself is described by `linear_form`.
+
+        Args:
+            theta: Parameters of the arm, shape (P,).
+        """
         return Gains(Law.KNOWN, known=(theta * self.gravity).tolist())
 
-    def linear_form(self, at: LinearSituation) -> LinearForm | None:
-        """Returns the lines as pure delays, in continuous time, with no wave late or lost."""
+    def linear_form(self, situation: LinearSituation) -> LinearForm | None:
+        """Returns the linear form of the lines' ends, for waves that are never late or lost.
+
+        Time is continuous, and a line between two ends is a pure delay.
+
+        Args:
+            situation: The site and its arm.
+
+        Returns:
+            The linear form of the site. None if some joints have a spring and others do not.
+        """
         has_springs = any(self.K)
         if has_springs and not all(self.K):
             return None
-        site = at.names[at.site]
-        states = [f"q_sd_{at.names[j]}" for j in at.peers] if has_springs else []
-        form = LinearForm(len(at.inertia), states)
-        for j in at.peers:
-            b = np.array(self.find_impedances(site, at.names[j]))
+        site = situation.names[situation.site]
+        states = [f"q_sd_{situation.names[j]}" for j in situation.peers] if has_springs else []
+        form = LinearForm(len(situation.inertia), states)
+        for j in situation.peers:
+            b = np.array(self.find_impedances(site, situation.names[j]))
             if not b.all():
                 continue
             if has_springs:
-                self._add_spring_end(form, j, f"q_sd_{at.names[j]}", b)
+                self._add_spring_end(form, j, f"q_sd_{situation.names[j]}", b)
             else:
                 c = np.sqrt(2.0 * b)
                 form.add("tau", "qd", -b / self.beta)
@@ -510,10 +634,10 @@ class Wave(EnergyLaw):
         """Adds the small motions of a line's end with K and B, whose state is q_sd.
 
         Args:
-            form: the law's form.
-            j: the peer at the other end of the line.
-            state: the name of the state q_sd.
-            b: impedance of the line at each joint, N m s/rad.
+            form: The law's linear form, which is extended.
+            j: Index of the peer at the other end of the line.
+            state: Name of the state q_sd.
+            b: Impedance of the line at each joint, N m s/rad.
         """
         K = np.array(self.K)
         B = np.array(self.B)
@@ -534,7 +658,13 @@ class Wave(EnergyLaw):
         form.add(("to", j), ("from", j), 1.0)
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns the condition: passive surroundings, and the shares that the lines give."""
+        """Returns the stability condition: operators and environments must be passive.
+
+        The text also states the weights with which the lines let the site follow its peers.
+
+        Args:
+            situation: The site and its lines.
+        """
         site = situation.names[situation.site]
         peers = [name for name in situation.names if name != site]
         impedances = [self.find_impedances(site, peer)[0] for peer in peers]
@@ -549,10 +679,14 @@ class Wave(EnergyLaw):
         return StabilityCondition(True, text)
 
     @classmethod
-    def write_control(cls, gains: Mapping[str, float], at: TuningSite) -> dict[str, Any]:
+    def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
         """Returns the [control] table of a site for tuned gains.
 
-        All ends, the masters' too, are matched to their lines, so that waves are not reflected
-        again and again.
+        All ends, the masters' too, are matched to their lines (B = b), so that waves are not
+        reflected again and again.
+
+        Args:
+            gains: The tuned gains by name.
+            site: The site whose table is written.
         """
-        return {**gains, "B": gains["b"], "gravity": at.gravity}
+        return {**gains, "B": gains["b"], "gravity": site.gravity}
