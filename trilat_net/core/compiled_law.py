@@ -1,8 +1,12 @@
-"""Control laws whose `torque` is compiled: same class, same bits, speed of the kernel.
+"""Compiles a user's control law, so that it runs at the speed of the simulation kernel.
+
+A control law is a class with a method `torque`. This module compiles that method with Numba.
+The compiled method returns exactly the same numbers as the Python method, down to the last bit,
+so that a law can be developed in plain Python and compiled later.
 
 Invariant:
-    - A law is compiled for the layout of its rows alone. Its numbers are in a row of floats, so
-      that other gains do not recompile the law.
+    - The gains of a law are passed in a row of floats, so that new gains need no compilation.
+      Only another number of joints or peers, or other vectors, compile the law again.
     - The kernel calls a law by its address, so that no law recompiles the kernel.
     - An index out of range and a division by zero raise as they do in plain Python.
 """
@@ -64,13 +68,14 @@ def compiled(law: T) -> T:
 
 
 def is_compiled(law: Any) -> bool:
-    """True if the `torque` of a law will be compiled; False if Numba is disabled."""
+    """Returns True if the `torque` of a law will be compiled; False if Numba is disabled."""
     config: Any = numba.config
     return bool(getattr(law, "is_compiled", False)) and not config.DISABLE_JIT
 
 
 @leaf
 def _all_finite(values: Array) -> bool:
+    """Returns True if no number of an array is NaN or infinite."""
     are_finite = True
     for i in range(values.shape[0]):
         are_finite = are_finite and np.isfinite(values[i])
@@ -89,23 +94,24 @@ def law_stage(
     channel: ChannelArrays,
     sent: Array,
 ) -> None:
-    """Computes stage 6 of a tick by a compiled law.
+    """Computes stage 6 of a tick, the torque, by a compiled law.
 
-    An exception that is raised while the row's `asked` is 1 comes from the law.
+    The row's field `asked` is 1 while the law runs. An exception that is raised meanwhile comes
+    from the law.
 
     Args:
-        k: the tick.
-        t_ns: nominal time of the tick, ns since the epoch.
-        address: address of the law's machine code.
-        law: the law's numbers.
-        site: the site's row.
-        links: the rows of its links.
-        chain: the chain's rows, or None for the planar arm.
-        channel: the vectors that the peers' laws sent.
-        sent: the vectors that this law sends; written.
+        k: The tick.
+        t_ns: Nominal time of the tick, ns since the epoch, the common start of the session.
+        address: Address of the law's machine code.
+        law: Numbers of the law, the remembered ones first.
+        site: Row of the site.
+        links: Rows of the site's links.
+        chain: Rows of the chain of joints, or None for the planar arm.
+        channel: Vectors that the peers' laws sent.
+        sent: Vectors that this law sends; written.
 
     Raises:
-        FloatingPointError: a result is not finite.
+        FloatingPointError: A result is not finite.
     """
     update_law_view(k=k, t_ns=t_ns, site=site, links=links, chain=chain)
     s: Row = site[0]
@@ -121,16 +127,16 @@ def law_stage(
 
 
 class _Form(NamedTuple):
-    """The layouts for which a law is compiled.
+    """Layouts for which a law is compiled. Laws with equal forms share the compiled code.
 
     Attributes:
-        law: layout of the law's numbers.
-        site: layout of the site's row.
-        link: layout of the links' rows.
-        received: layout of the vectors that a peer sends, or None without any.
-        to_all: layout of the vectors that go to all peers, or None without any.
-        sent: layout of the vectors that go to one peer alone, or None without any.
-        peers: the number of peers.
+        law: Layout of the law's numbers.
+        site: Layout of the site's row.
+        link: Layout of the links' rows.
+        received: Layout of the vectors that a peer sends, or None if there are none.
+        to_all: Layout of the vectors that go to all peers, or None if there are none.
+        sent: Layout of the vectors that go to one peer alone, or None if there are none.
+        peers: Number of peers.
     """
 
     law: np.dtype[np.void]
@@ -143,11 +149,11 @@ class _Form(NamedTuple):
 
 
 def _vectors_dtype(vectors: Sequence[SentVector], width: int = 0) -> np.dtype[np.void] | None:
-    """Returns the layout of vectors that stand one after another, or None without any.
+    """Returns the layout of vectors that stand one after another, or None if there are none.
 
     Args:
-        vectors: the vectors.
-        width: count of numbers in an array's row, if the row is longer than the vectors.
+        vectors: The vectors.
+        width: Count of numbers in an array's row, if the row is longer than the vectors.
     """
     if not vectors:
         return None
@@ -166,10 +172,16 @@ def _compile_law(torque: Callable[..., Any], form: _Form) -> Any:
     """Returns the compiled form of a law's `torque`.
 
     Its arguments are the law's numbers, the site's row, its links' rows, and the arrays of the
-    received and the sent vectors.
+    received and the sent vectors. They are views of arrays, from which the compiled function
+    builds the law's input. Laws of this package are stored on disk, laws of users are compiled
+    in each process.
+
+    Args:
+        torque: The method of the law's class.
+        form: Layouts of the arguments.
 
     Raises:
-        NumbaError: the law cannot be compiled.
+        NumbaError: The law cannot be compiled.
     """
     law_dtype = form.law
     received_dtype = form.received
@@ -232,7 +244,14 @@ def _compile_law(torque: Callable[..., Any], form: _Form) -> Any:
 def _read_numbers(law: Any) -> dict[str, np.ndarray[Any, Any]]:
     """Returns the attributes of a law that are numbers: the remembered ones, then the others.
 
-    Numbers that `torque` writes, and lists, become floats; other integers remain integers.
+    Numbers that `torque` writes, and lists, become floats; other integers remain integers. The
+    names of the attributes that `torque` uses are read from its byte code.
+
+    Args:
+        law: An instance of the law's class.
+
+    Returns:
+        Numbers by name, as arrays. Attributes that are not numbers are left out.
     """
     code = list(dis.get_instructions(type(law).torque))
     written = {step.argval for step in code if step.opname == "STORE_ATTR"}
@@ -240,6 +259,7 @@ def _read_numbers(law: Any) -> dict[str, np.ndarray[Any, Any]]:
     used = {step.argval for step in code if step.opname in access}
     # Functions that `torque` calls may use any attribute of the instance.
     used |= vars(law).keys()
+
     remembered = list_remembered(law)
     others = sorted(name for name in used if hasattr(law, name))
     numbers_by_name = {}
@@ -259,11 +279,20 @@ def _read_numbers(law: Any) -> dict[str, np.ndarray[Any, Any]]:
 
 
 def _explain(error: Exception, law: Any) -> str:
-    """Returns a sentence that says which part of a law Numba cannot compile."""
+    """Returns a sentence that says which part of a law Numba cannot compile.
+
+    The messages of Numba are long and name types of Numba. Frequent causes are recognised and
+    explained in the terms of a law; otherwise the first sentence of the message is returned.
+
+    Args:
+        error: The error of Numba.
+        law: An instance of the law's class.
+    """
     text = re.sub(r"\x1b\[[0-9;]*m", "", str(error))
     file = re.escape(Path(type(law).torque.__code__.co_filename).name)
-    lines = re.findall(rf'{file}"?,? (?:line |\()(\d+)', text)
-    location = f" (line {lines[-1]})" if lines else ""
+    line_numbers = re.findall(rf'{file}"?,? (?:line |\()(\d+)', text)
+    location = f" (line {line_numbers[-1]})" if line_numbers else ""
+
     if "NRT required" in text or "returning of array" in text:
         return (
             f"it makes an array or a list{location}: arithmetic goes number by number, as in "
@@ -280,6 +309,7 @@ def _explain(error: Exception, law: Any) -> str:
             f"it uses {unknown[1]}{location}, which is neither a number nor a function with "
             "@trilat_net.compiled"
         )
+
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     noise = ("Failed in", "File", "During", "-", "^", "<", "[")
     sentences = [line for line in lines if not line.startswith(noise)]
@@ -287,7 +317,13 @@ def _explain(error: Exception, law: Any) -> str:
 
 
 def _explain_attribute(name: str, law: Any, location: str) -> str:
-    """Returns why a compiled law cannot use an attribute."""
+    """Returns a sentence that says why a compiled law cannot use an attribute.
+
+    Args:
+        name: Name of the attribute.
+        law: An instance of the law's class.
+        location: Line of the law, as in " (line 12)"; empty if unknown.
+    """
     if not hasattr(law, name):
         kind = "no attribute of it"
     elif callable(getattr(law, name)):
@@ -301,17 +337,17 @@ def _explain_attribute(name: str, law: Any, location: str) -> str:
 
 
 class CompiledLaw:
-    """A compiled law at its site.
+    """Compiled law at its site.
 
     Args:
-        law: an instance of the law's class.
-        setup: the setup of the site.
-        arrays: the arrays of the site; their vectors may be longer than the site's.
-        sent: the sent vectors in the site's record, see `LawChannel`.
+        law: An instance of the law's class.
+        setup: Setup of the site.
+        arrays: Arrays of the site; their vectors may be longer than the site's.
+        sent: Sent vectors in the site's record, see `LawChannel`.
 
     Attributes:
-        row: the law's numbers, the remembered ones first.
-        address: address of its machine code.
+        row: Numbers of the law, the remembered ones first.
+        address: Address of its machine code.
 
     Raises:
         ScenarioError: Numba cannot compile the law.
@@ -328,6 +364,7 @@ class CompiledLaw:
                 "list of numbers",
                 path=path,
             )
+
         received_size = 0 if arrays.channel is None else arrays.channel.received.shape[-1]
         fields: Any = [(name, value.dtype, value.shape) for name, value in numbers.items()]
         form = _Form(
@@ -345,6 +382,7 @@ class CompiledLaw:
             raise ScenarioError(
                 f"{law_name(law)} cannot be compiled: {_explain(error, law)}", path=path
             ) from None
+
         self.address = find_address(self._function)
         row = np.zeros(1, form.law)
         for name, value in numbers.items():
@@ -359,7 +397,7 @@ class CompiledLaw:
         arrays.site["remembered"] = self._remembered
 
     def bind(self) -> None:
-        """Compiles the stage that `compute` calls, and looks up its types once and for all."""
+        """Compiles the stage that `compute` calls, before the first tick needs it."""
         a = self._arrays
         assert a.channel is not None
         self._stage = bind_leaf(
@@ -376,10 +414,14 @@ class CompiledLaw:
         )
 
     def compute(self, k: int, t_ns: int) -> list[float]:
-        """Computes stage 6 of tick k, see `law_stage`, and returns the law's memory.
+        """Computes stage 6 of a tick, see `law_stage`, and returns the law's memory.
+
+        Args:
+            k: The tick.
+            t_ns: Nominal time of the tick, ns since the epoch.
 
         Raises:
-            LawFailed: the law failed.
+            LawFailed: The law failed.
         """
         a = self._arrays
         assert a.channel is not None
@@ -393,16 +435,23 @@ class CompiledLaw:
 
     @property
     def memory(self) -> list[float]:
-        """The numbers that the law remembers now."""
+        """Numbers that the law keeps from tick to tick, as they are now."""
         memory: list[float] = self.row[: self._remembered].tolist()
         return memory
 
     def restore(self, memory: Sequence[float]) -> None:
-        """Restores the law from its memory."""
+        """Restores the law from its memory, as a record contains it."""
         self.row[: self._remembered] = memory
 
     def find_failure(self, error: Exception) -> LawFailed | None:
-        """Returns the failure of the law, or None if the error does not come from the law."""
+        """Returns the failure of the law that an error reports.
+
+        Args:
+            error: An exception that a tick raised.
+
+        Returns:
+            The failure. None if the error does not come from the law.
+        """
         s: Row = self._arrays.site[0]
         if not s.asked:
             return None
@@ -423,10 +472,16 @@ class CompiledLaw:
 def plug_law(
     law: Any, setup: SiteSetup, arrays: SiteArrays, sent: Array
 ) -> PlainLaw | CompiledLaw:
-    """Returns a law at its site, ready to compute torques; for the arguments see `PlainLaw`.
+    """Returns a law at its site, ready to compute torques, compiled if it is marked for it.
+
+    Args:
+        law: An instance of the law's class.
+        setup: Setup of the site.
+        arrays: Arrays of the site.
+        sent: Sent vectors in the site's record, see `LawChannel`.
 
     Raises:
-        ScenarioError: the law is to be compiled, and Numba cannot compile it.
+        ScenarioError: The law is to be compiled, and Numba cannot compile it.
     """
     arrays.site["needs_model"] = getattr(law, "needs_model", False)
     arrays.site["holds"] = getattr(law, "holds", False)

@@ -1,13 +1,14 @@
-"""The vectors that a control law sends to its peers besides motion and exogenous torque.
+"""Describes the vectors that a control law sends to its peers besides the motion of its arm.
 
-A receiver gets the vectors for all peers and the vectors for itself. Therefore the vectors that
-it received can be found in the sender's record.
+A law may send for example waves or energies. Some vectors go to all peers, others to one peer
+alone. All numbers of a law stand one after another in a single row, which a record contains in
+its field `ch`. A peer receives the part of the row that is meant for it, so the vectors that a
+site received can be found in the sender's record.
 
 Invariant:
     - A law declares its vectors once.
-    - Their numbers stand one after another in the field `ch` of the law's record and sample:
-      first the vectors that go to all peers, then, per peer in scenario order, the vectors that
-      go to that peer alone.
+    - The order of the row is: first the vectors that go to all peers, then, per peer in
+      scenario order, the vectors that go to that peer alone.
 """
 
 from collections.abc import Iterator, Sequence
@@ -22,13 +23,13 @@ MAX_RECORD_SENT = 1024
 
 
 class SentVector(NamedTuple):
-    """A vector that a law sends at every tick.
+    """Vector that a law sends at every tick.
 
     Attributes:
-        name: the vector's name, as the law uses it.
-        unit: unit of its numbers.
-        length: count of its numbers.
-        per_peer: true: each peer gets its own vector; false: all peers get the same vector.
+        name: Name of the vector, as the law uses it.
+        unit: Unit of its numbers.
+        length: Count of its numbers.
+        per_peer: True: each peer gets its own vector; false: all peers get the same vector.
     """
 
     name: str
@@ -41,9 +42,9 @@ class SentEntry(NamedTuple):
     """One number that a law sends.
 
     Attributes:
-        vector: the vector of the number.
-        peer: the peer that gets the vector alone, or "" if all peers get it.
-        position: position of the number in the vector, from 0.
+        vector: Vector of the number.
+        peer: Peer that alone gets the vector, or "" if all peers get it.
+        position: Position of the number in the vector, from 0.
     """
 
     vector: SentVector
@@ -52,7 +53,10 @@ class SentEntry(NamedTuple):
 
     @property
     def key(self) -> str:
-        """The vector's name, with the peer that gets it alone in brackets: "E", "u[m2]"."""
+        """Name of the vector, followed by its receiver in brackets: "E", "u[m2]".
+
+        There are no brackets if all peers receive the vector.
+        """
         return f"{self.vector.name}[{self.peer}]" if self.peer else self.vector.name
 
     def __str__(self) -> str:
@@ -60,22 +64,30 @@ class SentEntry(NamedTuple):
 
 
 class LawChannel(NamedTuple):
-    """All vectors that the law of a site sends.
+    """All vectors that the law of a site sends, in the order of the record.
 
     Attributes:
-        vectors: the vectors, those for all peers before those for each peer.
-        peers: the number of the site's peers.
+        vectors: The vectors, those for all peers before those for each peer.
+        peers: Number of the site's peers.
     """
 
     vectors: tuple[SentVector, ...] = ()
     peers: int = 0
 
     def select_vectors(self, *, per_peer: bool) -> tuple[SentVector, ...]:
-        """Returns the vectors that go to each peer alone, or those that go to all peers."""
+        """Returns the vectors of one kind.
+
+        Args:
+            per_peer: True: the vectors that go to each peer alone; false: those that go to all.
+        """
         return tuple(vector for vector in self.vectors if vector.per_peer is per_peer)
 
     def count_numbers(self, *, per_peer: bool) -> int:
-        """Returns the count of numbers that go to each peer alone, or to all peers."""
+        """Returns the count of numbers in the vectors of one kind.
+
+        Args:
+            per_peer: True: numbers that go to each peer alone; false: numbers that go to all.
+        """
         return sum(vector.length for vector in self.select_vectors(per_peer=per_peer))
 
     @property
@@ -85,15 +97,19 @@ class LawChannel(NamedTuple):
 
     @property
     def record_size(self) -> int:
-        """Count of the numbers in a record."""
+        """Count of the numbers that a record contains."""
         to_all = self.count_numbers(per_peer=False)
         to_each = self.count_numbers(per_peer=True)
         return to_all + self.peers * to_each
 
     def find_columns(self, vectors: Sequence[SentVector]) -> list[int]:
-        """Returns the index of each number of the vectors among the numbers of a peer.
+        """Returns the index of each number of a law among the numbers that a peer receives.
 
-        The index is -1 for a vector that this law does not send.
+        Args:
+            vectors: The vectors that the law of the peer reads.
+
+        Returns:
+            An index per number. It is -1 for a vector that this law does not send.
         """
         start = 0
         starts = {}
@@ -111,7 +127,7 @@ class LawChannel(NamedTuple):
         """Yields an entry for each number of a record, in order.
 
         Args:
-            peers: the names of the site's peers, in scenario order.
+            peers: Names of the site's peers, in scenario order.
         """
         to_each = self.select_vectors(per_peer=True)
         groups = [("", self.select_vectors(per_peer=False))]
@@ -125,8 +141,8 @@ class LawChannel(NamedTuple):
         """Returns the numbers of a record that a peer receives.
 
         Args:
-            sent: the numbers of the record.
-            peer_index: index of the peer among the sender's peers.
+            sent: Numbers of the record.
+            peer_index: Index of the peer among the sender's peers.
         """
         to_all = self.count_numbers(per_peer=False)
         to_each = self.count_numbers(per_peer=True)
@@ -139,8 +155,11 @@ class LawChannel(NamedTuple):
 def join_received(channels: Sequence[LawChannel]) -> tuple[SentVector, ...]:
     """Returns the vectors that a law may receive from any of its peers, each name once.
 
+    Args:
+        channels: Vectors that the laws of the peers send.
+
     Raises:
-        ValueError: two peers send vectors with the same name and different lengths.
+        ValueError: Two peers send vectors with the same name and different lengths.
     """
     by_name: dict[str, SentVector] = {}
     for channel in channels:

@@ -1,4 +1,9 @@
-"""The energies that prove a control law passive, as functions of its site's records.
+"""Describes the energies that prove a control law passive, as functions of its site's records.
+
+A law is passive if it never gives more energy than it received. Some laws keep accounts of
+energy: what they sent to peers, what they took, and what they store. Such a law returns these
+accounts for the records of a run, and the certificate compares them with the motion of the
+arms.
 
 Invariant:
     - A peer takes no more energy than has arrived from the law that gave it.
@@ -15,13 +20,13 @@ from .vectors import Array, IntArray
 
 
 class PeerRecords(NamedTuple):
-    """A peer as the law saw it at K ticks, one row per tick, and the vectors sent to it.
+    """Peer as the law saw it in K ticks, one row per tick, and the vectors sent to it.
 
     Attributes:
-        tick: stamp of the sample in use, shape (K,); -1 before the first sample.
-        received: the vectors of that sample by name, shape (K, length); zeros before the first
+        tick: Stamp of the sample in use, shape (K,); -1 before the first sample.
+        received: Vectors of that sample by name, shape (K, length); zeros before the first
             sample.
-        sent: the vectors that went to this peer alone, by name, shape (K, length).
+        sent: Vectors that went to this peer alone, by name, shape (K, length).
     """
 
     tick: IntArray
@@ -30,17 +35,17 @@ class PeerRecords(NamedTuple):
 
 
 class LawRecords(NamedTuple):
-    """The records of a law's site, K ticks with one row per tick.
+    """Records of the site of a law: K ticks, one row per tick.
 
     Attributes:
-        h_s: the period, s.
-        q: joint angles, shape (K, n), rad.
-        qd: joint velocities, shape (K, n), rad/s.
-        tau: control torque within its limits, shape (K, n), N m.
-        tau_x: exogenous torque, shape (K, n), N m; the torque ON the arm is its negative.
-        to_all: the vectors that went to all peers, by name, shape (K, length).
-        memory: the law's memory after the tick, by the names of `remembers`, shape (K, length).
-        peers: the peers in scenario order.
+        h_s: The period, s.
+        q: Joint angles, shape (K, n), rad.
+        qd: Joint velocities, shape (K, n), rad/s.
+        tau: Control torque within its limits, shape (K, n), N m.
+        tau_x: Exogenous torque, shape (K, n), N m; the torque ON the arm is its negative.
+        to_all: Vectors that went to all peers, by name, shape (K, length).
+        memory: The law's memory after the tick, by the names of `remembers`, shape (K, length).
+        peers: The peers in scenario order.
     """
 
     h_s: float
@@ -54,24 +59,24 @@ class LawRecords(NamedTuple):
 
 
 class LawEnergies(NamedTuple):
-    """Energies of a law at K ticks, J, shape (K,) or (K, parts) each.
+    """Energies of a law in K ticks, J, shape (K,) or (K, parts) each.
 
     Flows are sums since the beginning. Each part, for instance that of a joint, must not be
     below zero by itself.
 
     Attributes:
-        gave: per peer, the energy that was sent to it.
-        took: per peer, the energy that the law took out of the energy that the peer sent, part
+        gave: Per peer, the energy that was sent to it.
+        took: Per peer, the energy that the law took out of the energy that the peer sent, part
             by part.
-        port: the energy that the arm gave to the law, by the law's own account; None: the
-            energy computed from the records.
-        store: the energy that the law stores.
-        taken: the energy that the law has dissipated, by its own formula; None: the remainder
-            of the other energies.
-        observed: per peer, the energy that the site knows to remain of the energy sent by the
+        port: Energy that the arm gave to the law, by the law's own account; None: the energy
+            is computed from the records.
+        store: Energy that the law stores.
+        taken: Energy that the law has dissipated, by its own formula; None: the remainder of
+            the other energies.
+        observed: Per peer, the energy that the site knows to remain of the energy sent by the
             peer; () if the law does not observe it.
-        weight: weight of the arm's energy in the sum over all sites.
-        gravity: share of gravity that the law compensates; the work of this torque is no work
+        weight: Weight of the arm's energy in the sum over all sites.
+        gravity: Factor of gravity that the law compensates; the work of this torque is no work
             of the law.
     """
 
@@ -89,8 +94,8 @@ def sum_work(tau: Array, q: Array) -> Array:
     """Returns the work of held torques from the first tick up to each tick, shape (K,), J.
 
     Args:
-        tau: torque held from each tick to the next, shape (K, n), N m.
-        q: joint angles at each tick, shape (K, n), rad.
+        tau: Torque held from each tick to the next, shape (K, n), N m.
+        q: Joint angles at each tick, shape (K, n), rad.
     """
     steps: Array = np.einsum("kj,kj->k", tau[:-1], np.diff(q, axis=0))
     return np.concatenate([[0.0], np.cumsum(steps)])

@@ -1,4 +1,8 @@
-"""The view of a tick that a plugged control law gets, in the rows of its site and links.
+"""Gives a control law its input in each tick, from the rows of its site and links.
+
+The state of a site is stored in rows of arrays, on which the compiled stages of a tick work. A
+compiled law reads the rows directly. For a law in plain Python, this module copies the rows to
+lists and writes the results back.
 
 Invariant:
     - The compiled and the plain form of a law see the same numbers.
@@ -24,7 +28,12 @@ from .vectors import Array, Row, RowArray
 
 @leaf
 def _update_model(s: Row, chain: RowArray | None) -> None:
-    """Writes G, M and the bias torque of the arm, which is planar if `chain` is None."""
+    """Writes the gravity torque G, the inertia matrix M and the bias torque of the arm.
+
+    Args:
+        s: Row of the site.
+        chain: Rows of the chain of joints, or None for the planar arm.
+    """
     if chain is None:
         two_link_stages.update_model(s)
     else:
@@ -35,10 +44,17 @@ def _update_model(s: Row, chain: RowArray | None) -> None:
 def update_law_view(
     k: int, t_ns: int, site: RowArray, links: RowArray, chain: RowArray | None
 ) -> None:
-    """Writes the parts of a law's view that no stage has written: time, model and peers.
+    """Writes the parts of a law's input that no stage has written: time, model and peers.
 
     The torque becomes NaN, so that the check after the law finds a torque that the law has not
     written.
+
+    Args:
+        k: The tick.
+        t_ns: Nominal time of the tick, ns since the epoch.
+        site: Row of the site.
+        links: Rows of the site's links.
+        chain: Rows of the chain of joints, or None for the planar arm.
     """
     s: Row = site[0]
     s.k = k
@@ -63,7 +79,12 @@ _IN_ROW = {"gravity": "G"}
 
 
 def _name_vectors(vectors: Sequence[SentVector], numbers: list[float]) -> SimpleNamespace:
-    """Returns a namespace of vectors, filled with consecutive numbers."""
+    """Returns a namespace of vectors, filled with consecutive numbers.
+
+    Args:
+        vectors: Names and lengths of the vectors.
+        numbers: Their numbers, one vector after another. Further numbers are ignored.
+    """
     named = SimpleNamespace()
     first = 0
     for vector in vectors:
@@ -74,15 +95,15 @@ def _name_vectors(vectors: Sequence[SentVector], numbers: list[float]) -> Simple
 
 
 class PlainLaw:
-    """A law in plain Python at its site.
+    """Law in plain Python at its site.
 
-    The law gets lists, and its results are written into the site's row.
+    The law receives lists, and its results are written into the site's row.
 
     Args:
-        law: the law.
-        setup: the setup of the site.
-        arrays: the arrays of the site; their vectors may be longer than the site's.
-        sent: the sent vectors in the site's record, see `LawChannel`.
+        law: The law.
+        setup: Setup of the site.
+        arrays: Arrays of the site; their vectors may be longer than the site's.
+        sent: Sent vectors in the site's record, see `LawChannel`.
     """
 
     def __init__(self, law: UserLaw, setup: SiteSetup, arrays: SiteArrays, sent: Array) -> None:
@@ -120,17 +141,21 @@ class PlainLaw:
         self._peer_size = channel.count_numbers(per_peer=True)
 
     def bind(self) -> None:
-        """Compiles the leaf that `compute` calls, and looks up its types once and for all."""
+        """Compiles the leaf that `compute` calls, before the first tick needs it."""
         a = self._arrays
         self._update = bind_leaf(update_law_view, 0, 0, a.site, a.links, a.chain)
 
     def compute(self, k: int, t_ns: int) -> list[float]:
-        """Computes stage 6 of tick k, and returns the law's memory.
+        """Computes stage 6 of a tick, the torque, and returns the law's memory.
 
         Torque, estimate and sent vectors are written into the site's arrays.
 
+        Args:
+            k: The tick.
+            t_ns: Nominal time of the tick, ns since the epoch.
+
         Raises:
-            LawFailed: the law failed.
+            LawFailed: The law failed.
         """
         a = self._arrays
         setup = self._setup
@@ -144,15 +169,15 @@ class PlainLaw:
 
     @property
     def memory(self) -> list[float]:
-        """The numbers that the law remembers now."""
+        """Numbers that the law keeps from tick to tick, as they are now."""
         return read_memory(self._law)
 
     def restore(self, memory: Sequence[float]) -> None:
-        """Restores the law from its memory."""
+        """Restores the law from its memory, as a record contains it."""
         restore_law(self._law, self._setup.name, memory)
 
     def _read(self, k: int) -> LawInput:
-        """Returns the input of tick k, after `update_law_view`."""
+        """Returns the input of tick `k`, after `update_law_view` has written the rows."""
         setup = self._setup
         columns: list[Any] = [column.tolist() for column in self._peer_columns]
         # The last three columns are the vectors q, qd and tau_x.
@@ -183,8 +208,11 @@ class PlainLaw:
     def _collect_sent(self, now: LawInput) -> list[float]:
         """Returns the numbers of all vectors that the law sends, in the order of the record.
 
+        Args:
+            now: Input of the tick, which contains the vectors that the law wrote.
+
         Raises:
-            ValueError: a vector has another length than the law declares.
+            ValueError: A vector has another length than the law declares.
         """
         sent = _collect_vectors(self._sends_to_all, now.to_all, "to_all")
         for j, to_peer in enumerate(now.sent):
@@ -196,12 +224,12 @@ def _collect_vectors(declared: Sequence[SentVector], vectors: Any, name: str) ->
     """Returns the numbers of a law's vectors one after another.
 
     Args:
-        declared: the vectors that the law declares.
-        vectors: the law's values, as attributes.
-        name: name of `vectors` in the law's input, for errors.
+        declared: Vectors that the law declares.
+        vectors: Values of the vectors, as attributes.
+        name: Name of `vectors` in the law's input, for errors.
 
     Raises:
-        ValueError: a vector has another length than the law declares.
+        ValueError: A vector has another length than the law declares.
     """
     numbers: list[float] = []
     for vector in declared:

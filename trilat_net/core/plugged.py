@@ -1,9 +1,13 @@
-"""Functions of operators and delay models that the kernel calls by their address.
+"""Compiles functions of operators and delay models, which the kernel calls by their address.
+
+The kernel is the compiled code that computes a tick. A model, for example an operator who moves
+an arm, has a few numbers and a function that computes with these numbers and a row of the
+kernel's arrays.
 
 Invariant:
     - A function is compiled for the layout of its numbers and of its row.
-    - The numbers themselves are in a table, so that a new value compiles nothing.
-    - No function recompiles the kernel.
+    - The numbers themselves are in a table, so that new values need no compilation.
+    - No function recompiles the kernel, because the kernel knows only addresses.
 """
 
 import hashlib
@@ -52,7 +56,7 @@ def _call_compiled(_context: Any, address: Any, arguments: Any) -> Any:
 
 
 def _call_plain(address: int, arguments: tuple[Any, ...]) -> None:
-    """Calls a function by the number that replaces its address if Numba is disabled."""
+    """Calls a function by the number that replaces its address while Numba is disabled."""
     function = _PLAIN[address]
     function(*arguments)
 
@@ -62,9 +66,16 @@ call_address: Any = _call_plain if _config.DISABLE_JIT else _call_compiled
 
 
 def digest_sibling_sources(function: Callable[..., Any]) -> str:
-    """Returns a hash of all source files in the folder of a function of this package.
+    """Returns a hash of all source files in the folder of a function.
 
-    The result is "" for a function of another package.
+    The hash names the compiled function on disk, so that a change of the source compiles it
+    again.
+
+    Args:
+        function: The function.
+
+    Returns:
+        The hash. Empty for a function outside of this package, which is not stored.
     """
     folder = Path(function.__code__.co_filename).parent
     if not folder.is_relative_to(Path(__file__).parents[1]):
@@ -80,7 +91,7 @@ def find_address(compiled: Any) -> int:
 
 
 def _find_numbers(model: Any) -> dict[str, Array]:
-    """Returns the fields of a model that are numbers, by name."""
+    """Returns the fields of a model that are numbers, by name, as arrays of floats."""
     numbers = {}
     for name in model.__struct_fields__:
         value = np.asarray(getattr(model, name))
@@ -91,7 +102,11 @@ def _find_numbers(model: Any) -> dict[str, Array]:
 
 
 def list_numbers(model: Any) -> Array:
-    """Returns the numbers of a model one after another, in the order of its fields."""
+    """Returns the numbers of a model one after another, in the order of its fields.
+
+    Args:
+        model: An operator, an environment or a delay model.
+    """
     fields = [value.ravel() for value in _find_numbers(model).values()]
     # A model without numbers gives an empty array.
     return np.concatenate([np.zeros(0), *fields])
@@ -104,9 +119,9 @@ def _compile(
     """Returns the compiled form of a function, called with an array of numbers and a row.
 
     Args:
-        function: the function.
-        form: layout of the numbers of its model.
-        row: layout of the row.
+        function: The function.
+        form: Layout of the numbers of its model.
+        row: Layout of the row.
     """
     count = form.itemsize // 8
     compute = numba.njit(**_OPTIONS)(function)
@@ -130,11 +145,14 @@ def _compile(
 def compile_to_address(model: Any, name: str, row: np.dtype[np.void]) -> int:
     """Compiles a function of a model, and returns the address of the machine code.
 
+    While Numba is disabled, the result is a number under which the plain function is
+    registered.
+
     Args:
-        model: an operator, an environment or a delay model. The function is called with the
+        model: An operator, an environment or a delay model. The function is called with the
             model's numbers and a row.
-        name: the name of the function.
-        row: layout of the row.
+        name: Name of the function.
+        row: Layout of the row.
     """
     fields: Any = []
     for field, value in _find_numbers(model).items():

@@ -1,4 +1,7 @@
-"""A user's control law in plain Python: its input, its results and its memory.
+"""Calls a user's control law in plain Python: its input, its results and its memory.
+
+A control law is a class with a method `torque`, which computes the torque of an arm in each
+tick of the control loop. Between ticks a law may keep numbers, its memory.
 
 Invariant:
     - A law is part of the site's step and a function of its input and its memory.
@@ -21,24 +24,24 @@ MAX_LAW_MEMORY = 1024
 
 
 class LawContext(NamedTuple):
-    """The facts that a law gets before the run.
+    """Facts that a law receives before the run.
 
     >>> class Damper:
     ...     def __init__(self, facts: tn.LawContext, d: float = 2.0) -> None:
     ...         self.d = [d] * facts.joints
 
     Attributes:
-        site: the site's name.
-        rate_hz: tick rate of the site, Hz.
-        g_m_s2: gravitational acceleration, m/s^2.
-        lengths_m: lengths of the two links, m.
-        theta: the arm's true parameters, shape (5,), for a law that knows them; () if they are
+        site: Name of the site, the process that runs one arm.
+        rate_hz: Tick rate of the site, Hz.
+        g_m_s2: Gravitational acceleration, m/s^2.
+        lengths_m: Lengths of the two links, m.
+        theta: The arm's true parameters, shape (5,), for a law that knows them; () if they are
             unknown, as for a real arm that was not identified.
-        tau_limit_nm: largest torque of a joint, N m; one number, or one per joint.
-        joints: the number of joints of the arm.
-        coordinates: count of numbers in q, qd and tau_x of a peer: one per joint, or one per
+        tau_limit_nm: Largest torque of a joint, N m; one number, or one per joint.
+        joints: Number of joints of the arm.
+        coordinates: Count of numbers in q, qd and tau_x of a peer: one per joint, or one per
             coordinate of the end effector.
-        peers: names of the peers, in scenario order.
+        peers: Names of the peers, in scenario order.
     """
 
     site: str
@@ -53,7 +56,11 @@ class LawContext(NamedTuple):
 
 
 def _make_operator(operate: Callable[[Any, Any], Any]) -> Any:
-    """Returns an arithmetic method of `LawVector` that works number by number."""
+    """Returns an arithmetic method of `LawVector` that works number by number.
+
+    Args:
+        operate: The operation on two numbers.
+    """
 
     def compute(numbers: "LawVector", other: Any) -> Any:
         if isinstance(other, Real):
@@ -71,7 +78,7 @@ def _make_operator(operate: Callable[[Any, Any], Any]) -> Any:
 
 
 class LawVector(list[Any]):
-    """A list with arithmetic by number: `-5.0 * (now.q - now.q_des) - 2.0 * now.qd`."""
+    """List with arithmetic by number: `-5.0 * (now.q - now.q_des) - 2.0 * now.qd`."""
 
     __add__ = __radd__ = __iadd__ = _make_operator(operator.add)
     __sub__ = _make_operator(operator.sub)
@@ -84,16 +91,18 @@ class LawVector(list[Any]):
 
 
 class PeerView(NamedTuple):
-    """A peer as a law sees it at a tick: its sample in use, or its start pose at rest.
+    """Peer as a law sees it in a tick: its sample in use, or its start pose at rest.
+
+    A sample is the state that a peer published in one of its ticks.
 
     Attributes:
-        alpha: dominance factor of the peer now.
-        tick: stamp of the sample in use, a tick of the peer; -1 before the first sample.
-        age_s: age of that sample, s; before the first sample, the time since the epoch.
+        alpha: Dominance factor of the peer now, the weight with which this site follows it.
+        tick: Stamp of the sample in use, a tick of the peer; -1 before the first sample.
+        age_s: Age of that sample, s; before the first sample, the time since the epoch.
         new: 1 if the sample came into use at this tick, else 0.
-        q: joint angles or coordinates of the sample, rad or m.
-        qd: derivative of q, rad/s or m/s.
-        tau_x: exogenous torque of the peer, N m or N; the torque ON its arm is the negative.
+        q: Joint angles or coordinates of the sample, rad or m.
+        qd: Derivative of q, rad/s or m/s.
+        tau_x: Exogenous torque of the peer, N m or N; the torque ON its arm is the negative.
     """
 
     alpha: float
@@ -106,7 +115,7 @@ class PeerView(NamedTuple):
 
 
 class LawInput(NamedTuple):
-    """The input of a law at a tick.
+    """Input of a law in a tick, and the places for its results.
 
     A vector has one number per joint, or one per coordinate that the sites share.
 
@@ -117,28 +126,28 @@ class LawInput(NamedTuple):
     numbers one by one.
 
     Attributes:
-        k: the tick.
-        t_s: nominal time since the epoch, s.
-        h_s: the period, s.
-        q: joint angles, rad.
-        qd: joint velocities, rad/s.
-        q_des: reference of Eq. (6), rad.
-        qd_des: derivative of q_des, rad/s.
-        felt: the torque on the peers' arms as received, weighted by dominance, N m.
-        joints: the number of joints.
-        coordinates: count of numbers in the vectors of a peer.
-        tau: the torque of each joint, N m, written by the law and then limited.
-        peers: the peers in scenario order.
-        received: per peer the vectors that its law sent with the sample in use, by name; zeros
+        k: The tick.
+        t_s: Nominal time since the epoch, s.
+        h_s: The period, s.
+        q: Joint angles, rad.
+        qd: Joint velocities, rad/s.
+        q_des: Reference of Eq. (6), rad.
+        qd_des: Derivative of q_des, rad/s.
+        felt: Torque on the peers' arms as received, weighted by dominance, N m.
+        joints: Number of joints.
+        coordinates: Count of numbers in the vectors of a peer.
+        tau: Torque of each joint, N m, written by the law and then limited.
+        peers: The peers in scenario order.
+        received: Per peer the vectors that its law sent with the sample in use, by name; zeros
             before the first sample, and for a vector that the peer's law does not send.
-        sent: per peer the vectors that go to this peer alone, written by the law; a vector that
+        sent: Per peer the vectors that go to this peer alone, written by the law; a vector that
             is not written keeps its numbers.
-        to_all: the vectors that go to all peers, also written by the law.
-        tau_x: exogenous torque of this tick, N m; the torque ON the arm is its negative.
-        tau_before: torque of the previous tick, within its limits, N m; zeros at tick 0.
-        q_before: joint angles of the previous tick, rad; the start pose at tick 0.
-        gravity: the torque that holds the arm, N m; zeros if its parameters are unknown.
-        theta_hat: the estimate in the record, written by the law; otherwise it does not change.
+        to_all: Vectors that go to all peers, also written by the law.
+        tau_x: Exogenous torque of this tick, N m; the torque ON the arm is its negative.
+        tau_before: Torque of the previous tick, within its limits, N m; zeros at tick 0.
+        q_before: Joint angles of the previous tick, rad; the start pose at tick 0.
+        gravity: Torque that holds the arm, N m; zeros if its parameters are unknown.
+        theta_hat: Estimate in the record, written by the law; otherwise it does not change.
         inertia: M(q), one row per joint, for a law with `needs_model`; otherwise zeros.
         bias: C qd + G (for a chain with friction, less the torque of its stops), N m, for a law
             with `needs_model`; otherwise zeros.
@@ -193,16 +202,16 @@ UserLawFactory = Callable[[LawContext], UserLaw]
 def call_law(
     law: UserLaw, site: str, now: LawInput, collect_sent: Callable[[LawInput], list[float]]
 ) -> "LawResults":
-    """Calls a law at a tick and returns its results.
+    """Calls a law in a tick and returns its results.
 
     Args:
-        law: the law.
-        site: the name of its site.
-        now: the input of the tick.
-        collect_sent: returns the numbers of the vectors that the law sends.
+        law: The law.
+        site: Name of the site.
+        now: Input of the tick.
+        collect_sent: Function that returns the numbers of the vectors that the law sends.
 
     Raises:
-        LawFailed: the law raised, or its results are not finite numbers of the right count.
+        LawFailed: The law raised, or its results are not finite numbers of the right count.
     """
     try:
         returned = law.torque(now)
@@ -217,6 +226,7 @@ def call_law(
         raise
     except (Exception, SystemExit) as error:
         raise describe_failure(law, site, now.k, error) from error
+
     required_lengths = (
         ("torque", torque, now.joints),
         ("theta_hat", estimate, len(now.theta_hat)),
@@ -230,7 +240,7 @@ def call_law(
 
 
 class LawResults(NamedTuple):
-    """The results of a law at a tick: torque, estimate, memory and sent numbers."""
+    """Results of a law in a tick: torque, estimate, memory and sent numbers."""
 
     torque: list[float]
     theta_hat: list[float]
@@ -241,8 +251,14 @@ class LawResults(NamedTuple):
 def check_results(law: UserLaw, site: str, tick: int, results: LawResults) -> None:
     """Refuses results that are not finite, and a memory that is too large.
 
+    Args:
+        law: The law, for the error.
+        site: Name of the site, for the error.
+        tick: The tick, for the error.
+        results: Results of the law.
+
     Raises:
-        LawFailed: with the first problem.
+        LawFailed: The first problem.
     """
     count = len(results.memory)
     if count > MAX_LAW_MEMORY:
@@ -261,7 +277,14 @@ def check_results(law: UserLaw, site: str, tick: int, results: LawResults) -> No
 def describe_failure(
     law: UserLaw, site: str, tick: int | None, error: BaseException
 ) -> LawFailed:
-    """Returns the failure of a law that raised an exception."""
+    """Returns the failure of a law that raised an exception.
+
+    Args:
+        law: The law.
+        site: Name of the site.
+        tick: The tick; None outside of a tick.
+        error: The exception.
+    """
     problem = _one_line(error)
     if "LawVector" in problem:
         problem += "; for more than + - * / make it an array, as in numpy.asarray(now.q)"
@@ -269,7 +292,7 @@ def describe_failure(
 
 
 def _flatten(value: Any) -> Iterator[float]:
-    """Yields the numbers of a value: of a number, or of nested lists."""
+    """Yields the numbers of a value in order: of a number, or of nested lists."""
     if isinstance(value, Real):
         yield float(value)
         return
@@ -278,7 +301,15 @@ def _flatten(value: Any) -> Iterator[float]:
 
 
 def _fill(value: Any, numbers: Iterator[float]) -> Any:
-    """Returns a value of the same form as `value`, filled with the next numbers."""
+    """Returns a value of the same form as `value`, filled with the next numbers.
+
+    This is the inverse of `_flatten`. Types are kept: an integer attribute stays an integer as
+    long as its number is integral.
+
+    Args:
+        value: A number, an array, or nested lists of numbers.
+        numbers: The numbers, which are consumed in order.
+    """
     if isinstance(value, bool):
         return bool(next(numbers))
     if isinstance(value, Real):
@@ -291,7 +322,7 @@ def _fill(value: Any, numbers: Iterator[float]) -> Any:
 
 
 def list_remembered(law: Any) -> tuple[str, ...]:
-    """Returns the names of the attributes that a law remembers; () without memory."""
+    """Returns the names of the attributes that a law remembers; () for a law without memory."""
     return tuple(getattr(law, "remembers", ()))
 
 
@@ -306,7 +337,12 @@ def read_memory(law: Any) -> list[float]:
 
 
 def write_memory(law: Any, memory: Sequence[float]) -> None:
-    """Restores a law from its memory."""
+    """Restores a law from its memory: by its method `recall`, or its remembered attributes.
+
+    Args:
+        law: The law, which is changed.
+        memory: Numbers that `read_memory` returned.
+    """
     if callable(getattr(law, "recall", None)):
         law.recall(memory)
         return
@@ -318,8 +354,13 @@ def write_memory(law: Any, memory: Sequence[float]) -> None:
 def restore_law(law: UserLaw, site: str, memory: Sequence[float]) -> None:
     """Restores a law from the memory in a record.
 
+    Args:
+        law: The law, which is changed.
+        site: Name of the site, for the error.
+        memory: Numbers of the record.
+
     Raises:
-        LawFailed: the law raised an exception.
+        LawFailed: The law raised an exception.
     """
     try:
         write_memory(law, memory)
