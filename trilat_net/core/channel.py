@@ -1,4 +1,7 @@
-"""The network's effect on each sample of a directed link: its due time, or its loss.
+"""Computes the network's effect on each sample of a link: its due time, or its loss.
+
+A link is the directed connection between two sites. It delays each sample that a site sends,
+and may lose or duplicate it.
 
 Invariant (L4):
 
@@ -39,7 +42,7 @@ _CUSTOM = int(DelayKind.CUSTOM)
 
 @leaf
 def _in_outage(stamp_ns: int, link: LinkRow, points: Points) -> bool:
-    """True if a stamp lies in an outage of the link: at its start or later, before its end."""
+    """Returns True if a stamp lies in an outage of the link, its end excluded."""
     for n in range(link.outage_first, link.outage_first + link.outage_count):
         if points[n, 0] <= stamp_ns < points[n, 1]:
             return True
@@ -48,11 +51,17 @@ def _in_outage(stamp_ns: int, link: LinkRow, points: Points) -> bool:
 
 @leaf
 def _draw_loss(sample: int, fresh: bool, link: LinkRow, model: Row) -> bool:
-    """Advances the chain of losses by one sample; true if the sample is lost.
+    """Advances the chain of losses by one sample, and returns True if the sample is lost.
 
     The chain of Gilbert and Elliott has a good and a bad state, each with a probability of
     loss. A fresh chain starts in its stationary distribution, where the bad state has the
     probability enter / (enter + leave).
+
+    Args:
+        sample: Index of the sample.
+        fresh: True for the first sample of the model.
+        link: Row of the link, whose state is changed.
+        model: Model in force.
     """
     if model.loss_good == 0.0 and model.enter == 0.0:
         return False
@@ -72,7 +81,16 @@ def _draw_loss(sample: int, fresh: bool, link: LinkRow, model: Row) -> bool:
 def _delay_us(
     sample: int, stamp_ns: int, fresh: bool, link: LinkRow, model: Row, points: Points
 ) -> int:
-    """Returns the delay of a sample, us; LOST if a trace says so."""
+    """Returns the delay of a sample, us, or LOST if a trace says that the sample is lost.
+
+    Args:
+        sample: Index of the sample.
+        stamp_ns: Stamp of the sample, ns since the epoch.
+        fresh: True for the first sample of the model.
+        link: Row of the link.
+        model: Model in force.
+        points: The site's traces.
+    """
     key: DrawKey = link.key
     if model.kind == _MEASURED:
         return 0
@@ -102,6 +120,14 @@ def _due_ns(
 
     Loss and delay are drawn for every sample, also for lost ones, so that their memories
     advance by index.
+
+    Args:
+        sample: Index of the sample.
+        stamp_ns: Stamp of the sample, ns since the epoch.
+        fresh: True for the first sample of the model.
+        link: Row of the link.
+        model: Model in force.
+        points: The site's traces and outages.
     """
     lost = _draw_loss(sample, fresh, link, model)
     delay_us = _delay_us(
@@ -109,6 +135,7 @@ def _due_ns(
     )
     if lost or delay_us < 0 or _in_outage(stamp_ns, link, points):
         return LOST
+
     if model.duplicate > 0.0:
         u, _ = uniforms(link.key, sample, DUPLICATE, 0)
         if u < model.duplicate:
@@ -118,6 +145,7 @@ def _due_ns(
             if model.kind < _AR1:
                 copy_us = clamp_delay_us(draw_delay_us(link.key, sample, COPY, model))
                 delay_us = min(delay_us, copy_us)
+
     due_ns: int = stamp_ns + max(delay_us, model.playout_us) * 1000
     if model.in_order == 1:
         due_ns = max(due_ns, link.due_before)

@@ -1,4 +1,4 @@
-"""The control laws of the kernel: the paper's adaptive law and the laws of known gravity.
+"""Computes the kernel's control laws: the paper's adaptive law, and laws of known gravity.
 
 The functions are for the planar two-link arm; `chain_stages` has the same laws for chains.
 Gains are diagonal matrices, written as vectors with one number per joint (N m s/rad; Lambda in
@@ -28,9 +28,16 @@ ROBUST_RESIDUE = ((5.0**0.5 - 1.0) / 2.0) ** 2.5
 def control_errors(
     q: Vector, qd: Vector, q_des: Vector, qd_des: Vector, Lambda: Vector
 ) -> tuple[Pair, Pair, Pair]:
-    """Returns e, its derivative ed, and r.
+    """Returns the error e, its derivative ed, and the filtered error r.
 
-    e = q - q_des,  ed = qd - qd_des,  r = qd + Lambda e        Eq. (9), (18), (10)
+        e = q - q_des,  ed = qd - qd_des,  r = qd + Lambda e        Eq. (9), (18), (10)
+
+    Args:
+        q: Joint angles.
+        qd: Joint velocities.
+        q_des: Reference of the joints.
+        qd_des: Derivative of the reference.
+        Lambda: Rate at which errors decay, per joint.
     """
     e_1 = q[0] - q_des[0]
     e_2 = q[1] - q_des[1]
@@ -63,7 +70,14 @@ def regressor_transpose_times(Y: tuple[Five, Five], r: Vector) -> Five:
 
 @leaf
 def update_estimate(theta_hat: Vector, gain_s: float, Gamma: Vector, Yr: Vector) -> Five:
-    """Returns theta_hat - gain_s Gamma Y' r: Eq. (15) integrated over `gain_s` seconds."""
+    """Returns theta_hat - gain_s Gamma Y' r: Eq. (15) integrated over a step.
+
+    Args:
+        theta_hat: Estimate of the parameters, shape (5,).
+        gain_s: Duration of the step, s.
+        Gamma: Adaptation gain per parameter.
+        Yr: Y' r, shape (5,).
+    """
     return (
         theta_hat[0] - gain_s * Gamma[0] * Yr[0],
         theta_hat[1] - gain_s * Gamma[1] * Yr[1],
@@ -119,6 +133,11 @@ def robust_torque(rho: float, width: float, r: float) -> float:
 
     The law subtracts this torque. With a disturbance d of at most rho, the power
     (d - robust torque) r is at most ROBUST_RESIDUE rho width.
+
+    Args:
+        rho: Largest torque.
+        width: Value of r at which the torque is 0.71 rho.
+        r: Filtered error of a joint.
     """
     smooth_sign = r / sqrt(r * r + width * width)
     return rho * smooth_sign
@@ -137,7 +156,13 @@ def project_estimate(theta_hat: Vector, low: Vector, high: Vector) -> Five:
     """Returns the projection of an estimate into its box: each parameter limited to its range.
 
     If Gamma is diagonal and the true theta lies in the box, the projection never increases
-    (theta_hat - theta)' Gamma^-1 (theta_hat - theta). V' <= 0 therefore still holds.
+    (theta_hat - theta)' Gamma^-1 (theta_hat - theta). V' <= 0 therefore still holds, where V is
+    the energy function of the stability proof.
+
+    Args:
+        theta_hat: Estimate of the parameters, shape (5,).
+        low: Lower bound of each parameter.
+        high: Upper bound of each parameter.
     """
     return (
         _clip(theta_hat[0], low[0], high[0]),

@@ -1,4 +1,7 @@
-"""Delay models of a link, as the core computes them.
+"""Computes the delay of each sample on a link by a delay model.
+
+A link is the directed connection between two sites, and a sample is the state that a site sends
+in one tick. A delay model is a distribution of delays, a function of time, or a recorded trace.
 
 Invariant (L4):
 
@@ -64,27 +67,29 @@ class TraceEnd(IntEnum):
 
 
 class LinkModel(NamedTuple):
-    """The effect of a link on its samples from a stamp on.
+    """Effect of a link on its samples, from a stamp on until the next model applies.
+
+    The stamp of a sample is the time at which it was sent.
 
     Attributes:
-        from_ns: the first stamp to which the model applies, ns since the epoch.
-        kind: a `DelayKind`, which defines `location`, `scale`, `extra` and `weight`.
-        at_end: a `TraceEnd`, for a trace.
-        trace_first: the first row in the site's table of the points of a trace, or of the
-            numbers of a CUSTOM model.
-        trace_count: the number of these rows.
-        loss_good: probability that a sample is lost in the good state.
-        loss_bad: probability that a sample is lost in the bad state.
-        enter: probability of a change from good to bad, per sample.
-        leave: probability of a change from bad to good, per sample.
-        duplicate: probability that a sample has a copy, with another delay.
-        in_order: 1: no sample is released before an older sample; 0: the newest wins.
-        playout_us: the least delay of each sample, us (play-out buffer).
-        call: the address of the function of a CUSTOM model, see `plugged`.
-        key: input of that function: the key of the link.
-        sample: input: the sample.
-        stamp_ns: input: its stamp, ns since the epoch.
-        drawn_us: output: the delay, us.
+        from_ns: First stamp to which the model applies, ns since the epoch.
+        kind: A `DelayKind`, which defines `location`, `scale`, `extra` and `weight`.
+        at_end: A `TraceEnd`, for a trace.
+        trace_first: First row in the site's table of the points of a trace, or of the numbers
+            of a CUSTOM model.
+        trace_count: Number of these rows.
+        loss_good: Probability that a sample is lost in the good state.
+        loss_bad: Probability that a sample is lost in the bad state.
+        enter: Probability of a change from good to bad, per sample.
+        leave: Probability of a change from bad to good, per sample.
+        duplicate: Probability that a sample has a copy, with another delay.
+        in_order: 1: no sample is released before an older sample; 0: the newest sample counts.
+        playout_us: Least delay of each sample, us (play-out buffer).
+        call: Address of the function of a CUSTOM model, see `plugged`.
+        key: Input of that function: the key of the link.
+        sample: Input: the index of the sample.
+        stamp_ns: Input: the stamp of the sample, ns since the epoch.
+        drawn_us: Output: the delay, us.
     """
 
     from_ns: int = 0
@@ -129,7 +134,14 @@ sqrt(-2 log 2^-53) by Box and Muller, and -log 2^-53.
 
 
 def _longest_us(model: LinkModel, trace: Points | None) -> float:
-    """Returns a bound of the delays of a model, us, from the bounds of its random numbers."""
+    """Returns an upper bound of the delays of a model, us.
+
+    The bound follows from the bounds of the model's random numbers.
+
+    Args:
+        model: The model.
+        trace: Points of its trace, or None.
+    """
     location = model.location
     scale = model.scale
     extra = model.extra
@@ -142,8 +154,8 @@ def _longest_us(model: LinkModel, trace: Points | None) -> float:
         return math.exp(min(location + _LARGEST_NORMAL * scale, math.log(MAX_DELAY_US)))
     if model.kind == DelayKind.AR1:
         # The sum over all past draws, each at its largest: sqrt(1 - c^2) / (1 - c).
-        most = math.sqrt((1.0 + weight) / (1.0 - weight)) if weight < 1.0 else math.inf
-        return location + _LARGEST_NORMAL * scale * most
+        gain = math.sqrt((1.0 + weight) / (1.0 - weight)) if weight < 1.0 else math.inf
+        return location + _LARGEST_NORMAL * scale * gain
     return {
         DelayKind.CONSTANT: location,
         DelayKind.UNIFORM: location + scale,
@@ -157,11 +169,11 @@ def _longest_us(model: LinkModel, trace: Points | None) -> float:
 
 
 def max_delay_us(models: Sequence[LinkModel], traces: Sequence[Points | None]) -> int:
-    """Returns a bound of the delays of a link, us, play-out included.
+    """Returns an upper bound of the delays of a link, us, the play-out buffer included.
 
     Args:
-        models: the models of the link.
-        traces: per model the points of its trace, or None.
+        models: Models of the link.
+        traces: Per model the points of its trace, or None.
     """
     bounds_us = []
     for model, trace in zip(models, traces, strict=True):
@@ -191,10 +203,10 @@ def draw_delay_us(key: DrawKey, sample: int, purpose: int, model: Row) -> float:
     """Returns a draw of a delay model without memory, us, not rounded.
 
     Args:
-        key: the key of the link.
-        sample: the sample.
-        purpose: DELAY or COPY.
-        model: the model, a row of LINK_MODEL_DTYPE.
+        key: Key of the link, from which all its random numbers follow.
+        sample: Index of the sample.
+        purpose: DELAY for the sample, COPY for its duplicate.
+        model: The model, a row of LINK_MODEL_DTYPE.
     """
     location: float = model.location
     scale: float = model.scale
@@ -242,7 +254,12 @@ def next_ar1_value(
 
 @leaf
 def sine_delay_us(stamp_ns: int, model: Row) -> float:
-    """Returns the sinusoidal delay of a sample with this stamp, us, not rounded."""
+    """Returns the sinusoidal delay of a sample with this stamp, us, not rounded.
+
+    Args:
+        stamp_ns: Stamp of the sample, ns since the epoch.
+        model: The model, a row of LINK_MODEL_DTYPE.
+    """
     location: float = model.location
     scale: float = model.scale
     turns = stamp_ns * 1e-3 / model.extra
@@ -251,10 +268,15 @@ def sine_delay_us(stamp_ns: int, model: Row) -> float:
 
 @leaf
 def trace_delay_us(stamp_ns: int, model: Row, points: Points) -> int:
-    """Returns the delay of a trace at a stamp, us; -1: the sample is lost.
+    """Returns the delay of a trace at a stamp, us; -1 if the sample is lost.
 
     The delay is that of the last point at or before the stamp. A trace that loops starts again
     after its last point, which lasts as long as the point before it.
+
+    Args:
+        stamp_ns: Stamp of the sample, ns since the epoch.
+        model: The model, a row of LINK_MODEL_DTYPE.
+        points: Points of all traces, rows of time and delay, us.
     """
     first = model.trace_first
     count = model.trace_count
@@ -285,8 +307,15 @@ def custom_delay_us(
 ) -> float:
     """Returns the delay of a CUSTOM model, us, not rounded and at most `location`.
 
-    The function of the model gets its own numbers, which are stored in the site's table of
+    The function of the model receives its own numbers, which are stored in the site's table of
     points, two in each row.
+
+    Args:
+        key: Key of the link.
+        sample: Index of the sample.
+        stamp_ns: Stamp of the sample, ns since the epoch.
+        model: The model, in which the function finds its input and writes the delay.
+        points: The site's table of points.
     """
     model.key = np.int64(key)
     model.sample = sample

@@ -1,5 +1,7 @@
 # mypy: disallow-untyped-calls=False, disable-error-code="no-any-return"
-"""The typed wrapper around Numba: `leaf` compiles a function and keeps its machine code.
+"""Compiles functions of the core with Numba, and stores their machine code.
+
+A leaf is a compiled function of numbers and arrays; the decorator `leaf` makes a function one.
 
 Machine code is kept in the user's cache directory, in a folder named after a hash of all
 sources of the core. (Numba alone notices a change of the file that holds a leaf, but not of the
@@ -90,9 +92,9 @@ _ships = _SHIPPED.is_dir()
 
 
 def is_core_cached() -> bool:
-    """True if machine code of this version of the core is kept.
+    """Returns True if machine code of this version of the core is stored.
 
-    The whole tick is compiled last, so its code stands for all.
+    The whole tick is compiled last, so the presence of its code is sufficient.
     """
     folders = [_CACHE, _SHIPPED if _ships else None]
     for folder in folders:
@@ -146,7 +148,7 @@ _register("numba:compile", compiling_notice)
 
 
 def _mangle_record(record: types.Record) -> tuple[str, tuple[str]]:
-    """Returns the name of a record in symbols of machine code, from a hash of its fields.
+    """Returns the name that a record has in symbols of machine code, from a hash of its fields.
 
     Numba itself numbers records in the order in which a process uses them. Leaves that two
     processes compiled for two layouts would then have equal symbols, and a third process that
@@ -275,9 +277,10 @@ class _LeafCache(FunctionCache):
         self._inner = files(str(folder), f"{base}-within", stamp)
 
     def load_overload(self, signature: Any, context: Any) -> Any:
-        """Returns the kept code for a signature, or None.
+        """Returns the stored code for a signature, or None if there is none.
 
-        Numba's method first prepares the compiler, which takes far longer than loading.
+        The user's folder is read first, then the wheel. Numba's method would first prepare the
+        compiler, which takes far longer than loading.
         """
         with self._guard_against_spurious_io_errors():
             result = self._load_overload(signature, context)
@@ -301,7 +304,7 @@ class _LeafCache(FunctionCache):
         return None if kept is None else self._impl.rebuild(context, kept)
 
     def save_inner(self, argument_types: Any, result: Any) -> None:
-        """Keeps a compiled inner leaf."""
+        """Stores a compiled inner leaf, if the user's folder can be written."""
         if _CACHE is not None:
             self._impl.locator.ensure_cache_path()
             key = self._index_key(argument_types, result.codegen)
@@ -419,7 +422,14 @@ class _Leaf(CPUDispatcher):
 
 
 def bind_leaf(function: Callable[P, R], *arguments: P.args, **_: P.kwargs) -> Callable[P, R]:
-    """Returns a leaf compiled for the types of these arguments; calls no longer check types."""
+    """Returns a leaf compiled for the types of these arguments.
+
+    Calls of the result no longer check types, which saves time in each tick.
+
+    Args:
+        function: The leaf.
+        *arguments: Arguments of the types with which the result is called.
+    """
     if _config.DISABLE_JIT:
         return function
     dispatcher: Any = function
@@ -428,7 +438,11 @@ def bind_leaf(function: Callable[P, R], *arguments: P.args, **_: P.kwargs) -> Ca
 
 
 def leaf(function: Callable[P, R]) -> Callable[P, R]:
-    """Compiles a function of numbers and arrays; its type for readers and mypy is unchanged."""
+    """Compiles a function of numbers and arrays (decorator).
+
+    For readers and mypy the type of the function is unchanged. If Numba is disabled, the
+    function itself is returned.
+    """
     if _config.DISABLE_JIT:
         return function
     options = {"nopython": True, "boundscheck": None, **_OPTIONS}
@@ -456,10 +470,10 @@ def compile_named(
     in any process.
 
     Args:
-        function: the closure.
-        name: its name.
-        signature: its signature, as Numba has it.
-        **options: options of `numba.njit`.
+        function: The closure.
+        name: Name of the closure.
+        signature: Signature of the closure, as Numba has it.
+        **options: Options of `numba.njit`.
     """
     function.__qualname__ = name
     # Loaded code must count no references either, so the options hold in both cases.

@@ -1,8 +1,15 @@
-"""One tick of one site, compiled: its eight stages in order (README.md lists them).
+"""Computes one tick of one site, as compiled code: its eight stages in order.
+
+A site is a process that runs one arm and its control loop; a tick is one period of the loop.
+The stages, which README.md describes, are 1 accept, 2 release, 3 reference, 4 errors, 5
+estimate, 6 torque, 7 emit and 8 advance. The state of a site is a row of numbers, `SiteRow`,
+which the stages read and write. For an arm that is a chain of joints, `chain` contains the rows
+of its joints; for the planar two-link arm it is None.
 
 Invariant:
 
-- One call computes a whole tick, and each stage is a leaf that the fused run calls as well.
+- One call computes a whole tick, and each stage is a leaf (a compiled function) that the fused
+  run, the simulation of several sites in one call, uses as well.
 - The arm advances by one period with the classical Runge-Kutta method of fourth order. Each of
   its four evaluations evaluates operators and environments anew.
 - The control torque and the torque of sampled sources are constant over the period.
@@ -41,6 +48,12 @@ def _place_arm(
     """Computes the kinematics of a chain, and the orientation of its reference if requested.
 
     The planar arm needs neither.
+
+    Args:
+        s: Row of the site.
+        chain: Rows of the chain, or None.
+        links: Rows of the site's links.
+        updates_reference: True in a tick; false if the reference was restored from a record.
     """
     if chain is None:
         return
@@ -51,7 +64,7 @@ def _place_arm(
 
 @leaf
 def _update_errors(s: SiteRow, chain: RowArray | None) -> None:
-    """Runs stage 4: errors, r, and the dynamics that the law needs."""
+    """Runs stage 4: the errors, the filtered error r, and the dynamics that the law needs."""
     if chain is None:
         two_link_stages.update_errors(s)
     else:
@@ -60,7 +73,14 @@ def _update_errors(s: SiteRow, chain: RowArray | None) -> None:
 
 @leaf
 def _advance_estimate(s: SiteRow, chain: RowArray | None, gain_s: float, Yr: Vector) -> None:
-    """Advances the estimate by theta_hat - gain_s Gamma Yr, within its box."""
+    """Advances the estimate of the arm's parameters to theta_hat - gain_s Gamma Yr, in its box.
+
+    Args:
+        s: Row of the site.
+        chain: Rows of the chain, or None.
+        gain_s: Duration of the step, s.
+        Yr: Y' r of Eq. (15), one number per parameter.
+    """
     if chain is None:
         two_link_stages.advance_estimate(s, gain_s, Yr)
     else:
@@ -69,7 +89,10 @@ def _advance_estimate(s: SiteRow, chain: RowArray | None, gain_s: float, Yr: Vec
 
 @leaf
 def _adapts(s: SiteRow) -> bool:
-    """True if the mode lets the estimate adapt."""
+    """Returns True if the estimate adapts in the present mode.
+
+    It does not adapt in DIVERGED, and at rest only while the law's own torque is in use.
+    """
     return bool(s.mode != _DIVERGED and (rests_by_law(s) or not rests(s)))
 
 
@@ -92,7 +115,14 @@ def _update_estimate(k: int, s: SiteRow, chain: RowArray | None) -> None:
 
 @leaf
 def torque_stage(site: RowArray, chain: RowArray | None) -> None:
-    """Runs stage 6 of a law that the kernel computes; `law_stage` runs a user's law."""
+    """Runs stage 6, the torque, of a law that the kernel computes.
+
+    For a user's law this function does nothing: `law_stage` computes its torque.
+
+    Args:
+        site: Row of the site.
+        chain: Rows of the chain, or None.
+    """
     s: SiteRow = site[0]
     if s.law == _USER:
         return
@@ -104,7 +134,13 @@ def torque_stage(site: RowArray, chain: RowArray | None) -> None:
 
 @leaf
 def _put_known_gravity(s: SiteRow, chain: RowArray | None, torque: Array) -> None:
-    """Writes the gravity torque for the parameters that the law knows or has estimated."""
+    """Writes the gravity torque for the parameters that the law knows or has estimated.
+
+    Args:
+        s: Row of the site.
+        chain: Rows of the chain, or None.
+        torque: Written, shape (n,), N m.
+    """
     learns = s.law == _ADAPTIVE or (s.law == _USER and s.theta_known == 0)
     theta = s.theta_hat if learns else s.known
     if chain is None:
@@ -115,9 +151,16 @@ def _put_known_gravity(s: SiteRow, chain: RowArray | None, torque: Array) -> Non
 
 @leaf
 def _guard_torque(k: int, t_ns: int, s: SiteRow, chain: RowArray | None) -> None:
-    """Ends stage 6: the torque of an arm at rest or returning to its law, and its limits.
+    """Ends stage 6: replaces or changes the torque of an arm at rest, and limits all torques.
 
-    Under the rule `glide` a torque that is not finite leads to FAULT here.
+    Under the rule `glide` a torque that is not finite leads to FAULT here. The torque of an arm
+    that rests, or that has just left its rest, differs from that of its law.
+
+    Args:
+        k: The tick.
+        t_ns: Nominal time of the tick, ns since the epoch, the common start of the session.
+        s: Row of the site.
+        chain: Rows of the chain, or None.
     """
     resting = False
     if s.on_stale == _GLIDE:
@@ -140,6 +183,10 @@ def _write_record(s: SiteRow, row: Array) -> None:
     """Runs stage 7: writes the record's floats in the order of `Layout.columns`.
 
     A number that is not finite becomes 0, and the site becomes DIVERGED.
+
+    Args:
+        s: Row of the site.
+        row: The record's floats; written.
     """
     n = s.joints
     m = s.shared
@@ -176,7 +223,7 @@ def _write_record(s: SiteRow, row: Array) -> None:
 def _update_external_torque(
     t_s: float, s: SiteRow, chain: RowArray | None, actors: TorqueSourceRows, table: TorqueTable
 ) -> None:
-    """Writes the torque of operators and environments at t_k, which stage 6 may use."""
+    """Writes the torque of operators and environments at time t_k, which stage 6 may use."""
     if chain is None:
         two_link_stages.update_external_torque(t_s, s, actors, table)
     else:
@@ -194,7 +241,11 @@ def _advance_arm(
     actors: TorqueSourceRows,
     table: TorqueTable,
 ) -> bool:
-    """Advances q and qd by one period; returns false, without a change, if they overflow."""
+    """Advances q and qd by one period.
+
+    Returns:
+        False, without a change, if the result is not finite.
+    """
     if chain is None:
         return two_link_stages.advance_arm(t_s=t_s, h_s=h_s, s=s, actors=actors, table=table)
     return chain_stages.advance_arm(
@@ -245,7 +296,12 @@ def _advance(
 
 @leaf
 def channel_of(channel: ChannelArrays | None, peer: int) -> ChannelArrays | None:
-    """Returns the channel of one peer, or of one site of stacked arrays."""
+    """Returns the arrays of the numbers that one peer's law sends, or None without them.
+
+    Args:
+        channel: Arrays of all peers, or of all sites of stacked arrays.
+        peer: Index of the peer or the site.
+    """
     if channel is None:
         return None
     return ChannelArrays(channel.waiting[peer], channel.received[peer], channel.columns[peer])
@@ -253,7 +309,7 @@ def channel_of(channel: ChannelArrays | None, peer: int) -> ChannelArrays | None
 
 @leaf
 def link_arrays(arrays: SiteArrays, peer: int) -> LinkArrays:
-    """Returns the arrays of the link from one peer."""
+    """Returns the arrays of the link from one peer, as views."""
     return LinkArrays(
         state=arrays.links[peer : peer + 1],
         models=arrays.models[peer],
@@ -266,13 +322,19 @@ def link_arrays(arrays: SiteArrays, peer: int) -> LinkArrays:
 
 @leaf
 def find_release(peer: int, tick: int, arrays: SiteArrays) -> int:
-    """Returns the tick that releases a peer's sample, or LOST, as `link.release_tick`."""
+    """Returns the tick that releases a peer's sample, or LOST, as `link.release_tick`.
+
+    Args:
+        peer: Index of the peer.
+        tick: Stamp of the sample, a tick of the peer.
+        arrays: Arrays of the site.
+    """
     return release_tick(tick, arrays.site[0].rate_hz, link_arrays(arrays, peer))
 
 
 @leaf
 def accept_stage(k: int, count: int, arrays: SiteArrays, buffers: TickBuffers) -> None:
-    """Runs stage 1: files the first `count` arrivals in their links."""
+    """Runs stage 1: files the first `count` arrivals of the buffers in their links."""
     rate_hz = arrays.site[0].rate_hz
     for n in range(count):
         arrival: ArrivalRow = buffers.arrivals[n]
@@ -299,7 +361,21 @@ def reference_stages(
     table: TorqueTable,
     chain: RowArray | None,
 ) -> None:
-    """Runs stages 3 to 5 and computes the external torque, with the released samples in use."""
+    """Runs stages 3 to 5 with the samples in use, and then computes the external torque.
+
+    The arguments are fields of `SiteArrays`; the fused run has them for each site of its stack.
+
+    Args:
+        k: The tick.
+        t_ns: Nominal time of the tick, ns since the epoch.
+        site: Row of the site.
+        links: Rows of its links.
+        ramps: Changes of the dominance factors, the weights with which the site follows its
+            peers.
+        actors: Rows of operators and environments.
+        table: Numbers of operators and environments.
+        chain: Rows of the chain, or None.
+    """
     s: SiteRow = site[0]
     # 3 reference
     update_reference(t_ns, s, links, ramps)
@@ -321,7 +397,15 @@ def reference_stages(
 def sense_stages(
     k: int, t_ns: int, count: int, arrays: SiteArrays, buffers: TickBuffers
 ) -> None:
-    """Runs stages 1 to 5 of a tick with `count` arrivals, and computes the external torque."""
+    """Runs stages 1 to 5 of a tick with `count` arrivals, and computes the external torque.
+
+    Args:
+        k: The tick.
+        t_ns: Nominal time of the tick, ns since the epoch.
+        count: Number of arrivals in the buffers.
+        arrays: Arrays of the site.
+        buffers: Arrivals of the tick.
+    """
     rate_hz = arrays.site[0].rate_hz
     # Missed ticks release their samples too: each page of a calendar must be read once.
     for missed in range(k - arrays.site[0].skipped, k):
@@ -425,7 +509,10 @@ def site_tick(
 
 @leaf
 def resume_stages(k: int, arrays: SiteArrays) -> None:
-    """Repeats stages 4 and 8 of tick k, after its state was restored from records."""
+    """Repeats stages 4 and 8 of tick k, after its state was restored from records.
+
+    They compute the numbers that no record contains and that tick k+1 needs.
+    """
     s: SiteRow = arrays.site[0]
     t_ns = tick_ns(k, s.rate_hz)
     _place_arm(s, arrays.chain, arrays.links, False)

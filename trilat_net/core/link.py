@@ -1,4 +1,8 @@
-"""The receiving end of one directed link j -> i, which applies the delay.
+"""Applies the delay of a link, at its receiving end.
+
+A link is the directed connection from site j to site i. Site j sends a sample, the state of its
+arm, in each of its ticks; the number of the tick is the stamp of the sample. The delay of the
+network is simulated by keeping each sample until it is due.
 
 A link is a calendar: a ring of pages, one for each of the receiver's next ticks.
 `accept_sample` files a sample in the page of the tick that releases it, unless that page holds
@@ -48,14 +52,14 @@ def sample_dtype(shared: int) -> np.dtype[np.void]:
 
 
 class ChannelArrays(NamedTuple):
-    """The numbers that a peer's law sends, in the order in which the receiver's law reads them.
+    """Numbers that a peer's law sends, in the order in which the receiver's law reads them.
 
     The arrays of all peers, and of all sites of a stack, have further axes in front.
 
     Attributes:
-        waiting: the numbers of the waiting samples, by page of the calendar, shape (pages, C).
-        received: the numbers of the sample in use, shape (C,); zeros before the first sample.
-        columns: for each number its column among the numbers that arrive with a sample, shape
+        waiting: Numbers of the waiting samples, by page of the calendar, shape (pages, C).
+        received: Numbers of the sample in use, shape (C,); zeros before the first sample.
+        columns: For each number its column among the numbers that arrive with a sample, shape
             (C,); -1: the peer does not send the number, which is 0.
     """
 
@@ -65,16 +69,16 @@ class ChannelArrays(NamedTuple):
 
 
 class LinkArrays(NamedTuple):
-    """The arrays of one link.
+    """Arrays of one link.
 
     Attributes:
-        state: the row of the link, shape (1,), see `link_dtype`.
-        models: the models of its channel, shape (M,), LINK_MODEL_DTYPE.
-        dues: the due times of its newest samples, ns, or LOST; sample m is at m modulo the
-            length. The entry of a sample that has arrived is `_FILED` minus the due time.
-        calendar: the samples that wait, shape (pages,), see `sample_dtype`.
-        points: the site's traces and outages, shape (n, 2).
-        channel: the numbers that the peer's law sends; None: the site's law ignores them.
+        state: Row of the link, shape (1,), see `link_dtype`.
+        models: Models of the link's delay and loss, shape (M,), LINK_MODEL_DTYPE.
+        dues: Due times of its newest samples, ns, or LOST; sample m is at m modulo the length.
+            The entry of a sample that has arrived is `_FILED` minus the due time.
+        calendar: Samples that wait, shape (pages,), see `sample_dtype`.
+        points: The site's traces and outages, shape (n, 2).
+        channel: Numbers that the peer's law sends; None: the site's law ignores them.
     """
 
     state: RowArray
@@ -102,6 +106,10 @@ def span_ticks(span_ns: int, rate_hz: int) -> int:
     """Returns the number of ticks that span a time, rounded up.
 
     The result is that of `first_tick_at`, in plain Python: callers need no compiled core.
+
+    Args:
+        span_ns: The time, ns.
+        rate_hz: Tick rate, Hz.
     """
     return -(-span_ns * rate_hz // NS_PER_S)
 
@@ -109,12 +117,14 @@ def span_ticks(span_ns: int, rate_hz: int) -> int:
 def calendar_pages(
     rate_hz: int, delay_us: int = MAX_DELAY_US, ahead_ns: int = AHEAD_LIMIT_NS
 ) -> int:
-    """Returns the pages of a calendar, a power of two; by default the largest number needed.
+    """Returns the number of pages of a calendar, a power of two.
+
+    By default this is the largest number that any link needs.
 
     Args:
-        rate_hz: the tick rate of the receiver, Hz.
-        delay_us: the longest delay, us.
-        ahead_ns: the longest time by which a sender may be ahead of the receiver, ns.
+        rate_hz: Tick rate of the receiver, Hz.
+        delay_us: Longest delay, us.
+        ahead_ns: Longest time by which a sender may be ahead of the receiver, ns.
     """
     span = span_ticks(delay_us * 1000 + ahead_ns, rate_hz)
     return 1 << (span + 2).bit_length()
@@ -122,10 +132,17 @@ def calendar_pages(
 
 @leaf
 def release_tick(tick: int, rate_hz: int, link: LinkArrays) -> int:
-    """Returns the receiver's tick at which sample `tick` comes into use if it arrives in time.
+    """Returns the receiver's tick in which a sample comes into use if it arrives in time.
 
-    The result is LOST if the link loses the sample, or if the sample is so old that the link
-    has forgotten its due time.
+    Args:
+        tick: Stamp of the sample, a tick of the sender.
+        rate_hz: Tick rate of the receiver, Hz.
+        link: Arrays of the link.
+
+    Returns:
+        The tick. LOST if the link loses the sample, or if the sample is so old that the link
+            has
+        forgotten its due time.
     """
     row: LinkRow = link.state[0]
     dues = link.dues
@@ -142,7 +159,14 @@ def release_tick(tick: int, rate_hz: int, link: LinkArrays) -> int:
 
 @leaf
 def _is_far_ahead(k: int, rate_hz: int, tick: int, peer_rate_hz: int) -> bool:
-    """True if a sample's stamp is more than AHEAD_LIMIT_S ahead of tick k."""
+    """Returns True if a sample's stamp is more than AHEAD_LIMIT_S ahead of tick k.
+
+    Args:
+        k: Present tick of the receiver.
+        rate_hz: Tick rate of the receiver, Hz.
+        tick: Stamp of the sample.
+        peer_rate_hz: Tick rate of the sender, Hz.
+    """
     # Compare whole seconds first: the nanoseconds of a hostile stamp would overflow int64.
     if tick // peer_rate_hz > k // rate_hz + AHEAD_LIMIT_S + 1:
         return True
@@ -151,7 +175,13 @@ def _is_far_ahead(k: int, rate_hz: int, tick: int, peer_rate_hz: int) -> bool:
 
 @leaf
 def _file_sent(channel: ChannelArrays | None, page: int, sent: Array) -> None:
-    """Files the numbers that a peer's law sent with a sample in a page of the calendar."""
+    """Files the numbers that a peer's law sent with a sample in a page of the calendar.
+
+    Args:
+        channel: Arrays of these numbers; None if the receiver's law ignores them.
+        page: Index of the page.
+        sent: Numbers as they arrived.
+    """
     if channel is None:
         return
     for c in range(channel.columns.shape[0]):
@@ -161,7 +191,12 @@ def _file_sent(channel: ChannelArrays | None, page: int, sent: Array) -> None:
 
 @leaf
 def _use_sent(channel: ChannelArrays | None, page: int) -> None:
-    """Brings the numbers that a peer's law sent with a released sample into use."""
+    """Brings the numbers that a peer's law sent with a released sample into use.
+
+    Args:
+        channel: Arrays of these numbers; None if the receiver's law ignores them.
+        page: Index of the sample's page.
+    """
     if channel is not None:
         put(channel.received, channel.waiting[page])
 
@@ -199,11 +234,13 @@ def accept_sample(
     if tick < 0 or (tick > row.scheduled and _is_far_ahead(k, rate_hz, tick, row.rate_hz)):
         row.refused += 1
         return
+
     index = tick % dues.shape[0]
     has_due = row.scheduled - dues.shape[0] < tick <= row.scheduled
     if has_due and dues[index] <= _FILED:
         row.duplicate += 1
         return
+
     release = release_tick(tick, rate_hz, link)
     if release == LOST:
         row.lost += 1
@@ -221,6 +258,7 @@ def accept_sample(
     if tick <= row.used:
         row.superseded += 1
         return
+
     page = release & (calendar.shape[0] - 1)
     slot: SampleRow = calendar[page]
     if slot.tick >= 0:

@@ -1,4 +1,7 @@
-"""A user's hand program, which sees its site's knowledge and moves or pushes the arm.
+"""Runs a user's hand program: a program that acts as the operator of an arm.
+
+The program decides at a fixed rate. For each decision it receives a view of what its site
+knows, and returns a target for the arm or a force on it.
 
 Invariant:
     - A decision that is based on tick k acts a fixed time after tick k, wherever it is made, as
@@ -36,7 +39,7 @@ PROGRAM = 1
 
 
 class HandContext(NamedTuple):
-    """The facts that a hand program gets before the run.
+    """Facts that a hand program receives before the run.
 
     >>> class Still:
     ...     def __init__(self, facts: tn.HandContext) -> None:
@@ -45,16 +48,16 @@ class HandContext(NamedTuple):
     ...         return [0.0] * self.size
 
     Attributes:
-        site: the site whose arm the hand holds.
-        peers: names of the peers, in scenario order.
-        mode: "tip": the hand moves the end effector; "joint": it turns the joints; "force": it
-            pushes.
-        size: count of the numbers of an action: one per axis, m or N, or one per joint, rad.
-        rate_hz: rate of decisions, Hz.
-        delay_s: time from a view to the action that is based on it, s.
-        speed_limit: largest speed of the target, m/s or rad/s; inf for a hand that pushes.
-        limit: the largest force, N, or the largest norm of the hand's torques, N m.
-        seed: seed for random numbers, derived from the scenario and the site.
+        site: Site whose arm the program holds.
+        peers: Names of the peers, in scenario order.
+        mode: "tip": the program moves the end effector; "joint": it turns the joints; "force":
+            it pushes.
+        size: Count of the numbers of an action: one per axis, m or N, or one per joint, rad.
+        rate_hz: Rate of decisions, Hz.
+        delay_s: Time from a view to the action that is based on it, s.
+        speed_limit: Largest speed of the target, m/s or rad/s; inf for a program that pushes.
+        limit: Largest force, N, or largest norm of the torques, N m.
+        seed: Seed for random numbers, derived from the scenario and the site.
     """
 
     site: str
@@ -117,13 +120,14 @@ class HandProgram(Protocol):
 
 
 class OwnHand:
-    """The hand program at one site: the ticks of its decisions, and when a decision acts.
+    """Hand program at one site: the ticks of its decisions, and the times at which they act.
 
     Args:
-        rules: limits of the hand.
-        period_ticks: ticks from one decision to the next.
-        delay_ticks: ticks from a view to the action that is based on it.
-        locate: returns the arm's pose in the coordinates of the target, by its joint angles.
+        rules: Limits of the program's actions.
+        period_ticks: Ticks from one decision to the next.
+        delay_ticks: Ticks from a view to the action that is based on it.
+        locate: Function that returns the arm's pose in the coordinates of the target, from its
+            joint angles.
     """
 
     def __init__(
@@ -142,16 +146,22 @@ class OwnHand:
         self._newest = -1
 
     def is_decision_tick(self, k: int) -> bool:
-        """True if the program decides at tick k."""
+        """Returns True if the program decides at tick `k`."""
         return k % self.period_ticks == 0
 
     def find_next_event(self, k: int) -> int:
-        """Returns the first tick after k at which a decision is made or starts to act."""
+        """Returns the first tick after `k` at which a decision is made or starts to act."""
         next_decision = (k // self.period_ticks + 1) * self.period_ticks
         return min([next_decision, *(due for due, _ in self._due if due > k)])
 
     def build_view(self, k: int, arrays: SiteArrays, layout: Layout) -> HandView:
-        """Returns the program's view at tick k, which the site has not computed yet."""
+        """Returns the program's view at tick `k`, which the site has not computed yet.
+
+        Args:
+            k: The tick.
+            arrays: Arrays of the site after the previous tick.
+            layout: Lengths of the site's vectors.
+        """
         # NumPy reads fields of plain arrays faster than those of records.
         site = np.asarray(arrays.site)
         links = np.asarray(arrays.links)
@@ -172,7 +182,13 @@ class OwnHand:
         )
 
     def _view_peers(self, k: int, links: Any, coordinates: int) -> tuple[PeerView, ...]:
-        """Returns the peers at tick k, by the samples in use at the previous tick."""
+        """Returns the peers at tick `k`, by the samples in use at the previous tick.
+
+        Args:
+            k: The tick.
+            links: Rows of the site's links.
+            coordinates: Count of numbers in the vectors of a peer.
+        """
         now_ns = tick_ns(k, self._rules.rate_hz)
         vectors = {name: links[name][:, :coordinates].copy() for name in ("q", "qd", "tau_x")}
         alpha = links["alpha"].tolist()
@@ -196,16 +212,17 @@ class OwnHand:
         return tuple(peers)
 
     def accept_decision(self, k: int, goal: Sequence[float] | None) -> None:
-        """Schedules the decision that is based on the view of tick k.
+        """Schedules the decision that is based on the view of tick `k`.
 
         A decision that is older than the newest one is ignored.
 
         Args:
-            k: the tick of the view.
-            goal: the target or the force; None releases the arm.
+            k: Tick of the view.
+            goal: Target or force; None releases the arm.
 
         Raises:
-            ValueError: the hand may not have such a target or force.
+            ValueError: The target or force has the wrong count of numbers, is not finite, or is
+                too large.
         """
         numbers = () if goal is None else tuple(float(number) for number in goal)
         if goal is not None and len(numbers) != self._rules.size:
@@ -215,11 +232,14 @@ class OwnHand:
         if not all(map(math.isfinite, numbers)):
             raise ValueError(f"it acts with {list(numbers)}, which is not finite")
         norm = math.hypot(*numbers)
-        most = self._rules.max_goal_norm
-        if norm > most:
-            raise ValueError(f"it acts with a norm of {norm:g}, at most {most:g} is accepted")
+        largest_norm = self._rules.max_goal_norm
+        if norm > largest_norm:
+            raise ValueError(
+                f"it acts with a norm of {norm:g}, at most {largest_norm:g} is accepted"
+            )
         if k <= self._newest:
             return
+
         self._newest = k
         self._schedule(k, k + self.delay_ticks, numbers, grip=goal is not None)
 
@@ -229,7 +249,14 @@ class OwnHand:
         self._schedule(k, k, (), grip=False)
 
     def _schedule(self, k: int, due: int, target: tuple[float, ...], *, grip: bool) -> None:
-        """Appends the command of tick k that acts at tick `due`."""
+        """Appends the command of tick `k`, which acts at tick `due`.
+
+        Args:
+            k: Tick of the view on which the command is based.
+            due: Tick in which the command acts.
+            target: Target or force; empty if the arm is released.
+            grip: True if the program holds the arm.
+        """
         command = HandCommand(
             source=PROGRAM,
             number=k // self.period_ticks,
@@ -240,11 +267,11 @@ class OwnHand:
         self._due.append((due, command))
 
     def advance_to(self, k: int, read_angles: Callable[[], Sequence[float]]) -> HandStep:
-        """Returns the hand's action in tick k, see `advance_hand`.
+        """Returns the program's action in tick `k`, see `advance_hand`.
 
         Args:
-            k: the tick after the one of the previous call.
-            read_angles: returns the joint angles, rad.
+            k: The tick after that of the previous call.
+            read_angles: Function that returns the joint angles, rad.
         """
         commands = []
         while self._due and self._due[0][0] <= k:
@@ -262,14 +289,15 @@ class OwnHand:
     def advance_span(
         self, k: int, end: int, read_angles: Callable[[], Sequence[float]]
     ) -> Array:
-        """Returns the hand's actions from tick k until it needs the arm again.
+        """Returns the program's actions from tick `k` until it needs the arm again.
 
-        The result equals that of `advance_to`, tick by tick, bit for bit.
+        The result equals that of `advance_to`, tick by tick, bit for bit. A span of ticks
+        without a decision is computed by one compiled call.
 
         Args:
-            k: the first tick.
-            end: the actions end before this tick at the latest.
-            read_angles: returns the joint angles at tick k, rad.
+            k: The first tick.
+            end: The actions end before this tick at the latest.
+            read_angles: Function that returns the joint angles at tick `k`, rad.
 
         Returns:
             One row per tick, with the numbers of `HandInForce`.
@@ -283,9 +311,11 @@ class OwnHand:
         memory = self._memory
         silence_ns = tick_ns(last - 1, rate_hz) - memory.received_ns
         if not memory.source or silence_ns > SILENCE_NS:
+            # The program does not hold the arm, or its silence may end its grip.
             for n in range(1, len(rows)):
                 rows[n] = self.advance_to(k + n, read_angles).vector
             return rows
+
         target = np.array(memory.target)
         rate = np.array(memory.rate)
         grip = glide(

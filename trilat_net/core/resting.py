@@ -1,4 +1,4 @@
-"""How an arm comes to rest where it is, and stays there.
+"""Lets an arm come to rest where it is, and keeps it there.
 
 An arm rests while its site waits, holds, is stopped or in fault. The reference of a joint
 starts at the joint's angle q and speed v, and comes to rest within T. Per period h,
@@ -76,7 +76,7 @@ _KNOWN = int(Law.KNOWN)
 
 @leaf
 def rests(site: SiteRow) -> bool:
-    """True if the arm comes to rest or stays at rest."""
+    """Returns True if the arm comes to rest or stays at rest in the present mode."""
     still = site.mode in (_WAITING, _HOLD, _FAULT, _STOPPED)
     return bool(still and site.on_stale == _GLIDE)
 
@@ -93,14 +93,14 @@ def find_brake_ratio(site: SiteRow) -> float:
 
 @leaf
 def is_fast(site: SiteRow) -> bool:
-    """True if a joint is so fast that B |qd| alone exceeds the limit of its torque."""
+    """Returns True if a joint is so fast that B |qd| alone exceeds the limit of its torque."""
     fast: bool = find_brake_ratio(site) > 1.0
     return fast
 
 
 @leaf
 def rests_by_law(site: SiteRow) -> bool:
-    """True if the torque of an arm at rest contains that of its law, which still adapts."""
+    """Returns True if the torque at rest contains that of the law, which still adapts."""
     holds = site.law != _USER or site.holds != 0
     learns_in_task = site.task != 0 and site.law != _KNOWN
     failed = site.reason == _NOT_FINITE
@@ -113,6 +113,12 @@ def enter_rest(t_ns: int, mode: int, reason: int, site: SiteRow) -> None:
     """Enters a mode in which the arm comes to rest.
 
     An arm that rests already keeps its reference, unless its law failed now or before.
+
+    Args:
+        t_ns: Time, ns since the epoch, the common start of the session.
+        mode: The mode to enter.
+        reason: Reason of the change of mode.
+        site: Row of the site.
     """
     failed = reason == _NOT_FINITE or site.reason == _NOT_FINITE
     keeps_reference = rests(site) and not failed
@@ -135,7 +141,14 @@ def _read_reference(site: SiteRow, i: int) -> tuple[float, float]:
 
 @leaf
 def _write_reference(site: SiteRow, i: int, q: float, qd: float) -> None:
-    """Writes the rest reference of joint i into the fields that the record's `mem` contains."""
+    """Writes the rest reference of joint i into the fields that the record's `mem` contains.
+
+    Args:
+        site: Row of the site.
+        i: The joint.
+        q: The reference, rad.
+        qd: Its rate, rad/s.
+    """
     if site.task:
         site.q_rest[i] = q
         site.qd_rest[i] = qd
@@ -146,7 +159,12 @@ def _write_reference(site: SiteRow, i: int, q: float, qd: float) -> None:
 
 @leaf
 def _find_remaining_s(elapsed_s: float, site: SiteRow) -> float:
-    """Returns T_left of the reference, s, at `elapsed_s` after the start of the rest."""
+    """Returns the time T_left until the reference rests, s.
+
+    Args:
+        elapsed_s: Time since the start of the rest, s.
+        site: Row of the site.
+    """
     remaining_s = LEAST_STOP_S - elapsed_s
     for i in range(site.joints):
         _, rate = _read_reference(site, i)
@@ -156,21 +174,31 @@ def _find_remaining_s(elapsed_s: float, site: SiteRow) -> float:
 
 @leaf
 def advance_rest_reference(t_ns: int, ticks: int, site: SiteRow) -> None:
-    """Advances the rest reference to time t, over `ticks` periods."""
+    """Advances the rest reference to the present tick.
+
+    The reference slows down as described at the top of this module. While the arm is fast, or
+    its torque is limited, the reference moves along with a joint that would move away from it.
+
+    Args:
+        t_ns: Time of the present tick, ns since the epoch.
+        ticks: Number of periods since the last tick; more than 1 if the site missed ticks.
+        site: Row of the site.
+    """
     if t_ns == site.return_from_ns:
-        return
+        return  # the reference starts in this tick
+
     step_s = ticks / site.rate_hz
     # The time from the start of the rest to the previous tick.
     elapsed_s = (t_ns - site.return_from_ns) * 1e-9 - step_s
     remaining_s = _find_remaining_s(elapsed_s, site)
-    share = 0.0
+    factor = 0.0
     if remaining_s > step_s + _ROUNDING_S:
-        share = 1.0 - step_s / remaining_s
+        factor = 1.0 - step_s / remaining_s
     fast = is_fast(site)
     for i in range(site.joints):
         qd = site.qd[i]
         q_ref, rate_before = _read_reference(site, i)
-        rate = share * rate_before
+        rate = factor * rate_before
         if rate * qd <= 0.0:
             rate = 0.0
         elif abs(rate) > abs(qd):
@@ -191,7 +219,7 @@ def advance_rest_reference(t_ns: int, ticks: int, site: SiteRow) -> None:
 
 @leaf
 def _brakes(t_ns: int, site: SiteRow) -> bool:
-    """True while the arm brakes.
+    """Returns True while the arm brakes.
 
     It brakes for at least LEAST_STOP_S, until the reference rests, and while a joint is fast.
     """
@@ -208,6 +236,11 @@ def put_rest_reference(site: SiteRow, q: Array, qd: Array) -> None:
     """Writes the rest reference in shared coordinates into q and qd.
 
     In task space that is the present pose of the end effector: the joints rest by themselves.
+
+    Args:
+        site: Row of the site.
+        q: Written: the reference, one number per shared coordinate.
+        qd: Written: the rate of the reference.
     """
     for i in range(q.shape[0]):
         if site.task:
@@ -238,21 +271,27 @@ def _shrink(torque: float, change: float) -> float:
 
 @leaf
 def add_rest_torque(k: int, t_ns: int, site: SiteRow) -> None:
-    """Adds w - B s to the torque in `tau`, within its limit; `u` is the sum without the limit.
+    """Adds w - B s to the torque in `tau`, and limits the sum.
 
-    At the start of a rest w is initialised with the unexplained part of the last torque.
+    The sum without the limit is written into `u`. At the start of a rest w is initialised with
+    the unexplained part of the last torque.
+
+    Args:
+        k: The tick.
+        t_ns: Time of the tick, ns since the epoch.
+        site: Row of the site.
     """
     brakes = _brakes(t_ns, site)
-    share = 0.0
+    held_part = 0.0
     if k > site.first:
-        share = max(0.0, 1.0 - find_brake_ratio(site))
+        held_part = max(0.0, 1.0 - find_brake_ratio(site))
     for i in range(site.joints):
         qd = site.qd[i]
         damping = site.damping[i]
         w = site.tau_held[i]
         if t_ns == site.return_from_ns:
             unexplained = site.tau_before[i] - site.tau[i]
-            w = share * unexplained
+            w = held_part * unexplained
         if brakes and w * qd > 0.0:
             w = _shrink(w, damping * qd)
         torque = site.tau[i] + w - damping * _find_slip(site, i)
@@ -282,15 +321,18 @@ def limit_torque_rate(site: SiteRow) -> None:
     """Limits the torque's rate of change; before the first tick the torque counts as zero.
 
     Torques that brake an arm at rest may change by B |qd| more in a tick.
+
+    Args:
+        site: Row of the site, whose torque `tau` is limited.
     """
     braking = rests(site)
     for i in range(site.joints):
         rate_limit = site.tau_rate[i]
         if rate_limit < inf:
-            most = rate_limit / site.rate_hz
+            largest_change = rate_limit / site.rate_hz
             before = site.tau_before[i]
             brake = site.damping[i] * site.qd[i] if braking else 0.0
-            low = before - most - max(brake, 0.0)
-            high = before + most - min(brake, 0.0)
+            low = before - largest_change - max(brake, 0.0)
+            high = before + largest_change - min(brake, 0.0)
             tau = site.tau[i]
             site.tau[i] = min(max(tau, low), high)

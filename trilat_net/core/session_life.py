@@ -1,4 +1,7 @@
-"""The modes of a site under the rule `glide`: it waits, aligns, follows, and holds.
+"""Changes the mode of a site under the rule `glide`: it waits, aligns, follows, and holds.
+
+The rule `glide` lets a site start and end smoothly when its peers, the other sites whose states
+it receives, appear or fall silent. Its modes are:
 
     WAITING -> RETURN (aligns) -> RUN (engaged) -> HOLD (a peer is silent) -> RETURN -> RUN
     any mode -> FAULT (limit exceeded, number not finite, arm lost) -- order RESET -> WAITING
@@ -92,7 +95,16 @@ _ORDER_HELD = int(LifeOrder.HELD)
 
 @leaf
 def _all_heard(t_ns: int, silence_ns: int, links: RowArray) -> bool:
-    """True if a sample of each peer with a share came into use within the last `silence_ns`."""
+    """Returns True if no peer that the site follows is silent.
+
+    A peer is silent if none of its samples came into use within the last `silence_ns`. Peers
+    with a dominance factor of zero are not followed.
+
+    Args:
+        t_ns: Time, ns since the epoch.
+        silence_ns: Longest time without a sample, ns.
+        links: Rows of the site's links.
+    """
     for j in range(links.shape[0]):
         link: LinkRow = links[j]
         is_silent = link.used < 0 or t_ns - link.used_ns > silence_ns
@@ -103,7 +115,7 @@ def _all_heard(t_ns: int, silence_ns: int, links: RowArray) -> bool:
 
 @leaf
 def _alignment_s(site: SiteRow) -> float:
-    """Returns the duration of the alignment whose offset starts at `q_held`, s."""
+    """Returns the duration T of the alignment whose offset starts at `q_held`, s."""
     distance = 0.0
     for i in range(count_linear_coordinates(site)):
         distance = max(distance, abs(site.q_held[i]))
@@ -120,11 +132,11 @@ def _start_alignment(t_ns: int, site: SiteRow, reason: int, q: Array, qd: Array)
     """Starts an alignment, unless the peers are farther away than the limit.
 
     Args:
-        t_ns: the time, ns since the epoch.
-        site: the row of the site, with the peers' reference in q_des and qd_des.
-        reason: the reason of the change of mode.
-        q: the reference from which the site aligns.
-        qd: its rate.
+        t_ns: Time, ns since the epoch.
+        site: Row of the site, with the peers' reference in q_des and qd_des.
+        reason: Reason of the change of mode.
+        q: Reference from which the site aligns.
+        qd: Rate of this reference.
     """
     turn = (0.0, 0.0, 0.0)
     rate = (0.0, 0.0, 0.0)
@@ -135,6 +147,7 @@ def _start_alignment(t_ns: int, site: SiteRow, reason: int, q: Array, qd: Array)
         peers_rate = rotate_by_vector(turn, three(site.qd_des[3:]))
         velocity = subtract(three(qd[3:]), peers_rate)
         rate = rotation_vector_rate(turn, velocity)
+
     near = length(turn) <= site.align_limit
     for i in range(count_linear_coordinates(site)):
         distance = abs(q[i] - site.q_des[i])
@@ -142,6 +155,7 @@ def _start_alignment(t_ns: int, site: SiteRow, reason: int, q: Array, qd: Array)
     if not near:
         site.reason = _ALIGN_LIMIT
         return
+
     for i in range(count_linear_coordinates(site)):
         site.q_held[i] = q[i] - site.q_des[i]
         site.qd_held[i] = qd[i] - site.qd_des[i]
@@ -165,7 +179,10 @@ def _leave_rest(t_ns: int, site: SiteRow, reason: int) -> None:
 
 @leaf
 def _extrapolate_reference(site: SiteRow) -> None:
-    """Extrapolates the reference of the previous tick by one period with its rate."""
+    """Extrapolates the reference of the previous tick by one period with its rate.
+
+    A site that drops or restores a peer aligns from there, because it has not rested before.
+    """
     h_s = 1.0 / site.rate_hz
     for i in range(count_linear_coordinates(site)):
         site.q_followed[i] += h_s * site.qd_followed[i]
@@ -177,7 +194,7 @@ def _extrapolate_reference(site: SiteRow) -> None:
 
 @leaf
 def is_law_returning(t_ns: int, site: SiteRow) -> bool:
-    """True if the torque of a site still returns to that of its law after a rest."""
+    """Returns True while the torque of a site changes from that at rest to that of its law."""
     # A site that drops or restores a peer aligns without a rest before.
     rested = site.reason != _DROPPED and site.reason != _RESTORED
     elapsed_ns = t_ns - site.return_from_ns
@@ -190,6 +207,12 @@ def latch_mode(t_ns: int, site: SiteRow, mode: int, reason: int) -> None:
     """Enters FAULT or STOPPED, where the arm comes to rest.
 
     Estimates that are not finite become zero, so that the gravity torque stays finite.
+
+    Args:
+        t_ns: Time, ns since the epoch.
+        site: Row of the site.
+        mode: The mode to enter.
+        reason: Reason of the change of mode.
     """
     for p in range(site.theta_hat.shape[0]):
         if not isfinite(site.theta_hat[p]):
@@ -199,7 +222,11 @@ def latch_mode(t_ns: int, site: SiteRow, mode: int, reason: int) -> None:
 
 @leaf
 def _find_fault(site: SiteRow) -> int:
-    """Returns the reason for a fault in the arm's motion, or -1."""
+    """Returns the reason for a fault in the arm's motion, or -1 if there is no fault.
+
+    A fault is a number that is not finite, an angle beyond its limits, or a speed above its
+    limit.
+    """
     for i in range(site.joints):
         q = site.q[i]
         qd = site.qd[i]
@@ -214,7 +241,15 @@ def _find_fault(site: SiteRow) -> int:
 
 @leaf
 def _apply_order(t_ns: int, site: SiteRow) -> None:
-    """Applies the waiting order and the consequences of missed ticks, and clears both."""
+    """Applies the waiting order and the consequences of missed ticks, and clears both.
+
+    At most one branch applies. Orders that leave FAULT or STOPPED come first; in these modes
+    all other orders have no effect.
+
+    Args:
+        t_ns: Time, ns since the epoch.
+        site: Row of the site, with the order and the number of missed ticks.
+    """
     order = site.order
     skipped = site.skipped
     mode = site.mode
@@ -250,12 +285,19 @@ def _apply_order(t_ns: int, site: SiteRow) -> None:
 
 @leaf
 def _update_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
-    """Changes the mode for a fault of the motion, or for silent or returning peers."""
+    """Changes the mode for a fault of the motion, or for silent or returning peers.
+
+    Args:
+        t_ns: Time, ns since the epoch.
+        site: Row of the site.
+        links: Rows of the site's links.
+    """
     fault = _find_fault(site)
     if fault >= 0 and site.mode != _FAULT:
         latch_mode(t_ns, site, _FAULT, fault)
     if site.mode == _FAULT or site.mode == _STOPPED or site.reason == _ARM_SILENT:
-        return
+        return  # peers do not change these modes
+
     heard = _all_heard(t_ns, site.stale_ns, links)
     moves = site.mode == _RUN or site.mode == _ALIGN
     elapsed_ns = t_ns - site.return_from_ns
@@ -280,7 +322,13 @@ def _update_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
 def update_session_life(t_ns: int, site: SiteRow, links: RowArray) -> None:
     """Changes the mode, and turns the peers' reference into the reference of the mode.
 
-    The reference of the previous tick is in `q_followed` and `qd_followed`.
+    The peers' reference is in `q_des` and `qd_des`, where the new reference is written. The
+    reference of the previous tick is in `q_followed` and `qd_followed`.
+
+    Args:
+        t_ns: Time, ns since the epoch.
+        site: Row of the site.
+        links: Rows of the site's links.
     """
     if site.mode == _DIVERGED:
         return
@@ -300,7 +348,16 @@ def update_session_life(t_ns: int, site: SiteRow, links: RowArray) -> None:
 
 @leaf
 def _find_offset(t_ns: int, duration_s: float, site: SiteRow, i: int) -> tuple[float, float]:
-    """Returns the offset of coordinate i from the peers' reference, and its rate."""
+    """Returns the offset of a coordinate from the peers' reference, and its rate.
+
+    The polynomial is that at the top of this module.
+
+    Args:
+        t_ns: Time, ns since the epoch.
+        duration_s: Duration T of the alignment, s.
+        site: Row of the site.
+        i: The coordinate.
+    """
     x = (t_ns - site.return_from_ns) * 1e-9 / duration_s
     remaining = 1.0 - x
     start = site.q_held[i]
