@@ -96,7 +96,7 @@ class SessionResult:
 
 
 class SessionProcess:
-    """A child process of a session, as this process sees it.
+    """State of one process of a session: a site, a recorder or an operator program.
 
     `ProcessStarter` creates this object, and updates it with the reports of the starter
     process.
@@ -136,8 +136,8 @@ class SessionProcess:
         """
         code = self.code
         if self._signalled and self.pid is None:
-            # The signal met an interpreter that was still starting, which may end with any
-            # code.
+            # The signal has interrupted the start of the process, which may then end with any
+            # exit code.
             return None
         if code in (0, None):
             return None
@@ -371,7 +371,7 @@ def compile_core(scenario: Scenario, say: Callable[[str], None], interrupt: Inte
 def _start(
     scenario: Scenario, folder: Path, reserved: ExitStack, endpoints: list[str], wait_s: int
 ) -> tuple[ProcessStarter, list[SessionProcess], Callable[[], SessionProcess]]:
-    """Starts all sites, and the user's operator programs that run in processes of their own.
+    """Starts the processes of all sites, and those of the user's own operator programs.
 
     Args:
         scenario: The scenario.
@@ -409,13 +409,16 @@ def _start(
 
     record = ["record", "--session", session, *chain(*connect), "-o", str(log)]
     record += [*patience, "--force"]
-    return starter, processes, lambda: starter.start(topics.RECORDER, record)
+    start_recorder = partial(starter.start, topics.RECORDER, record)
+    return starter, processes, start_recorder
 
 
 def _is_over(children: list[SessionProcess], result: SessionResult) -> bool:
-    """Returns True if a process has failed, or if all processes have ended.
+    """Returns True if the session is over: a process has failed, or all processes have ended.
 
-    The problems of failed processes are added to the result.
+    Args:
+        children: The processes.
+        result: Outcome of the session. The problems of failed processes are added to it.
     """
     problems = [child.problem() for child in children]
     result.problems += [problem for problem in problems if problem]
@@ -430,10 +433,18 @@ def _end_all(
     interrupt: Interrupt,
     say: Callable[[str], None],
 ) -> None:
-    """Ends first the sites, and then the recorder, which has received their last messages.
+    """Ends the processes of a session: first the sites, and then the recorder.
 
-    If the user presses Ctrl-C a second time, all processes receive another signal, which ends
-    them at once.
+    In this order, the recorder stores the last messages of the sites. If the user presses
+    Ctrl-C a second time, all processes receive another signal, which ends them at once.
+
+    Args:
+        starter: Starter of the processes.
+        sites: Processes of the sites and of operator programs.
+        recorder: Process of the recorder. Empty if it has not been started.
+        clock: Clock of this process.
+        interrupt: Handler of the signals of this process.
+        say: Function that prints a line for the user.
     """
     announce = partial(
         say,
@@ -506,9 +517,10 @@ def _end_group(
 
 
 def run_starter(number: int, scenario_file: str) -> list[str] | None:
-    """Runs the starter, which copies itself on request until the requesting process is gone.
+    """Runs the starter process, which creates the processes of a session as copies of itself.
 
-    The function returns twice, as `os.fork` does: once in each copy, and finally in the
+    It does so on request, until the requesting process is gone. As with `os.fork`, the function
+    returns in every process: in each copy, which then runs its command, and finally in the
     starter.
 
     Args:
@@ -534,7 +546,7 @@ def run_starter(number: int, scenario_file: str) -> list[str] | None:
 
 
 class _StarterProcess:
-    """The loop of the starter process, and the processes that it has created.
+    """Executes the requests to the starter process, and keeps track of its copies.
 
     Args:
         pipe: Connection to the requesting process.
@@ -561,10 +573,13 @@ class _StarterProcess:
             except (EOFError, OSError):
                 self._end_all()
                 return None
-            if not number and self._fork(name):
-                _become_process(arguments, output)
-                return arguments
-            if number and name in self._running:
+            is_start_request = number == 0
+            if is_start_request:
+                is_copy = self._fork(name)
+                if is_copy:
+                    _become_process(arguments, output)
+                    return arguments
+            elif name in self._running:
                 os.kill(self._running[name], number)
 
     def _fork(self, name: str) -> bool:

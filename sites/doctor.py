@@ -5,12 +5,9 @@ their states over the network. The checks concern the keys, the network endpoint
 the operating system's real-time rights, the tick rate that this machine achieves, the disk and
 the processors. The command is `trilat doctor`.
 
-Invariant:
-    - The checks change nothing. They send nothing except the messages of a member that
-      connects.
-    - Each finding states the result of a check and, if there is a problem, a remedy.
-    - Rights and rates are measured in a process of their own, so that this process keeps its
-      settings.
+Each check yields a finding: its result and, if there is a problem, a remedy. The checks change
+nothing on this machine. The real-time rights and the tick rate are measured in another process,
+because the settings of the measuring process have to be changed for that.
 """
 
 import json
@@ -210,7 +207,7 @@ def examine_links(
 
 
 def _describe_untried(endpoint: str) -> DoctorFinding:
-    """Returns the finding about an endpoint that this module cannot try."""
+    """Returns the finding about an endpoint of a kind that this module cannot check."""
     text = f"{endpoint} was not tried: not an address of TCP or QUIC"
     return DoctorFinding("links", "warn", text)
 
@@ -323,9 +320,14 @@ def _split_address(endpoint: str) -> tuple[str, int] | None:
 
 
 def examine_clock(clock: Clock) -> Iterator[DoctorFinding]:
-    """Checks if the clocks of this machine run steadily, for `CLOCK_TEST_NS`.
+    """Checks for `CLOCK_TEST_NS` if the clocks of this machine run steadily.
 
-    The monotonic clock must not go back. The time of day must not step relative to it.
+    The monotonic clock must not go back. The time of day must not step relative to the
+    monotonic clock. The finding also states the longest time between two readings, which shows
+    how long the operating system interrupts a process.
+
+    Args:
+        clock: Clock of this process.
     """
     begun_ns = clock.monotonic_ns()
     wall_ns = clock.unix_ns()
@@ -385,7 +387,10 @@ def examine_offsets(
 
 
 def _run_in_process(code: str) -> Any:
-    """Runs Python code in a new process.
+    """Runs Python code in a new process, and returns the value that it prints.
+
+    Args:
+        code: The code.
 
     Returns:
         The JSON value in the last line that the process prints. None if the process fails.
@@ -434,10 +439,11 @@ def examine_system() -> DoctorFinding:
 
 
 class Rehearsal(LoopStats):
-    """The control loop of a single site, with everything that a tick does except the network.
+    """Runs the control loop of a single site without a network, to measure how late ticks are.
 
-    The object replaces the statistics and the `RunningSite` of the loop. It keeps the lateness
-    of each tick.
+    The loop does the same work as in a session, except that no messages are exchanged. This
+    object takes the place of two objects of the loop: of its statistics, so that the lateness
+    of each tick can be stored, and of the `RunningSite`, whose methods do nothing here.
 
     Args:
         scenario: The scenario.
@@ -495,7 +501,10 @@ class Rehearsal(LoopStats):
 
 
 def rehearse_rates(clock: Clock) -> list[tuple[int, int, int]]:
-    """Runs a site at decreasing tick rates until a rate is achieved.
+    """Runs a site at decreasing tick rates until its ticks are punctual.
+
+    Args:
+        clock: Clock of this process.
 
     Returns:
         For each rate that was tried: the rate in Hz, the lateness in us that
@@ -516,7 +525,9 @@ def rehearse_rates(clock: Clock) -> list[tuple[int, int, int]]:
 
 
 def is_held(rate_hz: int, late_us: int) -> bool:
-    """Returns True if a lateness is punctual at a tick rate, see `MAX_LATE_PERIODS`.
+    """Returns True if ticks with a given lateness count as punctual at a tick rate.
+
+    They do so up to `MAX_LATE_PERIODS` periods of the rate.
 
     Args:
         rate_hz: The tick rate.

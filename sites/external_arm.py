@@ -3,17 +3,18 @@
 An arm is external (`plant = "external"` in the scenario) if it is a real arm, or a simulation
 in another program. Its driver sends the measured joint positions to the site, the process that
 computes the torque. A dead-man switch is a button that somebody must hold while the arm moves.
-`ExternalArm` and `DeadManSwitch` watch both for silence, and derive orders for the site from
-it: to hold the position, to stop, or to continue.
+`ExternalArm` and `DeadManSwitch` measure how long nothing has arrived from each, and derive
+orders for the site from it: to hold the position, to stop, or to continue.
 
 Invariant:
     - A received message cannot raise an error in the control loop. The queue of messages is
       bounded.
-    - Only the newest measurement counts. The site does not start without a measurement. It
-      holds its position after `HELD_SILENCE_NS` without one, and enters the mode "fault" after
-      `SILENCE_LIMIT_NS`.
+    - Only the newest measurement is used. The site does not start without a measurement. It
+      holds its position after `HELD_SILENCE_NS` without a measurement, and enters the mode
+      "fault" after `SILENCE_LIMIT_NS`, because the torque would no longer fit the state of the
+      arm.
     - A measurement that the arm cannot have reached since the previous one is dropped, and does
-      not count as received.
+      not count as received, because the sensor or the driver must be faulty.
     - A switch that has sent nothing for `SWITCH_SILENCE_NS` counts as released.
 """
 
@@ -260,14 +261,14 @@ class ExternalArm:
 
 @dataclass
 class _Holder:
-    """State of one program that reports whether somebody holds the switch.
+    """Newest report of one program about whether somebody holds the dead-man switch.
 
     Attributes:
         n: Number of its newest message.
         pressed_ns: Time at which its newest report of a held switch arrived, in ns. None if it
             does not hold the switch.
-        counts: False if another program has released the switch while this one held it. Then
-            the switch of this program has to be released and pressed again.
+        counts: False if another program has released the switch while this program held it.
+            The switch of this program then has to be released and pressed again.
     """
 
     n: int = -1
@@ -301,7 +302,10 @@ class DeadManSwitch:
         self._was_released = False
 
     def _list_holders(self) -> list[_Holder]:
-        """Lists the programs that hold the switch and count."""
+        """Lists the programs whose switch is pressed, and was not released by another program.
+
+        After a program has released the switch, the others must release it and press it again.
+        """
         return [
             program
             for program in self._programs.values()
@@ -347,12 +351,13 @@ class DeadManSwitch:
         return "held" if is_stopped_by_switch else ""
 
     def _release(self, released: Sequence[_Holder]) -> None:
-        """Releases the switch for some programs.
+        """Marks the switch as released, because some programs have released it or are silent.
 
-        All others stop counting until they press it again.
+        All other programs that hold the switch must release it and press it again.
 
         Args:
-            released: The programs. If there are none, nothing changes.
+            released: The programs that have released it or are silent. If there are none,
+                nothing changes.
         """
         if not released:
             return

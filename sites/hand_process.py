@@ -1,17 +1,17 @@
-"""Runs a user's own operator class as a process that moves the arm of a site.
+"""Runs a user's own operator class in a process that moves the arm of a site.
 
-An operator moves an arm. A user can write one as a class whose method `act` receives a view,
-the state of the site, and returns a target or a force. The site sends a view several times a
-second over the network, and this process, the command `trilat hand`, replies with the decisions
-of the class.
+An operator is the person or program that moves an arm. A user can write an operator as a Python
+class whose method `act` receives a view, which is the present state of the site, and returns a
+target or a force. The site sends views over the network at regular intervals, and this process,
+the command `trilat hand`, replies with the decisions of the class.
 
 Invariant:
-    - The class sees only the views that the site sends, and nothing else of the session.
-    - Each decision names the tick of its view. The site applies it a fixed time after that
-      tick, so that delays on the network do not change the run.
-    - Views that are too old for a decision in time are skipped.
+    - Each decision names the tick of its view. The site applies the decision a fixed time after
+      that tick, so that delays on the network do not change the run.
+    - Views that are too old for a decision in time are skipped, so that a slow class does not
+      fall further and further behind.
     - If the class fails, the arm is released and the process ends. If the process is killed,
-      the site notices that its messages have stopped.
+      the site releases the arm, because no more messages arrive.
 """
 
 from collections import deque
@@ -80,9 +80,9 @@ class HandProcess(SiteClient):
         self._max_waiting = max(1, int(hand_site.delay_s * hand_site.rate_hz))
 
     def serve(self) -> None:
-        """Replies to the oldest waiting view that is not too old.
+        """Sends the decision of the class for the oldest waiting view that is not too old.
 
-        Before the first view has arrived, it announces this process to the site regularly.
+        Until the first view has arrived, this process is announced to the site regularly.
 
         Raises:
             RunFailed: The class failed. The arm has been released.
@@ -100,7 +100,10 @@ class HandProcess(SiteClient):
             self._send(0, None)
 
     def _decide(self, message: HandViewMessage) -> None:
-        """Passes a view to the class, and sends its decision to the site.
+        """Calls the user's class with a view, and sends its decision to the site.
+
+        Args:
+            message: The view, as received from the site.
 
         Raises:
             RunFailed: The class failed. The arm has been released.
@@ -131,9 +134,14 @@ class HandProcess(SiteClient):
 
 
 def read_view(message: HandViewMessage) -> HandView:
-    """Converts a message to the view that the class receives. Lists become arrays."""
+    """Converts a message of the site to the view that the user's class receives.
+
+    Args:
+        message: The message. Its lists of numbers become arrays.
+    """
 
     def read_fields(source: Any, names: tuple[str, ...]) -> Any:
+        """Returns the fields of a message or of a peer by name, except that of the peers."""
         fields = {}
         for name in names:
             if name != "peers":

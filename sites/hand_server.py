@@ -1,16 +1,16 @@
-"""Receives the goals of the operator who moves the arm of a site.
+"""Receives the target positions or forces of the operator who moves the arm of a site.
 
-An operator is a person or a program. The operator's goals, target positions or forces, arrive
-as messages over the network. `HandServer` serves people and programs that connect to the
-session. `RemoteHand` serves a class of the user that runs in a process of its own, and that
-receives the state of the site in return.
+An operator is a person or a program. The operator's goals, which are target positions or
+forces, arrive as messages over the network. `HandServer` receives them from people and programs
+that connect to the session. `RemoteHand` receives them from a Python class of the user that
+runs in a process of its own, and sends the state of the site to that process.
 
 Invariant:
-    - A message cannot raise an error in the control loop, and a tick reads a limited number of
-      messages.
-    - The site limits the motion of the operator's target, whatever the sender requests: the
-      rules of the scenario apply, and only one operator at a time holds the arm.
-    - Refused messages are counted by reason.
+    - A message cannot raise an error in the control loop, and each tick reads a limited number
+      of messages, so that many messages do not make a tick late. Refused messages are counted
+      by reason.
+    - Only one operator at a time moves the arm, and the site limits the motion of the target as
+      the scenario says. The sender of a message cannot circumvent these rules.
 """
 
 import math
@@ -71,7 +71,7 @@ def _read_messages(
 
 
 class HandServer:
-    """Moves the arm of a site as the people or programs request that connect to the session.
+    """Moves the arm of a site as requested by people and programs that connect to the session.
 
     Args:
         site: The site in the simulation kernel.
@@ -82,8 +82,8 @@ class HandServer:
         limits: Limits of the motion of the site. None if there are none.
 
     Attributes:
-        news: Who has taken hold of the arm or released it: pairs of a tick and a sentence. The
-            site publishes them as events and empties the list.
+        news: Pairs of a tick and a sentence, for each operator who has started or ended to move
+            the arm. The site publishes them as events and empties the list.
     """
 
     def __init__(
@@ -100,22 +100,24 @@ class HandServer:
         self._inbox = inbox
         self._dropped = dropped
         self._rules = hand.make_rules(site.rate_hz, arm, limits)
+        # Pose of the arm in the coordinates of the operator's target.
         self._compute_pose = lambda: (
             site.q if hand.mode == "joint" else arm.end_effector(site.q)
         )
         self._memory = HandMemory()
-        self._free_state = empty_hand_vector(self._rules.size)
-        self._names: dict[int, str] = {}
+        self._free_state = empty_hand_vector(self._rules.size)  # if nobody moves the arm
+        self._names: dict[int, str] = {}  # names of the senders, by their boots
         self.news: list[tuple[int, str]] = []
 
     def track(self, _site: Site, k: int) -> list[float]:
-        """Returns the state of the operator in a tick, an input of the simulation kernel.
+        """Applies the waiting messages, and returns the operator's influence on a tick.
 
         Args:
             k: The tick.
 
         Returns:
-            The numbers that `HandInForce` describes.
+            Who moves the arm, and with which target or force, as the vector of numbers that
+            `HandInForce` describes. It is an input of the simulation kernel.
         """
         messages = _read_messages(self._inbox, self._site, self._dropped)
         parsed = [self._parse_command(message) for message in messages]
@@ -177,12 +179,13 @@ class HandServer:
 
 
 class RemoteHand(HandPlayer):
-    """Moves the arm of a site as a user's class decides that runs in a process of its own.
+    """Moves the arm of a site as decided by a user's Python class in another process.
 
-    In some ticks, the site sends the process a view, the state of the site. The process replies
-    with its decision, which acts a fixed time after the tick of the view. A decision that
-    arrives too late acts at once and is counted. Only decisions of the class that the scenario
-    names are accepted.
+    At regular intervals, the site sends the process a view, which is the present state of the
+    site. The process replies with its decision: a target, a force, or to release the arm. The
+    decision takes effect a fixed time after the tick of the view. If it arrives too late, it
+    takes effect at once and is counted. Only decisions of the class that the scenario names are
+    accepted.
 
     Args:
         hand_site: Site of the operator, and settings of the class.
@@ -213,7 +216,15 @@ class RemoteHand(HandPlayer):
         self._source = hand_site.source
 
     def track(self, site: Site, k: int) -> list[float]:
-        """Applies the waiting decisions, and returns the state of the operator in tick `k`."""
+        """Applies the waiting decisions, and returns the operator's influence on a tick.
+
+        Args:
+            site: The site in the simulation kernel.
+            k: The tick.
+
+        Returns:
+            The vector of numbers that `HandInForce` describes.
+        """
         for message in self._read_decisions():
             self._decide(k, message)
         return super().track(site, k)
@@ -261,31 +272,34 @@ class RemoteHand(HandPlayer):
         return _read_messages(self._inbox, self._site, self._dropped, self._source)
 
     def _decide(self, k: int, message: HandMessage) -> None:
-        """Applies a decision of the process.
+        """Schedules a decision of the process, so that it takes effect at its planned tick.
 
         Args:
             k: Present tick.
-            message: The decision. Its number states the view that it answers.
+            message: The decision. Its number n refers to the view of tick n * `period_ticks`.
         """
-        asked_tick = message.n * self.hand.period_ticks
+        view_tick = message.n * self.hand.period_ticks
         # The process announces itself with a message that contains no decision. It may arrive
         # after the first view was sent.
         is_announcement = message.n == 0 and not message.grip
-        if self.failure or is_announcement or asked_tick > self._asked_tick:
+        refers_to_future = view_tick > self._asked_tick
+        if self.failure or is_announcement or refers_to_future:
             return
-        if asked_tick + self.hand.delay_ticks < k:
+
+        is_late = view_tick + self.hand.delay_ticks < k
+        if is_late:
             self._dropped["hand: late"] += 1
-        goal = None
+        goal = None  # releases the arm
         if message.grip:
-            goal = message.target or message.force
+            goal = message.target or message.force  # one of them is empty
         try:
-            self.hand.accept_decision(asked_tick, goal)
+            self.hand.accept_decision(view_tick, goal)
         except ValueError as error:
             self.fail(k, str(error))
 
 
 def _list_numbers(view: Any) -> dict[str, Any]:
-    """Returns the fields of a view by name. Arrays are converted to lists."""
+    """Returns the fields of a view by name, with arrays converted to lists for a message."""
     return {
         name: value.tolist() if isinstance(value, np.ndarray) else value
         for name, value in view._asdict().items()

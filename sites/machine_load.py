@@ -1,8 +1,7 @@
 """Warns before a session if the processors of this machine are busy with other programs.
 
-Invariant:
-    - The measurement changes nothing and takes 0.2 s.
-    - If the operating system does not report its load, there is no warning.
+The load is measured for 0.2 s, from the statistics that Linux provides in /proc/stat. On other
+operating systems there is no warning.
 """
 
 from contextlib import suppress
@@ -62,7 +61,9 @@ def measure_busy_share(clock: Clock) -> float | None:
         clock.sleep_until(clock.monotonic_ns() + MEASURED_NS)
         after = ProcessorTimes.parse(_STATISTICS.read_text(encoding="ascii"))
         passed = after.total - before.total
-        return 1.0 - (after.idle - before.idle) / passed if passed > 0 else None
+        if passed > 0:
+            idle_share = (after.idle - before.idle) / passed
+            return 1.0 - idle_share
     return None
 
 

@@ -91,7 +91,17 @@ def describe_site(
 
 
 def _describe_record(scenario: Scenario, name: str, record: State) -> SiteRow:
-    """Returns those texts of a row that follow from a record."""
+    """Returns the texts of a site's row that follow from its newest record.
+
+    Args:
+        scenario: Scenario of the session.
+        name: Name of the site.
+        record: The record, which is the result of one tick of the site.
+
+    Returns:
+        Time, mode, joint angles, norm of the synchronisation error, largest torque, and whether
+        an operator moves the arm, by the headings of the columns.
+    """
     position = np.array([record.x or record.q])
     desired = np.array([record.q_des])
     if record.x:
@@ -112,14 +122,20 @@ def _describe_record(scenario: Scenario, name: str, record: State) -> SiteRow:
 
 
 def _describe_hold(hand: HandInForce | None) -> str:
-    """Returns whether somebody holds the arm: "yes", "fades" after a release, "free", or empty.
+    """Returns the text of the column "held": whether a person or a program moves the arm.
 
     Args:
-        hand: State of the operator in the record. None if the scenario has no live operator.
+        hand: State of the operator in the record. None if nobody may move the arm during the
+            run.
+
+    Returns:
+        "yes" if an operator moves the arm. "fades" just after the operator has released it,
+        while the force is reduced to zero. "free" afterwards. Empty if nobody may move it.
     """
     if hand is None:
         return ""
-    if hand.source:
+    has_operator = hand.source != 0
+    if has_operator:
         return "yes"
     is_fading = hand.grip > 0.0
     return "fades" if is_fading else "free"
@@ -135,10 +151,22 @@ def describe_angles(q: Sequence[float]) -> str:
 
 
 def describe_row(row: SiteRow) -> str:
-    """Returns the row of a site as a line of text, with the most important columns."""
-    keys = {"|e|": "|e|", "torque": "torque", "age": AGES, "hand": "held", "late": "late"}
+    """Returns the row of a site as a line of text, with the most important columns.
+
+    Args:
+        row: The texts of the row, by the headings of the columns.
+    """
+    headings_by_label = {
+        "|e|": "|e|",
+        "torque": "torque",
+        "age": AGES,
+        "hand": "held",
+        "late": "late",
+    }
     parts = [f"{row['site']} {row['time']} {row['mode']}".strip(), row["angles"]]
-    parts += [f"{word} {row[key]}" for word, key in keys.items() if row[key]]
+    for label, heading in headings_by_label.items():
+        if row[heading]:
+            parts.append(f"{label} {row[heading]}")
     return "; ".join(parts)
 
 
@@ -175,6 +203,7 @@ class SessionDisplay:
     def __init__(self, console: Console, clock: Clock) -> None:
         self._console = console
         self._clock = clock
+        # The table of the terminal. None if the output is a file or a pipe.
         self._live = Live(console=console, auto_refresh=False) if console.is_terminal else None
         self._updated_ns = clock.monotonic_ns()
         self._title = ""

@@ -1,16 +1,15 @@
 """Measures a network before a session: round trips by message size, rate and transport.
 
-The near end sends messages to the far end (`trilat ping --answer`), which sends each of them
-back at once. The near end measures the round trip times and the lost messages. The results are
-judged against the delay and the loss that a scenario tolerates. The command is `trilat ping
---benchmark`.
+The near end, the process on this machine, sends messages to the far end, a process on another
+machine (`trilat ping --answer`), which sends each of them back at once. The near end measures
+the round trip times and counts the lost messages. The results are compared with the delay and
+the loss that a scenario tolerates. The command is `trilat ping --benchmark`.
 
 Invariant:
     - The benchmark measures what a session would experience. Its messages have the size, rate,
       priority and network settings of samples, the states that sites send to each other in
       every tick.
-    - The benchmark is not part of any session. It uses a session name of its own.
-    - The benchmark takes as long as the user requests, plus the time to connect.
+    - The benchmark disturbs no session, because it uses a session name of its own.
 """
 
 import math
@@ -91,6 +90,7 @@ def answer_benchmarks(bus: Bus, member: str) -> None:
     put = bus.publisher(topics.key(SESSION, member, topics.SAMPLE))
 
     def answer(_: str, payload: bytes) -> None:
+        """Sends a message back, marked as a reply. Replies themselves are not sent back."""
         header = _parse_header(payload)
         if header is None:
             return
@@ -102,7 +102,7 @@ def answer_benchmarks(bus: Bus, member: str) -> None:
 
 
 class NearEnd:
-    """The end that sends messages and measures when they come back.
+    """Sends messages to the far end, and measures when they come back.
 
     Args:
         bus: Network connection of the near end.
@@ -170,6 +170,7 @@ class NearEnd:
         first = self._number
 
         def count_missing() -> int:
+            """Stores the round trips of new replies, and returns how many are missing."""
             for number, trip_ns in self._read_replies():
                 if number >= first:
                     trips_s[number - first] = trip_ns / 1e9
@@ -320,10 +321,13 @@ class ScenarioNeeds(NamedTuple):
 
 
 def find_needs(scenario: Scenario) -> ScenarioNeeds:
-    """Computes the requirements of a scenario on the network.
+    """Computes the delay, the message size and the rate that a scenario needs of the network.
 
-    The stable delays come from the linear analysis of the control loop, which takes as long as
-    the command `trilat linear`.
+    The delays for which the control loop is stable come from its linear analysis, which takes
+    as long as the command `trilat linear`.
+
+    Args:
+        scenario: The scenario.
     """
     links = list(scenario.links.values())
     held_ms = []
@@ -365,10 +369,14 @@ def find_needs(scenario: Scenario) -> ScenarioNeeds:
 def _measure_sample(scenario: Scenario) -> int:
     """Returns the size in bytes of an encoded sample of the scenario's largest arm.
 
-    The values are typical ones of a long session: numbers take more bytes the larger they are.
+    Larger integers take more bytes. The sample therefore contains large values, as late in a
+    long session.
+
+    Args:
+        scenario: The scenario.
     """
-    shared = max(arm.counts.shared for arm in scenario.arms.values())
-    vectors = {name: [0.5] * shared for name in ("q", "qd", "tau_x")}
+    coordinates = max(arm.counts.shared for arm in scenario.arms.values())
+    vectors = {name: [0.5] * coordinates for name in ("q", "qd", "tau_x")}
     sample = PeerSample(
         v=VERSION,
         site=max(scenario.names, key=len),

@@ -5,9 +5,9 @@ processor, precise sleeping (timer slack), memory that is not swapped to disk, r
 scheduling, and no garbage collection.
 
 Invariant:
-    - A setting that the operating system refuses is reported, and the site continues without
-      it.
-    - A log contains the settings that its sites have obtained.
+    - If the operating system refuses a setting, the site continues without it.
+    - The log contains the settings that each site has obtained, because they explain how
+      punctual its ticks are.
 """
 
 import ctypes
@@ -52,7 +52,8 @@ def prepare(cpu: int | None, sites: int = 1) -> dict[str, str]:
     cpus = os.cpu_count() or 1
     has_room = sites <= SITES_PER_PROCESSOR * cpus
 
-    def describe_shared() -> str:
+    def describe_crowded_machine() -> str:
+        """Returns why no real-time scheduling is requested."""
         shares = count_nouns(sites, "site shares", "sites share")
         return f"normal ({shares} {count_nouns(cpus, 'processor')})"
 
@@ -61,9 +62,10 @@ def prepare(cpu: int | None, sites: int = 1) -> dict[str, str]:
         "affinity": lambda: _set_affinity(cpu),
         "timer_slack": lambda: _call_libc("1 ns", "prctl", _PR_SET_TIMERSLACK, 1),
         "memory": lambda: _call_libc("locked", "mlockall", memory_flags),
-        "scheduling": _set_scheduling if has_room else describe_shared,
+        "scheduling": _set_scheduling if has_room else describe_crowded_machine,
         "collector": _stop_collector,
     }
+    # A setting that is refused or does not exist on this platform does not prevent the others.
     obtained = {}
     for name, step in steps.items():
         try:
@@ -109,19 +111,23 @@ def _set_scheduling() -> str:
         Description of the scheduling that was obtained.
     """
     try:
+        # All threads get real-time scheduling, and the thread of the loop the highest priority.
         _set_threads(
             lambda thread: os.sched_setscheduler(
                 thread, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY - 1)
             )
         )
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY))
+        calling_thread = 0
+        os.sched_setscheduler(calling_thread, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY))
+        return f"SCHED_FIFO {FIFO_PRIORITY}"
     except (OSError, AttributeError):
-        try:
-            _set_threads(lambda thread: os.setpriority(os.PRIO_PROCESS, thread, NICE))
-        except (OSError, AttributeError):
-            return "normal (neither SCHED_FIFO nor a better nice value was permitted)"
+        pass  # not permitted, or not on this platform
+
+    try:
+        _set_threads(lambda thread: os.setpriority(os.PRIO_PROCESS, thread, NICE))
         return f"nice {NICE} (SCHED_FIFO was not permitted)"
-    return f"SCHED_FIFO {FIFO_PRIORITY}"
+    except (OSError, AttributeError):
+        return "normal (neither SCHED_FIFO nor a better nice value was permitted)"
 
 
 def _set_threads(change: Callable[[int], None]) -> None:
@@ -134,9 +140,11 @@ def _set_threads(change: Callable[[int], None]) -> None:
         change: Function that changes the thread of a given number. 0 is the calling thread.
     """
     change(0)
-    tasks = Path("/proc/self/task")
-    for thread in tasks.iterdir() if tasks.is_dir() else ():
-        with suppress(ProcessLookupError):  # it has ended
+    threads_folder = Path("/proc/self/task")  # Linux lists the threads of a process here
+    if not threads_folder.is_dir():
+        return
+    for thread in threads_folder.iterdir():
+        with suppress(ProcessLookupError):  # the thread has ended meanwhile
             change(int(thread.name))
 
 

@@ -38,10 +38,11 @@ EVENTS_BYTES = 4_000_000
 
 
 class ChannelBuffer:
-    """The latest messages of one channel, numbered consecutively.
+    """Stores the latest messages of one channel, numbered consecutively.
 
-    The messages are stored in a ring of bytes that is allocated at the start, so that no memory
-    is allocated while the control loop runs.
+    A channel is for example that of a site's records. The messages are stored one after another
+    in a ring of bytes that is allocated at the start, so that no memory is allocated while the
+    control loop runs. New messages overwrite the oldest ones.
 
     Args:
         capacity: Largest number of messages.
@@ -66,7 +67,7 @@ class ChannelBuffer:
         self._head = 0
 
     def start_at(self, number: int) -> None:
-        """Sets the number of the first message. The buffer must be empty."""
+        """Sets the number of the first message. No message must have been stored before."""
         self.next_number = number
         self.oldest = number
 
@@ -128,7 +129,7 @@ class ChannelBuffer:
 
 
 class RetransmitBuffer:
-    """The recently published messages of a site, for the queries of recorders.
+    """Stores the recently published messages of a site, and answers the queries of recorders.
 
     Args:
         site: The site in the simulation kernel.
@@ -160,7 +161,10 @@ class RetransmitBuffer:
         self.channels[topics.LINK].start_at(link_number)
 
     def skip(self, first: int, next_tick: int) -> None:
-        """Adds empty messages for skipped ticks, so that later messages have their numbers.
+        """Adds an empty message for each message that the skipped ticks would have published.
+
+        Messages are numbered by the tick. Without the empty messages, later messages would be
+        stored under wrong numbers.
 
         Args:
             first: First skipped tick.
@@ -174,7 +178,11 @@ class RetransmitBuffer:
         self.channels[topics.LINK].skip(max(0, next_number - published))
 
     def answer_query(self) -> bool:
-        """Answers the oldest query. Returns False if there is no query."""
+        """Answers the oldest waiting query of a recorder.
+
+        Returns:
+            True if a query was answered. False if no query was waiting.
+        """
         query = self._queries.poll()
         if query is None:
             return False
@@ -182,7 +190,12 @@ class RetransmitBuffer:
         return True
 
     def _find_messages(self, wanted: BackfillRequest) -> tuple[int, list[bytes], int]:
-        """Looks up the messages that a query requests, see `answer_backfill`."""
+        """Finds the messages that a query requests, as `answer_backfill` needs them.
+
+        Returns:
+            Number of the first message, the messages, and the number of the next message that
+            will be published.
+        """
         buffer = self.channels[wanted.channel]
         first, payloads = buffer.read_chunk(wanted.first, wanted.last)
         return first, payloads, buffer.next_number

@@ -856,7 +856,7 @@ def _describe_inputs(ends: BridgeEnds, bridge: Bridge, robots: Iterable[str]) ->
     Returns:
         A clause for each topic, such as "/session/s/robot_states measures the arm of s".
     """
-    clauses = [f"/{topic} holds an arm" for topic in bridge.targets]
+    clauses = [f"/{topic} commands an arm" for topic in bridge.targets]
     for site in robots:
         topic = ends.topic(site, "robot_states")
         clauses.append(f"/{topic} measures the arm of {site}")

@@ -31,7 +31,7 @@ LATCHED = QualityOfService(latched=True, depth=1)
 
 
 class BridgeEnds(NamedTuple):
-    """Both ends of the bridge between a session and ROS programs.
+    """Connections of the bridge to its two ends: the ROS programs and the session.
 
     Attributes:
         graph: Connection to the ROS programs.
@@ -58,7 +58,7 @@ class BridgeEnds(NamedTuple):
 
 
 class SiteTopics:
-    """Publisher of the topics of one site.
+    """Publishes the records and statistics of one site on its ROS topics.
 
     Args:
         ends: Connections to ROS and to the session.

@@ -6,8 +6,8 @@ receiving sites measure themselves. `ping_topic` measures the delays of the mess
 topic.
 
 Invariant:
-    - The measurement does not disturb the session. This process announces no token, so that the
-      session neither waits for it nor knows about it.
+    - The measurement does not disturb the session. This process does not announce itself as a
+      member, so that the session does not wait for it.
 """
 
 from collections.abc import Callable, Sequence
@@ -62,7 +62,9 @@ class PingReport(Result):
 
 
 class SessionPing:
-    """One measurement of a session's network. The caller calls `poll` until `is_over` is True.
+    """Measures the network of a session once.
+
+    The caller calls `poll` repeatedly until `is_over` returns True, and then `report`.
 
     Args:
         bus: Network connection that reaches the session.
@@ -138,11 +140,14 @@ class SessionPing:
         return PingReport(self._session, members, links)
 
     def _describe_member(self, info: Info) -> dict[str, Any]:
-        """Returns the row of a member.
+        """Returns the row of a member in the report.
 
-        The row contains the round trip times if the member has replied to pings, and their mean
-        change from one to the next (jitter). It contains the offset of the clock if it is
-        known.
+        If the member has replied to pings, the row contains quantiles of the round trip time
+        and the jitter, which is the mean change from one round trip time to the next. If the
+        offset of the member's clock is known, the row contains it with its error bound.
+
+        Args:
+            info: Identity of the member.
         """
         trips = self.pinger.trips.get(info.boot)
         has_same_clock = info.clock == self._clock.identity()
@@ -202,6 +207,7 @@ def ping_session(
     """
 
     def read_site_names(text: str) -> tuple[str, ...]:
+        """Returns the names of the sites in the text of a scenario."""
         try:
             return parse_embedded(text, session).names
         except ScenarioError:
@@ -276,6 +282,7 @@ def ping_topic(
     types: dict[bytes, str] = {}
 
     def receive(kind: str, attachment: Attachment) -> None:
+        """Stores the number and the delay of a message, in a thread of Zenoh."""
         delay_ns = clock.unix_ns() - attachment.sent_unix_ns
         types[attachment.gid] = kind
         samples.setdefault(attachment.gid, []).append((attachment.number, delay_ns))

@@ -9,10 +9,12 @@ and ten times a second.
 
 Invariant:
     - A site announces itself only after it has declared its subscriptions and compiled its
-      control step. Other members can rely on a site that they see.
+      control step. A site that is announced can thus be expected to execute its first tick in
+      time, and to receive all messages.
     - The arm is braked until the epoch.
-    - After its last tick, the site stays until every recorder that is present has stored all
-      messages of the site, or until a time limit.
+    - After its last tick, the process continues until every recorder that is present has
+      stored all messages of the site, or until a time limit. Otherwise the end of the log
+      could be lost.
 """
 
 import signal
@@ -66,7 +68,7 @@ from .site_parts import SiteOptions, SiteParts
 POLL_NS = 5_000_000
 """Longest pause between two polls while the site joins or leaves a session, in ns."""
 NO_BOOT = -1
-"""Stands for the boot of a peer that is not present yet."""
+"""Used in place of the boot (the number of a process start) of a peer that is not present."""
 STATUS_PERIOD_S = 5
 """Time between two status lines for the user, in s."""
 LINGER_NS = 10 * NS_PER_S
@@ -244,15 +246,16 @@ def _describe_failed_join(parts: SiteParts, joining: SessionJoin) -> SessionErro
 
 
 class RunningSite:
-    """A site from the epoch until it has left the session.
+    """Runs a site from the epoch, the common start of the session, until it leaves the session.
 
     `join_session` creates this object. The loop calls its methods: `should_stop` and `step` in
     every tick, `report_tick` after ticks in which something changed, and `run_housekeeping` ten
     times a second. After the last tick, `leave_session` completes the work.
 
-    If a quarter of a period is left after a block of records was published, the loop also calls
-    `use_slack`, which answers a recorder's query for lost messages. If `use_slack` returns
-    True, the loop calls it again after the next tick.
+    If at least a quarter of the period is left after a block of records was published, the loop
+    also calls `use_slack`, which answers one query of a recorder for lost messages. It returns
+    True if it has answered one. The loop then calls it again after the next tick, because more
+    queries may wait.
 
     Args:
         parts: Parts of the site.
@@ -275,7 +278,7 @@ class RunningSite:
         self._epoch = epoch
         self._failure: RunFailed | None = None
         self._mode = Mode.RUN
-        self._skipped = list[str]()  # ranges of ticks that are not published yet
+        self._skipped = list[str]()  # ranges of skipped ticks that are not published yet
         self._output: TickRecord | None = None  # the record of the newest tick
         # Seconds of the session in which a status line, a `waiting` event and an alarm were
         # last issued. They limit how often these are repeated.
@@ -379,10 +382,11 @@ class RunningSite:
             self._publish_skipped(output.tick, output.t_ns)
 
     def _publish_setup(self) -> None:
-        """Publishes the settings of the process and the clocks, and tells them to the user.
+        """Publishes the real-time settings and the clock offsets, and prints them for the user.
 
-        A site that joins a running session also publishes the event `join`. An external arm is
-        bound to the start of the run here: the warning says if the arm is elsewhere.
+        A site that joins a running session also publishes the event `join`. From here on, an
+        external arm accepts measurements only from its present driver. If the arm is not where
+        the scenario says that it starts, a warning is published.
         """
         parts = self._parts
         user_lines = self._clock_texts
@@ -425,7 +429,7 @@ class RunningSite:
             self._publisher.publish(**notice, t_ns=t_ns)
 
     def should_stop(self) -> bool:
-        """Receives from the arm and the dead-man switch, and decides if the run ends now.
+        """Reads the messages of the arm and its dead-man switch, and decides if the run ends.
 
         Returns:
             True if the site failed, if a member ended the run for all, if the user stopped the
@@ -471,9 +475,11 @@ class RunningSite:
         return self._output
 
     def run_housekeeping(self, k: int, t_ns: int) -> None:
-        """Does the work that is not urgent: replies, clocks, members, and news for the user.
+        """Executes the work that need not be done in every tick.
 
-        The loop calls this method ten times a second.
+        The site replies to queries, updates the clock offsets, admits peers that join,
+        publishes events, and prints a status line for the user. The loop calls this method ten
+        times a second.
 
         Args:
             k: Tick that was executed last.
@@ -490,7 +496,7 @@ class RunningSite:
         self._watch_members(t_ns)
         self._rejoin(t_ns)
 
-        if parts.hand is not None:
+        if parts.hand is not None:  # who has started or ended to move the arm
             for _, text in parts.hand.news:
                 _, _, text_without_site = text.partition(": ")
                 parts.say(text_without_site)
@@ -505,11 +511,11 @@ class RunningSite:
             parts.say(self._describe_status(self._output))
 
     def _publish_news(self, kind: str, news: list[tuple[int, str]]) -> None:
-        """Publishes all news of one kind, and empties their list.
+        """Publishes an event for each entry of a list, and empties the list.
 
         Args:
             kind: Kind of the events.
-            news: Tick and sentence of each piece of news.
+            news: The entries: the tick in which something happened, and a sentence about it.
         """
         rate_hz = self._parts.site.rate_hz
         for tick, text in news:
@@ -517,9 +523,13 @@ class RunningSite:
         news.clear()
 
     def _publish_skipped(self, k: int, t_ns: int) -> None:
-        """Publishes which ticks the site has skipped since the last call, in one event.
+        """Publishes one event about the ticks that the site has skipped since the last call.
 
         A site skips ticks only if its arm is external, and the loop was late.
+
+        Args:
+            k: Tick that was executed last.
+            t_ns: Nominal time of that tick, in ns since the epoch.
         """
         if self._skipped:
             ticks = " ".join(self._skipped)
@@ -530,8 +540,12 @@ class RunningSite:
     def _publish_waiting(self, k: int, t_ns: int) -> None:
         """Reports once a second that the arm is too far from its peers to approach them.
 
-        This can only happen if the scenario lets an arm glide back to its peers after a break.
-        The arm then waits until somebody moves it closer.
+        This can only happen if the scenario lets an arm glide back to its peers after an
+        interrupted connection. The arm then waits until its operator moves it closer.
+
+        Args:
+            k: Tick that was executed last.
+            t_ns: Nominal time of that tick, in ns since the epoch.
         """
         output = self._output
         if output is None or output.mode not in (Mode.WAITING, Mode.HOLD):
@@ -547,7 +561,7 @@ class RunningSite:
             self._parts.say(text)
 
     def _watch_members(self, t_ns: int) -> None:
-        """Follows which members leave and join, and decides if this site still waits for them.
+        """Updates who takes part in the session, and checks if a peer is away for too long.
 
         Args:
             t_ns: Present time, in ns since the epoch.
@@ -582,10 +596,10 @@ class RunningSite:
         return t_ns - first_left_ns > patience_s * NS_PER_S
 
     def _admit_peer(self, event: Event, t_ns: int) -> None:
-        """Prepares this site for a peer that joins the running session.
+        """Prepares this site for a peer that joins, or rejoins, the running session.
 
-        From the tick that the event names, samples of the peer's new boot are accepted. Samples
-        of its previous boot are not accepted any more.
+        From the tick that the event names, samples of the new process of the peer are accepted.
+        Samples of its previous process are not accepted any more.
 
         Args:
             event: Event with which the peer announced its join.
@@ -603,13 +617,16 @@ class RunningSite:
         parts.say(f"{event.member} joins at t = {join_ns * 1e-9:.3f} s")
 
     def _rejoin(self, t_ns: int) -> None:
-        """Repeats the announcement to join while a peer that is heard ignores this site.
+        """Repeats the request to join the session until no peer ignores this site any more.
 
-        A peer whose connection was broken at the time of the join has not received the
-        announcement, and drops the samples of this site. The announcement is repeated at most
-        once a second, until every peer that is heard acknowledges samples of this site.
+        A peer whose connection was interrupted has not received the request, and drops the
+        samples of this site as those of an unknown process. The request is repeated at most
+        once a second, until every peer whose samples arrive has confirmed samples of this site.
+
+        Args:
+            t_ns: Present time, in ns since the epoch.
         """
-        coming = self._epoch.coming
+        coming = self._epoch.coming  # None if this site was present from the start
         now_ns = self._parts.clock.monotonic_ns()
         if coming is None or t_ns < self._rejoined_ns + NS_PER_S:
             return
@@ -626,14 +643,14 @@ class RunningSite:
             self._publisher.publish(**fields)
 
     def _publish_last_heard(self, index: int, coming: Event, t_ns: int) -> None:
-        """Publishes the last tick that was received from the previous boot of a peer.
+        """Publishes the last tick that was received from a peer before the peer was restarted.
 
-        The previous boot may have been killed before it could publish its own end. Its last
-        tick tells the recorder how many records to expect.
+        The previous process of the peer may have been killed before it could publish its end.
+        From its last tick, the recorder knows how many records to expect.
 
         Args:
             index: Index of the peer.
-            coming: Event with which the new boot of the peer announced its join.
+            coming: Event with which the new process of the peer announced its join.
             t_ns: Present time, in ns since the epoch.
         """
         tick = self._inbox.find_last_tick_of(index, coming.boot)
@@ -649,7 +666,11 @@ class RunningSite:
         )
 
     def _describe_status(self, output: TickRecord) -> str:
-        """Composes the status line: time, mode, error, torque, late ticks, dropped messages."""
+        """Returns the status line that is printed for the user every few seconds.
+
+        It contains the time, the mode, the largest synchronisation error and torque of a joint,
+        and the numbers of late ticks and dropped messages.
+        """
         parts = self._parts
         position = np.array([output.shared()[0]])
         desired = np.array([output.q_des])
@@ -699,10 +720,13 @@ class RunningSite:
             self._raise_alarm(output)
 
     def _raise_alarm(self, output: TickRecord) -> None:
-        """Prints an alarm for the user, with its reason and a remedy.
+        """Prints an alarm with a reason and a remedy, if the new mode requires an alarm.
 
-        An arm that is stopped raises an alarm each time. An arm that holds its position may
-        change its mode many times, and raises at most one alarm a second.
+        Alarms exist only under the rule `glide` for interrupted connections. An arm that holds
+        its position may change its mode many times, and raises at most one alarm a second.
+
+        Args:
+            output: Record of the tick in which the mode has changed.
         """
         parts = self._parts
         mode = output.mode
@@ -743,6 +767,7 @@ class RunningSite:
         interrupt = parts.interrupt
         monitor = parts.monitor
         self._publish_end()
+
         # The exit code is read before the wait: a later signal only ends the wait.
         code = interrupt.exit_code if interrupt.is_requested() else 0
         monitor.watch(self._publisher, self._t_ns)
@@ -801,12 +826,12 @@ class RunningSite:
         return "; ".join(text for _, text in self._parts.monitor.departed.values())
 
     def _find_cause(self) -> tuple[str, str]:
-        """Finds out why the run ended before the last tick of the scenario.
+        """Determines why the run ended before the last tick of the scenario.
 
         Returns:
-            The member that ended the run, and the end of a sentence that names the cause. The
-            member is empty if no single member is the cause. Both are empty if the run was
-            completed.
+            member: Name of the member that ended the run. Empty if the run was completed, or
+                was ended by a request to all sites.
+            cause: End of a sentence that names the cause. Empty if the run was completed.
         """
         parts = self._parts
         monitor = parts.monitor

@@ -1,4 +1,4 @@
-"""Defines the interface of input devices, with which a person moves an arm and feels it.
+"""Defines the interface of input devices, with which a person moves an arm and feels its force.
 
 Each device is a class in a file of its own in this folder. `open_device` finds the class by the
 name of the file, so that a further device needs no entry in any list.

@@ -1,13 +1,11 @@
 """Uses an Inverse3 of Haply as an input device, through the service of its maker.
 
 The service runs on the same machine and exchanges JSON messages over a WebSocket. It replies to
-each message with one state, so that this program determines the rate.
+each message, which contains a force, with one state of the device. This program therefore
+determines the rate, and must reply to each state with a force, even if the force is zero.
 
-Invariant:
-    - Each state is answered with one message that contains a force, even if the force is zero.
-      This keeps the exchange going.
-    - If a message cannot be parsed, it becomes a state with a position that is not finite. Such
-      a state moves nothing.
+If a message of the service cannot be parsed, the state is returned with a position that is not
+finite, which `DeviceHand` ignores.
 """
 
 import math
@@ -51,7 +49,7 @@ _CONNECT_OPTIONS: dict[str, Any] = {
 class HaplyInverse3:
     """An Inverse3 of Haply with its wireless grip, through version 3 of the maker's service.
 
-    >>> tn.lead("play", "m1", tn.HaplyInverse3("ws://127.0.0.1:10001"))  # doctest: +SKIP
+    >>> tn.session("play").lead("m1", tn.HaplyInverse3())  # doctest: +SKIP
 
     Args:
         address: Address of the service. If it ends with "#values", forces are sent under the

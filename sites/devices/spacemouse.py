@@ -1,12 +1,8 @@
 """Reads a SpaceMouse of 3Dconnexion on Linux, from its hidraw file.
 
-A SpaceMouse does not move. The deflection of its cap is interpreted as a velocity, which is
-integrated to a position.
-
-Invariant:
-    - A cap that has reported nothing for `STILL_NS` is at rest, because a deflected cap reports
-      continuously.
-    - No web page needs to be open, unlike with a connection through a browser (WebHID).
+The cap of a SpaceMouse can only be deflected from its rest position. The deflection is
+interpreted as a velocity, which is integrated to a position. If no report has arrived for
+`STILL_NS`, the cap is at rest, because a deflected cap reports continuously.
 """
 
 import os
@@ -78,7 +74,11 @@ class SpaceMouse:
         os.close(self._file)
 
     def read(self) -> DeviceState:
-        """Returns the state, with the position integrated from the deflections of the cap."""
+        """Reads the new reports of the device, and integrates the deflection of its cap.
+
+        Returns:
+            Position since the device was connected, present velocity, and buttons.
+        """
         now_ns = self._clock.monotonic_ns()
         while self._read_report(now_ns):
             pass
@@ -97,15 +97,14 @@ class SpaceMouse:
         return DeviceState(self._position_m, self._velocity_m_s, buttons)
 
     def _read_report(self, now_ns: int) -> bool:
-        """Reads one report, if there is one, and stores the deflections or buttons in it.
-
-        Report 1 contains the deflections, and report 3 the buttons. Other reports are ignored.
+        """Reads the next report of the device, and stores the velocity or the buttons in it.
 
         Args:
             now_ns: Present time, in ns.
 
         Returns:
-            False if there was no report.
+            True if a report was read, so that another one may follow. False if no report was
+            waiting.
 
         Raises:
             ConnectionError: The device is gone.

@@ -7,7 +7,7 @@ messages under keys, receives the messages of other members, and sends and answe
 Invariant:
     - When a message arrives, the network thread of a site only reads the time, decodes the
       message and appends it to a queue, or sends a short reply. The control loop therefore
-      loses little time to network threads. The decoding function must not raise an error.
+      loses little time to network threads.
     - Messages wait in queues of limited length until the control loop polls them. If a queue is
       full, the oldest message is dropped. The receiver notices the gap because messages are
       numbered.
@@ -153,15 +153,20 @@ class Bus(Protocol):
 
 @lru_cache(256)
 def _compile_expression(expression: str) -> re.Pattern[str]:
-    """Converts a key with wildcards to a regular expression, see `matches_key`."""
+    """Converts a key with wildcards to a regular expression, see `matches_key`.
+
+    The regular expression matches keys with a leading slash, so that every part of a key has
+    the same form: a slash and some characters.
+    """
+    one_part = "/[^/]+"
     pattern = ""
-    for chunk in expression.split("/"):
-        if chunk == "**":
-            pattern += "(?:/[^/]+)*"
-        elif chunk == "*":
-            pattern += "/[^/]+"
+    for part in expression.split("/"):
+        if part == "**":
+            pattern += f"(?:{one_part})*"
+        elif part == "*":
+            pattern += one_part
         else:
-            literals = map(re.escape, chunk.split("$*"))
+            literals = map(re.escape, part.split("$*"))
             pattern += "/" + "[^/]*".join(literals)
     return re.compile(pattern)
 

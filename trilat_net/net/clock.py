@@ -1,9 +1,9 @@
-"""Reads the time. No other module reads a clock of the operating system.
+"""Provides the clocks that all other modules use to read the time and to sleep.
 
-Invariant:
-    - Rule L1: code that needs the time receives a clock as an argument, so that tests and
-      simulations can use a clock of their own.
-    - Times are integers in ns. Floating-point numbers would lose precision after a few months.
+No other module reads a clock of the operating system. Code that needs the time receives a
+`Clock` as an argument (rule L1), so that tests and simulations can use a clock of their own.
+Times are integers in ns, because floating-point numbers would lose precision after a few
+months.
 """
 
 import platform
@@ -96,19 +96,19 @@ class SkewedClock:
     def monotonic_ns(self) -> int:
         """Returns the reading of the skewed clock, in ns."""
         passed_ns = self._clock.monotonic_ns() - self._start_ns
-        return (
-            self._start_ns
-            + self._offset_ns
-            + passed_ns
-            + passed_ns * self._drift_ppb // NS_PER_S
-        )
+        drift_ns = passed_ns * self._drift_ppb // NS_PER_S
+        return self._start_ns + self._offset_ns + passed_ns + drift_ns
 
     def unix_ns(self) -> int:
         """Returns the time of day of the other clock, in ns since 1970."""
         return self._clock.unix_ns()
 
     def sleep_until(self, deadline_ns: int) -> None:
-        """Sleeps until the skewed clock reads `deadline_ns`, if that is in the future."""
+        """Sleeps until the skewed clock reads `deadline_ns`, if that is in the future.
+
+        The equation of this clock is solved for the reading of the other clock at that time.
+        """
+        # Time from the start to the deadline, on this clock and on the other clock.
         passed_ns = deadline_ns - self._start_ns - self._offset_ns
         # -(-a // b) is a / b rounded up, so that the sleep does not end before the deadline.
         other_passed_ns = -(-passed_ns * NS_PER_S // (NS_PER_S + self._drift_ppb))

@@ -1,14 +1,14 @@
 """Finds a running session from outside, connects to it, and sends requests to its sites.
 
 Programs that are not part of a session use this module: the commands that stop arms, change
-links or measure the network, and a playback of a log.
+links or measure the network, and a playback of a log. A session consists of processes
+("sites") that each run one arm, and optionally recorders.
 
 Invariant:
-    - `find_members` is the only function that queries which members are present.
-    - A session name belongs to one session. A log cannot be played back under the name of a
-      session that has a site which is present.
     - A change is requested only once, because a second request might apply it twice. The caller
       receives either a reply, or an error that names the site that did not reply.
+    - A log is not played back under the name of a session whose sites are present, because
+      programs could not distinguish the messages of the log from those of the session.
 """
 
 import math
@@ -133,6 +133,7 @@ def connect_to_session(
     with ExitStack() as stack:
 
         def connect(target: Connection) -> Bus | None:
+            """Opens a connection until the end of the `with` block. None if stopped."""
             bus = open_bus(
                 connection=target, clock=clock, stopped=stopped, timeout_s=timeout_s, say=say
             )
@@ -142,24 +143,25 @@ def connect_to_session(
         if connection.connect is None and recorder_boot is None:
             connection = replace(connection, connect=find_known_endpoints(session, connection))
         if connection.connect is None:
-            first = default_endpoint(session, 0)
-            visitor = connect(replace(connection, listen=(), connect=[first]))
-            if visitor is not None and recorder_boot is not None:
-                visitor.announce(liveliness_token(session, topics.RECORDER, recorder_boot))
+            first_endpoint = default_endpoint(session, 0)
+            first_bus = connect(replace(connection, listen=(), connect=[first_endpoint]))
             sites = None
-            if visitor is not None:
+            if first_bus is not None:
+                if recorder_boot is not None:
+                    token = liveliness_token(session, topics.RECORDER, recorder_boot)
+                    first_bus.announce(token)
                 sites = _query_sites(
-                    bus=visitor,
+                    bus=first_bus,
                     clock=clock,
                     session=session,
                     names=names,
                     stopped=stopped,
                     timeout_s=timeout_s,
                 )
-            if sites is None:
+            if sites is None:  # the caller has stopped the search
                 yield None
                 return
-            endpoints = list(default_endpoints(session, sites).values()) or [first]
+            endpoints = list(default_endpoints(session, sites).values()) or [first_endpoint]
             connection = replace(connection, connect=endpoints)
         yield connect(connection)
 
@@ -173,6 +175,8 @@ def _query_sites(
     timeout_s: float | None,
 ) -> tuple[str, ...] | None:
     """Queries the members of a session for the names of its sites.
+
+    The arguments are those of `connect_to_session`, with a bus that reaches the first site.
 
     Returns:
         The names, from the first reply that contains a scenario. None if `stopped` returned
@@ -200,8 +204,15 @@ def send_change(
 ) -> ChangeReply:
     """Sends a request to a site of a running session, and waits for the reply.
 
-    With keys, only the operator's keys permit changes. The order to stop is permitted to all
-    members.
+    If the members of the session have keys, changes can be requested only with the keys of the
+    operator. Every member may send the order to stop.
+
+    Args:
+        bus: Network connection that reaches the site.
+        clock: Clock of the caller.
+        session: Name of the session.
+        site: Name of the site.
+        request: The request.
 
     Returns:
         The reply of the site, accepted or refused.
@@ -237,6 +248,12 @@ def send_change(
 def _query_once(bus: Bus, clock: Clock, key: str, request: Request) -> bytes | None:
     """Sends a request once, and waits for the first reply.
 
+    Args:
+        bus: Network connection that reaches the receiver.
+        clock: Clock of the caller.
+        key: Key under which the receiver accepts requests, see `topics.key`.
+        request: The request.
+
     Returns:
         The payload of the reply. None if no reply arrives within `REPLY_TIMEOUT_S`.
     """
@@ -255,6 +272,12 @@ def list_past_events(bus: Bus, clock: Clock, session: str, site: str) -> Iterato
 
     The first event is the oldest one that the site still stores. The iteration ends early if
     the site does not reply.
+
+    Args:
+        bus: Network connection that reaches the site.
+        clock: Clock of the caller.
+        session: Name of the session.
+        site: Name of the site.
     """
     key = topics.key(session, site, topics.PAST)
     first = 0
@@ -283,6 +306,15 @@ def open_playback_bus(
 ) -> Bus | None:
     """Opens the network connection of a playback, which publishes the messages of a log again.
 
+    If the port is in use, the error says whether a session of the same name uses it.
+
+    Args:
+        connection: Endpoints of the playback.
+        clock: Clock of the caller.
+        session: Name under which the log will be played back.
+        stopped: Function that returns True to give up.
+        say: Function that prints a line for the user.
+
     Returns:
         The connection. None if `stopped` returned True.
 
@@ -299,12 +331,12 @@ def open_playback_bus(
             raise
         # The port may be in use by a site of a session with the same name.
         target = replace(connection, listen=(), connect=connection.listen)
-        visitor = open_bus(
+        session_bus = open_bus(
             connection=target, clock=clock, stopped=stopped, timeout_s=1.0, say=say
         )
-        if visitor is not None:
-            with closing(visitor):
-                refuse_running_session(visitor, clock, session, stopped)
+        if session_bus is not None:
+            with closing(session_bus):
+                refuse_running_session(session_bus, clock, session, stopped)
         raise
 
 
@@ -312,6 +344,12 @@ def refuse_running_session(
     bus: Bus, clock: Clock, session: str, stopped: Callable[[], bool]
 ) -> None:
     """Checks that no site of a session is present, before its name is used for a playback.
+
+    Args:
+        bus: Network connection that would reach the session.
+        clock: Clock of the caller.
+        session: Name of the session.
+        stopped: Function that returns True to end the check early.
 
     Raises:
         SessionError: A site of that session replies.

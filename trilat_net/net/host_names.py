@@ -1,11 +1,8 @@
 """Checks that host names in endpoints can be resolved, before a connection is opened.
 
-Zenoh would try to connect to a misspelt host name for ever, without an error.
-
-Invariant:
-    - Endpoints without a host name, such as numeric addresses and socket files, are not
-      checked.
-    - The check opens no connection. It only queries the name service.
+Zenoh would try to connect to a misspelt host name for ever, without an error. The check queries
+the name service for each host name, and opens no connection. Endpoints without a host name,
+such as numeric addresses and socket files, need no check.
 """
 
 import ipaddress

@@ -2,20 +2,18 @@
 
 A member is a process that takes part in a session, such as a site or a recorder. `trilat keys
 new` creates a private certificate authority for the session, which signs one certificate per
-member. Every member loads the keys in its own folder. The authority has a separate folder,
-which should be stored safely. Zenoh encrypts all connections with these keys (TLS or QUIC with
-certificates of both ends).
+member. Zenoh encrypts all connections with these keys (TLS or QUIC with certificates of both
+ends).
 
-The keys end one day earlier than their certificate. During this day, no member can start with
-the keys, but `trilat stop` can still connect and stop the arms. Zenoh needs a valid certificate
-for each new connection, and each time a connection is opened again.
+Every member loads the keys in its own folder. The folder contains its private key, its
+certificate, the certificate of the authority, and the list of all members, from which the
+access rules are derived. No other user of the machine can read the private key or change a file
+in the folder. The private key of the authority has a separate folder, which should be stored
+safely.
 
-Invariant:
-    - Every certificate ends after some days.
-    - The folder of a member contains its private key, its certificate, the certificate of the
-      authority, and the list of all members. The access rules of Zenoh follow from this list.
-    - No other user of the machine can read the private key or change a file in the folder.
-    - Either the keys of all members are created, or no keys.
+The validity of the keys ends one day earlier than that of their certificate. During this day,
+no member can start with the keys, but `trilat stop` can still connect and stop the arms. Zenoh
+needs a valid certificate for each new connection, and each time a connection is opened again.
 """
 
 import datetime
@@ -132,7 +130,14 @@ def create_keys(
 
 
 def _find_name_fault(members: Sequence[Any]) -> str:
-    """Returns why members cannot have these names. Empty if they can."""
+    """Checks names of members, and returns what is wrong with them.
+
+    Args:
+        members: The names.
+
+    Returns:
+        The first fault, as a sentence for the user. Empty if all names are valid.
+    """
     for name in members:
         has_valid_letters = isinstance(name, str) and re.fullmatch("[A-Za-z0-9_-]+", name)
         if not has_valid_letters or len(name) > MOST_LETTERS or name == _AUTHORITY_FOLDER:
@@ -147,14 +152,22 @@ def _find_name_fault(members: Sequence[Any]) -> str:
 
 
 def _find_host_fault(host: str) -> str:
-    """Returns why a certificate cannot contain a host name. Empty if it can.
+    """Checks that a certificate can contain a host name or an address.
 
     Names with a port and patterns that stand for several hosts are refused.
+
+    Args:
+        host: The name or address.
+
+    Returns:
+        The fault, as a sentence for the user. Empty if the host is valid.
     """
+    # A label, a part between dots, has at most 63 characters, and no hyphen at an end.
     label = "(?!-)[A-Za-z0-9_-]{1,63}(?<!-)"
     try:
         is_valid = not ipaddress.ip_address(host).is_unspecified
     except ValueError:
+        # Not an address. The last label of a host name must not be a number.
         is_host_name = bool(re.fullmatch(rf"({label}\.)*(?!\d+$){label}", host))
         is_valid = is_host_name and len(host) <= 253
     if is_valid:
@@ -300,7 +313,13 @@ def _write_all_keys(
 
 
 def _format_member_list(member: str, members: Sequence[str], ends: datetime.datetime) -> str:
-    """Returns the content of a member's file `MEMBERS`."""
+    """Returns the content of the file `MEMBERS` in the folder of a member, in JSON.
+
+    Args:
+        member: Name of the member.
+        members: Names of all members.
+        ends: End of the validity of the keys.
+    """
     content = {"member": member, "members": list(members), "ends": ends.isoformat()}
     return f"{json.dumps(content)}\n"
 
@@ -308,7 +327,12 @@ def _format_member_list(member: str, members: Sequence[str], ends: datetime.date
 def _sign_authority(
     key: ec.EllipticCurvePrivateKey, ends: datetime.datetime
 ) -> x509.Certificate:
-    """Returns the certificate of the authority, which it signs itself."""
+    """Returns the certificate of the authority, signed with its own key.
+
+    Args:
+        key: Private key of the authority.
+        ends: End of the validity of the keys.
+    """
     constraints = x509.BasicConstraints(ca=True, path_length=0)
     builder = _start_certificate(_ISSUER, key.public_key(), ends)
     return builder.add_extension(constraints, critical=True).sign(key, hashes.SHA256())
@@ -351,7 +375,13 @@ _ISSUER = _make_subject("trilat-net authority")
 def _start_certificate(
     subject: x509.Name, public_key: Any, ends: datetime.datetime
 ) -> x509.CertificateBuilder:
-    """Returns the fields that all certificates of a session have in common, unsigned."""
+    """Returns an unsigned certificate with the fields that all certificates have.
+
+    Args:
+        subject: Name of the member, or of the authority.
+        public_key: Its public key.
+        ends: End of the validity of the keys. That of the certificate is `STOPPING_TIME` later.
+    """
     return (
         x509.CertificateBuilder()
         .subject_name(subject)
@@ -579,7 +609,12 @@ def _find_key_fault(
 
 
 def _make_settings(folder: Path, members: Sequence[str]) -> dict[str, Any]:
-    """Returns the Zenoh settings of a member that uses the keys in a folder."""
+    """Returns the Zenoh settings of a member that uses the keys in a folder.
+
+    Args:
+        folder: Folder of the member.
+        members: Names of all members, whose access rules are part of the settings.
+    """
     tls = {
         "root_ca_certificate": str(folder / AUTHORITY),
         "enable_mtls": True,

@@ -10,15 +10,17 @@ Each member also replies to queries with its identity (`Info`): the boot, the sc
 clock and the state of the session.
 
 Invariant:
-    - A site refuses a session that runs already or has another scenario, and a second start of
-      a member that is present, when their first identity arrives. Nothing has moved by then.
+    - A site gives up if the session runs already, if another member has another scenario, or if
+      the same site was started twice. This is decided when the first identity arrives, before
+      any arm has moved.
+    - A site may join a running session only if `LateSites.may_join_late` is True. This requires
+      that every site of the scenario waits for its peers and aligns with them before it moves,
+      because the arms would otherwise jump.
+    - A recorder may join a running session, and several recorders may be present. A recorder
+      that joins late reads the sites, the start time and the boots from the identities of the
+      running sites.
     - Replies from programs that are not members of the session are ignored. The reason why they
       cannot be read is kept for the error message.
-    - A recorder may join a running session, and several recorders may be present. A recorder
-      that joins late learns the sites, the start time and the boots from the running sites. It
-      waits only for members that are still present and answer pings.
-    - A site may join a running session only if `LateSites.may_join_late` is True. This requires
-      that every site of the scenario waits for its peers and aligns with them before it moves.
 """
 
 import hashlib
@@ -174,10 +176,10 @@ class EventPublisher:
 
 
 class MemberQuery:
-    """Repeated query for the identities of the members of a session.
+    """Queries the members of a session repeatedly for their identities.
 
-    A query may be lost, and members may start at any time. Therefore the query is repeated
-    until the owner of this object no longer calls `poll`.
+    A query may be lost, and members may start at any time. Therefore the query is repeated as
+    long as the owner of this object calls `poll`.
 
     Args:
         bus: Network connection of the member that sends the query.
@@ -215,7 +217,7 @@ class MemberQuery:
 
 
 class LateSites(NamedTuple):
-    """Rules about sites that join a session while it runs, from the view of one site.
+    """Rules of one site about joining a session while it runs.
 
     Attributes:
         may_join_late: True if this site may join a running session. The caller sets it if
@@ -321,7 +323,12 @@ class Membership:
         return [name for name in awaited if name not in not_missing]
 
     def has_restarted(self, name: str, boot: int) -> bool:
-        """Returns True if a member was started again, and its start `boot` is not present."""
+        """Returns True if a start of a member is gone, and another start has replaced it.
+
+        Args:
+            name: Name of the member.
+            boot: Number that identifies the start in question.
+        """
         info = self.others.get(name)
         return info is not None and info.boot != boot and str(boot) not in self.alive
 
@@ -364,12 +371,12 @@ class Membership:
             self._update_presence(parts.member, parts.boot, is_alive=is_alive)
 
     def _update_presence(self, member: str, boot: str, *, is_alive: bool) -> None:
-        """Applies the news that the token of one start of a member appeared or disappeared.
+        """Updates the lists after the token of a member has appeared or disappeared.
 
         Args:
             member: Name of the member.
-            boot: Boot of the start, as text, as in the key of the token.
-            is_alive: True if the token appeared.
+            boot: Number of the member's start, as text, as in the key of the token.
+            is_alive: True if the token has appeared.
         """
         is_recorder = member == topics.RECORDER
         if is_alive:
@@ -446,10 +453,14 @@ class Membership:
         return self._late.may_join_late and info.member != self.local_info.member
 
     def _refuse(self, info: Info) -> None:
-        """Handles a member whose scenario differs from the scenario of this member.
+        """Refuses a member whose scenario differs, or gives up if that member is the leader.
 
-        The scenario of the leader counts. If this member is the leader, it publishes once that
-        the other member is refused. If the other member is the leader, this member gives up.
+        The scenario of the leader, the first site, is that of the session. If this member is
+        the leader, it publishes once that the other member is refused. If the other member is
+        the leader, this member gives up. If neither is the leader, nothing happens here.
+
+        Args:
+            info: Identity of the other member.
 
         Raises:
             SessionError: The other member is the leader.
@@ -479,9 +490,9 @@ class Epoch(NamedTuple):
         epochs: The epoch on each member's own monotonic clock, by name. Empty for a recorder
             that joins late, which needs only its own clock.
         first: First tick that this site executes. It is 0 unless the site joins late.
-        coming: Event with which this site asked to join the running session. The site publishes
-            the event again until all peers acknowledge its samples. None if the site was there
-            from the start.
+        coming: Event with which this site requested to join the running session. The site
+            publishes the event again until all peers confirm that they receive its samples.
+            None if the site was present from the start.
     """
 
     mono_ns: int

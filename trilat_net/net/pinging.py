@@ -6,11 +6,7 @@ difference between the member's clock and the local clock is then known to half 
 however large the difference is.
 
 Queries and replies may be lost, or may take longer than the time between two queries. Therefore
-a query is repeated, and replies to earlier copies still count.
-
-Invariant:
-    - A reply is accepted however late it arrives, as long as its query is among the last
-      QUERIES_KEPT ones.
+a query is repeated, and replies to the last QUERIES_KEPT copies are accepted.
 """
 
 from collections import deque
@@ -33,7 +29,7 @@ QUERY_PERIOD_NS = 200_000_000
 
 
 class RepeatedQuery:
-    """A query that is sent again and again.
+    """Sends a query repeatedly, and collects the replies to all of its copies.
 
     Args:
         bus: Network connection of the member that sends the query.
@@ -107,6 +103,7 @@ def answer_pings(bus: Bus, clock: Clock, session: str, info: Info) -> None:
     """
 
     def answer(_: bytes) -> bytes:
+        """Returns the reply to a ping, whose payload is empty."""
         received_ns = clock.monotonic_ns()
         sent_ns = clock.monotonic_ns()
         pong = Pong(
@@ -144,7 +141,7 @@ def answer_backfill(
     try:
         request = decode(query.payload, BackfillRequest)
     except WireError:
-        return 0  # a query of a stranger
+        return 0  # sent by another program
     first, payloads, published = find(request)
     backfill = Backfill(
         member=member,
@@ -159,7 +156,7 @@ def answer_backfill(
 
 
 class RoundTrips:
-    """Round trips of the pings to one member, and the estimate of its clock's offset from them.
+    """Collects the round trips of pings to one member, and estimates its clock offset.
 
     `Pinger` creates one object for each start of a member.
 
@@ -223,6 +220,7 @@ class RoundTrips:
         drift_per_ns = self.latest.drift / NS_PER_S if self.latest else 0.0
 
         def extrapolate_limit(limit: OffsetLimit) -> float:
+            """Returns the limit at the present time, in ns."""
             return limit.offset_ns - drift_per_ns * (limit.local_ns - now_ns)
 
         ceilings, floors = zip(*self._window, strict=True)
@@ -291,7 +289,8 @@ class Pinger:
     def estimate(self, boot: int) -> OffsetEstimate:
         """Returns the latest estimate of the offset of a member's clock.
 
-        A member that has not replied to any ping is assumed to have the same clock.
+        The offset is exactly zero for a member without an estimate, because only members on
+        other machines are pinged.
 
         Args:
             boot: Boot of the member.

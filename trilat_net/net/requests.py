@@ -4,12 +4,14 @@ They are replies to pings, requests for changes, requests for lost messages, mea
 real arms, reports of dead-man switches, and goals of operators (the people or programs that
 move arms). Published messages, which everybody receives, are defined in `messages`.
 
-Invariant:
-    - A log does not contain these messages, but their effects. A change is logged as an event,
-      a lost message as the message itself, a measurement as `q` and `qd` of the record of the
-      tick that used it, and a goal as `hand` of the records of the ticks in which it acts.
-    - In each tick, a site uses the newest measurement of the arm and the newest goal of the
-      operator.
+A log does not contain these messages, but their effects:
+
+- A change is logged as an event.
+- A lost message that was sent again is logged like all others.
+- A measurement is logged as `q` and `qd` of the record of the tick that used it. In each tick,
+  a site uses the newest measurement.
+- A goal of an operator, which is a target or a force, is logged as `hand` of the records of the
+  ticks in which it acts.
 """
 
 import math
@@ -173,7 +175,9 @@ class ArmMeasurement(Request, frozen=True, kw_only=True):
 
 
 class ArmEnable(Request, frozen=True, kw_only=True):
-    """Report of the dead-man switch of an external arm, sent at least ten times a second.
+    """Report on whether somebody holds the dead-man switch of an external arm.
+
+    The program of the switch sends it at least ten times a second.
 
     Attributes:
         site: Name of the site.
@@ -192,7 +196,10 @@ class ArmEnable(Request, frozen=True, kw_only=True):
 
 
 class HandMessage(Request, frozen=True, kw_only=True):
-    """Goal of an operator for an arm, sent when it changes and repeated within `SILENCE_NS`.
+    """Target or force with which an operator, a person or a program, moves an arm.
+
+    The message is sent when the target or force changes, and repeated within `SILENCE_NS`, so
+    that the site knows that the operator's program still runs.
 
     Attributes:
         site: Name of the site of the arm.
@@ -235,7 +242,7 @@ class HandViewMessage(Request, frozen=True, kw_only=True):
     The fields other than `site` and `boot` are those of `HandView`, which the program receives.
 
     Attributes:
-        site: Name of the site whose arm the operator holds.
+        site: Name of the site whose arm the operator moves.
         boot: Random number that identifies this start of the site.
     """
 

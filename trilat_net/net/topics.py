@@ -1,13 +1,14 @@
-"""Names the channels on which members of a session exchange messages, and numbers messages.
+"""Defines the network addresses ("keys") and the numbers of the messages of a session.
 
-A member is a process of a session: a site or a recorder. Each message has a Zenoh key of the
-form trilat/<session>/<member>/<channel>, where the channel is the kind of the messages. The key
-of a liveliness token, which shows that a process is present, has the channel "alive" and ends
-with the boot of the process (a random number per start).
+A member is a process of a session: a site, which runs one arm, or a recorder. Members exchange
+messages over Zenoh under keys of the form trilat/<session>/<member>/<channel>, where the
+channel is the kind of the messages. The key of a liveliness token, which shows that a process
+is present, has the channel "alive" and ends with the boot of the process, a random number that
+identifies its start.
 
 Messages of a channel are numbered consecutively, so that a recorder notices lost messages. The
-number of a record is its tick. Statistics, which are published ten times a second, are numbered
-from 0.
+number of a record, the stored result of one tick, is the tick. Statistics, which are published
+ten times a second, are numbered from 0.
 """
 
 from collections.abc import Iterator
@@ -80,7 +81,10 @@ def presence_key(session: str, member: str) -> str:
 
 
 def read_presence(inbox: PresenceInbox) -> Iterator[tuple[KeyParts, bool]]:
-    """Removes all waiting changes of presence from an inbox, and yields them.
+    """Yields the processes that have appeared or disappeared since the last call.
+
+    Args:
+        inbox: Queue of the liveliness tokens that have appeared or disappeared. It is emptied.
 
     Yields:
         The parts of a token's key, and True if the token has appeared or False if it has
@@ -105,10 +109,14 @@ def key(session: str, member: str, channel: str) -> str:
 
 
 def parse_key(key: str) -> KeyParts | None:
-    """Splits a key into its parts. Returns None if the key belongs to another program."""
+    """Splits a key into session, member, channel and boot.
+
+    Returns:
+        The parts. None if the key belongs to another program.
+    """
     root, _, rest = key.partition("/")
     parts = rest.split("/")
-    has_valid_length = len(parts) in (3, 4)  # with the boot, four
+    has_valid_length = len(parts) in (3, 4)  # the fourth part is the boot of a token
     if root != ROOT or not has_valid_length:
         return None
     return KeyParts(*parts)
@@ -148,12 +156,17 @@ def count_under_way(channel: str, rate_hz: int) -> int:
     """Returns how many published messages may be lost if a site is killed.
 
     These are the messages of the last 20 ms, which may not have left the machine yet.
+
+    Args:
+        channel: `STATE` or `LINK`.
+        rate_hz: Tick rate of the site.
     """
-    return 1 if channel == LINK else rate_hz // 50
+    ticks_in_20_ms = rate_hz // 50
+    return 1 if channel == LINK else ticks_in_20_ms
 
 
 def skipped_numbers(channel: str, tick: int, skipped: int, rate_hz: int) -> tuple[int, int]:
-    """Returns which numbers of messages belong to ticks that a site skipped.
+    """Returns between which numbers the messages of skipped ticks are missing.
 
     Args:
         channel: `STATE` or `LINK`.

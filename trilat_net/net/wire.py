@@ -149,6 +149,7 @@ def encode_state(
         numbers = chain.from_iterable(vectors)
         if not all(map(_isfinite, numbers)):
             raise WireError("not finite", f"{site} at tick {tick}")
+
     fields = {
         "v": VERSION,
         "site": site,
@@ -224,6 +225,9 @@ def encode_sample(
 def join_states(payloads: Sequence[bytes]) -> Iterator[bytes]:
     """Joins consecutive records into blocks, which cost less to send than single records.
 
+    Args:
+        payloads: The encoded records.
+
     Yields:
         Blocks of at most `BACKFILL_BYTES`. If a single record is longer, it forms a block
         alone.
@@ -258,7 +262,8 @@ def split_states(block: bytes) -> Iterator[bytes]:
     unpacker = msgpack.Unpacker(max_buffer_size=MAX_BYTES)
     unpacker.feed(block)
     start = 0
-    while start < len(block) or not block:  # an empty block fails in the first round
+    # For an empty block the loop is entered as well: `skip` then raises the error.
+    while start < len(block) or not block:
         try:
             unpacker.skip()
         except (msgpack.UnpackException, ValueError) as error:
@@ -329,6 +334,7 @@ def make_decoder(
     lengths = list(vector_lengths.values()) if layout else None
 
     def decode_payload(payload: bytes) -> Any:
+        """Decodes and checks one payload. Raises WireError if the payload is not valid."""
         if len(payload) > limit:
             raise WireError(
                 "oversized", f"{count_nouns(len(payload), 'byte')}, at most {limit}"
@@ -354,9 +360,10 @@ def make_decoder(
 def make_reader(
     kind: type[msgspec.Struct], layout: Layout
 ) -> Callable[[bytes], Any | WireError]:
-    """Returns a function that returns the decoded message, or the error as a `WireError`.
+    """Returns a function that decodes payloads, and returns errors instead of raising them.
 
-    The function is called in network threads, in which an exception would be lost.
+    The function returns the message, or a `WireError` if the payload is not valid. It is called
+    in network threads, in which an exception would be lost.
 
     Args:
         kind: Expected type of the messages.
@@ -365,6 +372,7 @@ def make_reader(
     decoder = make_decoder(kind, layout=layout)
 
     def read(payload: bytes) -> Any | WireError:
+        """Returns the message in a payload, or the error."""
         try:
             return decoder(payload)
         except WireError as error:

@@ -73,7 +73,9 @@ class RouterSilent(SessionError):  # noqa: N818 - it names an outcome
 
 
 class _ZenohRing(Generic[T]):
-    """Queue of received Zenoh objects, converted when they are polled.
+    """Queue of objects that Zenoh has received, such as messages, replies or tokens.
+
+    An object is converted when it is polled, and not when it arrives.
 
     Args:
         channel: Channel of Zenoh into which the objects arrive.
@@ -290,7 +292,12 @@ class ZenohBus:
         return ring
 
     def tap(self, key: str, callback: Callable[[str, bytes], None]) -> None:
-        """Calls a function with the key and payload of each message, in threads of Zenoh."""
+        """Calls a function for each message under a key, in threads of Zenoh.
+
+        Args:
+            key: The key, which may contain wildcards.
+            callback: Function that receives the key and the payload of a message.
+        """
         handler = _make_sample_handler(lambda sample: callback(*_read_sample(sample)))
         self._declarations.append(self._subscribe(key, handler))
 
@@ -314,6 +321,7 @@ class ZenohBus:
         """
 
         def answer_at_once(query: zenoh.Query) -> None:
+            """Replies to a query, if there is a reply."""
             # A query ends for its sender only when the query object is dropped.
             with query:
                 payload = answer(_ZenohQuery(query, key).payload)
@@ -365,6 +373,7 @@ class ZenohBus:
         """
 
         def read(sample: zenoh.Sample) -> tuple[str, bool] | None:
+            """Returns a token's key and whether it has appeared. None for own tokens."""
             token = str(sample.key_expr)
             # Liveliness has no locality setting: tokens of this session arrive, too.
             if token in self._tokens:
@@ -385,6 +394,12 @@ class ZenohBus:
 
 def read_zenoh_file(path: Path) -> ZenohFile:
     """Reads a user's Zenoh configuration from a file in JSON5 or JSON, and checks it.
+
+    Args:
+        path: Path of the file.
+
+    Returns:
+        The settings of the file, which suit a session.
 
     Raises:
         UsageError: The file cannot be read, is not a Zenoh configuration, or contradicts the
@@ -415,7 +430,8 @@ def _parse_json5(source: str, text: str) -> object:
         UsageError: The text is not JSON5, is nested too deeply, or contains several objects.
     """
     # Each opening bracket increases the nesting by 1, and each closing bracket decreases it.
-    nesting = accumulate((character in "[{") - (character in "]}") for character in text)
+    changes = {"[": 1, "{": 1, "]": -1, "}": -1}
+    nesting = accumulate(changes.get(character, 0) for character in text)
     if max(nesting, default=0) > MAX_DEPTH:
         raise UsageError(f"{source}: no JSON5: nested deeper than {MAX_DEPTH}")
     try:

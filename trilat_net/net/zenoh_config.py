@@ -16,15 +16,14 @@ permitted to do everything. The size of messages is limited as well, but not the
 limit of Zenoh would drop messages of a burst.
 
 Invariant:
-    - Members connect only to endpoints that are named explicitly. Multicast, gossip and shared
-      memory are off. Two sessions on one machine therefore never connect by accident.
-    - No setting in a user's file is overruled silently. It is accepted, or refused with its
-      key, its value and the required value. If the session itself sets a key, the file may
-      contain the same value.
-    - If a file is refused, the message lists all settings that contradict a session.
-    - With keys, everything that is not permitted is denied, at every member and at routers.
-    - With keys, a member can publish only under its own name, because its connections show a
-      certificate with that name.
+    - Members connect only to endpoints that are named explicitly, so that two sessions on one
+      machine never connect by accident. Zenoh's automatic discovery (multicast and gossip) is
+      off.
+    - No setting in a user's file is overruled silently. It is accepted, or the file is refused
+      with a message that lists all settings that do not suit a session, and the required
+      values.
+    - With keys, everything that is not permitted explicitly is denied. A member can publish
+      only under its own name, because its connections show a certificate with that name.
 """
 
 import difflib
@@ -162,9 +161,12 @@ def make_zenoh_config(
 
 
 def merge_settings(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Merges two nested dictionaries of settings.
+    """Returns nested settings in which some values are replaced.
 
-    Values of `overrides` replace those of `base`.
+    Args:
+        base: The settings.
+        overrides: Values that replace those of `base`, at any level. Settings of `base` that
+            `overrides` does not mention stay.
     """
     merged = dict(base)
     for key, value in overrides.items():
@@ -182,18 +184,32 @@ _Requirement = tuple[Callable[[Any], bool], str]
 
 
 def _require_value(required: object, text: str) -> _Requirement:
-    """Returns the requirement that a value and its type equal `required`: 0 is not False.
+    """Returns the requirement that a setting has a certain value and type.
 
     Args:
         required: The required value.
-        text: Text for errors.
+        text: The required value and the reason, as the error message states them.
     """
-    return (lambda value: value == required and isinstance(value, type(required)), text)
+
+    def is_required_value(value: Any) -> bool:
+        """Returns True for the required value. The type matters, as 0 == False in Python."""
+        return value == required and isinstance(value, type(required))
+
+    return is_required_value, text
 
 
 def _require_minimum(minimum: int, text: str) -> _Requirement:
-    """Returns the requirement that a value is an integer of at least `minimum`."""
-    return (lambda value: isinstance(value, int) and value >= minimum, text)
+    """Returns the requirement that a setting is an integer of at least a certain size.
+
+    Args:
+        minimum: The smallest permitted value.
+        text: The required value and the reason, as the error message states them.
+    """
+
+    def is_large_enough(value: Any) -> bool:
+        return isinstance(value, int) and value >= minimum
+
+    return is_large_enough, text
 
 
 def _require_session_value(session_values: Mapping[str, Any]) -> _Requirement:
@@ -205,6 +221,7 @@ def _require_session_value(session_values: Mapping[str, Any]) -> _Requirement:
     """
 
     def equals_session_value(mode: str, value: Any) -> bool:
+        """Returns True if a session sets this value, of the same type, in a mode."""
         if mode not in session_values:
             return False
         session_value = session_values[mode]
@@ -212,6 +229,7 @@ def _require_session_value(session_values: Mapping[str, Any]) -> _Requirement:
         return is_equal and type(value) is type(session_value)
 
     def are_session_values(values: Any) -> bool:
+        """Returns True if a session sets the values of all modes in a dictionary."""
         if not isinstance(values, dict):
             return False
         return all(equals_session_value(mode, value) for mode, value in values.items())
@@ -351,7 +369,12 @@ def check_zenoh_file(
 
 
 def _list_problems(source: str, problems: Sequence[str]) -> str:
-    """Returns the message about the problems of a file, in one line."""
+    """Returns an error message that lists the problems of a user's file, in one line.
+
+    Args:
+        source: Name of the file.
+        problems: A text for each problem, at least one.
+    """
     if len(problems) == 1:
         return f"{source}: {problems[0]}"
     count = count_nouns(len(problems), "setting")
@@ -359,7 +382,10 @@ def _list_problems(source: str, problems: Sequence[str]) -> str:
 
 
 def _find_problems(settings: Mapping[str, Any]) -> Iterator[str]:
-    """Checks each setting against the requirements of a session.
+    """Checks each setting of a user's file against the requirements of a session.
+
+    Args:
+        settings: Content of the file.
 
     Yields:
         A text for each problem, which begins with the key.
@@ -640,8 +666,8 @@ def _derive_rules(member: str, role: _Role) -> Iterator[dict[str, Any]]:
     all_presences = [topics.presence_key("*", "*")]
     watch_presence = ["declare_liveliness_subscriber", "liveliness_query"]
 
-    # What the member may send: its messages, its wish to receive messages, its replies, its
-    # queries, and the news that it is present.
+    # Messages from the member: what it publishes, subscribes to, replies and queries, its own
+    # token, and its subscription to the tokens of the others.
     yield _make_rule(["ingress"], ["put"], published)
     yield _make_rule(["ingress"], ["declare_subscriber"], received)
     yield _make_rule(["ingress"], ["declare_queryable", "reply"], keys(member, role.replies))
@@ -649,7 +675,7 @@ def _derive_rules(member: str, role: _Role) -> Iterator[dict[str, Any]]:
     yield _make_rule(["ingress"], ["liveliness_token"], local_presence)
     yield _make_rule(["ingress"], watch_presence, all_presences)
 
-    # What may be sent to the member: the counterparts of these messages.
+    # Messages to the member: the counterparts of these messages.
     published_by_all = keys("*", (*role.publishes, *role.publishes_to))
     yield _make_rule(["egress"], ["put"], received)
     yield _make_rule(["egress"], ["declare_subscriber"], published_by_all)
@@ -659,5 +685,11 @@ def _derive_rules(member: str, role: _Role) -> Iterator[dict[str, Any]]:
 
 
 def _make_rule(flows: list[str], messages: Sequence[str], keys: list[str]) -> dict[str, Any]:
-    """Returns a rule that permits messages in some directions under some keys."""
+    """Returns a rule of Zenoh's access control that permits some messages.
+
+    Args:
+        flows: Directions: "ingress" for messages from the member, "egress" for those to it.
+        messages: Kinds of messages, in Zenoh's words.
+        keys: Keys of the messages.
+    """
     return {"flows": flows, "messages": list(messages), "key_exprs": keys}
