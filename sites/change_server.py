@@ -194,7 +194,11 @@ class ChangeServer:
         return None
 
     def _add_mark(self, k: int, text: str) -> str:
-        """Stores a mark until it is published, and returns the text of the reply.
+        """Stores a mark until it is published as an event, and returns the text of the reply.
+
+        Args:
+            k: Next tick, which the mark names.
+            text: Text of the mark.
 
         Raises:
             ScenarioError: Too many marks wait.
@@ -207,7 +211,11 @@ class ChangeServer:
         return f"{self._site} marks tick {k}"
 
     def _make_order_change(self, k: int, order: SiteOrder) -> CoreChange:
-        """Returns the change with which an order takes effect in tick `k`.
+        """Returns the change with which the order of a user takes effect in a tick.
+
+        Args:
+            k: The tick.
+            order: The order: "stop", "enable" or "reset".
 
         Raises:
             ScenarioError: The site is not in the mode that the order needs, or the dead-man

@@ -204,7 +204,13 @@ class ProcessStarter:
         # ready has blocked it.
         self._starter.send_signal(signal.SIGINT)
 
-    def _send_order(self, name: str, arguments: list[str], number: int, output: Path) -> None:
+    def _send_order(
+        self,
+        name: str,
+        arguments: list[str],
+        number: int,
+        output: Path,
+    ) -> None:
         """Sends a request to the starter: a start if `number` is 0, otherwise a signal.
 
         Args:
@@ -369,7 +375,11 @@ def compile_core(scenario: Scenario, say: Callable[[str], None], interrupt: Inte
 
 
 def _start(
-    scenario: Scenario, folder: Path, reserved: ExitStack, endpoints: list[str], wait_s: int
+    scenario: Scenario,
+    folder: Path,
+    reserved: ExitStack,
+    endpoints: list[str],
+    wait_s: int,
 ) -> tuple[ProcessStarter, list[SessionProcess], Callable[[], SessionProcess]]:
     """Starts the processes of all sites, and those of the user's own operator programs.
 

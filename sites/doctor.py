@@ -358,6 +358,11 @@ def examine_offsets(
 ) -> Iterator[DoctorFinding]:
     """Compares the clock of this machine with those of a session's members.
 
+    Args:
+        connection: Endpoints of the session, and keys.
+        clock: Clock of this process.
+        session: Name of the session.
+
     Yields:
         For each member, the offset of its clock and the error bound of the offset.
     """

@@ -292,7 +292,11 @@ class DeadManSwitch:
     """
 
     def __init__(
-        self, site: str, ring: StampedInbox[bytes], clock: Clock, dropped: Counter[str]
+        self,
+        site: str,
+        ring: StampedInbox[bytes],
+        clock: Clock,
+        dropped: Counter[str],
     ) -> None:
         self._site = site
         self._ring = ring

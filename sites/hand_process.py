@@ -62,7 +62,12 @@ class HandProcess(SiteClient):
     """
 
     def __init__(
-        self, hand_site: HandSite, program: HandProgram, bus: Bus, clock: Clock, session: str
+        self,
+        hand_site: HandSite,
+        program: HandProgram,
+        bus: Bus,
+        clock: Clock,
+        session: str,
     ) -> None:
         super().__init__(bus, clock, session, hand_site.name)
         self.answered = 0

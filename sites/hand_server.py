@@ -44,7 +44,10 @@ POLL_NS = 5_000_000
 
 
 def _read_messages(
-    inbox: Inbox, site: str, dropped: Counter[str], source: str | None = None
+    inbox: Inbox,
+    site: str,
+    dropped: Counter[str],
+    source: str | None = None,
 ) -> Iterator[HandMessage]:
     """Yields the waiting messages of an operator, and counts those that are dropped.
 

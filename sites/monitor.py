@@ -271,7 +271,11 @@ class SessionMonitor:
     """
 
     def __init__(
-        self, bus: Bus, session: str, scenario: Scenario, display: SessionDisplay
+        self,
+        bus: Bus,
+        session: str,
+        scenario: Scenario,
+        display: SessionDisplay,
     ) -> None:
         self.latest: dict[str, LinkStats] = {}
         self.records: dict[str, State] = {}

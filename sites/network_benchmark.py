@@ -189,7 +189,11 @@ class NearEnd:
 
 
 def _open(
-    endpoint: str, keys: MemberKeys | None, *, listens: bool, insecure: bool
+    endpoint: str,
+    keys: MemberKeys | None,
+    *,
+    listens: bool,
+    insecure: bool,
 ) -> tuple[ZenohBus, str]:
     """Opens the network connection of a near or far end.
 
@@ -533,7 +537,10 @@ def ping_benchmark(
 
 
 def _measure_endpoint(
-    endpoint: str, keys: MemberKeys | None, needs: ScenarioNeeds, case_s: float
+    endpoint: str,
+    keys: MemberKeys | None,
+    needs: ScenarioNeeds,
+    case_s: float,
 ) -> Iterator[dict[str, Any]]:
     """Measures the transport of one endpoint, with all message sizes and rates.
 

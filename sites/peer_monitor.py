@@ -59,7 +59,13 @@ class PeerMonitor:
     """
 
     def __init__(
-        self, bus: Bus, session: str, site: str, peers: Sequence[str], *, admits: bool = False
+        self,
+        bus: Bus,
+        session: str,
+        site: str,
+        peers: Sequence[str],
+        *,
+        admits: bool = False,
     ) -> None:
         self.boots: Mapping[str, int] = {}
         self.recorders: set[str] = set()
@@ -108,7 +114,13 @@ class PeerMonitor:
             self._decide_on_join(publisher, event, t_ns)
 
     def _update_presence(
-        self, member: str, boot: str, publisher: EventPublisher, t_ns: int, *, alive: bool
+        self,
+        member: str,
+        boot: str,
+        publisher: EventPublisher,
+        t_ns: int,
+        *,
+        alive: bool,
     ) -> None:
         """Updates the attributes after the token of a member has appeared or disappeared.
 
@@ -204,15 +216,16 @@ class PeerMonitor:
             self.ended_member = self._site
 
     def _decide_on_join(self, publisher: EventPublisher, event: Event, t_ns: int) -> None:
-        """Admits a new start of a site, or refuses it while the previous one is still alive.
+        """Admits a new process of a site, or refuses it while the previous one still runs.
 
         Args:
             publisher: Publishes the events of this site.
-            event: Event with which the new start requests to join.
+            event: Event with which the new process requests to join.
             t_ns: Present time, in ns since the epoch.
         """
         member = event.member
         previous_boot = self.boots.get(member)
+        # The request was admitted already, with the same first tick.
         is_repeated = self._first_ticks.get(event.boot) == event.ticks
         is_consistent = event.boots.get(member) == event.boot
         if not is_consistent or is_repeated:
@@ -236,9 +249,22 @@ class PeerMonitor:
         self._publish_decision("admit", text, publisher, event=event, t_ns=t_ns)
 
     def _publish_decision(
-        self, kind: str, text: str, publisher: EventPublisher, event: Event, t_ns: int
+        self,
+        kind: str,
+        text: str,
+        publisher: EventPublisher,
+        event: Event,
+        t_ns: int,
     ) -> None:
-        """Publishes that this site admits or refuses a new start of another site."""
+        """Publishes that this site admits or refuses a new process of another site.
+
+        Args:
+            kind: Kind of the event: "admit" or "refused".
+            text: Sentence of the event.
+            publisher: Publishes the events of this site.
+            event: Event with which the new process requested to join.
+            t_ns: Present time, in ns since the epoch.
+        """
         publisher.publish(
             kind,
             text,

@@ -438,7 +438,12 @@ def _check_finite(numbers: Sequence[float]) -> list[float]:
     return list(numbers)
 
 
-def read_vector_target(frame: str, axes: int, count: int, data: bytes) -> list[float]:
+def read_vector_target(
+    frame: str,
+    axes: int,
+    count: int,
+    data: bytes,
+) -> list[float]:
     """Reads the position in a `PoseStamped` message, or the force in a `WrenchStamped`.
 
     Args:
@@ -633,7 +638,10 @@ class Bridge:
 
 
 def describe_target(
-    scenario: Scenario, site: str, hand: Hand, frame: str
+    scenario: Scenario,
+    site: str,
+    hand: Hand,
+    frame: str,
 ) -> tuple[str, str, Callable[[bytes], Sequence[float]], Callable[..., int]]:
     """Determines the topic that commands the arm of a site, and how its messages are used.
 
@@ -786,7 +794,10 @@ def serve_ros2(
 
 
 def publish_session(
-    ends: BridgeEnds, rate_hz: float, stopped: Callable[[], bool], say: Callable[[str], None]
+    ends: BridgeEnds,
+    rate_hz: float,
+    stopped: Callable[[], bool],
+    say: Callable[[str], None],
 ) -> bool:
     """Waits until a session begins, and connects it with ROS 2 until the session ends.
 
@@ -865,7 +876,10 @@ def _describe_inputs(ends: BridgeEnds, bridge: Bridge, robots: Iterable[str]) ->
 
 @contextmanager
 def open_robot(
-    ends: BridgeEnds, site: str, robot: RobotTable, joints: Sequence[Sequence[str]] = ()
+    ends: BridgeEnds,
+    site: str,
+    robot: RobotTable,
+    joints: Sequence[Sequence[str]] = (),
 ) -> Iterator[RobotArm]:
     """Connects the ROS robot of a site, as a context manager.
 

@@ -370,7 +370,7 @@ class RunningSession:
             return [self._send_change(bus, name, request).text for name in present]
 
     def _find_sites(self, bus: Bus) -> tuple[Scenario, dict[str, Info]]:
-        """Collects the replies of the sites of the session.
+        """Queries all sites of the session who they are, and collects their replies.
 
         The search ends when all sites of the scenario have replied. If the scenario allows
         sites to leave, it also ends `GATHERING_NS` after the first reply.
@@ -416,6 +416,13 @@ class RunningSession:
 
     def _find_running(self, bus: Bus, site: str) -> Info:
         """Waits for the reply of one site, and checks that the site runs.
+
+        Args:
+            bus: Network connection that reaches the session.
+            site: Name of the site.
+
+        Returns:
+            The identity of the site.
 
         Raises:
             SessionError: The session has no such site or has not begun, or the site does not

@@ -78,7 +78,13 @@ class SessionPing:
         pinger: Sends the pings, and estimates the offsets of the clocks.
     """
 
-    def __init__(self, bus: Bus, clock: Clock, session: str, count: int) -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        clock: Clock,
+        session: str,
+        count: int,
+    ) -> None:
         self.infos: dict[str, Info] = {}
         self.links: dict[str, LinkStats] = {}
         self._clock = clock
@@ -263,7 +269,11 @@ class TopicDelays(Result):
 
 
 def ping_topic(
-    graph: Ros2Graph, clock: Clock, topic: str, lasts_s: float, stopped: Callable[[], bool]
+    graph: Ros2Graph,
+    clock: Clock,
+    topic: str,
+    lasts_s: float,
+    stopped: Callable[[], bool],
 ) -> TopicDelays:
     """Measures the delays of the messages on a ROS 2 topic.
 

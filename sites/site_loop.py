@@ -168,7 +168,11 @@ class PeerInbox:
         return arrivals
 
     def _accept(
-        self, index: int, sample: PeerSample | WireError, arrived_ns: int, since_epoch_ns: int
+        self,
+        index: int,
+        sample: PeerSample | WireError,
+        arrived_ns: int,
+        since_epoch_ns: int,
     ) -> Arrival | None:
         """Checks one sample, counts it if it is dropped, and measures its delay.
 

@@ -288,6 +288,7 @@ class SiteParts:
         publish = self.bus.publisher(self._key(channel))
 
         def store_and_publish(payloads: list[bytes]) -> None:
+            """Stores each message, and publishes the messages joined into blocks."""
             for payload in payloads:
                 store(payload)
             for block in join_states(payloads):

@@ -86,7 +86,10 @@ QUERIED_NS = NS_PER_S
 
 
 def run_site(
-    scenario: Scenario, name: str, options: SiteOptions, say: Callable[[str], None]
+    scenario: Scenario,
+    name: str,
+    options: SiteOptions,
+    say: Callable[[str], None],
 ) -> int:
     """Runs one site of a scenario from its start to its end.
 
@@ -226,9 +229,13 @@ def join_session(parts: SiteParts, give_up_ns: int) -> "RunningSite | None":
 def _describe_failed_join(parts: SiteParts, joining: SessionJoin) -> SessionError:
     """Returns the error for a site that has waited in vain for its session to begin.
 
-    Its sentence names the reason: that of the join if it is known, otherwise the members that
-    are missing. Replies of members that could not be decoded are added, as they often explain
-    why a member seems to be missing.
+    The text names why a running session has not admitted the site, if that is known, and
+    otherwise the members that are missing. Replies of members that could not be decoded are
+    added, as they often explain why a member seems to be missing.
+
+    Args:
+        parts: Parts of the site.
+        joining: The attempt to join the session.
     """
     options = parts.options
     missing = joining.membership.list_missing()
@@ -270,7 +277,11 @@ class RunningSite:
     """
 
     def __init__(
-        self, parts: SiteParts, publisher: EventPublisher, pinger: Pinger, epoch: Epoch
+        self,
+        parts: SiteParts,
+        publisher: EventPublisher,
+        pinger: Pinger,
+        epoch: Epoch,
     ) -> None:
         site = parts.site
         self._parts = parts
@@ -424,7 +435,12 @@ class RunningSite:
             parts.say(line)
 
     def _publish_clocks(self, notices: Iterable[ClockNotice], t_ns: int) -> None:
-        """Publishes events about the peers' clocks, at time `t_ns` since the epoch."""
+        """Publishes events about the offsets and faults of the peers' clocks.
+
+        Args:
+            notices: Fields of the events.
+            t_ns: Time of the events, in ns since the epoch.
+        """
         for notice in notices:
             self._publisher.publish(**notice, t_ns=t_ns)
 
@@ -691,9 +707,13 @@ class RunningSite:
         )
 
     def report_tick(self, output: TickRecord) -> None:
-        """Publishes which changes took effect in a tick, and whether the mode has changed.
+        """Publishes the changes that took effect in a tick, and a change of the site's mode.
 
-        The skipped ticks are only collected here. `run_housekeeping` publishes them together.
+        If ticks were skipped before this tick, they are only stored here. `run_housekeeping`
+        publishes the skipped ticks of several reports together.
+
+        Args:
+            output: Record of the tick.
         """
         parts = self._parts
         skipped = count_skipped_ticks(output.cmd)

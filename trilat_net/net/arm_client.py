@@ -90,7 +90,13 @@ class SiteSender:
     """
 
     def __init__(
-        self, bus: Bus, clock: Clock, session: str, site: str, channel: str, boot: int
+        self,
+        bus: Bus,
+        clock: Clock,
+        session: str,
+        site: str,
+        channel: str,
+        boot: int,
     ) -> None:
         self.boot = boot
         self.number = -1
@@ -130,7 +136,13 @@ class SiteClient:
         site: Name of the site.
     """
 
-    def __init__(self, bus: Bus, clock: Clock, session: str, site: str) -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        clock: Clock,
+        session: str,
+        site: str,
+    ) -> None:
         self._bus = bus
         self._clock = clock
         self._site = site
@@ -240,7 +252,13 @@ class OutsideClient(SiteClient):
     member = ""
     """The member whose keys the program uses; "" stands for the site."""
 
-    def __init__(self, bus: Bus, clock: Clock, session: str, site: str) -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        clock: Clock,
+        session: str,
+        site: str,
+    ) -> None:
         super().__init__(bus, clock, session, site)
         self._sender = SiteSender(
             bus=bus,
@@ -253,7 +271,11 @@ class OutsideClient(SiteClient):
 
     @classmethod
     def connected(
-        cls, session: str, site: str, connect: Sequence[str], keys: str | Path | None = None
+        cls,
+        session: str,
+        site: str,
+        connect: Sequence[str],
+        keys: str | Path | None = None,
     ) -> Self:
         """Connects to a site over the network.
 
@@ -367,11 +389,23 @@ class ArmClient(OutsideClient):
         return tuple(record.tau) if is_coming_to_rest else None
 
 
-def make_hand_sender(bus: Bus, clock: Clock, session: str, site: str) -> SiteSender:
-    """Returns a sender of an operator's messages to a site.
+def make_hand_sender(
+    bus: Bus,
+    clock: Clock,
+    session: str,
+    site: str,
+) -> SiteSender:
+    """Returns an object that sends the messages of an operator to a site.
 
-    Its boot is a random number in 1 ... 2^32 - 1. Records store it as a float, which represents
-    these numbers exactly. The number 0 means that nobody holds the arm.
+    The operator is identified by a random number in 1 ... 2^32 - 1. Records store the number as
+    a float, which represents these numbers exactly. In a record, the number 0 means that no
+    operator moves the arm.
+
+    Args:
+        bus: Network connection of the operator's program.
+        clock: Clock of this process.
+        session: Name of the session.
+        site: Name of the site.
     """
     return SiteSender(
         bus=bus,

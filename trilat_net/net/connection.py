@@ -187,8 +187,9 @@ class Connection:
 
         encrypted: list[Endpoint] = []
         for endpoint in endpoints:
-            is_text = isinstance(endpoint, str)
-            encrypted.append(re.sub("^tcp/", "tls/", endpoint) if is_text else endpoint)
+            if isinstance(endpoint, str):
+                endpoint = re.sub("^tcp/", "tls/", endpoint)
+            encrypted.append(endpoint)
         return encrypted
 
     def open(self) -> ZenohBus:
@@ -492,7 +493,7 @@ def _join_options(
 ) -> Connection:
     """Derives the connection of a peer or a router from the command line and a Zenoh file.
 
-    The arguments are those of `resolve_member_connection`.
+    The arguments are those of `resolve_member_connection`, and the mode of the process.
 
     Raises:
         UsageError: Both the command line and the file name endpoints at which to listen.

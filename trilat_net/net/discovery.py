@@ -200,7 +200,11 @@ def _query_sites(
 
 
 def send_change(
-    bus: Bus, clock: Clock, session: str, site: str, request: ChangeRequest
+    bus: Bus,
+    clock: Clock,
+    session: str,
+    site: str,
+    request: ChangeRequest,
 ) -> ChangeReply:
     """Sends a request to a site of a running session, and waits for the reply.
 
@@ -245,7 +249,12 @@ def send_change(
     return reply
 
 
-def _query_once(bus: Bus, clock: Clock, key: str, request: Request) -> bytes | None:
+def _query_once(
+    bus: Bus,
+    clock: Clock,
+    key: str,
+    request: Request,
+) -> bytes | None:
     """Sends a request once, and waits for the first reply.
 
     Args:
@@ -267,7 +276,12 @@ def _query_once(bus: Bus, clock: Clock, key: str, request: Request) -> bytes | N
     return None
 
 
-def list_past_events(bus: Bus, clock: Clock, session: str, site: str) -> Iterator[Event]:
+def list_past_events(
+    bus: Bus,
+    clock: Clock,
+    session: str,
+    site: str,
+) -> Iterator[Event]:
     """Queries a running site for the events that it has published, and yields them in order.
 
     The first event is the oldest one that the site still stores. The iteration ends early if
@@ -341,7 +355,10 @@ def open_playback_bus(
 
 
 def refuse_running_session(
-    bus: Bus, clock: Clock, session: str, stopped: Callable[[], bool]
+    bus: Bus,
+    clock: Clock,
+    session: str,
+    stopped: Callable[[], bool],
 ) -> None:
     """Checks that no site of a session is present, before its name is used for a playback.
 

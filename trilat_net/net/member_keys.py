@@ -87,7 +87,10 @@ class MemberKeys(NamedTuple):
 
 
 def create_keys(
-    folder: str | Path, members: Sequence[str], hosts: Sequence[str] = (), days: int = 30
+    folder: str | Path,
+    members: Sequence[str],
+    hosts: Sequence[str] = (),
+    days: int = 30,
 ) -> list[Path]:
     """Creates an authority and a folder of keys for each member, as `trilat keys new` does.
 
@@ -245,7 +248,10 @@ def renew_keys(folder: str | Path, members: Sequence[str] = (), days: int = 30) 
 
 
 def _renew_member(
-    folder: Path, authority: x509.Certificate, authority_key: Any, ends: datetime.datetime
+    folder: Path,
+    authority: x509.Certificate,
+    authority_key: Any,
+    ends: datetime.datetime,
 ) -> tuple[x509.Certificate, str]:
     """Signs a new certificate for the existing private key of a member.
 
@@ -284,7 +290,10 @@ def _renew_member(
 
 
 def _write_all_keys(
-    folder: Path, members: Sequence[str], hosts: Sequence[str], days: int
+    folder: Path,
+    members: Sequence[str],
+    hosts: Sequence[str],
+    days: int,
 ) -> None:
     """Creates the folders of the authority and of all members.
 

@@ -49,7 +49,11 @@ def new_boot() -> int:
 
 
 def describe_member(
-    member: str, boot: int, clock: Clock, scenario: str = "", **fields: object
+    member: str,
+    boot: int,
+    clock: Clock,
+    scenario: str = "",
+    **fields: object,
 ) -> Info:
     """Returns the identity with which a member of this process introduces itself.
 
@@ -131,7 +135,11 @@ class EventPublisher:
     """
 
     def __init__(
-        self, bus: Bus, session: str, info: Info, keep: Callable[[bytes], None] = lambda _: None
+        self,
+        bus: Bus,
+        session: str,
+        info: Info,
+        keep: Callable[[bytes], None] = lambda _: None,
     ) -> None:
         self.info = info
         self.published = 0
@@ -191,7 +199,13 @@ class MemberQuery:
         unreadable: For each member whose reply cannot be decoded, the reason.
     """
 
-    def __init__(self, bus: Bus, clock: Clock, session: str, member: str = "*") -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        clock: Clock,
+        session: str,
+        member: str = "*",
+    ) -> None:
         self.unreadable: dict[str, str] = {}
         self._query = RepeatedQuery(bus, clock, topics.key(session, member, topics.INFO))
 

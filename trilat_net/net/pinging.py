@@ -92,7 +92,12 @@ _LATE_REPLY_NS = 20_000_000
 """Margin for the time in which a reply is expected, in ns. Two round trips are added to it."""
 
 
-def answer_pings(bus: Bus, clock: Clock, session: str, info: Info) -> None:
+def answer_pings(
+    bus: Bus,
+    clock: Clock,
+    session: str,
+    info: Info,
+) -> None:
     """Replies to pings in a network thread, until the network connection is closed.
 
     Args:
@@ -252,7 +257,13 @@ class Pinger:
         trips: Round trips to each start of a member, by its boot (random number per start).
     """
 
-    def __init__(self, bus: Bus, clock: Clock, session: str, required: int = PINGS) -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        clock: Clock,
+        session: str,
+        required: int = PINGS,
+    ) -> None:
         self.trips: dict[int, RoundTrips] = {}
         self._clock = clock
         self._required = required

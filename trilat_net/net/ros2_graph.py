@@ -170,7 +170,12 @@ def name_dds_type(kind: str) -> str:
     return f"{package}::{group}::dds_::{name}_"
 
 
-def topic_key(domain: int, name: str, kind: str, type_hash: str) -> str:
+def topic_key(
+    domain: int,
+    name: str,
+    kind: str,
+    type_hash: str,
+) -> str:
     """Returns the Zenoh key of a topic or a service.
 
     Args:
@@ -314,6 +319,7 @@ class Refusals:
         """
 
         def guarded(*args: P.args, **named: P.kwargs) -> None:
+            """Calls `act`, and counts a refusal if it raises an error."""
             try:
                 act(*args, **named)
             except (ValueError, TrilatError) as error:
@@ -332,7 +338,14 @@ class TopicPublisher:
         latched: True if late subscribers receive the last messages.
     """
 
-    def __init__(self, declared: Any, gid: bytes, clock: Clock, *, latched: bool) -> None:
+    def __init__(
+        self,
+        declared: Any,
+        gid: bytes,
+        clock: Clock,
+        *,
+        latched: bool,
+    ) -> None:
         self._declared = declared
         self._gid = gid
         self._clock = clock
@@ -498,6 +511,7 @@ class Ros2Graph:
         """
 
         def check_publisher(token: zenoh.Sample) -> None:
+            """Reports a publisher whose token has appeared, if it does not match."""
             has_appeared = token.kind == zenoh.SampleKind.PUT
             mismatch = describe_mismatch(str(token.key_expr), self._node.domain, kind)
             if has_appeared and mismatch:
@@ -538,6 +552,7 @@ class Ros2Graph:
         """
 
         def receive_sample(sample: zenoh.Sample) -> None:
+            """Passes on a message of a ROS program, and counts other messages as refused."""
             attachment = parse_attachment(sample.attachment)
             if attachment is None:
                 self.refusals.add(f"{topic}: a message without an attachment of ROS")
@@ -558,6 +573,7 @@ class Ros2Graph:
         key, _ = self._declare(EndpointKind.SERVER, service, kind, QualityOfService())
 
         def reply(query: zenoh.Query) -> None:
+            """Computes the response to one request, and sends it."""
             # A query ends for its sender only when the query object is dropped.
             with query:
                 request = parse_attachment(query.attachment)
@@ -574,7 +590,11 @@ class Ros2Graph:
         self._declarations.append(self._session.declare_queryable(key, handler, complete=True))
 
     def _declare(
-        self, end: EndpointKind, name: str, kind: str, qos: QualityOfService
+        self,
+        end: EndpointKind,
+        name: str,
+        kind: str,
+        qos: QualityOfService,
     ) -> tuple[str, bytes]:
         """Declares the liveliness token of an endpoint, so that ROS programs see it.
 

@@ -461,7 +461,11 @@ class SiteTiming:
         ]
 
     def admit(
-        self, index: int, t_ns: int, epoch_ns: int, bound_ns: int | None
+        self,
+        index: int,
+        t_ns: int,
+        epoch_ns: int,
+        bound_ns: int | None,
     ) -> list[ClockNotice]:
         """Starts to measure the link from a peer that joins, or rejoins, a running session.
 
@@ -555,10 +559,19 @@ class SiteTiming:
         return notices
 
     def _update_next_estimate(self, k: int, now_ns: int, due_ns: int) -> list[ClockNotice]:
-        """Estimates the offset of at most one peer per call, of each peer in turn.
+        """Estimates the clock offset of at most one peer, of each peer after another.
 
-        One estimate takes a considerable part of a period. Several of them would make the next
-        tick late.
+        One estimate takes a considerable part of a period. Several of them in one call would
+        make the next tick late.
+
+        Args:
+            k: Next tick.
+            now_ns: Present time on the site's clock, in ns.
+            due_ns: Time at which that tick is due, on the site's clock, in ns.
+
+        Returns:
+            The event that states the new estimate. Empty if no peer has a full window of time
+            stamps.
         """
         for _ in self.monitors:
             self._next_estimated = (self._next_estimated + 1) % len(self.monitors)
@@ -570,8 +583,13 @@ class SiteTiming:
     def _find_faults(self, index: int, k: int, now_ns: int) -> list[ClockNotice]:
         """Returns the events about a peer's clock faults and about its acknowledgements.
 
-        Clock faults are reported at most once per `FAULT_EVERY_NS`. Missing acknowledgements
-        are reported when they begin and when they end.
+        Clock faults are reported at most once per `FAULT_EVERY_NS`. If the peer no longer
+        confirms the samples of this site, this is reported once, and again when it has ended.
+
+        Args:
+            index: Index of the peer.
+            k: Next tick.
+            now_ns: Present time on the site's clock, in ns.
         """
         monitor = self.monitors[index]
         notices = []

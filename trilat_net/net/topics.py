@@ -165,7 +165,12 @@ def count_under_way(channel: str, rate_hz: int) -> int:
     return 1 if channel == LINK else ticks_in_20_ms
 
 
-def skipped_numbers(channel: str, tick: int, skipped: int, rate_hz: int) -> tuple[int, int]:
+def skipped_numbers(
+    channel: str,
+    tick: int,
+    skipped: int,
+    rate_hz: int,
+) -> tuple[int, int]:
     """Returns between which numbers the messages of skipped ticks are missing.
 
     Args:

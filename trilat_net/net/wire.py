@@ -186,7 +186,11 @@ def encode_state(
 
 
 def encode_sample(
-    site: str, boot: int, output: TickRecord, sent_ns: int, echo: Sequence[Sequence[int]]
+    site: str,
+    boot: int,
+    output: TickRecord,
+    sent_ns: int,
+    echo: Sequence[Sequence[int]],
 ) -> bytes:
     """Encodes the sample of one tick for the peers, the payload of a `PeerSample`.
 

@@ -119,6 +119,7 @@ def _make_sample_handler(receive: Callable[[Any], None]) -> Any:
     thread_locals = threading.local()
 
     def handle(sample: Any) -> None:
+        """Passes a message on, and keeps the data structure of the thread."""
         receive(sample)
         is_first_call_in_thread = not hasattr(thread_locals, "kept_state")
         if is_first_call_in_thread:
