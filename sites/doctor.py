@@ -310,7 +310,14 @@ def _tls_context(folder: Path | None) -> ssl.SSLContext:
 
 
 def _split_address(endpoint: str) -> tuple[str, int] | None:
-    """Returns the host and the port of an endpoint, or None if it has no such address."""
+    """Splits an endpoint of TCP, TLS or QUIC into its host and its port.
+
+    Args:
+        endpoint: The endpoint, such as "tls/[::1]:7447".
+
+    Returns:
+        The host and the port. None for other endpoints, such as socket files.
+    """
     # protocol / host or [IPv6 address] : port, with optional Zenoh settings after ? or #
     pattern = r"(?:tcp|tls|quic)/(\[[^\]]+\]|[^:/]+):(\d{1,5})(?:[?#].*)?"
     match = re.fullmatch(pattern, endpoint)

@@ -171,7 +171,10 @@ class ExternalArm:
         return warning if distance_rad > START_POSE_TOLERANCE_RAD else ""
 
     def poll(self) -> None:
-        """Accepts the measurements that have arrived, and updates the time of silence."""
+        """Receives the waiting measurements, and updates the time since the last accepted one.
+
+        The loop calls this method in every tick.
+        """
         now_ns = self._clock.monotonic_ns()
         accepted_before = self.accepted
         while (message := self._ring.poll()) is not None:
@@ -185,15 +188,18 @@ class ExternalArm:
         self._polled_ns = now_ns
 
     def pop_order(self, mode: Mode) -> SiteOrder:
-        """Returns the order to the site that follows from the arm's silence.
+        """Returns the order to the site if measurements are missing, or have returned.
+
+        Each order is returned once, except that "arm_lost" is repeated until the site is in the
+        mode "fault".
 
         Args:
-            mode: Present mode of the site. The order "arm_lost" is repeated until the mode is
-                "fault".
+            mode: Present mode of the site.
 
         Returns:
-            "arm_silent" or "arm_lost" if the arm has been silent, "arm_back" if it has
-            returned. Empty if nothing has changed.
+            "arm_silent" to hold the position, after `HELD_SILENCE_NS` without a measurement.
+            "arm_lost" to enter the mode "fault", after `SILENCE_LIMIT_NS`. "arm_back" to
+            continue. Empty if nothing has changed.
         """
         reported_before = self._reported_order
         self._reported_order = ""
@@ -218,10 +224,12 @@ class ExternalArm:
         except WireError as error:
             self._dropped[error.reason] += 1
             return
-        # After a long silence, the driver may have been restarted, with another boot.
+        # During the session, measurements of another driver process are dropped. The driver may
+        # only be restarted after a long silence.
+        is_other_process = message.boot != self._boot
         is_lost = self._silent_ns > SILENCE_LIMIT_NS
-        is_other_boot = self._is_bound and not is_lost and message.boot != self._boot
-        if message.site != self._site or is_other_boot:
+        is_other_driver = self._is_bound and not is_lost and is_other_process
+        if message.site != self._site or is_other_driver:
             self._dropped["stranger"] += 1
             return
 
@@ -254,9 +262,9 @@ class ExternalArm:
         """
         if self.newest is None:
             return True
-        reach = [limit * elapsed_s + STEP_MARGIN_RAD for limit in self._speed_limits]
-        steps = zip(q, self.newest.q, reach, strict=True)
-        return all(abs(angle - previous) <= limit for angle, previous, limit in steps)
+        largest_steps = [limit * elapsed_s + STEP_MARGIN_RAD for limit in self._speed_limits]
+        joints = zip(q, self.newest.q, largest_steps, strict=True)
+        return all(abs(angle - previous) <= largest for angle, previous, largest in joints)
 
 
 @dataclass

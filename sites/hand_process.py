@@ -115,8 +115,10 @@ class HandProcess(SiteClient):
         """
         self.answered += 1
         try:
-            goal = self._program.act(read_view(message))
-            numbers = None if goal is None else [float(number) for number in goal]
+            target_or_force = self._program.act(read_view(message))
+            numbers = None  # releases the arm
+            if target_or_force is not None:
+                numbers = [float(number) for number in target_or_force]
         except (Exception, SystemExit) as error:  # whatever the user's code raises
             self._send(message.k, None)
             class_name = self._code.split()[0]

@@ -144,11 +144,14 @@ class HandServer:
         return step.vector
 
     def _parse_command(self, message: HandMessage) -> HandCommand | None:
-        """Checks a message, and converts it to a command.
+        """Checks a message of an operator, and converts it to a command.
+
+        Args:
+            message: The message.
 
         Returns:
-            The command. None if the message is refused: if it lacks the goal that the
-            scenario's operator needs, has another number of coordinates, or is out of range.
+            The command. None if the message is refused, because it contains a force instead of
+            a target or the reverse, has a wrong number of coordinates, or is out of range.
         """
         if self._hand.mode == "force":
             noun = "force"

@@ -46,7 +46,7 @@ class PeerMonitor:
         admits: True if sites may leave and come back.
 
     Attributes:
-        boots: Boot of each member of the session, by name.
+        boots: Boot (number of the process start) of each member of the session, by name.
         recorders: Boots of the recorders that are present.
         stored: Boots of the recorders that have stored all messages of this site.
         ended_by: Sentence of the event with which a member ended the run for all. Empty if
@@ -126,7 +126,7 @@ class PeerMonitor:
 
         Args:
             member: Name of the member.
-            boot: Boot of the member, as text.
+            boot: Number that identifies the start of the member's process, as text.
             publisher: Publishes the events of this site.
             t_ns: Present time, in ns since the epoch.
             alive: True if the token has appeared.

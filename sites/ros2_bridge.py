@@ -278,7 +278,7 @@ class RobotArm:
         self._clock = clock
         self._sender = SingleSender(clock)
         self._lock = threading.Lock()
-        # Boot and tick of the record whose torque was published last.
+        # Process start (boot) and tick of the record whose torque was published last.
         self._published_tick: tuple[int, int] | None = None
         self._safe_ns = clock.monotonic_ns() - SAFE_PERIOD_NS
 
@@ -313,7 +313,7 @@ class RobotArm:
 
     def send_command(self) -> None:
         """Publishes the torque of the newest record if it is new, or the safe command."""
-        # The site may have rejoined with another boot, which needs another client.
+        # A site that was restarted needs another client, as a client follows one process.
         if self._client.over:
             with self._lock:
                 self._client = self._make_client()

@@ -101,8 +101,8 @@ class SiteTopics:
     def publish(self, record: State, rate_hz: float) -> None:
         """Publishes a record on all topics that have subscribers.
 
-        Records that are older than the newest published one of the same boot are ignored, and
-        so are records that would exceed the rate.
+        A record is ignored if it is older than the last published record of the same process of
+        the site, or if it would exceed the rate.
 
         Args:
             record: Result of one tick of the site.

@@ -106,7 +106,7 @@ class SessionPing:
 
     @property
     def _boots(self) -> set[int]:
-        """Boots of the members that have replied. Pings are addressed to them."""
+        """Numbers that identify the members that have replied. Their pings are evaluated."""
         return {info.boot for info in self.infos.values()}
 
     def is_over(self, timeout_ns: int, begun_ns: int) -> bool:

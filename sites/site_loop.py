@@ -86,7 +86,7 @@ class PeerInbox:
     Args:
         links: Links from the peers. All other sequences have the same order.
         rings: Inboxes of the samples, with the time of each arrival.
-        boots: Boots of the peers.
+        boots: Boot of each peer.
         monitors: Timing monitors of the links.
         dropped: Number of dropped samples by reason. The counts are increased in place.
         from_ns: Time of the site's first tick, in ns since the epoch.
@@ -118,12 +118,12 @@ class PeerInbox:
             self.drain(from_ns)
 
     def admit(self, index: int, boot: int, first: int) -> None:
-        """Accepts from now on only samples of a new boot of a peer.
+        """Accepts samples of a restarted peer, and no more samples of its previous process.
 
         Args:
             index: Index of the peer.
-            boot: The new boot.
-            first: First tick of the new boot.
+            boot: Number that identifies the new process of the peer.
+            first: First tick of the new process.
         """
         self._boots[index] = boot
         self._newest[index] = None
@@ -300,7 +300,7 @@ class StateBlock:
 
     Args:
         site: The site in the simulation kernel.
-        boot: Boot of this process.
+        boot: Random number that identifies this start of the site.
         send: Function that publishes the encoded records of a block.
         turn: Index of the site in the scenario. Sites on one machine send their blocks in
             different ticks, so that the work is spread over time.

@@ -110,7 +110,7 @@ def test_delays_of_topic_of_ros_is_that_of_every_publisher() -> None:
     assert first["rate_hz"] == pytest.approx(100.0, rel=0.01)
     text = found.summary()
     assert "std_msgs/msg/String" in text
-    assert "the clock there is ahead" in text  # of the second
+    assert "the publisher's clock is ahead" in text  # of the second
     assert is_documented("ping --ros2", found.to_dict())
 
 

@@ -188,9 +188,10 @@ class SiteClient:
     def _is_next_record(self, record: State, received_ns: int) -> bool:
         """Returns True if a record may follow the newest known one.
 
-        It must come from the same boot of the site, be newer, and not be further in the future
-        than the time that has passed since the last arrival explains. A forged record with a
-        wrong time would otherwise make the client ignore all correct ones.
+        It must come from the same process of the site and be newer. Its time must not be more
+        than `AHEAD_NS` later than the time of the newest record plus the time since that record
+        arrived. A forged record with a time far in the future would otherwise make the client
+        ignore all correct records.
 
         Args:
             record: The record.
@@ -203,7 +204,8 @@ class SiteClient:
             record.boot == last.boot and record.tick > last.tick and record.t_ns > last.t_ns
         )
         elapsed_ns = received_ns - self._received_ns
-        return is_newer and record.t_ns - last.t_ns <= elapsed_ns + AHEAD_NS
+        is_plausible = record.t_ns - last.t_ns <= elapsed_ns + AHEAD_NS
+        return is_newer and is_plausible
 
     def _read_messages(self) -> None:
         """Receives all waiting messages, and updates the newest record and the end of the run.
@@ -375,14 +377,15 @@ class ArmClient(OutsideClient):
         if record is None or not self.fresh:
             return None
 
-        # `mem` begins with the position that the arm holds. The next number is the time at
-        # which the fault or stop began. The reason of a stop follows after as many numbers
-        # again. In records without these numbers, the slices are empty.
-        shared = len(record.q_des)
-        begun_ns = record.mem[shared : shared + 1]
-        stop_reason = record.mem[2 * shared + 1 : 2 * shared + 2]
-        is_released = record.mode == "stopped" and stop_reason == [LifeReason.RELEASED]
-        if record.mode != "fault" and not is_released:
+        # With n coordinates, `mem` contains: n coordinates of the position that the arm holds,
+        # the time at which the fault or stop began, n further numbers, and the reason of a
+        # stop. In records without these numbers, the slices are empty.
+        n = len(record.q_des)
+        begun_ns = record.mem[n : n + 1]
+        stop_reason = record.mem[2 * n + 1 : 2 * n + 2]
+        is_switch_released = record.mode == "stopped" and stop_reason == [LifeReason.RELEASED]
+        must_brake_soon = record.mode == "fault" or is_switch_released
+        if not must_brake_soon:
             return tuple(record.tau)
 
         is_coming_to_rest = begun_ns and record.t_ns - begun_ns[0] < BRAKE_NS
@@ -592,8 +595,9 @@ class Hand(SiteClient):
                 K * (target - position) + B * (target_rate - rate)
                 for K, B, target, target_rate, position, rate in coordinates
             ]
-        size = math.hypot(*pull)
-        scale = hand.grip * (operator.limit / size if size > operator.limit else 1.0)
+        magnitude = math.hypot(*pull)
+        limitation = operator.limit / magnitude if magnitude > operator.limit else 1.0
+        scale = hand.grip * limitation
         return tuple(scale * component for component in pull)
 
     def _compute_pose_rate(self, record: State) -> list[float]:
@@ -606,7 +610,7 @@ class Hand(SiteClient):
         return [(after - before) / (2.0 * step_s) for after, before in pairs]
 
     def _wait_for_record(self) -> State:
-        """Returns the newest record, and waits for the first one if there is none yet.
+        """Returns the newest record of the site, and waits if none has arrived yet.
 
         Raises:
             UsageError: The run has ended before the first record.
@@ -618,11 +622,11 @@ class Hand(SiteClient):
         return record
 
     def _send(self, action: str, numbers: Sequence[float]) -> int:
-        """Sends a goal of the operator, and returns the number of the message.
+        """Sends a target or a force of the operator, and returns the number of the message.
 
         Args:
             action: Name of the method that the program called: "move", "turn" or "push".
-            numbers: Coordinates of the goal.
+            numbers: Coordinates of the target or the force.
 
         Raises:
             UsageError: The scenario's operator has another kind, or a number is not finite.

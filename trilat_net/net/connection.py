@@ -110,7 +110,11 @@ def reserve_session_endpoints(session: str, sites: Sequence[str]) -> Iterator[li
 
 
 def find_free_endpoints(count: int) -> list[str]:
-    """Returns endpoints on this machine whose ports are free at present."""
+    """Returns endpoints on this machine whose ports no program uses at this moment.
+
+    Args:
+        count: Number of endpoints.
+    """
     with ExitStack() as stack:
         return _bind_ports(stack, [0] * count, shared=False)
 
@@ -519,7 +523,9 @@ def _merge_endpoints(
     mode: ZenohMode,
     otherwise: Sequence[str] | None,
 ) -> Sequence[Endpoint] | None:
-    """Returns the endpoints to which to connect: those of the option, then those of the file.
+    """Joins the endpoints of the command line and of a Zenoh file to which to connect.
+
+    The endpoints of the command line come first. Each endpoint occurs once.
 
     Args:
         named: Endpoints of the option. None if the option is absent.

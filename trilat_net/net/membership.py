@@ -263,7 +263,7 @@ class Membership:
 
     Attributes:
         others: Identity of each other member that is known and present, by name.
-        alive: Boots of the members that are present, as text.
+        alive: Boots (numbers of process starts) of the members that are present, as text.
         gone: Boots of the members that have disappeared, as text.
     """
 
@@ -309,7 +309,10 @@ class Membership:
         }
 
     def boots(self) -> dict[str, int]:
-        """Returns the boot of each member that is present, including this member."""
+        """Returns the present members, including this member, with the boot of each.
+
+        The boot is the random number that identifies the start of the member's process.
+        """
         boots = {name: info.boot for name, info in self.others.items()}
         return boots | {self.local_info.member: self.local_info.boot}
 
@@ -500,7 +503,7 @@ class Epoch(NamedTuple):
     Attributes:
         mono_ns: The epoch on the monotonic clock of this process.
         unix_ns: The epoch in Unix time, as the leader's clock showed it.
-        boots: Boot of each member, by name.
+        boots: Number that identifies the start of each member's process, by name.
         epochs: The epoch on each member's own monotonic clock, by name. Empty for a recorder
             that joins late, which needs only its own clock.
         first: First tick that this site executes. It is 0 unless the site joins late.

@@ -254,7 +254,8 @@ class Pinger:
             known.
 
     Attributes:
-        trips: Round trips to each start of a member, by its boot (random number per start).
+        trips: Round trips to each member, by its boot, the random number that identifies the
+            start of the member's process.
     """
 
     def __init__(
@@ -294,7 +295,11 @@ class Pinger:
                 trips.receive(pinged_ns, pong, now_ns)
 
     def knows_clocks(self, boots: Collection[int]) -> bool:
-        """Returns True if the clocks of all members with these boots are known."""
+        """Returns True if the clock offsets of some members are known.
+
+        Args:
+            boots: Boots of the members.
+        """
         return all(boot in self.trips and self.trips[boot].is_known for boot in boots)
 
     def estimate(self, boot: int) -> OffsetEstimate:
@@ -312,7 +317,9 @@ class Pinger:
         return trips.latest
 
     def estimator(self, boot: int) -> OffsetEstimator | None:
-        """Returns the collected limits of a member's clock, or None before its first reply.
+        """Returns the estimator of a member's clock offset, with all limits from pings.
+
+        None if the member has not replied to any ping.
 
         Args:
             boot: Boot of the member.

@@ -1,8 +1,8 @@
 """Defines the messages that one process sends to one other process of a session.
 
 They are replies to pings, requests for changes, requests for lost messages, measurements of
-real arms, reports of dead-man switches, and goals of operators (the people or programs that
-move arms). Published messages, which everybody receives, are defined in `messages`.
+real arms, reports of dead-man switches, and the targets of operators (the people or programs
+that move arms). Published messages, which everybody receives, are defined in `messages`.
 
 A log does not contain these messages, but their effects:
 
@@ -10,8 +10,8 @@ A log does not contain these messages, but their effects:
 - A lost message that was sent again is logged like all others.
 - A measurement is logged as `q` and `qd` of the record of the tick that used it. In each tick,
   a site uses the newest measurement.
-- A goal of an operator, which is a target or a force, is logged as `hand` of the records of the
-  ticks in which it acts.
+- A target or force of an operator is logged as `hand` of the records of the ticks in which it
+  acts.
 """
 
 import math
@@ -206,7 +206,7 @@ class HandMessage(Request, frozen=True, kw_only=True):
         boot: Random number above 0 that identifies the operator. Only one operator at a time
             holds an arm.
         source: Name of the person or program, for the users of the session.
-        n: Number of the goal, from 0. A repeated number means that nothing has changed.
+        n: Number of the target or force, from 0. If it is repeated, nothing has changed.
         grip: False to release the arm.
         target: Target position of the end effector in m, or of the joints in rad. Empty for an
             operator who pushes.

@@ -199,8 +199,8 @@ class SessionJoin:
         if source is None:
             return None
 
-        # Convert with the present offset. The offset at the epoch is not known, as the clocks
-        # have drifted since.
+        # The site whose epoch is used may run on another clock. Convert with the present
+        # offset: that at the epoch is not known, as the clocks have drifted since.
         offset_ns = 0
         if source.clock != local_clock:
             offset_ns = self.pinger.estimate(source.boot).extrapolate_ns(now_ns)
@@ -210,22 +210,28 @@ class SessionJoin:
             return epoch
 
         # The site follows the schedule on which the ticks are now, not on which they started.
-        grid_ns = (source.grid_ns or source.epoch_mono_ns) - offset_ns
-        return self._request_admission(epoch._replace(mono_ns=grid_ns), running, now_ns)
+        schedule_start_ns = (source.grid_ns or source.epoch_mono_ns) - offset_ns
+        local_epoch = epoch._replace(mono_ns=schedule_start_ns)
+        return self._request_admission(local_epoch, running, now_ns)
 
     def _awaits_sites(self, running: Sequence[Info]) -> bool:
-        """Returns True if a site of the session is present, but is not known to run yet.
+        """Returns True if further sites of the running session are expected to reply.
 
-        Sites that have disappeared or were started again are not awaited.
+        The running sites state the members of the session. Those that have disappeared or were
+        started again are not expected to reply.
+
+        Args:
+            running: Identities of the running sites that have replied.
         """
         membership = self.membership
-        present_sites = set()
+        expected_sites = set()
         for name, boot in running[0].boots.items():
             is_gone = str(boot) in membership.gone or membership.has_restarted(name, boot)
             if not is_gone:
-                present_sites.add(name)
-        present_sites -= {topics.RECORDER, self._info.member}
-        return {info.member for info in running} < present_sites
+                expected_sites.add(name)
+        expected_sites -= {topics.RECORDER, self._info.member}
+        known_sites = {info.member for info in running}
+        return known_sites < expected_sites  # a proper subset
 
     def _select_epoch_source(self, running: Sequence[Info]) -> Info | None:
         """Selects the running site from which this member takes the epoch.
@@ -240,6 +246,7 @@ class SessionJoin:
         indices = {name: index for index, name in enumerate(self._sites)}
 
         def rank(info: Info) -> tuple[bool, int]:
+            """Returns the sort key: first sites on this machine, then by index."""
             return info.clock != local_clock, indices.get(info.member, -1)
 
         for info in sorted(running, key=rank):
@@ -312,11 +319,14 @@ class SessionJoin:
     def _list_other_clocks(
         self, boots: Mapping[str, int], clocks: Mapping[str, str]
     ) -> set[int]:
-        """Returns the boots of the sites on other machines, whose clocks must be measured.
+        """Lists the sites on other machines, whose clock offsets must be measured.
 
         Args:
-            boots: Boot of each member, by name.
+            boots: Number that identifies the start of each member's process, by name.
             clocks: Identity of each member's clock, by name.
+
+        Returns:
+            The boots of these sites.
         """
         return {
             boot
@@ -507,7 +517,11 @@ class SessionJoin:
         )
 
     def _make_epoch(self, start: Event) -> Epoch:
-        """Returns the confirmed epoch, given the leader's event `start`."""
+        """Returns the epoch that the leader has confirmed.
+
+        Args:
+            start: The leader's event `start`, which states the members and their epochs.
+        """
         assert self._agreed_proposal is not None
         return Epoch(
             mono_ns=self._epoch_ns,

@@ -45,7 +45,7 @@ STATS = "stats"
 MEASURED = "measured"
 """Channel of the measurements of an external arm."""
 HAND = "hand"
-"""Channel of the goals of an operator, a person or program that moves an arm."""
+"""Channel of the targets and forces of an operator, a person or program that moves an arm."""
 ENABLE = "enable"
 """Channel of the reports of a dead-man switch."""
 VIEW = "view"
@@ -61,7 +61,8 @@ class KeyParts(NamedTuple):
         session: Name of the session.
         member: Name of the member.
         channel: Name of the channel.
-        boot: Boot of the member, in the key of a liveliness token. Empty in other keys.
+        boot: In the key of a liveliness token, the number that identifies the start of the
+            member's process. Empty in other keys.
     """
 
     session: str

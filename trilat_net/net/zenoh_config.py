@@ -421,6 +421,10 @@ def _expand_mode(settings: Mapping[str, Any], value: Any) -> Any:
 
     A value that is not a dictionary applies to the mode in the file, or to peers if the file
     has no mode.
+
+    Args:
+        settings: Content of the file.
+        value: Value of the key.
     """
     return value if isinstance(value, dict) else {settings.get("mode", "peer"): value}
 
