@@ -1,14 +1,18 @@
 """trilat-net: dual-user (trilateral) teleoperation over a real network.
 
+Two users each move a master arm, and a slave arm follows both of them. Each arm has a control
+loop of its own, and the loops exchange their states over a network with delay.
+
     import trilat_net as tn
 
     log = tn.simulate("paper", set={"control.Kd": 5})
     log["m1"].t_s, log["m1"].q
     tn.certify(log)
 
-One `Site.step` has three drivers: live over a network, in virtual time, and again from a log.
-The same code gives the same numbers, bit for bit. Functions return objects with `summary()`,
-`to_frame()` and `to_dict()`; docs/python.md lists them all.
+The control loop of an arm is the function `Site.step`. The same function runs live over a
+network, in virtual time, and again from the log of a run, so the numbers are the same to the
+last bit. Functions of this package return objects with `summary()`, `to_frame()` and
+`to_dict()`. docs/python.md lists them all.
 """
 
 from importlib import import_module as _import_module
@@ -127,15 +131,21 @@ _NAMES = {
     "trilat_net.studies.log_comparison": "compare",
     "trilat_net.studies.trials": "check trials",
 }
-"""The public names of each module."""
+"""The public names that each module defines, separated by spaces."""
 _MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
+"""For each public name the module that defines it."""
 __all__ = sorted(["__version__", *_MODULES])
 
 
 def __getattr__(name: str) -> _Any:
-    """Imports a name's module on first use.
+    """Imports the module of a public name when the name is first used.
 
-    `trilat --help` needs none of them, and Numba takes a second to import.
+    Python calls this function for names that the package does not contain. Importing everything
+    at once would delay commands such as `trilat --help` by seconds, since Numba alone takes a
+    second.
+
+    Raises:
+        AttributeError: There is no such public name.
     """
     if name == "__version__":
         from .files import find_version
@@ -147,10 +157,15 @@ def __getattr__(name: str) -> _Any:
 
 
 def _import_name(name: str) -> _Any:
-    """Returns the object of a public name; if a package is missing, a function that says so.
+    """Imports the object of a public name.
 
-    An error would be wrong here: programs look names up (`hasattr`, `dir`, completion) without
-    using them.
+    Args:
+        name: The name.
+
+    Returns:
+        The object. If a package that it needs is missing, a function that raises UsageError
+        when it is called. Raising the error here would be wrong, because programs look up names
+        without using them (`hasattr`, `dir`, completion in an editor).
     """
     from .errors import UsageError
 
@@ -161,6 +176,7 @@ def _import_name(name: str) -> _Any:
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
         if package in ("", "live", "recorder", "sites", "trilat_net"):
+            # A missing module of this program is a bug, not a missing package.
             raise
         from .files import STUDY_LIBRARIES
 
@@ -171,7 +187,12 @@ def _import_name(name: str) -> _Any:
 
 
 def _make_stand_in(name: str, problem: str) -> _Any:
-    """Returns a function that raises UsageError, in place of one whose package is missing."""
+    """Returns a function that raises UsageError, in place of an unavailable object.
+
+    Args:
+        name: Public name of the object.
+        problem: Text of the error, which names the package.
+    """
     from .errors import UsageError
 
     def stand_in(*_args: _Any, **_settings: _Any) -> _Any:

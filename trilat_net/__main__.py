@@ -1,11 +1,12 @@
-"""Starts the program `trilat`, also as `python -m trilat_net`.
+"""Entry point of `trilat` and `python -m trilat_net`.
 
-`trilat stop` runs before the other commands are loaded, so that arms stop without delay.
+`trilat stop` runs before the modules of the other commands are loaded, so that arms stop
+without delay.
 
 Invariant:
     - Text that is printed into a file or pipe is UTF-8 with POSIX line ends on every system, as
-      in all files that are written.
-    - A terminal that lacks a character shows its number.
+      in all files that the program writes.
+    - A character that a terminal cannot show is replaced by its number.
 """
 
 import atexit
@@ -18,15 +19,17 @@ from contextlib import suppress
 
 def main() -> None:
     """Prepares the process, and runs the command of the command line."""
-    # With Python's default thresholds, garbage collection takes a ninth of the start.
+    # With Python's default thresholds, garbage collection takes a ninth of the start-up time.
     gc.set_threshold(100_000, 20, 20)
+
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             if not stream.isatty():
                 stream.reconfigure(encoding="utf-8", newline="\n")
             stream.reconfigure(errors="backslashreplace")
+
     code: int | None = None
-    # The function is registered first, and therefore called last.
+    # The function that is registered first is called last.
     atexit.register(lambda: _exit_before_zenoh(code))
     try:
         _run()
@@ -40,12 +43,12 @@ def main() -> None:
 def _run() -> None:
     """Runs the command of the command line.
 
-    Two commands are handled before the others are loaded: `stop`, and `start-processes`, which
-    starts the processes of a session.
+    Two commands are handled before the others are loaded: `stop`, and the hidden command
+    `start-processes`, which starts the processes of a session by forking.
     """
     if sys.argv[1:2] == ["stop"]:
         if sys.platform == "linux":
-            # The process runs ahead of other programs on a busy machine, if permitted.
+            # ahead of other programs on a busy machine, if permitted
             with suppress(OSError):
                 os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
         from .net.known_sites import stop_at_once
@@ -58,7 +61,7 @@ def _run() -> None:
 
     match sys.argv[1:]:
         case ["start-processes", number, scenario_file] if number.isdecimal():
-            # These modules are loaded once here, instead of in each process that is forked.
+            # Loaded once here, these modules need not be loaded in each forked process.
             from recorder import record_process  # noqa: F401
             from sites import site_process  # noqa: F401
             from sites.demo_session import run_starter
@@ -71,10 +74,12 @@ def _run() -> None:
 
 
 def _exit_before_zenoh(code: int | None) -> None:
-    """Exits at once if Zenoh is loaded, whose threads would abort the process at Python's end.
+    """Ends the process at once if the network library Zenoh is loaded.
+
+    Otherwise Python would shut down before the threads of Zenoh, which then abort the process.
 
     Args:
-        code: Exit code. None if the process ends by an exception.
+        code: The exit code. None if an exception ends the process, which Python has to report.
     """
     if code is not None and "zenoh" in sys.modules:
         with suppress(OSError):  # Python reports this error itself

@@ -1,13 +1,11 @@
-"""Offers one Python function per command, for logs, simulation and studies.
+"""The Python interface: one function for each command that needs no network.
 
-`import trilat_net as tn` makes these functions available as `tn.simulate` and so on. A
-scenario, the description of an experiment with robot arms, is given as a name, a path, a TOML
-text, its tables or a `Scenario`. A log, the recording of a run, is given as a path or a `Log`.
-Functions that need a network are in the package `sites`.
+A scenario describes an experiment. It may be the name of a shipped scenario, the path of a TOML
+file, a TOML text, its tables, or a `Scenario`. A log is the record of a run. It may be the path
+of an MCAP file, or a `Log`. Functions that need a network are in the package `sites`.
 
 Invariant:
-    - These functions only convert arguments and call the packages that do the work, so that
-      Python and the command line give the same results.
+    - These functions only convert arguments, and call the packages that do the work.
 """
 
 from collections.abc import Mapping, Sequence
@@ -41,16 +39,16 @@ Axes = str | Sequence[str] | Mapping[str, Any]
 
 
 def _open(log: AnyLog) -> Log:
-    """Returns a log, which is opened if it is given as a path."""
+    """Opens a log unless it is open already, and returns it."""
     return log if isinstance(log, Log) else open_log(log)
 
 
 def _list_override_texts(overrides: Overrides, duration_s: float | None) -> list[str]:
-    """Returns overrides of scenario keys as texts KEY=VALUE.
+    """Returns overrides as texts KEY=VALUE, as the command line has them.
 
     Args:
-        overrides: The overrides, as a mapping or as texts.
-        duration_s: Duration of the run, in s, which is added as an override. None to add none.
+        overrides: Overrides by key, or a text or texts KEY=VALUE.
+        duration_s: Duration of the run in s, which becomes the last override. None adds none.
     """
     from .studies.trials import list_assignments
 
@@ -73,19 +71,21 @@ def simulate(
     duration_s: float | None = None,
     seed: int | None = None,
 ) -> SimulatedLog:
-    """Runs a scenario in virtual time and returns its log. The command is `trilat sim`.
+    """Runs a scenario in virtual time and returns its log; the command is `trilat sim`.
 
-    A warning is issued if the run diverged. `log.diverged_s` is the time of divergence.
+    In virtual time, one process computes all arms and the network, as fast as possible. The
+    function warns if the run diverged. The time of divergence is then in `log.diverged_s`.
 
     >>> log = tn.simulate("two_sites", duration_s=0.1)
     >>> log["m"].q.shape
     (100, 2)
 
     Args:
-        scenario: Name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
+        scenario: The scenario, which describes the experiment: the name of a shipped scenario,
+            a path, a TOML text, its tables, or a `Scenario`.
         set: Overrides, as in `{"control.Kd": 5}` or `["control.Kd=5"]`.
-        duration_s: Duration of the run, in s. By default the scenario's.
-        seed: Seed of the random numbers. By default the scenario's.
+        duration_s: Duration of the run, in s. By default that of the scenario.
+        seed: Seed of random delays and losses. By default that of the scenario.
 
     Raises:
         ScenarioError: The scenario or an override is not valid.
@@ -103,7 +103,9 @@ def export(
     force: bool = False,
     **settings: Any,
 ) -> Path:
-    """Exports a log to files for other tools. The command is `trilat log export`.
+    """Exports a log to files that other tools can read, and returns their path.
+
+    The command is `trilat log export`.
 
     >>> tn.export(tn.simulate("two_sites", duration_s=0.1), "npz", "run.npz").name
     'run.npz'
@@ -113,11 +115,8 @@ def export(
         to: Format: ros2, parquet, csv, npz, mat or lerobot.
         out: Path of the file, or of the folder for parquet, csv and lerobot.
         force: True to replace an existing file or folder.
-        settings: Settings of the format, such as `fps=30`, `program="m2"` and `actions="tip"`
-            of lerobot.
-
-    Returns:
-        The path of the export.
+        settings: Settings of the format, as `fps=30`, `program="m2"` and `actions="tip"` of
+            lerobot.
 
     Raises:
         UsageError: There is no such format or setting, a package is missing, or the path
@@ -140,19 +139,21 @@ def verify(
     min_coverage: float = MIN_COVERAGE,
     resume_every: int = 0,
 ) -> LogCheckReport:
-    """Checks a log by executing its sites again. The command is `trilat verify`.
+    """Executes a run again from its log, and compares all computed numbers bit for bit.
 
-    All fields that a site computes are compared with the records, bit for bit.
+    The command is `trilat verify`.
 
     >>> tn.verify(tn.simulate("two_sites", duration_s=0.1)).passed
     True
 
     Args:
         log: The log, or its path.
-        virtual: True to compare also with a simulation in virtual time.
-        min_coverage: Smallest share of each site's ticks that must be judged to pass.
-        resume_every: Restart sites from the records after each such number of ticks. This
-            reveals state of a user's control law that the records lack. 0 never restarts them.
+        virtual: True to compare the log with a run in virtual time too.
+        min_coverage: Smallest fraction of the ticks (control periods) of each site that must be
+            compared for the check to pass.
+        resume_every: Number of ticks after which the state of each site is restored from the
+            log, again and again. This reveals state of a user's control law that the log lacks.
+            0 never restores.
 
     Raises:
         LogError: The log cannot be read.
@@ -169,19 +170,18 @@ def certify(
     own_laws: bool = False,
     twins: int = TWINS,
 ) -> Certificate:
-    """Judges whether a run was stable, and why. The command is `trilat certify`.
-
-    The judgement is stable, not stable or open.
+    """Judges if a run is stable, not stable or open, and why; the command is `trilat certify`.
 
     >>> print(tn.certify(tn.simulate("free")).stability)
     stable
 
     Args:
         log: The log, or its path.
-        min_coverage: Smallest share of each site's ticks that must be judged for a stable run.
-        own_laws: True if code of users' control laws may be executed, for the energies that
-            they declare and for twins.
-        twins: Number of twins, which are second executions of the run with a small push. They
+        min_coverage: Smallest fraction of the ticks (control periods) of each site that must be
+            judged for a stable run.
+        own_laws: True if the code of a user's control laws may be executed, for the energies
+            that they declare and for twins.
+        twins: Number of twins, which are repetitions of the run with a small disturbance. They
             show whether disturbances grow.
 
     Raises:
@@ -193,13 +193,16 @@ def certify(
 
 
 def metrics(log: AnyLog) -> LogMetrics:
-    """Measures a run: tracking, effort, energies, force sharing, network.
+    """Measures the tracking, effort, energies, force sharing and network of a run.
 
-    The command is `trilat metrics`.
+    The command is `trilat metrics`. docs/metrics.md has the formula of every metric.
 
     >>> found = tn.metrics(tn.simulate("two_sites", duration_s=0.1))
     >>> found.sites["m"]["rms_error_rad"].value > 0.0
     True
+
+    Args:
+        log: The log, or its path.
 
     Raises:
         LogError: The log cannot be read.
@@ -210,7 +213,7 @@ def metrics(log: AnyLog) -> LogMetrics:
 def report(
     log: AnyLog, out: str | Path | None = None, *, force: bool = False, png: bool = False
 ) -> "Conclusion":
-    """Writes the page and the summary of a log. The command is `trilat report`.
+    """Writes a report of a log: a page and a summary; the command is `trilat report`.
 
     >>> path = tn.simulate("two_sites", duration_s=0.1).save("run.mcap")
     >>> tn.report(path, "report").passed
@@ -218,7 +221,7 @@ def report(
 
     Args:
         log: Path of the log, or a log that was opened from a file.
-        out: Folder of the report. By default the log's path without .mcap.
+        out: Folder of the report. By default the name of the file without .mcap.
         force: True to use a folder that is not empty.
         png: True to write every figure as a PNG file too.
 
@@ -247,18 +250,20 @@ def linear(
     ports: bool = True,
     operators: Sequence[str | Path] = (),
 ) -> "LinearAnalysis":
-    """Linearises the arms and their controllers about an equilibrium: roots, margins, ports.
+    """Linearises the closed loop of all arms about its equilibrium, and analyses it.
 
-    The command is `trilat linear`.
+    The analysis has the characteristic roots, the margins to instability, and the passivity and
+    impedances that operators feel. The command is `trilat linear`.
 
     >>> tn.linear("p_d_margin", {"control.d": 0.9}, ports=False).verdict
     'unstable'
 
     Args:
-        scenario: Name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
+        scenario: The scenario, which describes the experiment: the name of a shipped scenario,
+            a path, a TOML text, its tables, or a `Scenario`.
         set: Overrides, as in `{"control.d": 0.9}`.
         pose: Joint angles of all sites, in rad. By default those at the end of a run.
-        roots: Number of characteristic roots to compute.
+        roots: Number of roots.
         over: Ranges of keys in which edges of stability are searched, as in
             `["control.d=0.1:3"]`.
         ports: True to analyse passivity and the impedances that operators feel.
@@ -302,7 +307,7 @@ def sweep(
     jobs: int | None = None,
     on: "Workers" = None,
 ) -> "SweepResults":
-    """Runs a scenario over a grid of its keys and judges the stability of each run.
+    """Runs a scenario over a grid of values of its keys, and judges the stability of each.
 
     The command is `trilat sweep`.
 
@@ -312,24 +317,25 @@ def sweep(
     2
 
     Args:
-        scenario: Name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
-        over: Axes of the grid, as lists or arrays of values by key,
-            `{"link.delay_ms": range(0, 1601, 50)}`, or as texts, `["link.delay_ms=0:1600:50"]`.
-        set: Overrides of all runs, as in `{"control.Kd": 5}`.
-        seeds: Number of seeds, or the seeds.
-        laws: Names or classes of control laws, as a further axis.
-        duration_s: First duration of a run, in s.
-        longest_s: Longest duration of an undecided run, in s. By default eight times
-            `duration_s`, or `duration_s` if twins judge.
-        judge: "twins" measures the growth of small disturbances in each run in addition to its
-            verdict.
+        scenario: The scenario, which describes the experiment: the name of a shipped scenario,
+            a path, a TOML text, its tables, or a `Scenario`.
+        over: Axes of the grid: lists or arrays of values by key, as in
+            `{"link.delay_ms": range(0, 1601, 50)}`, or texts, as in
+            `["link.delay_ms=0:1600:50"]`.
+        set: Overrides of all cells of the grid, as in `{"control.Kd": 5}`.
+        seeds: Number of seeds, or the seeds. Each cell has a run per seed.
+        laws: Names or classes of control laws, which are a further axis of the grid.
+        duration_s: First duration of the runs of a cell, in s.
+        longest_s: Longest duration of the runs of a cell whose stability is still open, in s.
+            By default eight times `duration_s`, or `duration_s` if twins judge.
+        judge: "verdict" or "twins". With "twins" the exponent with which small disturbances
+            grow is measured in each cell, in addition to its verdict.
         metrics: Keys of docs/metrics.md that are measured in each run. They become columns of
             the rows.
         out: Folder of the results. A sweep in it is continued. By default the next free
             runs/sweep-NAME-N.
-        jobs: Number of processes. None for one per core.
-        on: Address of a Dask scheduler, or an executor, that runs the grid instead of
-            processes.
+        jobs: Number of processes. None uses one per core.
+        on: Address of a Dask scheduler, or an executor, that executes the runs instead.
 
     Raises:
         ScenarioError: The scenario, an axis or one of its values is not valid.
@@ -364,25 +370,27 @@ def margin(
     jobs: int | None = None,
     on: "Workers" = None,
 ) -> "SweepMargins":
-    """Searches the edge of stability along a key. The command is `trilat sweep --margin`.
+    """Searches the edge of stability along a key; the command is `trilat sweep --margin`.
+
+    The edge is the value of the key at which runs change from stable to not stable.
 
     >>> found = tn.margin("p_d_margin", "control.d=0.2:3", tolerance=0.2, duration_s=4, jobs=1)
     >>> [search.margin.spans[0].stable_below for search in found.found]
     [False]
 
     Args:
-        scenario: Name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
+        scenario: The scenario, which describes the experiment: the name of a shipped scenario,
+            a path, a TOML text, its tables, or a `Scenario`.
         along: The key and its range, as in "control.d=0.2:3".
         over: Axes of a grid at whose points the edge is searched, as in `sweep`:
             `{"link.delay_ms": [100, 200]}`.
         set: Overrides of all runs.
-        tolerance: Largest width of an edge, relative to its value.
+        tolerance: Largest width of the interval that contains an edge, relative to its value.
         seeds: Number of seeds, or the seeds.
-        laws: Names or classes of control laws, for each of which the edge is searched.
+        laws: Names or classes of control laws, which are a further axis of the grid.
         duration_s: First duration of a run, in s.
-        jobs: Number of processes. None for one per core.
-        on: Address of a Dask scheduler, or an executor, that runs the search instead of
-            processes.
+        jobs: Number of processes. None uses one per core.
+        on: Address of a Dask scheduler, or an executor, that executes the runs instead.
 
     Raises:
         ScenarioError: The scenario or one of the values is not valid.
@@ -419,28 +427,27 @@ def tune(
     jobs: int | None = None,
     on: "Workers" = None,
 ) -> "TuningResult":
-    """Compares control laws after tuning each of them by the same procedure.
+    """Compares control laws that one procedure tunes; the command is `trilat compare --tune`.
 
-    The command is `trilat compare --tune`.
+    The procedure tries the same number of candidates for the gains of each law.
 
     >>> found = tn.tune("free", ["p_d"], budget=2, duration_s=2, jobs=1)
     >>> [law.space.law for law in found.found]
     ['p_d']
 
     Args:
-        scenario: Name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
-        laws: Names or classes of the laws. Empty for all laws that work with any number of
-            sites.
+        scenario: The scenario, which describes the experiment: the name of a shipped scenario,
+            a path, a TOML text, its tables, or a `Scenario`.
+        laws: Names or classes of the laws. Empty selects all laws for any number of sites.
         set: Overrides, as in `{"link.delay_ms": 100}`.
         budget: Number of candidates per law.
-        seed: Seed of the search.
+        seed: Seed of the search, which draws the candidates.
         seeds: Number of seeds of the scenario over which each candidate is averaged.
-        objective: "error" or "settling", in addition to effort.
+        objective: "error" or "settling", the objective of the search in addition to effort.
         gravity_percent: Gravity that all laws assume, in % of the true gravity.
-        duration_s: Duration of a run, in s.
-        jobs: Number of processes. None for one per core.
-        on: Address of a Dask scheduler, or an executor, that runs the candidates instead of
-            processes.
+        duration_s: Duration of a run, in s. By default that of the scenario.
+        jobs: Number of processes. None uses one per core.
+        on: Address of a Dask scheduler, or an executor, that executes the runs instead.
 
     Raises:
         ScenarioError: The scenario is not valid, or laws cannot be compared in it.
@@ -473,9 +480,9 @@ def bench(
     jobs: int | None = None,
     on: "Workers" = None,
 ) -> "BenchResults":
-    """Runs the benchmark suite of control laws.
+    """Runs the benchmark suite, which compares control laws in the same tasks and links.
 
-    The command is `trilat bench`, which writes tables and figures as well.
+    The command is `trilat bench`, which also writes tables and figures.
 
     >>> cell = {"tasks": ["free"], "laws": ["p_d"], "links": ["rtt68"]}
     >>> found = tn.bench(**cell, seeds=1, out="suite", jobs=1)
@@ -483,17 +490,17 @@ def bench(
     1
 
     Args:
-        study: Name of the study: full, small or round-trips.
-        tasks: Only these tasks. Empty for all.
-        laws: Only these laws. Empty for all.
-        links: Other links than the study's, as in "rtt68-loss10" or "4g".
-        seeds: Number of seeds. By default the study's.
-        confirm: True to run unstable cells again for 100 s, which confirms or refutes the
+        study: Part of the suite: full, small or round-trips.
+        tasks: Names of the selected tasks. Empty selects all tasks of the study.
+        laws: Names of the selected laws. Empty selects all laws of the study.
+        links: Names of the selected links, as in "rtt68-loss10" or "4g". Empty selects all
+            links of the study.
+        seeds: Number of seeds. By default that of the study.
+        confirm: True to run unstable cells again for 100 s, which refutes or confirms the
             verdict.
         out: Folder of the results. A suite in it is continued. By default runs/bench-STUDY.
-        jobs: Number of processes. None for one per core.
-        on: Address of a Dask scheduler, or an executor, that runs the suite instead of
-            processes.
+        jobs: Number of processes. None uses one per core.
+        on: Address of a Dask scheduler, or an executor, that executes the runs instead.
 
     Raises:
         UsageError: There is no such study, task, law or link, or the folder contains something
@@ -507,14 +514,16 @@ def bench(
 
 
 def view(*files: str | Path, full: bool = False, save: str | Path | None = None) -> None:
-    """Shows a log in the Rerun viewer, until it is closed. The command is `trilat log view`.
+    """Opens a log in the viewer Rerun; the command is `trilat log view`.
+
+    The function returns when the viewer is closed.
 
     >>> tn.view("run.mcap")  # doctest: +SKIP
 
     Args:
-        files: The log, or its parts.
+        files: Path of the log, or paths of its parts.
         full: True to show every record instead of the decimated channels.
-        save: Path of a file for Rerun to write instead of opening the viewer.
+        save: Path of a Rerun file to write instead of opening the viewer.
 
     Raises:
         UsageError: Rerun is not installed, or there is no display.
