@@ -1,13 +1,13 @@
-"""Defines the `trilat` command: registers all commands and maps errors to exit codes.
+"""The `trilat` command: registers all commands, and maps errors to exit codes.
 
-Each command is a function `..._command` in a module of this folder, with the decorator
-`options.command`. Its docstring is its help.
+The commands are functions in the files of this folder. The function `log_info_command` is the
+command `trilat log info`. Its docstring is the help of the command.
 
 Invariant:
-    - A command parses its options, calls one function of the library and prints the result.
+    - A command parses its options, calls one function of the library, and prints the result.
     - The exit code is 0 on success, 1 for a failed run or comparison, 2 for bad input, 4 if a
-      control law of a log may not run, 5 if a disk is full, and 128 + n if signal n ended the
-      command.
+      user's law that a log names may not run, 5 if a disk is full, and 128 + n if signal n
+      ended the command.
     - An error is printed as one sentence.
 """
 
@@ -32,19 +32,21 @@ from .options import flag
 
 
 class _Commands(TyperGroup):
-    """The group of all commands, which Ctrl-C ends with exit code 130.
+    """The group of all commands. Ctrl-C ends any of them with exit code 130.
 
-    The framework Typer alone would exit with 1. KeyboardInterrupt is lost if Python raises it
-    inside a `__del__`. Therefore `Interrupt` remembers the signal.
+    The framework (Typer) alone would exit with code 1. If Ctrl-C arrives while Python runs a
+    `__del__`, the KeyboardInterrupt is lost. The class `Interrupt` therefore records the
+    signal.
     """
 
     def list_commands(self, ctx: Any) -> list[str]:
         """Returns the names of all commands in the order of the help."""
-        rank = {name: n for n, name in enumerate(_FIRST_COMMANDS)}
-        return sorted(super().list_commands(ctx), key=lambda name: rank.get(name, len(rank)))
+        positions = {name: n for n, name in enumerate(_FIRST_COMMANDS)}
+        end = len(positions)
+        return sorted(super().list_commands(ctx), key=lambda name: positions.get(name, end))
 
     def invoke(self, ctx: Any) -> Any:
-        """Runs a command. Ctrl-C ends it with the exit code of the signal."""
+        """Runs a command; Ctrl-C ends it with the exit code of the signal."""
         with Interrupt() as interrupt:
             try:
                 with interrupt.raising():
@@ -67,7 +69,7 @@ app = typer.Typer(
 
 
 def _print_version(is_requested: bool) -> None:
-    """Prints the version and exits, if it is requested."""
+    """Prints the version and exits, if the option --version is used."""
     if is_requested:
         print_line(f"trilat-net {find_version()}")
         raise typer.Exit
@@ -82,7 +84,7 @@ def _main(
         ),
     ] = False,
 ) -> None:
-    """Declares the options of `trilat` itself."""
+    """Declares the options of `trilat` itself, which have their own functions."""
 
 
 _FIRST_COMMANDS = (
@@ -90,7 +92,7 @@ _FIRST_COMMANDS = (
     "doctor", "router", "ros2", "sim", "verify", "certify", "twin", "metrics", "compare",
     "figure", "report", "replay", "rerun", "log", "test", "sweep", "bench", "linear", "tune",
 )  # fmt: skip
-"""First commands of the help, in their order. The others follow."""
+"""The commands that the help lists first, in this order. The others follow."""
 _GROUPS: dict[str, dict[str, Any]] = {
     "log": {"help": "Inspects, checks, signs, recovers, exports or views a log."},
     "scenario": {"help": "Lists, shows, checks and creates scenarios."},
@@ -108,18 +110,18 @@ _GROUP_OPTIONS = {"set": "--session paper "}
 
 
 def _add_command(group: typer.Typer, command_line: str, run: Any) -> None:
-    """Adds a command to a group.
+    """Adds a command to a group of commands.
 
     Args:
         group: The group.
-        command_line: The command as in its examples, such as "log info".
-        run: Function of the command, see `options.command`.
+        command_line: Name of the command with that of its group, as in "log info".
+        run: Function of the command, which `options.command` has declared.
     """
     examples = [
         f"Example: trilat {command_line} {example}".rstrip() for example in run.examples
     ]
     text = run.__doc__ or "(Its help is left out by python -OO: start it as python -O.)"
-    # Each paragraph is joined into one line, because the help keeps line breaks.
+    # One line per paragraph, because the help keeps line breaks.
     paragraphs = inspect.cleandoc(text).split("\n\n")
     text = "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)
     name = command_line.split()[-1]
@@ -128,9 +130,11 @@ def _add_command(group: typer.Typer, command_line: str, run: Any) -> None:
 
 
 def _add_commands() -> None:
-    """Adds the commands that the modules of this folder define.
+    """Adds the commands of all files in this folder to their groups.
 
-    For example, the function `log_info_command` becomes the command `trilat log info`.
+    A function is a command if `options.command` has declared it. If the first word of its name
+    is that of a group, the command belongs to that group: `log_info_command` is `trilat log
+    info`.
     """
     groups = {
         name: typer.Typer(no_args_is_help=True, **settings)
@@ -164,22 +168,25 @@ _MEMORY_ERRORS = (
     "start new thread",
     "allocate memory",
 )
-"""Texts in errors of Python, Numba and threads that could not allocate memory."""
+"""Parts of the messages of Python, Numba and threads that could not allocate memory."""
 
 
 def _run() -> None:
-    """Runs `trilat`. The error for a library that `trilat-net-core` lacks names the remedy."""
+    """Runs `trilat`.
+
+    If a library is missing that `trilat-net-core` does without, the error names the remedy.
+    """
     try:
         app()
     except ModuleNotFoundError as error:
         library = (error.name or "").partition(".")[0]
         if library in STUDY_LIBRARIES:
-            require_libraries(library)
+            require_libraries(library)  # raises the error that names the remedy
         raise
 
 
 def main() -> None:
-    """Runs `trilat`. Errors become one sentence and an exit code."""
+    """Runs `trilat`. An error becomes one sentence and an exit code."""
     TrilatError.in_command = True
     try:
         _run()
@@ -192,31 +199,40 @@ def main() -> None:
         sys.exit(_report_system_error(error))
     finally:
         TrilatError.in_command = False
-        gc.freeze()  # so that Python does not traverse every record at exit
+        gc.freeze()  # keeps Python from traversing all objects at exit
 
 
 def _report_system_error(error: Exception) -> int:
     """Prints an error of the operating system.
 
+    Args:
+        error: The error that ended the command.
+
     Returns:
-        The exit code.
+        The exit code. It is 0 if the program that reads the output has ended, as in
+        `trilat ... | head`.
 
     Raises:
-        Exception: The error itself, if it is a bug of the program.
+        Exception: The error itself, if it is a bug of this program.
     """
     lacks_memory = any(text in str(error) for text in _MEMORY_ERRORS)
     if isinstance(error, MemoryError) or lacks_memory:
-        # The text is written directly, because the usual functions need more memory.
+        # Written directly, because the layout of the text by `print_error` needs memory, too.
         sys.stderr.write(f"error: {_TOO_LITTLE_MEMORY}\n")
         return 1
-    # An OSError is a full disk or a folder that has vanished. Other errors are bugs.
     if not isinstance(error, OSError):
+        # A bug. An OSError is, for example, a full disk or a folder that was deleted.
         raise error
-    # Windows reports a refused name and a closed pipe by the same error.
+
+    # Windows reports an invalid file name and a closed pipe by the same error number. Only the
+    # former comes with a file name.
     is_invalid = os.name == "nt" and error.errno == errno.EINVAL
-    if isinstance(error, BrokenPipeError) or (is_invalid and not error.filename):
+    is_closed_pipe = isinstance(error, BrokenPipeError) or (is_invalid and not error.filename)
+    if is_closed_pipe:
+        # Python flushes its output at exit, which must not fail again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+
     prefix = f"{error.filename}: " if error.filename else ""
     print_error(f"{prefix}{error.strerror or error}")
     if error.errno in DISK_ERRNOS:

@@ -1,4 +1,4 @@
-"""Defines the commands for the inputs of a run: scenarios, code, measured delays, keys."""
+"""Commands for the inputs of a run: scenarios, user-written code, measured delays, and keys."""
 
 import sys
 from pathlib import Path
@@ -21,7 +21,7 @@ def scenario_list_command(as_json: options.JsonOption = False) -> None:
 
     scenarios = {name: load_scenario(name) for name in list_shipped()}
     if as_json:
-        facts = [
+        entries = [
             {
                 "name": name,
                 "sites": scenario.names,
@@ -30,7 +30,8 @@ def scenario_list_command(as_json: options.JsonOption = False) -> None:
             }
             for name, scenario in scenarios.items()
         ]
-        return terminal.print_json(facts)
+        return terminal.print_json(entries)
+
     rows = [
         (name, str(len(scenario.names)), f"{scenario.duration_s:g} s", scenario.title)
         for name, scenario in scenarios.items()
@@ -88,13 +89,13 @@ def scenario_new_command(
 
 
 def _print_skeleton(kind: str, written: list[Path], key: str, check: str) -> None:
-    """Prints the files of a new law, hand or plant, and the commands that run it.
+    """Prints which files were written for a new law, hand or plant, and how to run it.
 
     Args:
         kind: "law", "hand" or "plant".
-        written: The file and its test.
-        key: Override of the scenario that uses the class, with {} for the class.
-        check: Command that examines the log of the run.
+        written: Path of the file, and path of its test.
+        key: Override that makes a scenario use the class, with {} in place of the class.
+        check: The command that examines the log of the run, as in "certify".
     """
     from ..scenario.skeletons import name_skeleton_class
 
@@ -171,7 +172,8 @@ def trace_import_command(
     """
     from ..scenario.delay_traces import import_trace
 
-    path = out if out is not None else Path(f"{file.name.split('.')[0]}-trace.csv")
+    name = file.name.split(".")[0]
+    path = out if out is not None else Path(f"{name}-trace.csv")
     refuse_existing(path, force=force)
     trace = import_trace(file, form, way=way, column=column, every_s=every_s)
     write_whole(path, trace.write_rows())
@@ -265,12 +267,13 @@ def keys_info_command(
 
     keys = read_member_keys(folder)
     if as_json:
-        facts = {
+        description = {
             "member": keys.member,
             "members": list(keys.members),
             "until": keys.ends.isoformat(),
+            "zenoh": keys.settings,
         }
-        return terminal.print_json({**facts, "zenoh": keys.settings})
+        return terminal.print_json(description)
     terminal.print_line(
         f"{keys.member} of {', '.join(keys.members)}; until {keys.ends:%Y-%m-%d %H:%M} UTC"
     )

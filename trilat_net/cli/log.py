@@ -1,7 +1,10 @@
-"""Defines `trilat log`: info, check, sign, recover, export, view.
+"""The commands `trilat log info`, `check`, `sign`, `recover`, `export` and `view`.
+
+A log is the MCAP file of a run.
 
 Invariant:
-    - No command of this file executes a log, so that they are safe for logs of others.
+    - No command of this file executes the run of a log, or code that the log names. They are
+      therefore safe for logs of unknown origin.
 """
 
 from contextlib import nullcontext
@@ -16,6 +19,7 @@ from ..reporting.exports import list_export_formats
 from . import options
 
 _LOSSY_EXIT_CODE = 3
+"""Exit code of `trilat log recover` if a part of the log was lost."""
 
 
 @options.command("run.mcap")
@@ -141,13 +145,16 @@ def log_export_command(
     format_settings = {key: value for key, _, value in pairs}
     if actions:
         format_settings["actions"] = actions
+    # Refuses wrong settings and an existing output before the log is read.
     exporter = Exporter(form, output, force=force, log=files[0], settings=format_settings)
+
     with terminal.progress_bar(f"reading {files[0]}") as progress:
         logs = open_logs(*files, progress=progress)
     for log in logs:
         terminal.warn_of_damage(log)
     with terminal.progress_bar(f"writing {exporter.path}") as progress:
         summary = exporter.export(*logs, progress=progress)
+
     records = {site: sum(len(log[site]) for log in logs) for site in logs[0].sites}
     if not summary:
         summary = f"{count_nouns(sum(records.values()), 'record')} of {', '.join(records)}"
@@ -185,7 +192,8 @@ def log_view_command(
     from ..files import stage_output
     from ..reporting.rerun_viewer import ViewerOptions, open_rerun
 
-    if not (full or web or save) and find_spec("rerun") is None:
+    needs_rerun = full or web or save
+    if not needs_rerun and find_spec("rerun") is None:
         return _open_page(files)
     with stage_output(save, force=force) if save is not None else nullcontext() as staged:
         open_rerun(
@@ -200,7 +208,13 @@ def log_view_command(
 
 
 def _open_page(files: list[Path]) -> None:
-    """Opens the page of a log in a browser. If it is missing, it is written first."""
+    """Opens the page of a log in a browser, in place of the viewer Rerun.
+
+    If the page is missing, it is written first, as by `trilat report`.
+
+    Args:
+        files: The log, or its parts.
+    """
     import webbrowser
     from contextlib import suppress
 

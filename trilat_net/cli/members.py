@@ -1,4 +1,9 @@
-"""Defines the commands that start a process of a session: site, recorder, replay, ROS."""
+"""Commands for the processes of a session, each of which can run on a machine of its own.
+
+A session is a live run. Its processes are the sites (one per arm, with the control loop), the
+programs that act as operators, the recorder, and optionally a router or a bridge to ROS 2. A
+replay publishes a log as if it were a running session.
+"""
 
 import math
 import os
@@ -75,13 +80,16 @@ def site_command(
 
     chosen = options.load_chosen_scenario(scenario, overrides, duration, seed)
     find_site(chosen, name)
-    identity = options.check_session_name(session or chosen.name)
-    endpoints = default_endpoints(identity, chosen.names, encrypted=ways.keys is not None)
+    session_name = options.check_session_name(session or chosen.name)
+
+    # By default each site connects to those before it, so that each pair has one connection.
+    endpoints = default_endpoints(session_name, chosen.names, encrypted=ways.keys is not None)
     earlier_sites = chosen.names[: chosen.names.index(name)]
     earlier_endpoints = [endpoints[site] for site in earlier_sites]
     connection = ways.resolve([endpoints[name]], earlier_endpoints).require(name)
+
     site_options = SiteOptions(
-        session=identity,
+        session=session_name,
         connection=connection,
         join_timeout_s=join_timeout,
         needs_recorder=needs_recorder,
@@ -149,8 +157,8 @@ def hand_command(
     from ..scenario import find_site
 
     chosen = options.load_chosen_scenario(scenario, overrides, duration, seed)
-    identity = options.check_session_name(session or chosen.name)
-    endpoints = default_endpoints(identity, chosen.names, encrypted=reach.keys is not None)
+    session_name = options.check_session_name(session or chosen.name)
+    endpoints = default_endpoints(session_name, chosen.names, encrypted=reach.keys is not None)
     find_site(chosen, name)
     member = options.MemberOptions(None, *reach)
     connection = member.resolve((), [endpoints[name]]).require(OPERATOR)
@@ -158,7 +166,7 @@ def hand_command(
         run_hand(
             scenario=chosen,
             name=name,
-            session=identity,
+            session=session_name,
             connection=connection,
             interrupt=interrupt,
             say=terminal.print_line,
@@ -172,13 +180,15 @@ def hand_command(
 def _lead_by_device(
     device: str, name: str, session: str | None, reach: options.Reach, timeout_s: float
 ) -> None:
-    """Leads an arm of a running session with a device, until the session ends or Ctrl-C.
+    """Lets the user lead an arm of a running session with an input device.
+
+    The function returns when the session ends, or at Ctrl-C.
 
     Args:
-        device: Name of the device, and its address if needed.
-        name: Name of the site of the arm.
+        device: Name of the device, and its address if needed, as in NAME=ADDRESS.
+        name: Name of the site whose arm is led.
         session: Name of the session.
-        reach: Options with which the command reaches the session.
+        reach: The options by which the command reaches the session.
         timeout_s: Longest wait for the site, in s.
     """
     from sites.devices import open_device
@@ -199,15 +209,19 @@ def _lead_by_device(
 
 
 def _check_without(scenario: "Scenario", name: str, without: list[str]) -> tuple[str, ...]:
-    """Checks and returns the sites without which a session may begin.
+    """Checks the sites without which a session may begin.
 
     Args:
-        scenario: Scenario of the session.
-        name: Name of the site of this process.
-        without: Names of the sites that may join later.
+        scenario: The scenario of the session.
+        name: Name of this site.
+        without: Names of the sites that may join later, from --without.
+
+    Returns:
+        The names in `without`.
 
     Raises:
-        UsageError: This site is not the first one, or sites cannot join later.
+        UsageError: This site is not the first one, or the scenario does not let sites join
+            later.
     """
     from ..scenario import find_site
 
@@ -283,7 +297,8 @@ def record_command(
         choice=parse_channel_filter(include or [], exclude or []),
         views_hz=parse_viz_rate(views),
     )
-    # refuses an existing file before the recorder waits for the session
+
+    # Problems of the output are reported now, before the recorder waits for the session.
     storage.find_first_part()
     if not os.access(path.parent, os.W_OK):
         raise UsageError(f"{path}: cannot be written: {path.parent} is not a writable folder")
@@ -293,11 +308,13 @@ def record_command(
     clock = make_system_clock(clock_offset, clock_drift)
 
     def warn_of_load() -> None:
+        """Warns if other programs keep the processors of this machine busy."""
         warning = describe_load(measure_busy_share(clock))
         if warning:
             terminal.print_note(warning)
 
     def conclude() -> None:
+        """Verifies the finished log and writes its report, if --conclude requests it."""
         if concluded:
             _conclude(list(find_parts(path).values()), png=png)
 
@@ -314,19 +331,20 @@ def record_command(
         )
     finally:
         if concluded and output is None:
-            # removes the folder if nothing was written into it
+            # Removes the new folder if nothing was written into it; otherwise this fails.
             with suppress(OSError):
                 path.parent.rmdir()
     raise typer.Exit(code)
 
 
 def _choose_path(output: Path | None, session: str, *, concluded: bool) -> Path:
-    """Returns the path of the log of a session. The folder of a report is created.
+    """Chooses the path of the log of a session, and makes the folder of its report.
 
     Args:
-        output: Path of the log. None for a default.
+        output: Path from --out. None uses SESSION.mcap, or run.mcap in a new folder if there
+            will be a report.
         session: Name of the session.
-        concluded: True if a report is written after the session.
+        concluded: True if a report is written into the folder of the log.
     """
     from ..files import make_folder, make_results_folder, require_libraries
 
@@ -340,15 +358,21 @@ def _choose_path(output: Path | None, session: str, *, concluded: bool) -> Path:
 
 
 def _conclude(parts: list[Path], *, png: bool) -> None:
-    """Checks a log and writes its report.
+    """Verifies a finished log, and writes its report into the folder of the log.
+
+    Args:
+        parts: Paths of all parts of the log.
+        png: True to write every figure as a PNG file too.
 
     Raises:
-        CodeWithheld: Code from outside was not executed, so that not all was judged.
-        RunFailed: The log failed a check, or the session ended by a failure.
+        CodeWithheld: The log names a user's code, which was not executed, so that the log could
+            not be verified completely.
+        RunFailed: The log failed a check, or the session ended with a failure.
     """
     log, conclusion = terminal.conclude_files(parts, parts[0].parent, png=png)
     if conclusion.exit_code == CodeWithheld.exit_code:
         raise CodeWithheld(f"{parts[0]}: not all was judged: it needs trilat verify --law FILE")
+
     if not conclusion.passed:
         raise RunFailed(f"{parts[0]}: failed a check")
     for event in log.events:
@@ -420,8 +444,10 @@ def replay_command(
         time=time,
     )
     speed = parse_rate(rate)
+    preload_bytes = preload << 20
     with terminal.progress_bar(f"reading {files[0]}") as progress:
-        header, block = preload_messages(files, selection, preload << 20, progress)
+        header, block = preload_messages(files, selection, preload_bytes, progress)
+
     prefixed_name = f"{prefix}-{header.session}" if prefix else header.session
     name = options.check_session_name(session or prefixed_name)
     ways = options.MemberOptions(
@@ -433,14 +459,17 @@ def replay_command(
         insecure=insecure,
     )
     connection = ways.resolve([default_endpoint(name, 0)], [])
+
     play_options = PlayOptions(
         session=name, rate=speed, loop=loop, low_cpu=low_cpu, needs_recorder=needs_recorder
     )
+    # With --json, the standard output contains nothing but the JSON.
     console = terminal.err if as_json else terminal.out
     print_line = partial(console.print, markup=False, soft_wrap=True)
     _announce_playback(header, name, speed, print_line)
-    reported = set(header.torn)  # a copy: more torn files may be met during the replay
+    reported = set(header.torn)  # a copy, because the replay may find more torn files
     _warn_torn(header.torn)
+
     clock = SystemClock()
     with Interrupt() as interrupt:
         outcome = play_log(
@@ -454,6 +483,7 @@ def replay_command(
             say=print_line,
             show=_make_progress_line(clock),
         )
+
     if outcome is None:
         raise typer.Exit(interrupt.exit_code)
     if as_json:
@@ -471,7 +501,14 @@ def replay_command(
 def _announce_playback(
     header: "SessionHeader", name: str, rate: float, print_line: Callable[[str], None]
 ) -> None:
-    """Prints the session that a replay opens, its speed, and the version of its messages."""
+    """Prints which session a replay opens, how fast it plays, and if its messages are of today.
+
+    Args:
+        header: Description of the recorded session.
+        name: Name of the session that the replay opens.
+        rate: Speed relative to the recording. Infinity for as fast as possible.
+        print_line: Function that prints a line.
+    """
     from ..net.messages import VERSION
 
     speed = "as fast as possible" if math.isinf(rate) else f"at {rate:g} times its speed"
@@ -488,19 +525,28 @@ def _announce_playback(
 def _make_progress_line(clock: Clock) -> Callable[["PlayProgress"], None]:
     """Returns a function that shows the progress of a replay in one line of the terminal.
 
-    The line has the position in the log, the present speed, the number of messages and the
-    lateness. Without a terminal the function does nothing.
+    The line has the position in the recording, the present speed relative to the recording, the
+    number of messages and the largest delay. If the output is not a terminal, the function does
+    nothing.
+
+    Args:
+        clock: Clock of this process, from which the speed is computed.
     """
-    previous: list[tuple[int, int]] = []
+    if not terminal.err.is_interactive:
+        return lambda _: None
+    last_now_ns: int | None = None
+    last_position_ns = 0
 
     def show(progress: "PlayProgress") -> None:
+        """Overwrites the line of the terminal with the present progress."""
+        nonlocal last_now_ns, last_position_ns
         now_ns = clock.monotonic_ns()
         position_ns = progress.position_ns
-        last_now_ns, last_position_ns = previous.pop() if previous else (now_ns, position_ns)
-        previous.append((now_ns, position_ns))
         rate = 0.0
-        if now_ns > last_now_ns:
+        if last_now_ns is not None and now_ns > last_now_ns:
             rate = (position_ns - last_position_ns) / (now_ns - last_now_ns)
+        last_now_ns = now_ns
+        last_position_ns = position_ns
         text = (
             f"{position_ns / 1e9:8.1f} s   x{rate:.2f}   "
             f"{count_nouns(progress.published, 'message')}   "
@@ -509,11 +555,17 @@ def _make_progress_line(clock: Clock) -> Callable[["PlayProgress"], None]:
         terminal.err.file.write(f"\r{text:<72}")
         terminal.err.file.flush()
 
-    return show if terminal.err.is_interactive else lambda _: None
+    return show
 
 
 def _describe_playback(outcome: "PlaybackSummary", rate: float) -> dict[str, Any]:
-    """Returns the result of a replay as plain values, for JSON."""
+    """Returns the outcome of a replay as plain values, with the keys of `trilat replay --json`.
+
+    Args:
+        outcome: The outcome.
+        rate: Speed relative to the recording. Infinity, which becomes None, for as fast as
+            possible.
+    """
     lateness = outcome.lateness
     late_us = None
     if lateness is not None:
@@ -536,11 +588,16 @@ def _describe_playback(outcome: "PlaybackSummary", rate: float) -> dict[str, Any
 
 
 def _show_playback(outcome: "PlaybackSummary") -> None:
-    """Prints the messages of each channel, the duration and the lateness of a replay."""
+    """Prints the outcome of a replay.
+
+    It has the number of messages of each channel, the duration, the delay of the messages
+    behind their schedule, and whether a recorder received all of them.
+    """
     if terminal.err.is_interactive:
-        terminal.err.file.write("\r" + " " * 72 + "\r")
+        terminal.err.file.write("\r" + " " * 72 + "\r")  # erases the line of the progress
     rows = [(topic, str(count)) for topic, count in sorted(outcome.counts.items())]
     terminal.print_table(TextTable(("channel", "messages"), rows, align="lr"))
+
     messages = count_nouns(sum(outcome.counts.values()), "message")
     text = f"{messages} in {outcome.took_s:.2f} s"
     if outcome.rounds > 1:
@@ -553,6 +610,7 @@ def _show_playback(outcome: "PlaybackSummary") -> None:
     if not outcome.cut:
         text += "; none dropped"
     terminal.print_text(text)
+
     if outcome.recorders:
         stored = "has not confirmed that it has everything"
         if outcome.stored:
@@ -565,7 +623,11 @@ def _show_playback(outcome: "PlaybackSummary") -> None:
 
 
 def _warn_torn(torn: dict[Path, str]) -> None:
-    """Prints which files of a log were not finished, and how to recover them."""
+    """Warns of files of a log that were not finished, for example because of a power failure.
+
+    Args:
+        torn: For each file the problem.
+    """
     for path, text in torn.items():
         terminal.print_note(
             f"{path}: {text}; the intact part is played; "
@@ -574,11 +636,13 @@ def _warn_torn(torn: dict[Path, str]) -> None:
 
 
 def _warn_about_playback(outcome: "PlaybackSummary", reported: set[Path]) -> None:
-    """Prints warnings of torn files, of subscribers that were cut off, and of late messages.
+    """Warns of everything in a replay that was not as recorded.
+
+    This may be torn files, subscribers that were cut off, or messages that were played late.
 
     Args:
-        outcome: Result of the replay.
-        reported: Torn files about which the user was warned already.
+        outcome: Outcome of the replay.
+        reported: Torn files of which the user has been warned already.
     """
     _warn_torn({path: text for path, text in outcome.torn.items() if path not in reported})
     if outcome.cut:
@@ -596,7 +660,9 @@ def _warn_about_playback(outcome: "PlaybackSummary", reported: set[Path]) -> Non
 
 
 LOOPBACK = "tcp/127.0.0.1:7447"
+"""Default endpoint of a router without keys, which other machines cannot reach."""
 ANY_ADDRESS = "tls/0.0.0.0:7447"
+"""Default endpoint of a router with keys, whose connections are encrypted."""
 
 
 @options.command("--keys keys/router")
@@ -653,6 +719,7 @@ def router_command(
     expiry = connection.describe_end()
     if expiry:
         terminal.print_note(expiry)
+
     clock = SystemClock()
     with Interrupt() as interrupt:
         bus = open_bus(
@@ -678,7 +745,7 @@ def router_command(
 
 
 def _print_router_line(text: str) -> None:
-    """Prints a line of the router."""
+    """Prints a line that starts with "router:"."""
     terminal.print_line(f"router: {text}")
 
 
@@ -720,10 +787,12 @@ def ros2_command(
         raise UsageError(f"--ros-distro is one of {', '.join(DISTROS)}, not {distro!r}")
     name = check_ros_name(options.check_session_name(session), "session")
     table = read_topic_table(names)
-    check_hosts(ros or ())  # before the search for the session: the bridge waits for its router
+    # Checked now, because the bridge would wait for a router at a wrong address forever.
+    check_hosts(ros or ())
     running = RunningSession(name, reach.resolve(operates=False).require(BRIDGE))
 
     def open_graph(refusals: Refusals) -> Ros2Graph:
+        """Joins the network of ROS as a node with the name of the session."""
         return Ros2Graph(
             refusals=refusals,
             routers=ros or [options.ROS_ROUTER],

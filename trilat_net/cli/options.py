@@ -1,8 +1,8 @@
-"""Defines the options that several commands share, and opens what they name.
+"""Options that several commands share, and the objects that they describe.
 
-Options that belong together, such as those that reach a session over the network, form a tuple
-(`MemberOptions`, `Reach`, ...). A command declares one parameter of this type, which
-`expand_option_tuples` replaces by the single options.
+The objects are scenarios, network connections and logs. Options that belong together are fields
+of a tuple, for instance `Reach`. A command with a parameter of that type has all of its options
+(`expand_option_tuples`), and the tuple has methods that make the object.
 """
 
 import inspect
@@ -30,16 +30,19 @@ Runs = TypeVar("Runs", bound=Callable[..., None])
 def check_range(
     low: float, high: float, noun: str
 ) -> Callable[[typer.CallbackParam, float | None], Any]:
-    """Returns a callback of an option that refuses a number outside of a range.
+    """Returns a function that refuses the number of an option if it is out of a range.
 
     Args:
         low: The smallest number.
         high: The largest number.
-        noun: What the number is, for the error message, as in "a share".
+        noun: Name of the number in the error message, as in "a share".
+
+    Returns:
+        A callback for `typer.Option`, which returns the number.
     """
 
     def check(param: typer.CallbackParam, value: float | None) -> float | None:
-        """Returns the value of the option if it is in the range."""
+        """Returns the number of the option. Raises UsageError if it is out of range."""
         if value is not None and not low <= value <= high:
             raise UsageError(
                 f"{param.opts[0]} is {noun} from {low:.7g} to {high:.7g}, not {value:g}"
@@ -50,7 +53,7 @@ def check_range(
 
 
 def value(names: str, metavar: str, text: str = "", **settings: Any) -> Any:
-    """Returns an option that takes a value.
+    """Declares an option that takes a value.
 
     Args:
         names: Names of the option, separated by spaces, as in "-o --out".
@@ -62,10 +65,10 @@ def value(names: str, metavar: str, text: str = "", **settings: Any) -> Any:
 
 
 def flag(names: str, text: str = "", **settings: Any) -> Any:
-    """Returns an option without a value.
+    """Declares an option without a value.
 
     Args:
-        names: Names of the option.
+        names: Names of the option, as in "--json" or "--ports/--no-ports".
         text: Help of the option.
         settings: Further arguments of `typer.Option`.
     """
@@ -73,7 +76,7 @@ def flag(names: str, text: str = "", **settings: Any) -> Any:
 
 
 def seconds(name: str, text: str = "") -> Any:
-    """Returns an option that takes a waiting time in s.
+    """Declares an option that takes a waiting time of up to a day, in s.
 
     Args:
         name: Name of the option.
@@ -87,30 +90,39 @@ _OPTION_ENTRY = re.compile(r"^    (\w+): (.+(?:\n {8}.+)*)", re.MULTILINE)
 
 
 def command(*examples: str) -> Callable[[Runs], Runs]:
-    """Returns a decorator that declares a command of the program.
+    """Returns a decorator that declares a function as a command of the program.
 
-    The help of an option that does not fit into its line is in the section `Options` of the
-    function's docstring.
+    The docstring of the function is the help of the command. The help of options that is too
+    long for their declaration is in the section `Options` of the docstring, with an entry for
+    each parameter.
 
     Args:
-        examples: Arguments of the examples in the help.
+        examples: Arguments of the examples that the help shows.
     """
 
     def declare(run: Runs) -> Runs:
-        """Stores the examples, and moves the help of options from docstring to options."""
+        """Stores the examples, and moves the help of options to their declarations."""
         run.examples = examples  # type: ignore[attr-defined]
         docstring = inspect.getdoc(run) or ""
-        head, _, option_entries = docstring.partition("\n\nOptions:\n")
-        run.__doc__ = head or None
-        for name, text in _OPTION_ENTRY.findall(option_entries):
-            run.__annotations__[name].__metadata__[0].help = " ".join(text.split())
+        command_help, _, option_entries = docstring.partition("\n\nOptions:\n")
+        run.__doc__ = command_help or None
+        for parameter, text in _OPTION_ENTRY.findall(option_entries):
+            option = run.__annotations__[parameter].__metadata__[0]
+            option.help = " ".join(text.split())
         return run
 
     return declare
 
 
 def complete_scenarios(incomplete: str) -> list[str]:
-    """Lists the scenarios that may complete an argument: shipped ones and files."""
+    """Lists the scenarios with which a shell may complete a word.
+
+    They are the shipped scenarios, and the TOML files of a folder.
+
+    Args:
+        incomplete: The word so far. If it has a slash, files of its folder are listed,
+            otherwise files of the current folder.
+    """
     shipped = (entry.name.removesuffix(".toml") for entry in _SCENARIOS.iterdir())
     names = [name for name in shipped if "." not in name and not name.startswith("_")]
     folder = Path(incomplete).parent if "/" in incomplete else Path()
@@ -119,22 +131,27 @@ def complete_scenarios(incomplete: str) -> list[str]:
 
 
 def complete_figures(incomplete: str) -> list[str]:
-    """Lists the figures with which a shell may complete an argument."""
+    """Lists the figures with which a shell may complete a word."""
     from ..reporting.figures.registry import FIGURES
 
     return [name for name in FIGURES if name.startswith(incomplete)]
 
 
 def complete_sites(context: typer.Context, incomplete: str) -> list[str]:
-    """Lists the sites with which a shell may complete an argument.
+    """Lists the sites with which a shell may complete a word.
 
-    They are the sites of the scenario or log that the command line names.
+    Args:
+        context: The command line, whose scenario or log has the sites.
+        incomplete: The word so far.
+
+    Returns:
+        The names. Empty if the command line has no valid scenario or log yet.
     """
     from ..log.log_reader import open_log
     from ..scenario import load_scenario
 
     files = context.params.get("files") or []
-    # The arguments before an option without a value are not parsed yet.
+    # Arguments in front of an option without a value are not parsed yet.
     if "files" in context.params and not files:
         files = [Path(argument) for argument in context.args]
     try:
@@ -195,17 +212,19 @@ InsecureOption = Annotated[
 
 
 MOST_LETTERS = 80
-"""Largest length of a session's name. That of a scenario's name is 64."""
+"""Largest length of a session's name. The name of a scenario has at most 64 letters."""
 
 
 def check_session_name(name: str) -> str:
-    """Returns a session's name, or refuses it if it cannot be part of a Zenoh key.
+    """Checks that the name of a session can be part of a Zenoh key, and returns the name.
+
+    Zenoh is the network protocol, and its keys are the names of the channels.
 
     Raises:
         UsageError: The name is too long or has other characters.
     """
     if len(name) > MOST_LETTERS or not re.fullmatch("[A-Za-z0-9_.-]+", name):
-        # Letters of other alphabets may look the same.
+        # Letters of other alphabets may look like those of ASCII.
         letters = "" if name.isascii() else "; its letters are a to z and A to Z"
         raise UsageError(
             f"a session's name is at most {MOST_LETTERS} letters, digits, _, - and ., "
@@ -273,7 +292,7 @@ MinCoverageOption = Annotated[
     ),
 ]
 MIN_COVERAGE = 0.999
-"""The same as in `log.accounting`, whose import takes long."""
+"""The same number as in `log.accounting`, whose import takes long."""
 OnOption = Annotated[
     str | None,
     value(
@@ -287,14 +306,14 @@ JsonOption = Annotated[bool, flag("--json", "Print everything as JSON.")]
 
 
 def check_picture(path: Path | None, *, force: bool) -> None:
-    """Checks that a figure can be written to a path, before the command computes it.
+    """Refuses the path of a figure that cannot be written.
 
     Args:
-        path: Path of the figure. None if no figure is requested.
-        force: True if an existing file may be replaced.
+        path: Path of the figure. None if no figure was requested.
+        force: True to replace an existing file.
 
     Raises:
-        UsageError: The suffix is not that of a figure, the file exists, or its folder does not.
+        UsageError: The format is unknown, the file exists, or its folder does not.
     """
     if path is None:
         return
@@ -317,7 +336,7 @@ def print_and_draw(
         result: The result.
         picture: Path of the figure. None for no figure.
         figure: Module and function that draw the figure, as in "twin_differences:draw_twins".
-        drawn: Argument of this function.
+        drawn: Argument of that function.
         as_json: True to print the result as JSON.
     """
     if picture is not None:
@@ -335,7 +354,14 @@ def print_and_draw(
 def load_chosen_scenario(
     source: str, overrides: list[str] | None, duration: float | None, seed: int | None
 ) -> "Scenario":
-    """Returns the scenario that the options of a command describe."""
+    """Returns the scenario that the options of a command describe.
+
+    Args:
+        source: Name of a shipped scenario, or path of a TOML file.
+        overrides: Overrides from --set.
+        duration: Duration in s from --duration. None keeps that of the scenario.
+        seed: Seed from --seed. None keeps that of the scenario.
+    """
     from ..scenario import load_scenario
 
     return load_scenario(source, overrides or [], duration_s=duration, seed=seed)
@@ -350,14 +376,15 @@ def list_overrides(overrides: list[str] | None, duration: float | None) -> list[
 
 
 def split_names(text: str | None) -> list[str]:
-    """Returns the names in a text such as adaptive,p_d. Empty for None."""
+    """Splits a text of names such as "adaptive,p_d". None gives an empty list."""
     return [] if text is None else [name.strip() for name in text.split(",")]
 
 
 def list_used_options(context: typer.Context) -> list[str]:
-    """Lists the options and arguments on the command line, in the order of declaration.
+    """Lists the options and arguments that the user wrote on the command line.
 
-    An option appears under its first name.
+    Returns:
+        The first name of each, in the order of declaration.
     """
     used = []
     for param in context.command.params:
@@ -368,7 +395,11 @@ def list_used_options(context: typer.Context) -> list[str]:
 
 
 class MemberOptions(NamedTuple):
-    """Options of a process that takes part in a session."""
+    """The options by which a process takes part in a session as one of its members.
+
+    The members of a session are its sites and recorders. A connection listens at some endpoints
+    and connects to others.
+    """
 
     listen: ListenOption = None
     connect: ConnectOption = None
@@ -380,11 +411,11 @@ class MemberOptions(NamedTuple):
     def find_endpoints(
         self, listen_else: Sequence[str] = (), connect_else: Sequence[str] | None = None
     ) -> "Connection":
-        """Returns the network addresses of the process, without its keys.
+        """Returns the connection that the options describe, without its keys.
 
         Args:
-            listen_else: Addresses at which to listen if the options name none.
-            connect_else: Addresses to which to connect if the options name none.
+            listen_else: Endpoints at which to listen if the options name none.
+            connect_else: Endpoints to which to connect if the options name none.
         """
         from ..net.connection import resolve_member_connection
         from ..net.zenoh_bus import read_zenoh_file
@@ -406,12 +437,15 @@ class MemberOptions(NamedTuple):
         *,
         stops: bool = False,
     ) -> "Connection":
-        """Returns the network addresses of the process with its keys.
+        """Returns the connection that the options describe, secured by the keys of the process.
+
+        Prints a note if the keys expire soon.
 
         Args:
-            listen_else: Addresses at which to listen if the options name none.
-            connect_else: Addresses to which to connect if the options name none.
-            stops: True if the connection only stops arms. Then expired keys are accepted.
+            listen_else: Endpoints at which to listen if the options name none.
+            connect_else: Endpoints to which to connect if the options name none.
+            stops: True if the connection only serves to stop arms. Expired keys are then
+                accepted, and no note is printed.
         """
         from ..net.connection import secure_connection
 
@@ -423,14 +457,14 @@ class MemberOptions(NamedTuple):
             keys = read_member_keys(keys, stops=True)
         secured = secure_connection(connection, keys, insecure=self.insecure)
         expiry = secured.describe_end()
-        # Somebody who stops an arm has no time to read notes.
+        # A user who stops an arm in a hurry does not read notes.
         if expiry and not stops:
             terminal.print_note(expiry)
         return secured
 
 
 class Reach(NamedTuple):
-    """Options of a command that reaches a session without taking part in it."""
+    """The options by which a command reaches a session without being one of its members."""
 
     connect: ConnectOption = None
     router: RouterOption = None
@@ -438,11 +472,12 @@ class Reach(NamedTuple):
     keys: KeysOption = None
 
     def resolve(self, *, operates: bool = True, stops: bool = False) -> "Connection":
-        """Returns the network addresses and keys.
+        """Returns the connection that the options describe.
 
         Args:
-            operates: True if the keys must be the operator's.
-            stops: True if the connection only stops arms. Then expired keys are accepted.
+            operates: True if the keys must be those of the operator.
+            stops: True if the connection only serves to stop arms, so that expired keys are
+                accepted.
         """
         from ..net.zenoh_config import OPERATOR
 
@@ -451,7 +486,11 @@ class Reach(NamedTuple):
 
 
 class LawFiles(NamedTuple):
-    """Options that allow files to run as the control laws that a log names."""
+    """The options that allow files to run as the user-written control laws that a log names.
+
+    A log may come from somebody else. Code that it names runs only with the permission of the
+    user.
+    """
 
     law: Annotated[
         list[Path] | None,
@@ -470,7 +509,7 @@ class LawFiles(NamedTuple):
     ] = False
 
     def open(self, *files: Path, runs_them: bool = True) -> "Log":
-        """Opens a log, with a warning if its code comes from outside.
+        """Opens a log, and warns of code from outside that the command will execute.
 
         Args:
             files: The log, or its parts.
@@ -485,7 +524,7 @@ class LawFiles(NamedTuple):
 
 
 class RunOptions(NamedTuple):
-    """Options of a live run on this machine, and of its results."""
+    """The options of a command that runs a session on this machine and reports on it."""
 
     duration: DurationOption = None
     folder: Annotated[
@@ -502,15 +541,15 @@ class RunOptions(NamedTuple):
 
         Args:
             source: Name of a shipped scenario, or path of a TOML file.
-            longest_s: Duration of the run if --duration is not given, in s. None for the
-                scenario's.
+            longest_s: Duration of the run without --duration, in s. None uses that of the
+                scenario.
         """
         duration_s = longest_s if self.duration is None else self.duration
         return load_chosen_scenario(source, self.overrides, duration_s, self.seed)
 
 
 class PageServing(NamedTuple):
-    """Options of a command that serves a page."""
+    """The options of a command that serves a page to browsers."""
 
     host: Annotated[
         str,
@@ -538,10 +577,14 @@ _OPTION_TUPLES = (MemberOptions, Reach, LawFiles, RunOptions, PageServing)
 
 
 def expand_option_tuples(run: Callable[..., Any]) -> Callable[..., Any]:
-    """Returns a command with one option for each field of its option tuples.
+    """Returns a command in which each option tuple is replaced by its options.
+
+    Typer makes one option of each parameter. A parameter whose type is a tuple such as `Reach`
+    becomes one parameter per field. When the command runs, the values of the fields are put
+    together again.
 
     Args:
-        run: Function of the command. Its parameters may be tuples of options such as `Reach`.
+        run: Function of the command.
     """
     declared = inspect.signature(run).parameters
     tuples = {
@@ -549,6 +592,7 @@ def expand_option_tuples(run: Callable[..., Any]) -> Callable[..., Any]:
         for name, parameter in declared.items()
         if parameter.annotation in _OPTION_TUPLES
     }
+
     parameters = []
     for name, parameter in declared.items():
         fields = [parameter]
@@ -558,12 +602,13 @@ def expand_option_tuples(run: Callable[..., Any]) -> Callable[..., Any]:
 
     @wraps(run)
     def run_with_tuples(**arguments: Any) -> Any:
-        """Runs the command, with the single options collected in tuples."""
+        """Puts the option tuples together, and runs the command."""
         for name, option_tuple in tuples.items():
             values = [arguments.pop(field) for field in option_tuple._fields]
             arguments[name] = option_tuple(*values)
         return run(**arguments)
 
+    # Typer reads the parameters from these two attributes.
     vars(run_with_tuples)["__signature__"] = inspect.Signature(parameters)
     run_with_tuples.__annotations__ = {
         parameter.name: parameter.annotation for parameter in parameters

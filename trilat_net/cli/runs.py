@@ -1,4 +1,4 @@
-"""Defines the commands that run a scenario in virtual time, or judge, draw or rerun a log."""
+"""Commands that run a scenario in virtual time, and commands that evaluate the log of a run."""
 
 from dataclasses import replace
 from enum import StrEnum
@@ -39,6 +39,7 @@ def sim_command(
     chosen = options.load_chosen_scenario(scenario, overrides, duration, seed)
     path = output if output is not None else Path(f"{chosen.name}.mcap")
     views_hz = parse_viz_rate(views)
+
     with Interrupt(compiles=True) as interrupt:
         stayed_in_limits = record_virtual(
             chosen, path, force=force, stopped=interrupt.is_requested, views_hz=views_hz
@@ -48,12 +49,14 @@ def sim_command(
             f"interrupted; {path} holds the records so far", markup=False, soft_wrap=True
         )
         raise typer.Exit(interrupt.exit_code)
+
     if as_json:
         from ..log.log_reader import open_log
 
         terminal.print_json(open_log(path).to_dict())
     else:
         terminal.print_text(f"{path}: {chosen.duration_s:g} s of {', '.join(chosen.names)}")
+
     if not stayed_in_limits:
         remedy = ""
         if any(spec.arm.urdf for spec in chosen.sites.values()):
@@ -102,7 +105,7 @@ def verify_command(
 
 
 Accepted = StrEnum("Accepted", ["BOUNDED", "OPEN"])
-"""Results that `--accept` lets pass, besides a stable run."""
+"""Results besides a stable run for which `--accept` gives the exit code 0."""
 
 
 @options.command("run.mcap")
@@ -262,13 +265,14 @@ def figure_command(
 
     out = folder
     if out is None:
-        # the sender of the log may have planted a link at the default path
+        # The sender of the log may have placed a symbolic link at the default path.
         out = file.with_name(f"{file.stem}-figures")
         refuse_link(out)
-    kinds = [kind.strip().lower() for kind in formats.split(",") if kind.strip()]
-    if not kinds:
+    format_names = [name.strip().lower() for name in formats.split(",") if name.strip()]
+    if not format_names:
         raise UsageError("--format names no format, as in --format pdf,png")
-    settings: dict[str, Any] = {"width_in": width_in, "formats": kinds, "force": force}
+
+    settings: dict[str, Any] = {"width_in": width_in, "formats": format_names, "force": force}
     if others:
         if names:
             raise UsageError(
@@ -277,11 +281,13 @@ def figure_command(
         logs = {file.stem: log}
         logs |= {path.stem: terminal.open_with_progress(path) for path in others}
         if len(logs) <= len(others):
+            # Logs of the same file name share a key, so there are too few entries.
             raise UsageError("logs that are drawn over one another need different file names")
         paths = write_overlay(logs, out, **settings)
     else:
         with terminal.progress_bar("drawing") as progress:
             paths = write_figures(log, out, names or (), progress=progress, **settings)
+
     if as_json:
         terminal.print_json([path.as_posix() for path in paths])
         return
@@ -289,10 +295,16 @@ def figure_command(
 
 
 def _list_figures(log: "Log", *, as_json: bool) -> None:
-    """Prints the names of all figures, and the reasons why a log lacks some of them."""
+    """Prints all figures, and for each that the log cannot have the reason.
+
+    Args:
+        log: The log.
+        as_json: True to print the list as JSON.
+    """
     from ..reporting.figures.registry import FIGURES
 
-    reasons = {name: plate.absent(log) for name, plate in FIGURES.items()}
+    # The reason is empty if the log has what the figure needs.
+    reasons = {name: figure.absent(log) for name, figure in FIGURES.items()}
     if as_json:
         rows = [
             {"name": name, "about": FIGURES[name].about, "absent": reason or None}
@@ -300,6 +312,7 @@ def _list_figures(log: "Log", *, as_json: bool) -> None:
         ]
         terminal.print_json(rows)
         return
+
     drawable = [(name, FIGURES[name].about) for name, reason in reasons.items() if not reason]
     terminal.print_table(TextTable(("figure", "shows"), drawable))
     for name, reason in reasons.items():
@@ -326,9 +339,9 @@ def report_command(
     from ..files import make_results_folder, refuse_link
     from ..reporting.conclude import conclude
 
-    log = laws.open(*files)  # before its folder is created
+    log = laws.open(*files)  # so that no folder is created for a log that cannot be read
     if folder is None:
-        # the sender of the log may have planted a link at the default path
+        # The sender of the log may have placed a symbolic link at the default path.
         folder = files[0].with_suffix("")
         refuse_link(folder)
     results = make_results_folder(folder, "", force=force)
@@ -371,7 +384,10 @@ def rerun_command(
     from ..log.log_layout import active_path
 
     if output is not None:
-        if any(output.exists() and file.exists() and output.samefile(file) for file in files):
+        is_input = any(
+            output.exists() and file.exists() and output.samefile(file) for file in files
+        )
+        if is_input:
             raise UsageError(f"{output}: is the log itself; choose another name")
         refuse_existing(output, force=force, unfinished=active_path(output))
     log = laws.open(*files)
@@ -379,6 +395,7 @@ def rerun_command(
         result = rerun(
             log, replace or [], overrides or [], closed_loop=closed_loop, progress=progress
         )
+
     if output is not None:
         result.save(output, force=force)
     if as_json:
@@ -391,6 +408,7 @@ def rerun_command(
 
 
 LinearFigure = StrEnum("LinearFigure", ["ROOTS", "IMPEDANCE", "PASSIVITY"])
+"""Figures that `trilat linear` can draw."""
 
 
 @options.command("p_d_margin --set control.d=0.9 --over control.d=0.1:3")
@@ -448,7 +466,9 @@ def linear_command(
         ports=ports or draws_ports,
         hands=read_hands(operators or []),
     )
-    printed = analysis if ports or as_json else replace(analysis, ports=None)
+    # The ports may have been analysed only for the figure; then they are not printed.
+    prints_ports = ports or as_json
+    printed = analysis if prints_ports else replace(analysis, ports=None)
     if drawn is LinearFigure.ROOTS:
         figure = "linear_figures:draw_root_map"
         argument: Any = analysis
@@ -459,7 +479,13 @@ def linear_command(
 
 
 def _parse_pose(text: str | None) -> tuple[float, ...] | None:
-    """Returns the joint angles in a text such as "0.1,0.3". Returns None for None.
+    """Parses joint angles from a text such as "0.1,0.3".
+
+    Args:
+        text: The text. None if the user gave no pose.
+
+    Returns:
+        The angles in rad. None if there is no text.
 
     Raises:
         UsageError: A part of the text is not a number.

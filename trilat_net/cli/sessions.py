@@ -1,7 +1,7 @@
-"""Defines the commands that start, show, measure, change or stop sessions.
+"""Commands that start, show, measure, change or stop a session, or check this machine.
 
-A session is a run in which several processes ("sites") each control one robot arm, and exchange
-their states over a network. Further commands check this machine.
+A session is a live run, in which the processes of several arms exchange their states over a
+network.
 """
 
 import re
@@ -39,12 +39,21 @@ def demo_command(
 
 
 def _describe_log(path: Path) -> str:
-    """Returns the contents of an interrupted session's log. Empty if it cannot be read."""
+    """Returns what the log of an interrupted session contains, as the end of a sentence.
+
+    Args:
+        path: The log.
+
+    Returns:
+        A text that starts with a colon. Empty if the log cannot be read.
+    """
     from ..errors import LogError
     from ..log.log_reader import open_log
 
     with suppress(LogError):
-        return f": {open_log(path).headline().partition('; ')[2]}"
+        # The headline names the session first, which the user knows.
+        _, _, contents = open_log(path).headline().partition("; ")
+        return f": {contents}"
     return ""
 
 
@@ -54,12 +63,13 @@ def run_and_report(
     """Runs a scenario live, then verifies its log and writes a report.
 
     Args:
-        chosen: the scenario.
-        run: the options of the run.
-        page: page that shows the session, may end it, and links to the report; None: no page.
+        chosen: The scenario.
+        run: The options of the run.
+        page: Page in a browser that shows the session, has a button that ends it, and links to
+            the report. None for no page.
 
     Raises:
-        typer.Exit: the session was interrupted or had problems, or the log failed a check.
+        typer.Exit: The session was interrupted or had problems, or the log failed a check.
     """
     from sites.demo_session import run_demo
 
@@ -74,8 +84,11 @@ def run_and_report(
         outcome = run_demo(chosen, results, terminal.out, page.attend if page else None)
     for problem in outcome.problems:
         terminal.print_error(problem)
+
     has_log = outcome.log.exists()
-    if outcome.interrupted and not (page and has_log):
+    # With a page, an interruption is the normal end of a session, and its log is verified.
+    ends_without_report = outcome.interrupted and not (page and has_log)
+    if ends_without_report:
         contents = ""
         if has_log:
             contents = f"; {outcome.log} holds the records so far{_describe_log(outcome.log)}"
@@ -83,6 +96,7 @@ def run_and_report(
         raise typer.Exit(128 + outcome.interrupted)
     if not has_log:
         raise typer.Exit(outcome.exit_code)
+
     _, conclusion = terminal.conclude_files(
         [outcome.log], results, as_json=run.as_json, png=run.png
     )
@@ -117,6 +131,7 @@ def live_command(
     say = terminal.print_line
     page = PageOptions(*serving)
     page.check()
+
     if session is not None:
         extra = _START_OPTIONS & set(options.list_used_options(context))
         if extra:
@@ -137,6 +152,7 @@ def live_command(
                 timeout_s=10.0,
             )
         )
+
     if any(reach):
         raise UsageError("--connect, --router, --zenoh-config and --keys go with --session")
     with PageAttendant(page, clock) as attendant:
@@ -233,6 +249,7 @@ def ping_command(
         return _ping_topic(ros2, ros, domain, seconds or 5.0, as_json=as_json)
     if answer:
         return _run_far_end(answer, reach.keys, seconds, insecure=insecure)
+
     from sites.session_ping import ping_session
 
     connection = reach.resolve(operates=False)
@@ -248,8 +265,10 @@ def ping_command(
         )
         if measurement is None:
             raise typer.Exit(interrupt.exit_code)
+
     terminal.print_result(measurement, as_json=as_json)
-    if not any(member["answers"] for member in measurement.members):
+    has_reply = any(member["answers"] for member in measurement.members)
+    if not has_reply:
         raise typer.Exit(1)
     return None
 
@@ -268,7 +287,7 @@ _MODE_OPTIONS = {
     "--answer": {"--answer", "--seconds", "--keys", "--insecure"},
     "--ros2": {"--ros2", "--ros", "--domain", "--seconds", "--json"},
 }
-"""All options that each mode of `trilat ping` accepts."""
+"""For each mode of `trilat ping`, all options that it accepts."""
 _OPTIONS_WITH_MODE = {
     "--set",
     "--seconds",
@@ -278,15 +297,16 @@ _OPTIONS_WITH_MODE = {
     "--ros",
     "--domain",
 }
-"""Options of `trilat ping` that need one of its modes."""
+"""Options of `trilat ping` that are only valid together with an option that selects a mode."""
 
 
 def _refuse_options_of_other_modes(context: typer.Context, mode: str) -> None:
-    """Checks that all options belong to the chosen mode of `trilat ping`.
+    """Refuses options that do not belong to the selected mode of `trilat ping`.
 
     Args:
         context: The command line.
-        mode: Option that selects the mode. Empty if a session is measured.
+        mode: The option that selects the mode, as in "--benchmark". Empty for the normal mode,
+            which measures a session.
 
     Raises:
         UsageError: An option belongs to another mode.
@@ -314,6 +334,15 @@ def _benchmark(
 ) -> None:
     """Measures whether the network is good enough for a scenario, and prints the result.
 
+    Args:
+        scenario: Name of a shipped scenario, or path of a TOML file.
+        overrides: Overrides of the scenario.
+        seconds: Duration of all measurements together, in s. None uses the default.
+        reach: The options that name the machine at the far end.
+        picture: Path of a figure to draw. None for no figure.
+        force: True to replace an existing figure.
+        as_json: True to print the result as JSON.
+
     Raises:
         typer.Exit: The network is not good enough.
     """
@@ -336,7 +365,15 @@ def _benchmark(
 def _ping_topic(
     topic: str, routers: list[str] | None, domain: int, lasts_s: float, *, as_json: bool
 ) -> None:
-    """Measures the delay of a ROS 2 topic's messages, and prints the result."""
+    """Measures the delay of the messages of a ROS 2 topic, and prints the result.
+
+    Args:
+        topic: Name of the topic.
+        routers: Endpoints of the Zenoh router of ROS. None uses the one on this machine.
+        domain: Number of the ROS domain.
+        lasts_s: Duration of the measurement, in s.
+        as_json: True to print the result as JSON.
+    """
     from sites.session_ping import ping_topic
 
     from ..net.ros2_graph import Refusals, Ros2Graph
@@ -366,7 +403,14 @@ def _ping_topic(
 def _run_far_end(
     endpoints: list[str], keys: Path | None, seconds: float | None, *, insecure: bool
 ) -> None:
-    """Replies to benchmarks of other machines, for a time in s or until Ctrl-C."""
+    """Replies to benchmarks from other machines, for a time or until Ctrl-C.
+
+    Args:
+        endpoints: Endpoints at which to listen.
+        keys: Folder of keys. None for unencrypted connections.
+        seconds: Duration, in s. None for no limit.
+        insecure: True to allow unencrypted connections from other machines.
+    """
     from math import inf
 
     from sites.network_benchmark import run_far_end
@@ -424,12 +468,12 @@ SitesArgument = Annotated[
 
 
 def _connect(session: str, reach: options.Reach, *, stops: bool = False) -> "RunningSession":
-    """Returns the connection to a running session.
+    """Prepares the connection to a running session.
 
     Args:
         session: Name of the session.
-        reach: Options with which the command reaches the session.
-        stops: True if the command only stops arms. Then expired keys are accepted.
+        reach: The options by which the command reaches the session.
+        stops: True if the command only stops arms, so that expired keys are accepted.
     """
     from sites.running_session import RunningSession
 
@@ -483,13 +527,17 @@ def reset_command(
 
 
 _UNITS = {"us": 1e-3, "ms": 1.0, "s": 1e3}
+"""Units of time in ms."""
 
 
 def parse_milliseconds(text: str) -> float:
-    """Returns a time in ms, from a text with a unit such as 350ms or 0.35s.
+    """Parses a time with its unit, such as 350ms or 0.35s.
+
+    Returns:
+        The time in ms.
 
     Raises:
-        UsageError: the text is not a number with a unit.
+        UsageError: The text is not a number with a unit.
     """
     match = re.fullmatch(r"([-+.\deE]+?)\s*(us|ms|s)", text.strip())
     try:
@@ -501,14 +549,18 @@ def parse_milliseconds(text: str) -> float:
 
 
 def parse_share(text: str) -> float:
-    """Returns a share, from a text such as 5% or 0.05.
+    """Parses a number or a percentage, such as 0.05 or 5%.
+
+    Returns:
+        The number, which is 0.05 for both examples.
 
     Raises:
-        UsageError: the text is not a number or a percentage.
+        UsageError: The text is not a number or a percentage.
     """
     number = text.strip().removesuffix("%")
+    is_percentage = number != text.strip()
     try:
-        return float(number) / (100.0 if number != text.strip() else 1.0)
+        return float(number) / (100.0 if is_percentage else 1.0)
     except ValueError:
         raise UsageError(
             f"a share is a number or a percentage, as in 0.05 or 5%, not {text!r}"
@@ -516,14 +568,17 @@ def parse_share(text: str) -> float:
 
 
 def parse_pairs(texts: list[str], example: str) -> dict[str, Any]:
-    """Returns KEY=VALUE texts as a table; a value is TOML or a bare word.
+    """Parses texts KEY=VALUE, in which a value is TOML or a bare word.
 
     Args:
-        texts: the texts.
-        example: an example for the error message.
+        texts: The texts.
+        example: A correct text, for the error message.
+
+    Returns:
+        The values by key.
 
     Raises:
-        UsageError: a text is not of that form.
+        UsageError: A text is not of that form.
     """
     from ..scenario.override import split_assignment
 
@@ -549,6 +604,7 @@ def set_command(
     Without endpoints the command asks the first site, at its loopback port, for the others.
     """
     name = None if session is None else options.check_session_name(session)
+    # Typer runs this function first, and then the command of the group, which needs both.
     context.obj = name, reach.resolve()
 
 
@@ -608,8 +664,14 @@ def set_dominance_command(
 def _send_change(context: typer.Context, site: str, change: dict[str, Any]) -> None:
     """Requests a change from a site of the running session, and prints its reply.
 
+    Args:
+        context: The command line. `set_command` has stored the session and the connection in
+            it.
+        site: Name of the site.
+        change: Fields of a `ChangeRequest`.
+
     Raises:
-        UsageError: The command line does not name the session, or the site refuses the change.
+        UsageError: The session is not named, or the site refuses the change.
     """
     from sites.running_session import RunningSession
 
@@ -654,6 +716,8 @@ def doctor_command(
         clock=SystemClock(),
         insecure=ways.insecure,
     )
+
+    # Each check is printed as soon as it is done, because some take seconds.
     findings = []
     for finding in examined:
         findings.append(finding)

@@ -1,8 +1,8 @@
-"""Defines the commands that study several runs: tests, comparisons, benchmarks, experiments.
+"""Commands that study several runs: tests, comparisons, tuning, benchmarks, experiments.
 
 Invariant:
-    - Numbers are printed, and nothing is ranked.
-    - If a suite of runs is interrupted, the same command continues it.
+    - Numbers are printed, and control laws are not ranked.
+    - An interrupted benchmark or experiment continues with the same command.
 """
 
 import os
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
 
 MAX_SEEDS = 100_000
+"""Largest number of seeds that --seeds may name."""
 
 
 @options.command("jitter --seeds 1..20 --junit out.xml")
@@ -90,16 +91,26 @@ def test_command(
 
 
 def parse_seeds(text: str | None) -> list[int]:
-    """Returns the seeds of a text such as 1..20 or 1,5,9 or 1..3,8; an empty list for None.
+    """Parses seeds such as 1..20 or 1,5,9 or 1..3,8.
+
+    Args:
+        text: The text. None if the user gave no seeds.
+
+    Returns:
+        The seeds. Empty if there is no text.
 
     Raises:
-        UsageError: the text is not of that form, or names too many seeds.
+        UsageError: The text is not of that form, or names more than `MAX_SEEDS` seeds.
     """
+    if text is None:
+        return []
     seeds: list[int] = []
-    for part in [] if text is None else text.split(","):
+    for part in text.split(","):
         match = re.fullmatch(r"\s*([0-9]{1,18})(?:\.\.([0-9]{1,18}))?\s*", part)
-        first = int(match[1]) if match else 1
-        last = int(match[2] or match[1]) if match else 0
+        if match is None:
+            raise UsageError(f"--seeds reads 1..20 or 1,5,9, not {text!r}")
+        first = int(match[1])
+        last = int(match[2] or match[1])
         if last < first:
             raise UsageError(f"--seeds reads 1..20 or 1,5,9, not {text!r}")
         if len(seeds) + last - first >= MAX_SEEDS:
@@ -114,10 +125,11 @@ def _list_trials(
     """Lists the trials of a test: each scenario with each seed.
 
     Args:
-        sources: Names or paths of scenarios. Empty for all shipped scenarios with expectations.
-        seeds: The seeds.
-        overrides: Overrides of scenario keys.
-        live: True if the trials are run live.
+        sources: Names or paths of the scenarios. Empty selects all shipped scenarios that have
+            expectations.
+        seeds: The seeds. Empty uses those of each scenario.
+        overrides: Overrides of all scenarios.
+        live: True if the trials run live over a network.
     """
     from ..scenario import list_shipped, load_scenario
     from ..studies.trials import trials
@@ -126,32 +138,42 @@ def _list_trials(
         sources = [
             name for name in list_shipped() if load_scenario(name).expect.has_expectations
         ]
-    return [
-        trial
-        for source in dict.fromkeys(sources)
-        for trial in trials(source, seeds, overrides, live=live)
-    ]
+    all_trials = []
+    for source in dict.fromkeys(sources):  # without repetitions
+        all_trials += trials(source, seeds, overrides, live=live)
+    return all_trials
 
 
 def _run_virtual(trials: "list[Trial]", jobs: int | None, on: str | None) -> "TrialReport":
-    """Runs trials in virtual time, and shows their progress."""
+    """Runs trials in virtual time, and shows their progress.
+
+    In a terminal it is a bar, otherwise a line for each scenario whose trials have all ended.
+
+    Args:
+        trials: The trials.
+        jobs: Number of processes. None uses one per core.
+        on: Address of a Dask scheduler that executes the trials instead.
+    """
     from ..studies.trials import run_trials
 
     remaining = Counter(trial.source for trial in trials)
     with terminal.progress_bar("runs") as show:
 
         def report_done(result: "TrialResult") -> None:
+            """Counts a finished trial, and reports a scenario after its last trial."""
             source = result.trial.source
             remaining[source] -= 1
-            show(len(trials) - remaining.total(), len(trials))
-            if not remaining[source] and not terminal.out.is_terminal:
+            done = len(trials) - remaining.total()
+            show(done, len(trials))
+            is_last_of_source = not remaining[source]
+            if is_last_of_source and not terminal.out.is_terminal:
                 terminal.print_text(f"{source}: ran")
 
         return run_trials(trials, jobs, report_done, on)
 
 
 def _run_live(trials: "list[Trial]") -> "TrialReport":
-    """Runs trials live, one after the other, so that they do not slow each other down."""
+    """Runs trials live, one after the other, and evaluates their logs."""
     from ..studies.trials import TrialReport, evaluate_live_log
 
     clock = SystemClock()
@@ -169,12 +191,12 @@ def run_in_own_folder(scenario: "Scenario", label: str, folder_name: str) -> "Se
     """Runs a scenario live, with its results in a new folder.
 
     Args:
-        scenario: the scenario.
-        label: label of the printed line.
-        folder_name: name of the folder, to which a number is added.
+        scenario: The scenario.
+        label: Name of the run in the printed line.
+        folder_name: Name of the folder, to which a number is added.
 
     Raises:
-        typer.Exit: the session was interrupted.
+        typer.Exit: The session was interrupted.
     """
     from sites.demo_session import run_demo
 
@@ -190,19 +212,22 @@ def run_in_own_folder(scenario: "Scenario", label: str, folder_name: str) -> "Se
 
 
 _PROGRESS_LINES = 10
-"""Number of lines of progress, if the output is no terminal."""
+"""Number of lines that show progress if the output is not a terminal."""
 
 
 @contextmanager
 def show_progress(
     label: str, print_line: Callable[[str], None], items: str = "runs"
 ) -> Iterator[Callable[[int, int], None]]:
-    """Yields a function of (done, total) that shows progress: as a bar, or as lines elsewhere.
+    """Shows progress as a bar in a terminal, and elsewhere as a few printed lines.
 
     Args:
-        label: label of the bar.
-        print_line: function that prints a line.
-        items: noun of the counted items, in the plural.
+        label: Label of the bar.
+        print_line: Function that prints a line.
+        items: Noun of the counted items, in the plural.
+
+    Yields:
+        A function to call with the number of finished items and of all items.
     """
     if terminal.err.is_interactive:
         with terminal.progress_bar(label) as show:
@@ -216,9 +241,11 @@ def show_progress(
     printed = 0
 
     def show_line(done: int, total: int) -> None:
+        """Prints a line with the remaining time after each tenth of the items."""
         nonlocal began_ns, first, printed
         if began_ns < 0:
-            # the start of the processes takes seconds and does not count
+            # The time before the first item is the start of the processes, which does not
+            # count towards the duration of an item.
             began_ns = clock.monotonic_ns()
             first = done
         lines = done * _PROGRESS_LINES // total
@@ -241,13 +268,13 @@ def _run_tuning(
     force: bool,
     as_json: bool,
 ) -> None:
-    """Tunes control laws, prints the comparison and writes its files.
+    """Tunes control laws, prints the comparison, and writes its files.
 
     Args:
         plan: The laws and the procedure.
-        folder: Folder of the results. None for the next free one.
-        jobs: Number of processes. None for one per core.
-        on: Address of a Dask scheduler. None for processes on this machine.
+        folder: Folder of the results. None uses the next free one.
+        jobs: Number of processes. None uses one per core.
+        on: Address of a Dask scheduler that executes the runs instead.
         force: True to replace existing files.
         as_json: True to print the result as JSON.
     """
@@ -269,6 +296,7 @@ def _run_tuning(
             f"{count_nouns(plan.runs, 'run')} on {cores}: about {duration} at the present "
             "speed of this machine"
         )
+
     with terminal.progress_bar("searching") as progress:
         comparison = plan.run(jobs, progress, on)
     paths = write_tuning(comparison, results_folder)
@@ -409,18 +437,20 @@ def tune_command(
 
 
 def _measure_delay(text: str, reach: options.Reach) -> str:
-    """Returns a delay as text, which is measured if the text names a running session.
+    """Returns a delay as `tune_arm` accepts it, and measures it if it names a running session.
 
-    The delay of a session is that of its slowest link, or half of the longest round trip if no
-    link has a measured delay.
+    The delay of a session is that of its slowest link. If the session measures no link, it is
+    half of the longest round trip from this machine, at the 99th percentile.
 
     Args:
-        text: A delay, a log, or "measured:" and the name of a session.
-        reach: Options with which the command reaches the session.
+        text: A delay such as "40ms", a file, or "measured:SESSION".
+        reach: The options by which the command reaches the session.
     """
     name = text.removeprefix("measured:")
-    if name == text or name.endswith(".mcap"):
+    names_session = name != text and not name.endswith(".mcap")
+    if not names_session:
         return text
+
     from sites.session_ping import ping_session
 
     measurement = ping_session(
@@ -436,17 +466,22 @@ def _measure_delay(text: str, reach: options.Reach) -> str:
         0.5 * member["rtt_us"]["p99"] for member in measurement.members if member["answers"]
     ]
     delays_us = [max(link["delay_us"], link["delay_max_us"]) for link in measurement.links]
-    return f"{max(delays_us or half_trips_us or [0.0]):.0f}us"
+    if delays_us:
+        return f"{max(delays_us):.0f}us"
+    longest_us = max(half_trips_us, default=0.0)
+    return f"{longest_us:.0f}us"
 
 
 def _tune_bench(laws: list[str], study: str, jobs: int | None, on: str | None) -> None:
-    """Tunes the laws of a study of the benchmark, and stores their gains with the suite.
+    """Tunes the control laws of a study of the benchmark, and stores their gains.
+
+    The file of the gains is part of the program.
 
     Args:
-        laws: Names of the laws. Empty for all laws of the study.
+        laws: Names of the laws. Empty selects all laws of the study.
         study: Name of the study.
-        jobs: Number of processes. None for one per core.
-        on: Address of a Dask scheduler. None for processes on this machine.
+        jobs: Number of processes. None uses one per core.
+        on: Address of a Dask scheduler that executes the runs instead.
 
     Raises:
         UsageError: A law is not part of the study.
@@ -458,13 +493,15 @@ def _tune_bench(laws: list[str], study: str, jobs: int | None, on: str | None) -
     unknown = [law for law in laws if law not in all_laws]
     if unknown:
         raise UsageError(f"--law: {unknown[0]} is no law of the study {study}")
-    chosen = {}
+
+    selected_by_form = {}
     for form, form_laws in laws_by_form.items():
-        chosen_laws = [law for law in form_laws if law in laws or not laws]
-        if chosen_laws:
-            chosen[form] = chosen_laws
+        selected_laws = [law for law in form_laws if law in laws or not laws]
+        if selected_laws:
+            selected_by_form[form] = selected_laws
+
     with show_progress("tuning", terminal.print_note) as progress:
-        gains = tune_laws(chosen, jobs, on, progress)
+        gains = tune_laws(selected_by_form, jobs, on, progress)
     write_gains(gains)
     terminal.print_paths([GAINS_FILE])
 
@@ -472,7 +509,14 @@ def _tune_bench(laws: list[str], study: str, jobs: int | None, on: str | None) -
 def _run_bench(
     folder: "BenchFolder", jobs: int | None, on: str | None, *, confirm: bool
 ) -> "BenchResults":
-    """Runs the benchmark in its folder. On Ctrl-C, a note says how to continue."""
+    """Runs the benchmark in its folder. On Ctrl-C it prints how to continue.
+
+    Args:
+        folder: Folder of the benchmark.
+        jobs: Number of processes. None uses one per core.
+        on: Address of a Dask scheduler that executes the runs instead.
+        confirm: True to repeat the runs that are not stable over a longer time.
+    """
     from ..studies.bench import run_bench
 
     try:
@@ -538,22 +582,28 @@ def bench_command(
         links=options.split_names(link),
         seeds=seeds,
     )
+
     if cell is not None:
-        for seed in plan.cell(cell).seeds:
+        bench_cell = plan.cell(cell)
+        for seed in bench_cell.seeds:
             log = f"{cell.replace('/', '-')}-{seed}.mcap"
-            terminal.print_line(f"{plan.cell(cell).build(seed).command} -o {log}")
+            terminal.print_line(f"{bench_cell.build(seed).command} -o {log}")
         return
+
     tuned_gains = {str(planned.tuned): planned.tuned for planned in plan.cells}
     stale = find_stale(tuned_gains.values())
     if stale:
         terminal.print_note(
             f"tuned for another text of law or task, see --tune: {', '.join(stale)}"
         )
+
     folder = prepare_bench_folder(plan, output)
     cells = count_nouns(len(plan.cells), "cell")
     runs = count_nouns(plan.runs, "run")
     terminal.print_note(f"{cells}, {runs}, into {folder.path}")
     results = _run_bench(folder, jobs, on, confirm=confirm)
+
+    # The command that repeats this benchmark, for its page.
     arguments = ["--study", chosen_study]
     filters = {"--task": task, "--law": law, "--link": link, "--seeds": seeds}
     for name, filter_value in filters.items():

@@ -1,10 +1,10 @@
-"""Defines `trilat sweep`, which runs a scenario over a grid of its keys.
+"""`trilat sweep`: runs a scenario over a grid of its keys, maps stability, and finds edges.
 
-The command judges the stability of each run, draws a map of stability, and searches the edges
-between stable and unstable values.
+A cell of the grid is a combination of values of the keys. An edge is the value of a key at
+which runs change from stable to not stable.
 
 Invariant:
-    - Everything that is printed is also in the result files, except live runs, which have logs.
+    - Everything printed is also in the result files, except live runs, which have logs.
     - An interrupted sweep prints the command that resumes it.
 """
 
@@ -35,10 +35,13 @@ _option = partial(typer.Option, rich_help_panel="Maps and edges")
 
 
 def _check_modes(used_options: Sequence[str]) -> None:
-    """Checks that the options on the command line can be combined.
+    """Refuses options that exclude each other.
+
+    Args:
+        used_options: The options that the user wrote on the command line.
 
     Raises:
-        UsageError: Two options exclude each other, or an option lacks the one to which it
+        UsageError: Two options exclude each other, or an option lacks the option to which it
             belongs.
     """
     modes = [
@@ -58,14 +61,14 @@ def _check_modes(used_options: Sequence[str]) -> None:
 def _draw_map(
     results: "SweepResults", folder: Path, width: float | None, jobs: int | None, on: str | None
 ) -> None:
-    """Draws the stability map of a sweep with the lines of theory, and prints its remarks.
+    """Draws the stability map of a sweep, together with the edges that theory predicts.
 
     Args:
-        results: the finished sweep.
-        folder: folder of the files.
-        width: width of the map, in; None: one column of a paper.
-        jobs: number of processes.
-        on: address of a Dask scheduler.
+        results: The finished sweep.
+        folder: Folder of the files.
+        width: Width of the map, in inches. None uses one column of a paper.
+        jobs: Number of processes. None uses one per core.
+        on: Address of a Dask scheduler that computes the map instead.
     """
     from ..reporting.appearance import COLUMN_IN, make_print_size
     from ..studies.sweep.fixed_gains import FAIR_COMPARISON
@@ -81,6 +84,7 @@ def _draw_map(
         "linear analysis", terminal.print_text, "columns of the map"
     ) as progress:
         stability_map = build_stability_map(results, (command,), jobs, progress, on=on)
+
     terminal.print_texts(f"note: {remark}" for remark in stability_map.remarks)
     terminal.print_text("map: drawing ...")
     paths = write_map(stability_map, folder, size.width_in)
@@ -98,14 +102,16 @@ def _search_margins(
     on: str | None,
     as_json: bool,
 ) -> None:
-    """Searches edges of stability along one key, prints them, and writes the result files.
+    """Searches edges along one key, prints them, and writes the result files.
+
+    The edges that theory predicts are printed beside them.
 
     Args:
-        plan: The sweep. Its last axis consists of the two ends of the range.
-        search_range: The key and its range.
-        folder: Folder of margin.json and margin.md. None for the next free one.
-        jobs: Number of processes. None for one per core.
-        on: Address of a Dask scheduler. None for processes on this machine.
+        plan: The sweep. Its last axis has the two ends of the range.
+        search_range: The key and the range in which edges are searched.
+        folder: Folder of margin.json and margin.md. None uses the next free one.
+        jobs: Number of processes. None uses one per core.
+        on: Address of a Dask scheduler that executes the runs instead.
         as_json: True to print the result as JSON.
     """
     from ..files import make_results_folder
@@ -120,6 +126,7 @@ def _search_margins(
             plan=plan, within=search_range, jobs=jobs, progress=progress, on=on
         )
         margins = SweepMargins(plan, search_range, edges)
+
     paths = margins.write(results_folder)
     if not as_json:
         terminal.out.print()
@@ -128,9 +135,7 @@ def _search_margins(
 
 
 def _confirm_cells(results: "SweepResults", count: int) -> None:
-    """Runs cells next to the edges live, and prints whether their verdicts agree.
-
-    A cell is a point of the grid.
+    """Runs cells next to the edges live, and compares their verdicts with the sweep.
 
     Args:
         results: The finished sweep.
@@ -149,16 +154,17 @@ def _confirm_cells(results: "SweepResults", count: int) -> None:
     rows = choose_cells_near_edges(results.rows, keys, count)
     name = f"confirm-{results.plan.base.name}"
 
-    def run(scenario: "Scenario", cell: str) -> "tuple[Path, Sequence[str]]":
+    def run_live(scenario: "Scenario", cell: str) -> "tuple[Path, Sequence[str]]":
+        """Runs a cell live, and returns its log and the problems of its session."""
         outcome = run_in_own_folder(scenario, cell, f"{name}-{cell}")
         return outcome.log, outcome.problems
 
-    confirmations = [confirm_cell(row, run) for row in rows]
+    confirmations = [confirm_cell(row, run_live) for row in rows]
     terminal.out.print()
     terminal.print_table(tabulate_confirmations(confirmations, keys))
-    same = sum(confirmation.same for confirmation in confirmations)
-    terminal.out.print(f"{same} of {len(confirmations)} verdicts are the same")
-    if same < len(confirmations):
+    same_count = sum(confirmation.same for confirmation in confirmations)
+    terminal.out.print(f"{same_count} of {len(confirmations)} verdicts are the same")
+    if same_count < len(confirmations):
         raise typer.Exit(1)
 
 
@@ -170,41 +176,48 @@ def _run_sweep(
     *,
     yes: bool,
 ) -> "FinishedSweep":
-    """Runs a sweep, or the remaining runs of the sweep in a folder, and prints its summary.
+    """Runs a sweep, or the remaining runs of a sweep, and prints its summary.
 
     A sweep that is too large is refused before its folder is created.
 
     Args:
-        new_plan: The sweep. None for that of the folder.
-        path: Folder of a sweep to continue, or of a new one. None for the next free folder.
-        jobs: Number of processes. None for one per core.
-        on: Address of a Dask scheduler. None for processes on this machine.
+        new_plan: The sweep. None uses the sweep in the folder.
+        path: Folder of a sweep to continue, or of a new sweep. None uses the next free folder.
+        jobs: Number of processes. None uses one per core.
+        on: Address of a Dask scheduler that executes the runs instead.
         yes: True to run a sweep even if it is too large.
+
+    Returns:
+        The finished sweep.
     """
     from ..studies.executor import count_workers
     from ..studies.sweep import sweep_results, sweep_run
 
     existing_folder = None
     plan = new_plan
-    done = []
+    finished_runs = []
     if path is not None and (plan is None or (path / sweep_results.PLAN_FILE).exists()):
         existing_folder = sweep_run.open_sweep_folder(path, plan)
         plan = existing_folder.plan
-        done = existing_folder.read_done()
-    assert plan is not None
+        finished_runs = existing_folder.read_done()
+    assert plan is not None  # the caller gives a plan or a folder
     terminal.print_texts(sweep_results.describe_sweep_plan(plan))
     if existing_folder is not None:
-        terminal.print_text(f"  {count_nouns(len(done), 'run is', 'runs are')} done already")
+        done = count_nouns(len(finished_runs), "run is", "runs are")
+        terminal.print_text(f"  {done} done already")
+
     workers = count_workers(jobs, on)
-    estimate = sweep_run.estimate_sweep(plan, done, workers)
+    estimate = sweep_run.estimate_sweep(plan, finished_runs, workers)
     if not yes:
         sweep_run.refuse_oversized_sweep(plan, estimate, workers)
+
     folder = existing_folder or sweep_run.prepare_sweep_folder(plan, path)
     if estimate.seconds:
         duration = sweep_run.format_wall_time(estimate.seconds)
         terminal.print_text(f"  about {duration}, by some of its cells; into {folder.path}")
     finished = _run_in_folder(folder, jobs, on, estimate)
-    if not (estimate.entries or finished.runs):
+    was_complete = not (estimate.entries or finished.runs)
+    if was_complete:
         terminal.out.print("nothing was left to run")
     remarks = [sweep_run.describe_sweep_speed(finished)] if finished.runs else []
     remarks.append(f"results: {folder.path / sweep_results.RESULTS_FILE}")
@@ -215,7 +228,14 @@ def _run_sweep(
 def _run_in_folder(
     folder: "SweepFolder", jobs: int | None, on: str | None, estimate: "DurationEstimate"
 ) -> "FinishedSweep":
-    """Runs a sweep in its folder. On Ctrl-C, the command that resumes it is printed."""
+    """Runs a sweep in its folder. On Ctrl-C it prints the command that resumes the sweep.
+
+    Args:
+        folder: Folder of the sweep.
+        jobs: Number of processes. None uses one per core.
+        on: Address of a Dask scheduler that executes the runs instead.
+        estimate: Estimate of the duration. The runs that it needed are not repeated.
+    """
     from ..studies.sweep import run_sweep
 
     try:
@@ -233,7 +253,13 @@ def _run_in_folder(
 
 
 def _print_results(results: "SweepResults", remarks: list[str], path: Path) -> None:
-    """Prints the summary of a sweep, remarks, and the commands that the user may need next."""
+    """Prints the summary of a sweep, remarks, and commands that are useful next.
+
+    Args:
+        results: The finished sweep.
+        remarks: Lines to print after the summary.
+        path: Folder of the sweep.
+    """
     from ..studies.sweep.sweep_results import list_next_commands, summarize_sweep
 
     terminal.print_texts(summarize_sweep(results))
@@ -242,7 +268,13 @@ def _print_results(results: "SweepResults", remarks: list[str], path: Path) -> N
 
 
 def _print_cell_commands(path: Path, number: int, *, as_json: bool) -> None:
-    """Prints the commands that write logs of one cell of the grid, or its rows as JSON."""
+    """Prints the commands that write logs of a cell of a finished sweep.
+
+    Args:
+        path: Folder of the sweep, or its table of results.
+        number: Number of the cell.
+        as_json: True to print the rows of the cell as JSON instead.
+    """
     from ..studies.sweep import read_results
     from ..studies.sweep.sweep_results import build_reproduce_command
 
@@ -323,10 +355,13 @@ def sweep_command(
     _check_modes(used_options)
     results = Path(scenario) if scenario is not None and _is_results(scenario) else None
     draw = partial(_draw_map, width=width, jobs=jobs, on=on)
-    if cell is not None or resume is not None or results is not None:
+
+    uses_finished_sweep = cell is not None or resume is not None or results is not None
+    if uses_finished_sweep:
         _refuse_plan_options(used_options)
     elif confirm is not None:
         raise UsageError("--confirm belongs to results: trilat sweep FOLDER --confirm 5")
+
     if resume is not None:
         if scenario is not None or cell is not None:
             raise UsageError("--resume continues the sweep of its folder: leave the rest out")
@@ -364,6 +399,7 @@ def sweep_command(
             )
         with terminal.lines_aside(as_json):
             finished = _run_sweep(plan, output, jobs, on, yes=yes)
+
     if mapped:
         with terminal.lines_aside(as_json):
             draw(finished.results, finished.folder.path)
@@ -382,10 +418,10 @@ def _show_results(
     """Confirms cells of a finished sweep, draws its map, or prints its summary.
 
     Args:
-        path: Path of the results.
-        confirm: Number of cells on each side of the edges to run live. None to run none.
-        draw: Function that draws the map. None for no map.
-        as_json: True to print the results as JSON.
+        path: Folder of the sweep, or its table of results.
+        confirm: Number of cells on each side of the edges to run live. None runs no cell.
+        draw: Function that draws the map. None draws no map.
+        as_json: True to print the results as JSON in addition.
     """
     from ..studies.sweep.sweep_results import describe_sweep_plan, read_results
 
@@ -413,14 +449,17 @@ _PLAN_OPTIONS = (
     "--set",
     "--duration",
 )
-"""Options that define a sweep, and that its results fix."""
+"""Options that define a sweep. For a finished or interrupted sweep they are fixed."""
 
 
 def _refuse_plan_options(used_options: Sequence[str]) -> None:
-    """Checks that no option defines a sweep whose results are given already.
+    """Refuses options that would change a sweep that exists already.
+
+    Args:
+        used_options: The options that the user wrote on the command line.
 
     Raises:
-        UsageError: An option does.
+        UsageError: One of the options defines a sweep.
     """
     for name in _PLAN_OPTIONS:
         if name in used_options:
@@ -430,20 +469,33 @@ def _refuse_plan_options(used_options: Sequence[str]) -> None:
 
 
 def parse_seed_count(text: str | None) -> int | list[int]:
-    """Returns the number of seeds, or the seeds, that a text describes.
+    """Parses the option --seeds of a sweep.
+
+    A text such as 10 is a number of seeds. Texts such as 1..20, 1,5,9 or 7, (with a comma) are
+    lists of seeds.
 
     Args:
-        text: A number such as 10, or seeds such as 1..20, 1,5,9 or 7,. None stands for 1.
+        text: The text. None if the user did not use the option.
+
+    Returns:
+        The number of seeds, or the list of the seeds. 1 if there is no text.
     """
     if text is None:
         return 1
-    if text.strip().isdecimal() and len(text) < 19:
+    fits_64_bits = len(text) < 19
+    if text.strip().isdecimal() and fits_64_bits:
         return int(text)
     return parse_seeds(text.strip().removesuffix(","))
 
 
 def _is_results(source: str) -> bool:
-    """Returns True if a source names the results of a sweep. A shipped scenario never does."""
+    """Returns True if an argument of the command names the results of a sweep.
+
+    The names of shipped scenarios never do, even if there is a folder of the same name.
+
+    Args:
+        source: The argument: a scenario, the folder of a sweep, or its table of results.
+    """
     from ..scenario import list_shipped
     from ..studies.sweep.sweep_results import PLAN_FILE
 
