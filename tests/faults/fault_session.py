@@ -86,6 +86,10 @@ class Published:
     events: list[Event] = field(default_factory=list)
 
 
+INSISTS_NS = 300_000_000
+"""After a first signal the second one, which ends a site that waits for a recorder that is gone."""
+
+
 @dataclass
 class FaultSession(Session):
     """A session on a network that fails, with everything that its sites publish."""
@@ -164,6 +168,10 @@ class FaultSession(Session):
                 clock.dies_ns = at_ns
             else:
                 clock.at(at_ns, lambda interrupt=interrupt: setattr(interrupt, "number", 15))
+                clock.at(
+                    at_ns + INSISTS_NS,
+                    lambda interrupt=interrupt: setattr(interrupt, "_is_repeated", True),
+                )
         for late_s in (0.0, LOOKS_AGAIN_S):
             self.relay.happens(self._at(self.timetable.healed_s + late_s), self._let_go)
         for fault in self.faults:

@@ -121,7 +121,7 @@ def says_an_older_sample() -> AbstractContextManager[Any]:
 
 def never_admits_again() -> AbstractContextManager[Any]:
     """A site that comes back stays a stranger to the others."""
-    return mock.patch.object(PeerMonitor, "_consider", return_value=None)
+    return mock.patch.object(PeerMonitor, "_decide_on_join", return_value=None)
 
 
 def begins_at_zero() -> AbstractContextManager[Any]:

@@ -135,7 +135,7 @@ def find_rises(session: FaultSession) -> Iterator[tuple[str, tuple[float, float]
             continue
         S, power = compute_storage(session.scenario, rest)
         qd_des = rest.rows("qd_des")[1:]
-        free = ~rest.limited[1:-1] & ~find_given_up(rest)
+        free = ~rest.limited[1:-1] & ~find_limited_law(rest) & ~find_given_up(rest)
         rests = (qd_des == 0.0).all(axis=1)[:-1]
         # a torque is extrapolated from the tick before, Eq. (8), and the first of a rest decelerates
         before = np.r_[False, False, rests]
@@ -150,6 +150,27 @@ def find_rises(session: FaultSession) -> Iterator[tuple[str, tuple[float, float]
                 (rises - work)[free & ~still].max(initial=-np.inf),
             ),
         )
+
+
+def find_limited_law(rest: Rest) -> np.ndarray:
+    """True for every tick in which, or in the tick before which, the law's own torque is at its limit.
+
+    The torque of a record is limit(law) + w - B s: the sum can be within the limit while the law's part,
+    of an estimate that is too large, is not.
+    """
+    gains, still = rest.setup.gains, rest.setup.rest
+    assert still is not None
+    q, qd, q_des, qd_des, tau = (
+        rest.rows(key)[1:] for key in ("q", "qd", "q_des", "qd_des", "tau")
+    )
+    first = 2 * (len(q[0]) + 1) + PEERS
+    w = np.array([state.mem[first : first + len(q[0])] for state in rest.states[:-1]])
+    slip = qd - qd_des + np.asarray(gains.Lambda) * (q - q_des)
+    law = tau - w + np.asarray(still.damping) * slip
+    most = np.asarray(rest.setup.tau_limit_nm) * (1.0 - RESIDUAL)
+    found = (np.abs(law) >= most).any(axis=1)
+    either: np.ndarray = found[1:] | found[:-1]
+    return either
 
 
 def find_given_up(rest: Rest) -> np.ndarray:
