@@ -1,18 +1,28 @@
-"""Entry program of a container: prepares cache and results folder, then becomes the command.
+"""Entry program of a container: prepares the container, and then becomes the real command.
 
 Usage: entry.py [--results FOLDER --heir FILE --keys VOLUMES] [--await-keys FOLDER] COMMAND...
 
-- The image's cache of compiled code is copied to a writable folder, because Numba uses no read-only one. On
-  another processor than the one that built it, Numba ignores it and compiles.
-- FOLDER is on the host. The engine creates a missing mounted folder as root. So, as root, this program gives
-  FOLDER to the owner of FILE, a file of the user who starts the containers, and becomes that user, or
-  `SERVANT` if that is root. Started as any other user, it remains that user.
-- VOLUMES holds a volume for each member. Unless there are keys in all of them that hold, this program has
-  them made by `COMMAND[0] keys new` and gives each member its own: the recorder's to the user that it
-  becomes, the sites' to `SITES`. A site's container has its own volume alone, and this program waits for the
-  keys in it (FOLDER). The authority's key is never written to a disk.
+The program does up to four things before it starts COMMAND:
 
-Invariant: the command never runs as root of the host, and only files that root owns change their owner.
+- It copies the image's cache of compiled code to a writable folder, because Numba does not use
+  a read-only cache. On a processor of another type than that on which the image was built,
+  Numba ignores the cache and compiles again.
+- `--results`: FOLDER is a folder of the host, which the container engine creates as root if it
+  is missing. If this program runs as root, it gives FOLDER to the owner of FILE, and continues
+  as that user. FILE belongs to the user who starts the containers. If that user is root, the
+  user of the image (`SERVANT`) takes its place. If the program does not run as root, it remains
+  the same user.
+- `--keys`: VOLUMES contains a volume (folder) for each member of the session. Unless all of
+  them contain keys that remain valid for days, the program creates keys with `COMMAND[0] keys new`
+  and gives each member its own: the recorder's keys to the user that this program becomes, and
+  the keys of sites to the user `SITES`. The key of the certificate authority is never written
+  to a disk.
+- `--await-keys`: the container of a site can read only its own volume, FOLDER, and waits until
+  the keys are there.
+
+Invariant:
+    - The command never runs as root of the host.
+    - Only files that belong to root get another owner.
 """
 
 import argparse
@@ -24,23 +34,33 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 SERVANT = 10001
-"""The user of the image: unused on most hosts."""
+"""Number of the image's user, which is not in use on most hosts."""
 SITES = 10002
-"""The user of sites, who can read no keys but those of sites."""
-RECORDER, MARK = "recorder", "members.json"
-"""The member that makes the keys; the file of a member's keys that is written last."""
+"""Number of the user of sites, who can read only keys of sites."""
+RECORDER = "recorder"
+"""The member whose container creates the keys."""
+MARK = "members.json"
+"""The file of a member's keys that is written last, so that its presence means completeness."""
 _FRESH_S = 25 * 86_400.0
-"""Keys older than this are made anew: they hold for 30 days."""
+"""Age in s up to which keys are used again. They are valid for 30 days."""
 _AWAIT_S = 60.0
+"""Longest wait for keys, in s."""
 _CACHE = Path("/opt/trilat/cache")
+"""Cache of compiled code in the image."""
 _NO_NAMESPACE = ["0", "0", "4294967295"]
+"""Map of users of a process whose users are those of the host: all numbers stay the same."""
 
 
 class Owner(NamedTuple):
-    """A user and a group, by number."""
+    """A user and a group, by number.
+
+    Attributes:
+        user: Number of the user.
+        group: Number of the group.
+    """
 
     user: int
     group: int
@@ -49,146 +69,205 @@ class Owner(NamedTuple):
         return f"{self.user}:{self.group}"
 
 
-def heir(mark: Path, user_map: Path = Path("/proc/self/uid_map")) -> Owner:
-    """Returns the owner of the results.
+def find_results_owner(mark: Path, user_map: Path = Path("/proc/self/uid_map")) -> Owner:
+    """Returns the user and group to whom the results shall belong.
 
     Args:
-        mark: a file of the user who starts the containers.
-        user_map: this process's map of users. Under a rootless engine, root is that user.
+        mark: A file of the user who starts the containers.
+        user_map: File of the system with the map of users of this process. Under a rootless
+            container engine, root of the container is an ordinary user of the host.
+
+    Returns:
+        The owner of the mark. If that is root of the host, the user of the image.
 
     Raises:
-        OSError: the mark does not exist.
+        OSError: The mark does not exist.
     """
-    facts = mark.stat()
-    if facts.st_uid == 0 and user_map.read_text(encoding="ascii").split() == _NO_NAMESPACE:
+    status = mark.stat()
+    is_root_of_host = (
+        status.st_uid == 0 and user_map.read_text(encoding="ascii").split() == _NO_NAMESPACE
+    )
+    if is_root_of_host:
         return Owner(SERVANT, SERVANT)
-    return Owner(facts.st_uid, facts.st_gid)
+    return Owner(status.st_uid, status.st_gid)
 
 
-def give(folder: Path, owner: Owner) -> None:
-    """Gives a folder, its content and its parent to their owner, as far as root owns them.
+def give_folder(folder: Path, owner: Owner) -> None:
+    """Gives a folder, its files and its parent folder to an owner.
 
-    The parent remains root's if the owner is `SERVANT`, who is no user of the host.
+    Only what belongs to root changes its owner. The parent remains root's if the owner is
+    `SERVANT`, who is not a user of the host.
+
+    Args:
+        folder: The folder. It is created if its parent belongs to root.
+        owner: The new owner.
 
     Raises:
-        OSError: a file cannot be made or given.
+        OSError: A file cannot be created, or its owner cannot be changed.
     """
-    above = folder.parent
-    if above.stat().st_uid == 0:
+    parent = folder.parent
+    if parent.stat().st_uid == 0:
         folder.mkdir(exist_ok=True)
         if owner.user != SERVANT:
-            os.chown(above, *owner)
+            os.chown(parent, *owner)
     if folder.exists() and folder.stat().st_uid == 0:
         for path in (*folder.iterdir(), folder):
             if path.lstat().st_uid == 0:
                 os.chown(path, *owner, follow_symlinks=False)
 
 
-def become(owner: Owner) -> None:
-    """Becomes a user for good; raises OSError if that is not permitted."""
+def become_user(owner: Owner) -> None:
+    """Makes this process run as another user from now on, without a way back to root.
+
+    Raises:
+        OSError: The system does not permit it.
+    """
+    # The user comes last, because only root may change the groups.
     os.setgroups([])
     os.setgid(owner.group)
     os.setuid(owner.user)
 
 
-def hand_over(results: Path, mark: Path) -> None:
-    """Makes a folder writable for this process, as the user that it becomes.
+def prepare_results(results: Path, mark: Path) -> None:
+    """Makes the results folder writable, and continues as the user to whom it belongs.
+
+    Args:
+        results: The folder.
+        mark: A file of the user who starts the containers.
 
     Raises:
-        SystemExit: that is impossible; the message names the user and the folder.
+        SystemExit: The folder is not writable. A message names the user, the folder and the
+            remedy.
     """
     owner = Owner(os.getuid(), os.getgid())
     try:
         if owner.user == 0:
-            owner = heir(mark)
-            give(results, owner)
-            become(owner)
+            owner = find_results_owner(mark)
+            give_folder(results, owner)
+            become_user(owner)
         results.mkdir(exist_ok=True)
         if not os.access(results, os.W_OK | os.X_OK):
             raise PermissionError(0, "it belongs to another user")
     except OSError as error:
         sys.stderr.write(
             f"error: user {owner} cannot write into {results}: {error.strerror}; on the host, "
-            f"give it to that user, as in: mkdir -p {results}; sudo chown -R {owner} {results}\n"
+            f"give it to that user, as in: mkdir -p {results}; "
+            f"sudo chown -R {owner} {results}\n"
         )
         sys.exit(2)
 
 
 def are_fresh(keys: Path) -> bool:
-    """True if there are keys of a member that will hold for days."""
+    """Returns True if a folder contains keys of a member that remain valid for days."""
     try:
         return time.time() - (keys / MARK).stat().st_mtime < _FRESH_S
     except OSError:
         return False
 
 
-def take(folder: Path) -> None:
-    """Makes a folder and all in it this user's, from the top down: without it root could not look into it."""
-    if os.getuid() == 0:
-        os.chown(folder, 0, 0)
-        for path in folder.iterdir():
-            take(path) if path.is_dir() else os.chown(path, 0, 0)
+def take_folder(folder: Path) -> None:
+    """Makes root the owner of a folder and of everything in it, if this process is root.
+
+    The root of a container may lack the right to read files of other users. Therefore each
+    folder changes its owner before its content is listed.
+    """
+    if os.getuid() != 0:
+        return
+    os.chown(folder, 0, 0)
+    for path in folder.iterdir():
+        if path.is_dir():
+            take_folder(path)
+        else:
+            os.chown(path, 0, 0)
 
 
-def hand_out_keys(volumes: Path, program: str, owner: Owner, scratch: Path) -> None:
-    """Makes keys for all members that have a volume, unless they have some that hold.
+def distribute_keys(volumes: Path, program: str, owner: Owner, scratch: Path) -> None:
+    """Creates keys for all members, unless all of them have keys that remain valid.
 
     Args:
-        volumes: the folder of the members' volumes, named after them.
-        program: the command that makes keys; it runs as the owner.
-        owner: the user that the recorder becomes.
-        scratch: a folder in memory.
+        volumes: Folder of the members' volumes, which have the names of the members.
+        program: The command that creates keys. It runs as the owner.
+        owner: The user that the recorder becomes.
+        scratch: A folder in memory, so that the keys of the authority reach no disk.
 
     Raises:
-        OSError: something cannot be written or given.
-        subprocess.CalledProcessError: the program failed.
+        OSError: A file cannot be written, or its owner cannot be changed.
+        subprocess.CalledProcessError: The program failed.
     """
     members = sorted(path.name for path in volumes.iterdir())
     if all(are_fresh(volumes / name) for name in members):
         return
-    is_root, made = os.getuid() == 0, scratch / "made"
-    hosts = [word for name in members for word in ("--host", name)]
-    identity = {"user": owner.user, "group": owner.group, "extra_groups": []} if is_root else {}
-    command = [program, "keys", "new", str(made), *members, *hosts]
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, **identity)
-    take(made)
+
+    is_root = os.getuid() == 0
+    identity: dict[str, Any] = {}
+    if is_root:
+        identity = {"user": owner.user, "group": owner.group, "extra_groups": []}
+    created = scratch / "made"
+    # Each member listens at the host name of its container, which is the name of the member.
+    hosts = []
     for name in members:
-        files = sorted((made / name).iterdir(), key=lambda path: path.name == MARK)
+        hosts += ["--host", name]
+    command = [program, "keys", "new", str(created), *members, *hosts]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, **identity)
+    take_folder(created)
+
+    for name in members:
+        key_owner = owner if name == RECORDER else Owner(SITES, SITES)
+        # The mark is copied last: a member that waits for it finds all of its keys.
+        files = sorted((created / name).iterdir(), key=lambda path: path.name == MARK)
         for file in files:
             target = volumes / name / file.name
             target.unlink(missing_ok=True)
             descriptor = os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-            with os.fdopen(descriptor, "wb") as sink:
-                sink.write(file.read_bytes())
+            with os.fdopen(descriptor, "wb") as stream:
+                stream.write(file.read_bytes())
             if is_root:
-                os.chown(target, *(owner if name == RECORDER else Owner(SITES, SITES)))
-    shutil.rmtree(made)
+                os.chown(target, *key_owner)
+    shutil.rmtree(created)
 
 
 def await_keys(keys: Path) -> None:
-    """Waits until there are keys.
+    """Waits until a folder contains the keys of a member.
+
+    Args:
+        keys: The folder.
 
     Raises:
-        SystemExit: there are none in time.
+        SystemExit: The keys have not appeared in time.
     """
-    give_up_s = time.monotonic() + _AWAIT_S
+    deadline_s = time.monotonic() + _AWAIT_S
     while not are_fresh(keys):
-        if time.monotonic() > give_up_s:
+        if time.monotonic() > deadline_s:
             sys.stderr.write(
-                f"error: no keys in {keys} after {_AWAIT_S:g} s: does the recorder's container run?\n"
+                f"error: no keys in {keys} after {_AWAIT_S:g} s: does the recorder's "
+                "container run?\n"
             )
             sys.exit(2)
         time.sleep(0.02)
 
 
-def warm(cache: Path, own: Path) -> None:
-    """Copies a cache into a writable folder, as far as there is room."""
-    with suppress(OSError):  # shutil.Error is one: without a cache the program compiles
-        shutil.copytree(cache, own, dirs_exist_ok=True)
+def copy_cache(cache: Path, writable: Path) -> None:
+    """Copies the cache of compiled code into a writable folder, as far as there is room.
+
+    Without a complete cache, the program compiles the rest itself.
+
+    Args:
+        cache: The read-only cache of the image.
+        writable: The folder, which may exist already.
+    """
+    with suppress(OSError):  # includes shutil.Error, which reports single files
+        shutil.copytree(cache, writable, dirs_exist_ok=True)
 
 
 def main(arguments: Sequence[str]) -> NoReturn:
-    """Prepares, and becomes the command."""
+    """Prepares the container, and replaces this program by the command.
+
+    Args:
+        arguments: Options and the command, as in the usage of this module.
+
+    Raises:
+        SystemExit: The container cannot be prepared. A message has the reason.
+    """
     parser = argparse.ArgumentParser()
     parser.add_argument("--results", type=Path)
     parser.add_argument("--heir", type=Path)
@@ -196,16 +275,21 @@ def main(arguments: Sequence[str]) -> NoReturn:
     parser.add_argument("--await-keys", type=Path)
     parser.add_argument("command", nargs=argparse.REMAINDER)
     options = parser.parse_args(arguments)
+
+    # The keys need root, so they are distributed before `prepare_results` gives it up.
     if options.keys is not None:
         try:
-            owner = heir(options.heir) if os.getuid() == 0 else Owner(os.getuid(), os.getgid())
-            hand_out_keys(options.keys, options.command[0], owner, Path(os.environ["HOME"]))
+            owner = Owner(os.getuid(), os.getgid())
+            if owner.user == 0:
+                owner = find_results_owner(options.heir)
+            scratch = Path(os.environ["HOME"])
+            distribute_keys(options.keys, options.command[0], owner, scratch)
         except (OSError, subprocess.CalledProcessError) as error:
             sys.stderr.write(f"error: no keys could be made in {options.keys}: {error}\n")
             sys.exit(2)
     if options.results is not None:
-        hand_over(options.results, options.heir)
-    warm(_CACHE, Path(os.environ["XDG_CACHE_HOME"]))
+        prepare_results(options.results, options.heir)
+    copy_cache(_CACHE, Path(os.environ["XDG_CACHE_HOME"]))
     if options.await_keys is not None:
         await_keys(options.await_keys)
     os.execvp(options.command[0], options.command)

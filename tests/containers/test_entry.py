@@ -40,19 +40,19 @@ def owner(path: Path) -> object:
 @needs_root
 def test_the_results_go_to_the_owner_of_the_mark(mark: Path) -> None:
     os.chown(mark, *SOMEBODY)
-    assert entry.heir(mark) == SOMEBODY
+    assert entry.find_results_owner(mark) == SOMEBODY
 
 
 @needs_root
 def test_the_command_never_runs_as_root_of_the_host(mark: Path, tmp_path: Path) -> None:
     nowhere = user_map(tmp_path, "         0          0 4294967295\n")
-    assert entry.heir(mark, nowhere) == Owner(entry.SERVANT, entry.SERVANT)
+    assert entry.find_results_owner(mark, nowhere) == Owner(entry.SERVANT, entry.SERVANT)
 
 
 @needs_root
 def test_root_of_rootless_engine_is_person_who_started_it(mark: Path, tmp_path: Path) -> None:
     rootless = user_map(tmp_path, "0 1000 1\n1 100000 65536\n")
-    assert entry.heir(mark, rootless) == Owner(0, 0)
+    assert entry.find_results_owner(mark, rootless) == Owner(0, 0)
 
 
 @needs_root
@@ -65,7 +65,7 @@ def test_what_the_engine_made_is_given_with_the_folder_above(
     if exists:
         results.mkdir()
         (results / "report.html").touch()
-    entry.give(results, SOMEBODY)
+    entry.give_folder(results, SOMEBODY)
     assert {owner(path) for path in (results.parent, results, *results.iterdir())} == {SOMEBODY}
 
 
@@ -73,7 +73,7 @@ def test_what_the_engine_made_is_given_with_the_folder_above(
 def test_roots_own_folder_above_stays_roots(tmp_path: Path) -> None:
     results = tmp_path / "runs" / "compose"
     results.parent.mkdir()
-    entry.give(results, Owner(entry.SERVANT, entry.SERVANT))
+    entry.give_folder(results, Owner(entry.SERVANT, entry.SERVANT))
     assert owner(results.parent) == Owner(0, 0)
     assert owner(results) == Owner(entry.SERVANT, entry.SERVANT)
 
@@ -88,12 +88,12 @@ def test_nobody_is_deprived(tmp_path: Path) -> None:
     kept.touch()
     link.symlink_to(secret)
     os.chown(kept, 99, 99)
-    entry.give(results, SOMEBODY)
+    entry.give_folder(results, SOMEBODY)
     assert (owner(secret), owner(kept), owner(link)) == (Owner(0, 0), Owner(99, 99), SOMEBODY)
     theirs.mkdir()
     (theirs / "kept").touch()
     os.chown(theirs, 99, 99)
-    entry.give(theirs, SOMEBODY)
+    entry.give_folder(theirs, SOMEBODY)
     assert (owner(theirs), owner(theirs / "kept")) == (Owner(99, 99), Owner(0, 0))
 
 
@@ -107,7 +107,7 @@ def test_who_may_not_write_is_told_who_and_where(
     monkeypatch.setattr(os, "getgid", lambda: 1235)
     monkeypatch.setattr(os, "access", lambda *_, **__: False)
     with pytest.raises(SystemExit) as end:
-        entry.hand_over(tmp_path, mark)
+        entry.prepare_results(tmp_path, mark)
     assert end.value.code == 2
     said = capsys.readouterr().err
     assert said.startswith(f"error: user 1234:1235 cannot write into {tmp_path}: ")
@@ -120,18 +120,18 @@ def test_a_mark_that_is_not_there_is_told(
 ) -> None:
     monkeypatch.setattr(os, "getuid", lambda: 0)
     with pytest.raises(SystemExit):
-        entry.hand_over(tmp_path, tmp_path / "missing")
+        entry.prepare_results(tmp_path, tmp_path / "missing")
     assert "No such file" in capsys.readouterr().err
 
 
 def test_cache_is_copied_and_missing_one_is_no_failure(tmp_path: Path) -> None:
     held, own = tmp_path / "held", tmp_path / "own"
-    entry.warm(held, own)
+    entry.copy_cache(held, own)
     assert not own.exists()
     (held / "deep").mkdir(parents=True)
     (held / "deep" / "code").write_bytes(b"compiled")
     for _ in range(2):  # a container that is started again has it already
-        entry.warm(held, own)
+        entry.copy_cache(held, own)
         assert (own / "deep" / "code").read_bytes() == b"compiled"
 
 
@@ -178,7 +178,7 @@ def volumes() -> Iterator[Path]:
 
 
 def hand_out(volumes: Path, user: Any) -> None:
-    entry.hand_out_keys(
+    entry.distribute_keys(
         volumes, str(volumes.with_name("program")), user, volumes.with_name("scratch")
     )
 
