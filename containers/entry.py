@@ -13,10 +13,10 @@ The program does up to four things before it starts COMMAND:
   user of the image (`SERVANT`) takes its place. If the program does not run as root, it remains
   the same user.
 - `--keys`: VOLUMES contains a volume (folder) for each member of the session. Unless all of
-  them contain keys that remain valid for days, the program creates keys with `COMMAND[0] keys new`
-  and gives each member its own: the recorder's keys to the user that this program becomes, and
-  the keys of sites to the user `SITES`. The key of the certificate authority is never written
-  to a disk.
+  them contain keys that remain valid for days, the program creates keys with
+  `COMMAND[0] keys new`, and gives each member its own: the recorder's keys to the user that
+  this program becomes, and the keys of sites to the user `SITES`. The key of the certificate
+  authority is never written to a disk.
 - `--await-keys`: the container of a site can read only its own volume, FOLDER, and waits until
   the keys are there.
 

@@ -1,15 +1,14 @@
-"""Drives one master arm of a trilat-net session from a LeRobot policy.
+"""A LeRobot robot through which a policy drives one of the two masters of a trilat-net session.
 
-LeRobot is a library for robot learning. A policy is a trained program that commands a robot. In
-a session, two master arms lead one slave arm. The policy drives one master, and another user,
-usually a person, drives the other one. Each action of the policy commands its master, if the
-scenario allows this. Each observation has the newest records of the slave and of that master,
-and the state of the hand, which is the connection through which a program holds an arm.
+In such a session a slave arm follows two master arms. The policy drives one master, and another
+user drives the other. An action of the policy moves its master as an operator would (a "live
+hand" of the scenario). An observation consists of the newest states of the slave and of that
+master, and of the position and force of the operator.
 
 Invariant:
-    - An action moves the arm within the limits of force and speed that the scenario sets.
+    - The scenario limits the force and speed with which an action moves the arm.
     - The slave follows all of its users, weighted by their dominance factors.
-    - The features of actions and observations follow from the scenario alone.
+    - The keys of actions and observations depend on the scenario alone.
 """
 
 import time
@@ -23,20 +22,25 @@ from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnected
 import trilat_net as tn
 
 _HAND_COMMANDS = {"tip": ("move", "pos"), "joint": ("turn", "pos"), "force": ("push", "force")}
-"""How a hand of each mode is commanded: the method of `tn.hand`, and the suffix of the keys."""
+"""How a hand (operator) of each mode is commanded.
+
+The values are the method of `tn.hand`, and the suffix of the keys of a command.
+"""
 
 
 @RobotConfig.register_subclass("trilat")
 @dataclass(kw_only=True)
 class TrilatRobotConfig(RobotConfig):
-    """The session and the site that the policy drives. A site is a process that runs one arm.
+    """The session, and the site (arm with its control loop) that the policy drives.
 
     Attributes:
         session: Name of the session.
-        scenario: Name or path of the session's scenario. Empty for the session's name.
+        scenario: Name or path of the scenario of the session. Empty if it has the name of the
+            session.
         site: Name of the master that the policy drives.
-        slave: Name of the site that the policy also observes.
-        connect: Network addresses of the session. By default those on this machine.
+        slave: Name of the slave, which the policy also observes.
+        connect: Network endpoints of the session. Empty for the default endpoints on this
+            machine.
         keys: Folder of the operator's keys. Empty for a session without keys.
         timeout_s: Longest wait for the session, in s.
     """
@@ -51,12 +55,12 @@ class TrilatRobotConfig(RobotConfig):
 
 
 class TrilatRobot(Robot):
-    """A robot for LeRobot that consists of the slave and one master of a session.
+    """The slave and one master of a session. A policy observes both, and drives the master.
 
-    The policy observes both arms and drives the master.
+    LeRobot creates the object from a `TrilatRobotConfig`, and calls its methods in a loop.
 
     Args:
-        config: The session and the site.
+        config: The session and the sites.
     """
 
     config_class = TrilatRobotConfig
@@ -74,6 +78,7 @@ class TrilatRobot(Robot):
         self._felt_keys = [f"{axis}.felt" for axis in axes]
         self._sites = (config.slave, config.site)
         self._joint_keys: list[str] = []
+        # Without repetitions, in case both names are the same.
         for site in dict.fromkeys(self._sites):
             joint_names = scenario.arms[site].joint_names
             for joint_quantity in ("pos", "vel", "tau_x"):
@@ -86,46 +91,45 @@ class TrilatRobot(Robot):
 
     @property
     def observation_features(self) -> dict[str, type]:
-        """Names and types of the numbers of an observation.
+        """Keys of an observation: states of both arms, and position and force of the operator.
 
-        These are the joint states of the slave and of the master, and the position and force of
-        the hand. A joint has angle in rad, speed in rad/s and external torque in N m. The hand
-        has its position in m and the force that it feels in N. A hand in mode `joint` has
-        angles in rad and torques in N m.
+        A joint has its angle in rad, its velocity in rad/s and its external torque in N m. The
+        operator has a position in m, and feels a force in N. In mode `joint` these are angles
+        in rad and torques in N m.
         """
         return dict.fromkeys([*self._joint_keys, *self._position_keys, *self._felt_keys], float)
 
     @property
     def action_features(self) -> dict[str, type]:
-        """Names and types of the numbers of an action, which commands the hand.
+        """Keys of an action: a command of the operator.
 
-        The command is a position in m (mode `tip`), angles in rad (`joint`) or a force in N
-        (`force`). The scenario determines the mode.
+        Depending on the mode in the scenario, the command is a position in m (mode `tip`),
+        angles in rad (`joint`) or a force in N (`force`).
         """
         return dict.fromkeys(self._action_keys, float)
 
     @property
     def is_connected(self) -> bool:
-        """True while the robot takes part in the session."""
+        """True between `connect` and the end of the session."""
         return self._hand is not None and not self._hand.over
 
     @property
     def is_calibrated(self) -> bool:
-        """True: the arms need no calibration."""
+        """True, because there is nothing to calibrate."""
         return True
 
     def calibrate(self) -> None:
-        """Does nothing: the arms need no calibration."""
+        pass
 
     def configure(self) -> None:
-        """Does nothing: the scenario has all settings."""
+        pass
 
     def connect(self, calibrate: bool = True) -> None:  # noqa: ARG002 - there is nothing to calibrate
-        """Joins the session, and waits for the first record of both sites.
+        """Joins the session, and waits for the first state of both sites.
 
         Raises:
             DeviceAlreadyConnectedError: The robot is connected already.
-            DeviceNotConnectedError: A site publishes no record in time.
+            DeviceNotConnectedError: A site does not publish its state in time.
         """
         if self._hand is not None:
             raise DeviceAlreadyConnectedError(f"{self} is already connected.")
@@ -147,11 +151,10 @@ class TrilatRobot(Robot):
             self._stack = stack.pop_all()
 
     def _await_records(self, timeout_s: float) -> None:
-        """Waits until both sites have published a record.
+        """Waits until both sites have published a record, the state in one control period.
 
         Raises:
-            DeviceNotConnectedError: A site has not published a record within `timeout_s`
-                seconds.
+            DeviceNotConnectedError: A site has published no record for `timeout_s` seconds.
         """
         deadline_s = time.monotonic() + timeout_s
         while set(self._sites) - self._records.keys():
@@ -162,12 +165,12 @@ class TrilatRobot(Robot):
             self._receive_newest()
 
     def _receive_newest(self) -> None:
-        """Receives the new records, and keeps the newest record of each site."""
+        """Receives all new records, and keeps the newest record of each site."""
         for record in self._receive_records():
             self._records[record.site] = record
 
     def get_observation(self) -> dict[str, float]:
-        """Returns the joint states of slave and master, and the state of the hand."""
+        """Returns the newest states, with the keys of `observation_features`."""
         hand = self._require_hand()
         self._receive_newest()
         values: list[float] = []
@@ -180,13 +183,13 @@ class TrilatRobot(Robot):
         return dict(zip(self.observation_features, values, strict=True))
 
     def send_action(self, action: dict[str, Any]) -> dict[str, float]:
-        """Commands the hand. The site enforces the limits of force and speed.
+        """Commands the operator. The site enforces the limits of force and speed.
 
         Args:
-            action: Numbers with the names of `action_features`.
+            action: A command, with the keys of `action_features`.
 
         Returns:
-            The numbers that were sent.
+            The command that was sent.
         """
         goal = {key: float(action[key]) for key in self._action_keys}
         command = getattr(self._require_hand(), self._command)
@@ -194,13 +197,13 @@ class TrilatRobot(Robot):
         return goal
 
     def disconnect(self) -> None:
-        """Releases the arm and leaves the session, which continues."""
+        """Releases the arm and leaves the session. The session continues."""
         self._require_hand()
         self._hand = None
         self._stack.close()
 
     def _require_hand(self) -> Any:
-        """Returns the hand.
+        """Returns the connection of the operator.
 
         Raises:
             DeviceNotConnectedError: The robot is not connected.
@@ -211,10 +214,19 @@ class TrilatRobot(Robot):
 
 
 def _find_hand_mode(scenario: Any, site: str) -> str:
-    """Returns the mode in which a program may hold the arm of a site.
+    """Returns the mode of the live hand that a scenario allows at a site.
+
+    A live hand is an operator whose commands come from another program.
+
+    Args:
+        scenario: The scenario of the session.
+        site: Name of the site.
+
+    Returns:
+        A key of `_HAND_COMMANDS`.
 
     Raises:
-        ValueError: The scenario does not allow programs to hold this arm.
+        ValueError: The scenario allows no live hand at the site.
     """
     for hand in scenario.sites[site].hands:
         mode: str = getattr(hand, "mode", "")
@@ -224,9 +236,13 @@ def _find_hand_mode(scenario: Any, site: str) -> str:
 
 
 def _list_hand_axes(scenario: Any, site: str, mode: str) -> list[str]:
-    """Returns the names of the axes along which a hand moves the arm.
+    """Returns the names of the axes along which the operator moves an arm.
 
-    A hand in mode `joint` turns the joints. A hand in another mode moves the end effector.
+    Args:
+        scenario: The scenario of the session.
+        site: Name of the site.
+        mode: Mode of the operator. In mode `joint` the axes are the joints of the arm. In other
+            modes they are x, y and, in space, z of the end effector.
     """
     arm = scenario.arms[site]
     if mode == "joint":

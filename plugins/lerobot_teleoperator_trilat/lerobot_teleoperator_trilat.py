@@ -1,16 +1,18 @@
-"""Lets LeRobot read and move the master arm of a person in a trilat-net session.
+"""A LeRobot teleoperator for the master that a person moves in a trilat-net session.
 
-LeRobot is a library for robot learning. In a session, two master arms lead one slave arm. A
-person drives one master, and a policy, a trained program, drives the other one. An action of
-the person is the position of the person's arm. Feedback lets LeRobot move this arm, for example
-to the policy's position before the person intervenes.
+In such a session a slave arm follows two master arms. The person moves one master, and a policy
+drives the other. An action of the person is the position of the person's arm. Feedback lets
+LeRobot move that arm, for example to the position of the policy's arm before the person
+intervenes.
 
 Invariant:
     - The slave follows both users, weighted by their dominance factors, also while the person
       intervenes.
-    - The person intervenes if the person's dominance factor is greater than the policy's.
+    - The person counts as intervening if the person's dominance factor is greater than that of
+      the policy.
     - Feedback moves the arm only while torque is enabled and no other user holds the arm.
-    - Feedback pulls the arm with the spring and within the limits that the scenario sets.
+    - Feedback acts through the spring and the limits of the arm's live hand, which is an
+      operator that the scenario allows.
 """
 
 from contextlib import ExitStack
@@ -24,21 +26,26 @@ from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnected
 import trilat_net as tn
 
 _HAND_COMMANDS = {"tip": ("move", "pos"), "joint": ("turn", "pos"), "force": ("push", "force")}
-"""How a hand of each mode is commanded: the method of `tn.hand`, and the suffix of the keys."""
+"""How a hand (operator) of each mode is commanded.
+
+The values are the method of `tn.hand`, and the suffix of the keys of a command.
+"""
 
 
 @TeleoperatorConfig.register_subclass("trilat")
 @dataclass(kw_only=True)
 class TrilatTeleoperatorConfig(TeleoperatorConfig):
-    """The session, and the sites of person and policy. A site is a process with one arm.
+    """The session, and the sites (arms with their control loops) of the person and the policy.
 
     Attributes:
         session: Name of the session.
-        scenario: Name or path of the session's scenario. Empty for the session's name.
+        scenario: Name or path of the scenario of the session. Empty if it has the name of the
+            session.
         site: Name of the person's master.
         program: Name of the policy's master.
-        slave: Name of the site that both masters lead.
-        connect: Network addresses of the session. By default those on this machine.
+        slave: Name of the slave, which follows both masters.
+        connect: Network endpoints of the session. Empty for the default endpoints on this
+            machine.
         keys: Folder of the operator's keys. Empty for a session without keys.
         timeout_s: Longest wait for the session, in s.
     """
@@ -54,7 +61,10 @@ class TrilatTeleoperatorConfig(TeleoperatorConfig):
 
 
 class TrilatTeleoperator(Teleoperator):
-    """A teleoperator for LeRobot that consists of the person's master in a session.
+    """The master of a session that a person moves.
+
+    LeRobot creates the object from a `TrilatTeleoperatorConfig`, and calls its methods in a
+    loop.
 
     Args:
         config: The session and the sites.
@@ -79,40 +89,39 @@ class TrilatTeleoperator(Teleoperator):
 
     @property
     def action_features(self) -> dict[str, type]:
-        """Names and types of the numbers of an action: the position of the arm in m.
+        """Keys of an action: the position of the arm in m, or angles in rad in mode `joint`.
 
-        A hand in mode `joint` has angles in rad. The names are those of the actions of
-        `TrilatRobot`.
+        They are also the position keys of the robot `TrilatRobot`.
         """
         return dict.fromkeys(self._position_keys, float)
 
     @property
     def feedback_features(self) -> dict[str, type]:
-        """Names and types of the numbers of feedback, which commands the hand at the arm.
+        """Keys of feedback: a command of the operator.
 
-        The command is a position in m (mode `tip`), angles in rad (`joint`) or a force in N
-        (`force`). The scenario determines the mode.
+        Depending on the mode in the scenario, the command is a position in m (mode `tip`),
+        angles in rad (`joint`) or a force in N (`force`).
         """
         return dict.fromkeys(self._feedback_keys, float)
 
     @property
     def is_connected(self) -> bool:
-        """True while the teleoperator takes part in the session."""
+        """True between `connect` and the end of the session."""
         return self._hand is not None and not self._hand.over
 
     @property
     def is_calibrated(self) -> bool:
-        """True: the arms need no calibration."""
+        """True, because there is nothing to calibrate."""
         return True
 
     def calibrate(self) -> None:
-        """Does nothing: the arms need no calibration."""
+        pass
 
     def configure(self) -> None:
-        """Does nothing: the scenario has all settings."""
+        pass
 
     def connect(self, calibrate: bool = True) -> None:  # noqa: ARG002 - there is nothing to calibrate
-        """Joins the session without holding the arm.
+        """Joins the session, without holding the arm.
 
         Raises:
             DeviceAlreadyConnectedError: The teleoperator is connected already.
@@ -141,9 +150,11 @@ class TrilatTeleoperator(Teleoperator):
         return dict(zip(self._position_keys, position, strict=True))
 
     def get_felt(self) -> dict[str, float]:
-        """Returns the force that the arm exerts on the hand that holds it, in N.
+        """Returns the force of the arm on the operator that holds it.
 
-        A hand in mode `joint` feels torques in N m.
+        Returns:
+            The force along each axis in N, or the torque of each joint in N m in mode `joint`.
+            The keys end in `.felt`, as in the observations of `TrilatRobot`.
         """
         # The hand feels the reaction of the force that it applies to the arm.
         felt_forces = [-force for force in self._require_hand().force]
@@ -154,8 +165,8 @@ class TrilatTeleoperator(Teleoperator):
         """Pulls or pushes the arm if torque is enabled.
 
         Args:
-            feedback: Numbers with the names of `feedback_features`. Unknown names are ignored.
-                If a name is missing, nothing moves.
+            feedback: A command, with the keys of `feedback_features`. Other keys are ignored.
+                If a key is missing, the arm is not moved.
         """
         hand = self._require_hand()
         is_complete = all(key in feedback for key in self._feedback_keys)
@@ -169,12 +180,15 @@ class TrilatTeleoperator(Teleoperator):
         self._torque_enabled = True
 
     def disable_torque(self) -> None:
-        """Releases the arm, which the person then moves alone."""
+        """Releases the arm. Then only the person moves it, and feedback has no effect."""
         self._torque_enabled = False
         self._require_hand().release()
 
     def get_teleop_events(self) -> dict[TeleopEvents, bool]:
-        """Returns whether the person intervenes, and whether the session is over."""
+        """Returns whether the person intervenes, and whether the session is over.
+
+        The events for success and for recording an episode again are never set.
+        """
         hand = self._require_hand()
         shares = self._get_shares()
         person_leads = shares[self.config.site] > shares[self.config.program]
@@ -186,13 +200,13 @@ class TrilatTeleoperator(Teleoperator):
         }
 
     def disconnect(self) -> None:
-        """Releases the arm and leaves the session, which continues."""
+        """Releases the arm and leaves the session. The session continues."""
         self._require_hand()
         self._hand = None
         self._stack.close()
 
     def _require_hand(self) -> Any:
-        """Returns the hand, which is the connection through which a program holds an arm.
+        """Returns the connection of the operator.
 
         Raises:
             DeviceNotConnectedError: The teleoperator is not connected.
@@ -203,10 +217,19 @@ class TrilatTeleoperator(Teleoperator):
 
 
 def _find_hand_mode(scenario: Any, site: str) -> str:
-    """Returns the mode in which a program may hold the arm of a site.
+    """Returns the mode of the live hand that a scenario allows at a site.
+
+    A live hand is an operator whose commands come from another program.
+
+    Args:
+        scenario: The scenario of the session.
+        site: Name of the site.
+
+    Returns:
+        A key of `_HAND_COMMANDS`.
 
     Raises:
-        ValueError: The scenario does not allow programs to hold this arm.
+        ValueError: The scenario allows no live hand at the site.
     """
     for hand in scenario.sites[site].hands:
         mode: str = getattr(hand, "mode", "")
@@ -216,9 +239,13 @@ def _find_hand_mode(scenario: Any, site: str) -> str:
 
 
 def _list_hand_axes(scenario: Any, site: str, mode: str) -> list[str]:
-    """Returns the names of the axes along which a hand moves the arm.
+    """Returns the names of the axes along which the operator moves an arm.
 
-    A hand in mode `joint` turns the joints. A hand in another mode moves the end effector.
+    Args:
+        scenario: The scenario of the session.
+        site: Name of the site.
+        mode: Mode of the operator. In mode `joint` the axes are the joints of the arm. In other
+            modes they are x, y and, in space, z of the end effector.
     """
     arm = scenario.arms[site]
     if mode == "joint":
