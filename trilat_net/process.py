@@ -231,6 +231,7 @@ def end_process_at_signals() -> Callable[[], None]:
     unwatch = _watch_signals() if is_first_process else lambda: None
 
     def restore() -> None:
+        """Restores the handlers of the signals that were replaced."""
         unwatch()
         for number, handler in replaced.items():
             signal.signal(number, handler)
@@ -254,19 +255,23 @@ def _watch_signals() -> Callable[[], None]:
         A function that stops the thread.
     """
     reader, writer = os.pipe()
-    # Windows has no containers whose first process is this one.
+    # Python requires a pipe that never blocks, which Windows does not support. It is not needed
+    # there, because no container has this program as its first process.
     if sys.platform != "win32":
         os.set_blocking(writer, False)
-    before = signal.set_wakeup_fd(writer)
+    previous_descriptor = signal.set_wakeup_fd(writer)
 
     def wait() -> None:
-        with os.fdopen(reader, "rb", 0) as arrived:
-            while number := arrived.read(1):
-                if number[0] in ENDING_SIGNALS:
-                    os._exit(128 + number[0])
+        """Reads the numbers of arriving signals until the pipe is closed."""
+        with os.fdopen(reader, "rb", 0) as pipe:
+            while data := pipe.read(1):  # a byte with the number of the signal
+                number = data[0]
+                if number in ENDING_SIGNALS:
+                    os._exit(128 + number)
 
     def unwatch() -> None:
-        signal.set_wakeup_fd(before)
+        """Stops the thread by closing its pipe."""
+        signal.set_wakeup_fd(previous_descriptor)
         os.close(writer)
 
     threading.Thread(target=wait, daemon=True).start()

@@ -25,7 +25,13 @@ from ...reporting import style
 from ...reporting.appearance import make_print_size
 from ..intervals import MeanInterval
 from ..study_folder import encode_csv
-from .bench_results import BenchResults, build_bench_page, encode_runs, name_law
+from .bench_results import (
+    BenchCellResult,
+    BenchResults,
+    build_bench_page,
+    encode_runs,
+    name_law,
+)
 
 FIGURES_OF_BENCH = {
     "stable": ("share of stable runs", ""),
@@ -35,8 +41,11 @@ FIGURES_OF_BENCH = {
 }
 """For each figure its label and its quantity. The share of stable runs has no quantity."""
 _WIDTH_IN = 7.0
+"""Width of a figure, which is that of two columns of a paper, in inches."""
 _ROW_IN = 0.14
+"""Height of a row, in inches."""
 _HEAD_IN = 0.65
+"""Height of the labels below all panels, in inches. The title of a panel takes half of it."""
 _TEXT_PT = 5.5
 _PALETTE = "cividis"
 _NONE = "#a23b53"
@@ -89,7 +98,8 @@ def draw_bench(results: BenchResults, name: str) -> Figure:
     law_counts = [len(field) for field in fields.values()]
     panels_height = sum(_HEAD_IN / 2 + _ROW_IN * count for count in law_counts)
     size = make_print_size(_WIDTH_IN)
-    with style.styled_figure(size, panels_height + _HEAD_IN) as figure:
+    figure_height = panels_height + _HEAD_IN
+    with style.styled_figure(size, figure_height) as figure:
         grid = style.add_panels(
             figure,
             len(fields),
@@ -110,6 +120,7 @@ def draw_bench(results: BenchResults, name: str) -> Figure:
             _mark_cells(axes, results, task)
             axes.set_title(task)
         panels[-1].set_xticks(range(len(links)), links, rotation=90, fontsize=_TEXT_PT)
+        # All panels have the same scale, so the last image stands for all of them.
         figure.colorbar(image, ax=list(panels), label=label, fraction=0.03)
     return figure
 
@@ -151,12 +162,28 @@ def _collect(results: BenchResults, task: str, quantity: str) -> Array:
     links = results.plan.links
     field = np.full((len(laws), len(links)), np.nan)
     for result in results.select(task):
-        value = result.compute_mean(quantity) if quantity else result.stable / len(result.runs)
-        if value is not None:
+        number = _compute_number(result, quantity)
+        if number is not None:
             row = laws.index((result.cell.law, result.cell.form))
             column = links.index(result.cell.link)
-            field[row, column] = value.mean if isinstance(value, MeanInterval) else value
+            field[row, column] = number
     return field
+
+
+def _compute_number(result: BenchCellResult, quantity: str) -> float | None:
+    """Computes the number of a cell: the mean of a quantity, or the share of stable runs.
+
+    Args:
+        result: Result of the cell.
+        quantity: The quantity. Empty for the share of stable runs.
+
+    Returns:
+        The number. None if the runs lack the quantity.
+    """
+    if not quantity:
+        return result.stable / len(result.runs)
+    mean = result.compute_mean(quantity)
+    return mean.mean if isinstance(mean, MeanInterval) else mean
 
 
 def _label_laws(axes: Axes, results: BenchResults, task: str) -> None:
@@ -193,7 +220,11 @@ def write_bench(results: BenchResults, folder: Path, command: str) -> list[Path]
         The paths of the files.
     """
     names = list_figures_with_values(results)
-    pictures = {f"bench-{name}.png": FIGURES_OF_BENCH[name][0] for name in names}
+    pictures = {}
+    for name in names:
+        label, _ = FIGURES_OF_BENCH[name]
+        pictures[f"bench-{name}.png"] = label
+
     texts = {
         "bench.md": build_bench_page(results, command, pictures),
         "places.csv": encode_csv(results.to_rows()),
@@ -201,6 +232,7 @@ def write_bench(results: BenchResults, folder: Path, command: str) -> list[Path]
     }
     for name, text in texts.items():
         write_whole(folder / name, text)
+
     figures = {folder / f"bench-{name}.png": name for name in names}
     for path, name in figures.items():
         style.write_figure(draw_bench(results, name), path, style.REPORT_DPI)
