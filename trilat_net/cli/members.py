@@ -409,9 +409,9 @@ def replay_command(
 ) -> None:
     """Publishes a log over Zenoh with its original timing, as a separate session.
 
-    For recorders, viewers and `trilat ping` the replay is like a running session: it replies
-    for the sites of the log, and its messages are theirs, byte for byte. Without endpoints it
-    listens at the port of the session's first site.
+    For recorders, viewers and `trilat ping` the replay is like a running session. It replies in
+    place of the sites of the log, and publishes their messages, byte for byte. Without
+    endpoints it listens at the port of the session's first site.
 
     Options:
         files: An MCAP log, or all parts of a log in their order.
@@ -763,9 +763,9 @@ def ros2_command(
     *,
     reach: options.Reach,
 ) -> None:
-    """Bridges a session to ROS 2, whose programs can hold arms and whose robots can be arms.
+    """Bridges a session to ROS 2: its programs can hold arms, and its robots can be arms.
 
-    ROS needs RMW_IMPLEMENTATION=rmw_zenoh_cpp and its router; nothing of ROS is needed on this
+    ROS needs RMW_IMPLEMENTATION=rmw_zenoh_cpp and its router. Nothing of ROS is needed on this
     machine. The bridge waits for the router, and ends with the session. docs/ros2.md has all
     topics and services.
 

@@ -80,6 +80,9 @@ def verify_command(
 ) -> None:
     """Executes every site again from a log and compares every computed field of every record.
 
+    A record is the stored result of a site in one control period. The numbers must agree bit
+    for bit.
+
     Exit code 0: everything agrees, the log was not changed, and enough of every site was
     judged. 1: something differs, was changed, or is missing. 2: no log. 4: a site's law is code
     from outside that may not run without --law; everything else agrees.
@@ -130,15 +133,16 @@ def certify_command(
     laws: options.LawFiles,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Judges a run: stable, not stable or open.
+    """Judges if a run is stable, not stable or open, and gives the reasons.
 
-    Prints V and its energy balance, the premises of the proof, and the roots at the end pose.
-    Executes the run again together with twins that get a small push; runs code of imported laws
-    only with --law or --own-laws. docs/certificate.md defines every term and every key of the
-    JSON.
+    Prints the energy function V of the stability proof with its balance, the conditions of the
+    proof (premises), and the roots of the linearised loop at the final pose. Executes the run
+    again together with twins, which are repetitions with a small push. Runs code of imported
+    laws only with --law or --own-laws. docs/certificate.md defines every term and every key of
+    the JSON.
 
     Exit code 0: stable. 1: not stable (bounded oscillation, drifting, growing, diverged) or
-    open, with the reasons. 2: no log.
+    open. 2: no log.
     """
     from ..theory.linear_analysis import certify_run
 
@@ -176,11 +180,11 @@ def twin_command(
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Executes a run again together with twins that get a small push, and shows its growth.
+    """Executes a run again with small pushes, and shows whether these disturbances grow.
 
-    The difference between run and twin is simulated in full, without a linear model: the twins
-    get the arrivals, delays, hands and changes of the run (docs/certificate.md, "Twins"). Exit
-    code 0 for any growth.
+    A pushed repetition is called a twin. It gets the arrivals, delays, hands and changes of the
+    run, and the difference from the run is simulated in full, without a linear model
+    (docs/certificate.md, "Twins"). Exit code 0 for any growth.
     """
     from ..analysis.twin_growth import twin
 
@@ -201,10 +205,11 @@ def identify_hand_command(
     ] = "m1",
     as_json: options.JsonOption = False,
 ) -> None:
-    """Identifies mass, damping and stiffness of the hand at an arm that sines move.
+    """Identifies the mass, damping and stiffness of the hand that holds an arm.
 
-    The scenario of the run has an operator of kind "multisine" at any site (docs/ports.md,
-    "Measured operators"). `trilat linear --operators` reads the JSON of the result.
+    During the run a sum of sines moves the arm: the scenario has an operator of kind
+    "multisine" at any site (docs/ports.md, "Measured operators"). `trilat linear --operators`
+    reads the JSON of the result.
     """
     from ..studies.hand_impedance import identify_hand
 
@@ -217,8 +222,9 @@ def metrics_command(file: options.LogsArgument, as_json: options.JsonOption = Fa
     """Measures a run by all metrics that apply to it.
 
     They cover tracking, effort, energies, force sharing, impedance, walls, learning and the
-    network. Sites, links and walls are columns. A dash is a missing number; if the run could
-    have it, the reason is given below the table. docs/metrics.md has every formula.
+    network. The table has a column for each site, link and wall. A dash is a missing number. If
+    the run could have the number, the reason is given below the table. docs/metrics.md has
+    every formula.
     """
     from ..analysis.metrics.log_metrics import compute_log_metrics
 
@@ -377,7 +383,8 @@ def rerun_command(
 ) -> None:
     """Executes sites of a log again with changed settings, and compares the results.
 
-    Without --closed-loop the other sites stay as recorded and do not react.
+    Without --closed-loop only the sites of --replace are executed again. The other sites stay
+    as recorded and do not react.
     """
     from ..execution.rerun import rerun
     from ..files import refuse_existing
@@ -448,9 +455,10 @@ def linear_command(
 ) -> None:
     """Linearises the loop about its equilibrium, and analyses the stability of small motions.
 
-    Computes roots, delay margin and edges of stability with delays (docs/linear.md). Without
-    operators and environments it computes passivity, Llewellyn's criterion and the impedances
-    that operators feel (docs/ports.md). Exit code 0 for any verdict.
+    Computes the characteristic roots, the largest stable delay and the edges of stability with
+    delays (docs/linear.md). For the arms without operators and environments it computes
+    passivity, Llewellyn's criterion of absolute stability, and the impedances that operators
+    feel (docs/ports.md). Exit code 0 for any verdict.
     """
     options.check_picture(picture, force=force)
     from ..studies.hand_impedance import read_hands

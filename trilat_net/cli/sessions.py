@@ -440,9 +440,10 @@ def watch_command(
 ) -> None:
     """Shows a running session in a terminal, until the session ends or Ctrl-C.
 
-    Each site has a line with angles, |e|, torque, mode, the age of each peer's sample and the
-    holder of the arm. The line above has V. Without endpoints the command asks the first site,
-    at its loopback port, for the others.
+    Each site has a line with its joint angles, the size |e| of its synchronisation error, its
+    torque and mode, the age of the newest sample of each peer, and who holds the arm. The line
+    above the sites has V, the energy function of the stability proof. Without endpoints the
+    command asks the first site, at its loopback port, for the others.
     """
     from live.terminal_watch import show_in_terminal, watch_session
 
@@ -508,7 +509,7 @@ def stop_command(
 def enable_command(
     session: SessionOption, sites: SitesArgument = None, *, reach: options.Reach
 ) -> None:
-    """Enables stopped arms: they wait for their peers, align with them and follow again."""
+    """Enables stopped arms: they wait for the other arms, align with them and follow again."""
     terminal.print_texts(_connect(session, reach).enable(*(sites or ())))
 
 
@@ -521,7 +522,8 @@ def reset_command(
 ) -> None:
     """Clears the fault of sites unless its cause persists.
 
-    The sites then wait for their peers and align with them.
+    The sites then wait for the other sites, and their arms align with those before they follow
+    them.
     """
     terminal.print_texts(_connect(session, reach).reset(*sites))
 
