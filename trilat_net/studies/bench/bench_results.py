@@ -323,8 +323,10 @@ def _confirm_run(runs: dict[tuple[str, int], BenchRun], cell: BenchCell, seed: i
         return run
     if run.length_s >= LONGEST_S:
         return msgspec.structs.replace(run, confirmed=True)
+
     repeated = runs.get((name_run(cell.key, LONGEST_S), seed))
     if repeated is None:
+        # Either the user did not request the repetition, or the run diverged.
         return run
     return msgspec.structs.replace(
         run,
@@ -515,6 +517,7 @@ def _describe_result(result: BenchCellResult, quantity: str) -> str:
         return f"no contact{mark}"
     if any(run.behaviour is EndBehaviour.DIVERGED for run in result.runs):
         return f"diverged{mark}"
+
     mean = result.compute_mean(quantity)
     if mean is None:
         if quantity == "settled_s":
@@ -587,6 +590,7 @@ def describe_bench(results: BenchResults) -> Iterator[str]:
     seeds = max(len(cell.seeds) for cell in plan.cells)
     yield f"{plan.study}: {STUDIES[plan.study].about}"
     yield f"{cells}, {runs}: one per cell without randomness, otherwise {seeds}"
+
     unstable = [run for run in results.runs if run.stability is Stability.NOT_STABLE]
     confirmed = sum(bool(run.confirmed) for run in unstable)
     refuted = sum(run.confirmed is False for run in results.runs)
@@ -594,6 +598,7 @@ def describe_bench(results: BenchResults) -> Iterator[str]:
         f"not stable: {count_nouns(len(unstable), 'run')}; runs of {LONGEST_S:g} s confirmed "
         f"{confirmed} of them, and refuted {refuted} more"
     )
+
     for task in plan.tasks:
         yield f"{task}: {TASKS[task].about}"
     for law, form in plan.laws:
@@ -610,10 +615,10 @@ def tabulate_gains(results: BenchResults) -> TextTable:
     The column "stable" has the number of stable candidates and of all candidates. The column
     "without margin" has the number of candidates with smaller errors that lacked the margin.
     """
-    used = {str(gains): gains for gains in _list_used_gains(results)}
-    used |= {str(gains): gains for gains in results.plan.without}
+    tunings = {str(gains): gains for gains in _list_used_gains(results)}
+    tunings |= {str(gains): gains for gains in results.plan.without}
     rows = []
-    for tuned in used.values():
+    for tuned in tunings.values():
         gains = ", ".join(f"{name} {value:g}" for name, value in tuned.gains.items())
         rows.append(
             [
@@ -695,6 +700,7 @@ def _build_row(result: BenchCellResult) -> dict[str, Any]:
         row[stability.value.replace(" ", "_")] = result.count(stability)
     row["share_low"] = share_low
     row["share_high"] = share_high
+
     for quantity in QUANTITIES:
         mean = result.compute_mean(quantity)
         if isinstance(mean, MeanInterval):
@@ -703,7 +709,8 @@ def _build_row(result: BenchCellResult) -> dict[str, Any]:
         else:
             row[quantity] = mean
             row[f"{quantity}_half"] = None
-    row |= dict.fromkeys(_FORMER_KEYS)
+
+    row |= dict.fromkeys(_FORMER_KEYS)  # with the value None
     row |= {
         "judgement": result.judgement.value,
         "bounded": all(run.bounded for run in result.runs),
