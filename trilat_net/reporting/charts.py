@@ -251,7 +251,7 @@ class ChartBuilder:
         rate_hz = self._log.scenario.sites[site].rate_hz
         table = ColumnTable(rate_hz=rate_hz, tick=_encode(tick, "<i4"), columns=columns)
         self._tables.append(table)
-        has_values = [bool(has_value) for has_value in np.isfinite(values).any(axis=0)]
+        has_values = [bool(np.isfinite(column).any()) for column in values.T]
         self._has_values.append(has_values)
         return len(self._tables) - 1
 
