@@ -1,5 +1,4 @@
-"""Analyse a log in Python: how well does the slave follow, and how old are the samples it
-follows?
+"""Analyses a log: how well does the slave follow, and how old are the samples in use?
 
 This script is also a notebook: each `# %%` starts a cell in VS Code, PyCharm, Spyder or, with
 `jupytext`, in Jupyter. Without arguments it simulates a run. It draws `look_into_a_log.png`.

@@ -1,5 +1,4 @@
-"""Shares a slave between a program and a person: the lead changes twice, and no reference
-jumps.
+"""Shares a slave between a program and a person who take turns to lead, without jumps.
 
 The program moves master m2 along a circle. A person moves master m1; here a second program
 takes the person's place (with `--alone`, move m1 with the mouse on the page). The slave's row

@@ -16,8 +16,9 @@ import trilat_net as tn
 
 @tn.compiled
 class Reaction:
-    """Control law: tau_i = gravity - d qd_i - torques of own springs + torques of peers'
-    springs.
+    """Springs between the sites that act at both of their ends.
+
+    tau_i = gravity - d qd_i - torques of the site's springs + torques of the peers' springs
 
     Args:
         facts: numbers of joints and peers.

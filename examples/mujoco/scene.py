@@ -1,5 +1,4 @@
-"""Simulates the arm of a scenario in MuJoCo, with a box to push, a door with a spring, or a
-slot.
+"""Simulates an arm in MuJoCo that touches a box, a door with a spring, or a slot.
 
     pip install 'trilat-net[sim]'
     cd examples/mujoco
