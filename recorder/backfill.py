@@ -1,14 +1,14 @@
-"""Repair gaps: request missing messages of a site from its retransmission buffer.
+"""Requests missing messages from a site, which keeps its recent messages in a buffer.
 
-A probe requests the newest messages of a site that has been silent for too long. Lost last
-records, a lost end event and lost statistics are found by that. No function waits; the time is
-an argument.
+A missing message is noticed by a gap in the numbers. If the last messages of a site are
+missing, there is no gap. Therefore, if nothing arrives from a site for a while, the recorder
+requests its newest messages (a probe). No function waits: the present time is an argument.
 
 Invariant:
-    - At most one request to a site is outstanding.
-    - No request is sent while no message is missing.
-    - A message that the site does not have is not requested twice.
-    - Backfilled messages pass the same checks as published messages.
+    - At most one request to a site is open at a time.
+    - No request for missing messages is sent if no message is missing.
+    - A message that the site no longer has is not requested again.
+    - Messages from the buffer pass the same checks as published messages.
 """
 
 from collections import Counter
@@ -25,32 +25,37 @@ from trilat_net.net.wire import decode, encode
 from .site_reception import SiteMessage, SiteReception
 
 GRACE_NS = 50_000_000
-"""Wait before a missing message is requested, because it may only be late."""
+"""Time to wait before a missing message is requested, because it may only be late, in ns."""
 SILENT_NS = 1_000_000_000
-"""Silence after which the newest messages of a site are requested; at least three periods of
-the site.
+"""Time without messages after which the newest messages of a site are requested, in ns.
+
+For slow
+
+sites it is three tick periods.
 """
 ANSWER_NS = (300_000_000, 3_000_000_000)
-"""First and longest timeout of a request. It doubles after each request without a reply."""
+"""Shortest and longest timeout of a request, in ns. It doubles after each request without a
+reply.
+"""
 REST_NS = 250_000_000
-"""Pause after a reply without any requested message."""
+"""Pause after a reply without any new message, in ns."""
 MAX_VAIN_REQUESTS = 20
-"""Number of successive replies of that kind after which the gaps of a channel are given up."""
+"""Number of successive replies without any new message after which the gaps are given up."""
 GIVE_UP_NS = 10_000_000_000
-"""Longest time without progress after a site has ended, before all its gaps are given up."""
+"""Time without any new message, after a site has ended, until its gaps are given up, in ns."""
 
 
 RepairedMessage = tuple[str, SiteMessage, bytes]
-"""A message from the retransmission buffer of a site: channel, message and payload."""
+"""A message that a site sent again on request: channel, message and payload."""
 
 
 class _OpenRequest(NamedTuple):
     """A request that waits for its reply.
 
     Attributes:
-        request: the request.
-        replies: receives the replies.
-        sent_ns: time at which the request was sent, ns.
+        request: The request.
+        replies: Inbox for the replies.
+        sent_ns: Time at which the request was sent, on the monotonic clock, in ns.
     """
 
     request: BackfillRequest
@@ -59,14 +64,14 @@ class _OpenRequest(NamedTuple):
 
 
 class GapRepair:
-    """The requests for missing messages to one site.
+    """Requests the missing messages of one site.
 
     Args:
-        bus: the connection to the session.
-        session: name of the session.
-        reception: the received messages of the site.
-        dropped: counts the invalid replies by reason.
-        now_ns: the present time on the recorder's clock, ns.
+        bus: Network connection of the recorder.
+        session: Name of the session.
+        reception: Received messages of the site, which knows the gaps.
+        dropped: Counts invalid replies by reason.
+        now_ns: Present time on the monotonic clock, in ns.
     """
 
     def __init__(
@@ -81,40 +86,50 @@ class GapRepair:
         self._key = topics.key(session, reception.name, topics.PAST)
         self._reception = reception
         self._dropped = dropped
-        self._turns = list(SITE_CHANNELS)  # the channel of the last request is at the end
-        self._probes: set[str] = set()  # channels whose newest messages are requested next
+        # The channels take turns. The channel of the last request is at the end.
+        self._turns = list(SITE_CHANNELS)
+        # Channels whose newest messages will be requested.
+        self._probes: set[str] = set()
+        # Number at which the search for the next gap begins, by channel.
         self._next_numbers = dict.fromkeys(SITE_CHANNELS, 0)
+        # Number of successive replies without any new message, by channel.
         self._vain_requests = dict.fromkeys(SITE_CHANNELS, 0)
         self._open: _OpenRequest | None = None
+        # Time at which the next request is sent. None if no message is missing.
         self._due_ns: int | None = None
-        # fewer messages per request while no replies arrive
         self._timeout_ns = ANSWER_NS[0]
+        # Number of messages per request. It is reduced while no replies arrive, because large
+        # replies may not get through a bad connection.
         self._request_size = BACKFILL_MESSAGES
         self._polled_ns = now_ns
         self._probed_ns = now_ns
+        # Time at which the last new message arrived.
         self._progress_ns = now_ns
         self._ended_ns: int | None = None
 
     def probe(self) -> None:
-        """Lets the next requests ask for the newest messages of every channel."""
+        """Schedules requests for the newest messages of every channel."""
         self._probes = set(SITE_CHANNELS)
 
     def poll(self, now_ns: int, *, alive: bool) -> Iterator[RepairedMessage]:
-        """Yields missing messages that have arrived, and requests more.
+        """Yields requested messages that have arrived, and requests more.
 
         Args:
-            now_ns: the present time, ns.
-            alive: whether the site is present, so that it can reply.
+            now_ns: Present time on the monotonic clock, in ns.
+            alive: True if the site is present, so that it can reply.
         """
-        if now_ns - self._polled_ns > SILENT_NS:  # this process was suspended, not the site
+        if now_ns - self._polled_ns > SILENT_NS:
+            # This process was suspended. The site is not to blame that nothing arrived.
             self._progress_ns = now_ns
         self._polled_ns = now_ns
+
         if self._open is not None:
             yield from self._receive_reply(self._open, now_ns)
         if alive:
             self._probe_if_silent(now_ns)
             if self._open is None:
                 self._send_request(now_ns)
+
         if self._reception.final_ticks is not None:
             if self._ended_ns is None:
                 self._ended_ns = now_ns
@@ -122,6 +137,7 @@ class GapRepair:
                 self._reception.give_up()
 
     def _probe_if_silent(self, now_ns: int) -> None:
+        """Schedules requests for the newest messages, if nothing arrives from the site."""
         last_received_ns = self._reception.last_received_ns or 0
         silence_ns = now_ns - max(last_received_ns, self._probed_ns)
         longest_ns = max(SILENT_NS, 3 * self._reception.period_ns)
@@ -130,7 +146,7 @@ class GapRepair:
             self.probe()
 
     def _send_request(self, now_ns: int) -> None:
-        """Sends the next request if it is due."""
+        """Sends the next request, if a message is missing and the request is due."""
         request = self._make_request()
         if request is None:
             self._due_ns = None
@@ -144,7 +160,11 @@ class GapRepair:
             self._open = _OpenRequest(request, replies, now_ns)
 
     def _make_request(self) -> BackfillRequest | None:
-        """Returns the next request; None if no message is missing."""
+        """Returns the next request. None if no message is missing and no probe is scheduled.
+
+        The gaps of a channel are requested in ascending order, and again from the first one
+        after the last one.
+        """
         for channel in self._turns:
             account = self._reception.accounts[channel]
             gap = account.find_requestable_gap(self._next_numbers[channel])
@@ -161,7 +181,14 @@ class GapRepair:
     def _receive_reply(
         self, open_request: _OpenRequest, now_ns: int
     ) -> Iterator[RepairedMessage]:
-        """Yields the messages of a valid reply; closes a request that has timed out."""
+        """Yields the messages of the reply, if it has arrived, or closes a request without one.
+
+        A reply adjusts the timeout to four times the round trip. Invalid replies are counted.
+
+        Args:
+            open_request: The open request.
+            now_ns: Present time on the monotonic clock, in ns.
+        """
         request = open_request.request
         round_trip_ns = now_ns - open_request.sent_ns
         while (reply := open_request.replies.poll()) is not None:
@@ -175,12 +202,18 @@ class GapRepair:
             self._open = None
             yield from self._accept_reply(past, request, now_ns)
             return
+
         if round_trip_ns >= self._timeout_ns:
             self._timeout_ns = min(2 * self._timeout_ns, ANSWER_NS[1])
             self._request_size = max(1, self._request_size // 2)
             self._open = None
 
     def _decode(self, payload: bytes, request: BackfillRequest) -> Backfill:
+        """Decodes a reply, and checks that it answers the request.
+
+        Raises:
+            WireError: The reply is not valid, or answers something else.
+        """
         past = decode(payload, Backfill)
         self._reception.check_sender(past)
         if past.channel != request.channel or past.first > max(past.made, request.first):
@@ -192,17 +225,25 @@ class GapRepair:
     def _accept_reply(
         self, past: Backfill, request: BackfillRequest, now_ns: int
     ) -> Iterator[RepairedMessage]:
-        """Counts the messages of a reply, and yields messages that are new."""
+        """Counts the messages of a reply, yields those that are new, and schedules a request.
+
+        Args:
+            past: The reply.
+            request: The request that it answers.
+            now_ns: Present time on the monotonic clock, in ns.
+        """
         channel = past.channel
         account = self._reception.accounts[channel]
         self._probes.discard(channel)
         self._reception.add_expected(channel, past.made)
-        if past.first > request.first:  # the site does not hold the messages before
+        if past.first > request.first:
+            # The site no longer has the messages before the first one of the reply.
             account.abandon_below(past.first)
+
         is_useful = False
         for number, payload in enumerate(past.payloads, past.first):
-            if not payload:  # the site skipped this tick, as a record states
-                continue
+            if not payload:
+                continue  # the site skipped this tick, as a record states
             try:
                 message = self._reception.read(channel, payload)
                 if message.number != number:
@@ -215,20 +256,22 @@ class GapRepair:
             if self._reception.refill(channel, message):
                 is_useful = True
                 yield channel, message, payload
+
         next_number = past.first + len(past.payloads)
         self._next_numbers[channel] = max(next_number, request.first + 1)
         gap = account.find_requestable_gap(request.first)
         self._due_ns = now_ns
         if is_useful:
             self._progress_ns = now_ns
-        if is_useful or gap is None or gap[0] > request.first:
+        is_gap_closed = gap is None or gap[0] > request.first
+        if is_useful or is_gap_closed:
             self._vain_requests[channel] = 0
         else:
             self._due_ns = now_ns + REST_NS
             self._count_vain_request(channel)
 
     def _count_vain_request(self, channel: str) -> None:
-        """Counts a reply without any requested message, and gives up after too many."""
+        """Counts a reply without any new message. After too many, the gaps are given up."""
         self._vain_requests[channel] += 1
         if self._vain_requests[channel] >= MAX_VAIN_REQUESTS:
             self._vain_requests[channel] = 0

@@ -1,11 +1,12 @@
-"""Run the recorder as a process: join a session, write its messages, and end with the session.
+"""Runs the recorder as a process: joins a session, writes its messages, and ends with it.
 
 Invariant:
-    - No message is lost that has arrived or that a site still holds.
-    - Messages are stamped on arrival and wait in one bounded queue. One thread writes them.
-    - The file is flushed every 100 ms, and completed at every orderly end of the process.
-    - The first signal ends the recorder once it has the messages that the sites still hold. The
-      second signal ends it at once.
+    - No message is lost that has arrived, or that a site still has in its buffer.
+    - Messages get the time of their arrival and wait in one bounded queue. One thread writes
+      them.
+    - The file is flushed about every 65 ms, and completed whenever the process ends in order.
+    - The first signal ends the recorder after it has received the messages that the sites still
+      have. The second signal ends it at once.
 """
 
 from collections.abc import Callable, Mapping
@@ -33,30 +34,34 @@ from .session_recording import RecorderReport, Recording
 from .site_reception import InboundQueue
 
 POLL_NS = 10_000_000
+"""Pause between two polls while the recorder waits for the session, in ns."""
 END_S = 10
-END_NS = END_S * 1_000_000_000
-"""Longest time after a signal to get the messages that sites still hold. Sites hold messages
-for that long, see `sites`.
+"""Longest time after a signal to get the messages that sites still have, in s. Sites keep their
+messages for that long.
 """
+END_NS = END_S * 1_000_000_000
 FLUSH_NS = 65_000_000
-"""Period of writing; each turn ends with a flush. A crash loses at most this time. A longer
-period costs less computing time.
+"""Period with which the messages are written and flushed, in ns.
+
+A crash loses at most this time.
+
+A longer period costs less computing time.
 """
 
 
 class Recorder:
-    """The recorder of one session, from the first poll to the end mark of the file.
+    """Recorder of one session, from the search for its members to the end mark of the file.
 
     Args:
-        bus: the connection to the session.
-        clock: the time.
-        session: name of the session.
-        boot: number of this start of the recorder.
-        storage: where the log is written.
-        stopped: returns True if the recorder has to end at once.
-        say: prints a line for the user.
-        is_ending: returns True if the recorder has to end once it has the messages that the
-            sites still hold, after `END_NS` at most.
+        bus: Network connection of the recorder.
+        clock: Clock of the recorder.
+        session: Name of the session.
+        boot: Random number that identifies this start of the recorder.
+        storage: Place where the log is written.
+        stopped: Function that returns True if the recorder must end at once.
+        say: Function that prints a line for the user.
+        is_ending: Function that returns True if the recorder must end when it has the messages
+            that the sites still have, or after `END_NS`.
     """
 
     def __init__(
@@ -89,16 +94,17 @@ class Recorder:
         )
 
     def join(self, timeout_s: float | None) -> Epoch | None:
-        """Waits for the session to begin and returns its epoch.
+        """Waits until the session begins, or joins it if it is running.
 
         Args:
-            timeout_s: longest time to wait, s; None: no limit.
+            timeout_s: Longest time to wait, in s. None does not limit it.
 
         Returns:
-            The epoch; None if the recorder has to end before the session begins.
+            The common start time of the session and the boots of its members. None if the
+            recorder must end before the session begins.
 
         Raises:
-            SessionError: the session did not begin in time.
+            SessionError: The session did not begin in time.
         """
         begun_ns = self._clock.monotonic_ns()
         while not (self._stopped() or self._is_ending()):
@@ -116,16 +122,22 @@ class Recorder:
         return None
 
     def record(self, epoch: Epoch) -> Recording:
-        """Writes the session from its epoch to its end, and returns the finished recording.
+        """Writes the messages of the session until it ends.
+
+        Args:
+            epoch: Common start time of the session.
+
+        Returns:
+            The finished recording.
 
         Raises:
-            UsageError: the file cannot be created.
-            LogRefused: the disk refused to store the log; the error names the part that is
-                kept.
+            UsageError: The file cannot be created.
+            LogRefused: The disk refused the data. The error states which part is saved.
         """
         scenario = self._find_scenario(epoch)
 
         def open_part(stream: Sink, part: Mapping[str, str]) -> LogWriter:
+            """Returns the writer of one file of the log."""
             return LogWriter(
                 stream=stream,
                 scenario=scenario,
@@ -155,7 +167,8 @@ class Recorder:
                 size=lambda: log.written_bytes,
             )
             self._announce_start(recording, epoch, log.path)
-            has_room = True  # a full disk has no room for the messages in the queue
+            # A full disk has no room for the messages that wait in the queue.
+            has_room = True
             try:
                 self._run(recording, report)
             except LogRefused:
@@ -171,7 +184,7 @@ class Recorder:
         return recording
 
     def _find_scenario(self, epoch: Epoch) -> Scenario:
-        """Returns the scenario that a member of the session states."""
+        """Returns the scenario that a member of the session has sent with its identity."""
         return next(
             parse_embedded(info.scenario, info.member)
             for info in self._joining.membership.others.values()
@@ -179,7 +192,13 @@ class Recorder:
         )
 
     def _announce_start(self, recording: Recording, epoch: Epoch, path: Path) -> None:
-        """Publishes that the recorder runs, and requests old messages if it joins late."""
+        """Announces that the recorder runs. If it joins late, it requests the earlier messages.
+
+        Args:
+            recording: The recording.
+            epoch: Common start time of the session.
+            path: The file, for the user.
+        """
         info = self._publisher.info
         now_ns = self._clock.monotonic_ns()
         self._publisher.update(running=True)
@@ -194,12 +213,18 @@ class Recorder:
             self._say(f"recorder: {clock_text}")
 
     def _receive_presence(self, recording: Recording) -> None:
+        """Passes the news about members that appeared or disappeared to the recording."""
         while (change := self._presence.poll()) is not None:
             key, alive = change
             recording.note_presence(key, alive)
 
     def _run(self, recording: Recording, report: RecorderReport) -> None:
-        """Writes the session until it is over, or until the recorder has to end."""
+        """Writes the messages periodically until the session is over or the recorder must end.
+
+        Args:
+            recording: The recording.
+            report: Publishes the statistics.
+        """
         ending_ns: int | None = None
         while not (self._stopped() or recording.is_over(self._clock.monotonic_ns())):
             now_ns = self._clock.monotonic_ns()
@@ -213,6 +238,7 @@ class Recorder:
                 has_waited = now_ns - ending_ns > END_NS
                 if has_waited or recording.is_up_to_date(ending_ns, now_ns):
                     return
+
             self._publisher.answer_queries()
             recording.write(self._queue, now_ns)
             self._receive_presence(recording)
@@ -236,21 +262,23 @@ def record_session(
     """Records one session in this process.
 
     Args:
-        session: name of the session.
-        storage: where the log is written.
-        connection: how to connect to the session, see `connect_to_session`.
-        join_timeout_s: longest time to wait for the session to begin, s; None: no limit.
-        clock: the time.
-        say: prints a line for the user.
-        afterwards: processes the finished log, unless the session was interrupted. The recorder
-            remains a member of the session until then; sites with `--stay` wait for that.
-        warn: called once the connection is open; warns the user of risks for the recording.
+        session: Name of the session.
+        storage: Place where the log is written.
+        connection: How to connect to the session, see `connect_to_session`.
+        join_timeout_s: Longest time to wait until the session begins, in s. None does not limit
+            it.
+        clock: Clock of the recorder.
+        say: Function that prints a line for the user.
+        afterwards: Function that processes the finished log, unless the session was
+            interrupted. The recorder remains a member of the session until then. Sites with
+            `--stay` wait for that.
+        warn: Function that is called when the connection is open, to warn the user of risks.
 
     Returns:
         The exit code: 0, or 128 plus the number of the signal that ended the recorder.
 
     Raises:
-        TrilatError: the session did not begin, the file cannot be written, or records are
+        TrilatError: The session did not begin, the file cannot be written, or records are
             missing.
     """
     share_threads()

@@ -1,12 +1,17 @@
-"""Record one session: write its messages, count missing messages, and publish statistics.
+"""Records one session: writes its messages, finds missing ones, and publishes statistics.
+
+A session consists of sites, processes that run one arm each. Each start of a site has a boot, a
+random number that identifies it. A site may be started again while the session runs. Its new
+start then continues the numbers of the records.
 
 Invariant:
     - A message of the session is written once, byte for byte. Any other message is counted as
-      dropped, by reason.
-    - The recorder publishes `stored` about a site once it has every message of the site that it
-      can get.
-    - Statistics are published and recorded once a second, and their size is bounded. A step of
-      the wall clock is visible only in the statistics.
+      dropped, with the reason.
+    - The recorder publishes the event "stored" about a site when it has every message of the
+      site that it can get. A site that has ended waits for this event, but only for a limited
+      time.
+    - Statistics are published and recorded once a second, with a bounded size. All times are
+      measured by the monotonic clock. If the wall clock is set, only the statistics show it.
 """
 
 from collections import Counter
@@ -27,37 +32,48 @@ from .backfill import GapRepair
 from .site_reception import InboundQueue, SiteMessage, SiteReception
 
 SETTLE_NS = 1_000_000_000
-"""Wait for messages in transit after a site has ended and its token has disappeared."""
+"""Time to wait for messages in transit after a site has ended and disappeared, in ns."""
 RECONNECT_NS = 10_000_000_000
-"""Wait for a site that has ended and still holds missing records, if its connection broke."""
-HEARD_NS = 500_000_000
-"""A site runs if a message of the site arrived within this time."""
-UNDER_WAY_NS = 100_000_000
-"""A message that arrives this long after its site's token disappeared may have been in transit.
+"""Time to wait for a site that has ended but still has missing records, if its connection is
+interrupted, in ns.
 """
+HEARD_NS = 500_000_000
+"""A site counts as running if one of its messages arrived within this time, in ns."""
+UNDER_WAY_NS = 100_000_000
+"""Time for which messages of a site that has disappeared may have been in transit, in ns."""
 AWAY_NS = 15_000_000_000
-"""Wait for a site that disappeared without an end event, because a cut link may heal."""
+"""Time to wait for a site that disappeared without an "end" event, in ns.
+
+Its link may have been
+
+cut, and may work again.
+"""
 STARTS_KEPT = 4096
-"""Largest number of starts that are remembered before they are admitted."""
+"""Largest number of starts of sites that are remembered before they are recorded."""
 LAST_NS = 6_000_000_000
-"""Longest stay of a site after its last due tick: 5 s and a margin."""
+"""Longest time that a site stays after its last tick: 5 s and a margin, in ns."""
 
 
 class Recording:
-    """One log while it is recorded, and the accounts of its messages.
+    """One log while it is recorded, and the counts of its messages.
+
+    `Recorder` creates this object when the session begins, and calls `write` periodically.
 
     Args:
-        writer: writes the log.
-        scenario: the scenario of the session.
-        session: name of the session.
-        epoch: the epoch of the session.
-        bus: the connection to the session.
-        publisher: publishes the recorder's own events and puts them into the same queue as
-            other messages.
+        writer: Writes the log.
+        scenario: Scenario of the session.
+        session: Name of the session.
+        epoch: Common start time of the session, and the boots of the members.
+        bus: Network connection of the recorder.
+        publisher: Publishes the recorder's own events. It also puts them into the queue of the
+            received messages, so that they are recorded.
 
     Attributes:
-        accounts: account of the messages of each channel, by key.
-        dropped: number of messages that were not written, by reason.
+        session: Name of the session.
+        epoch: Common start time of the session.
+        publisher: Publishes the recorder's own events.
+        accounts: Counts of the messages of each channel, by key.
+        dropped: Number of messages that were not written, by reason.
     """
 
     def __init__(
@@ -76,10 +92,15 @@ class Recording:
         self._writer = writer
         self._scenario = scenario
         self._bus = bus
-        self._boots = dict(epoch.boots)  # by site the start that is recorded now
-        self._candidates = dict[str, int]()  # by site a start that may be recorded next
-        self._admitted: set[int] = set()  # starts that other sites admitted
-        self._vanished: set[tuple[str, str]] = set()  # site and start of tokens that ended
+        # Boot of the start that is being recorded, by site.
+        self._boots = dict(epoch.boots)
+        # Boot of a start that may be recorded next, by site.
+        self._candidates = dict[str, int]()
+        # Boots of the starts that other sites have admitted to the session.
+        self._admitted: set[int] = set()
+        # Site and boot of starts that have disappeared before they were recorded.
+        self._vanished: set[tuple[str, str]] = set()
+        # Time at which every site should have left, on the monotonic clock.
         self._end_ns = epoch.mono_ns + round(scenario.duration_s * 1e9) + LAST_NS
         self._sites = {
             name: SiteReception(scenario, name, epoch.boots.get(name))
@@ -95,11 +116,13 @@ class Recording:
             )
             for name, site in self._sites.items()
         }
+        # Site and channel of each key.
         self._channels = {
             topics.key(session, name, channel): (site, channel)
             for name, site in self._sites.items()
             for channel in site.accounts
         }
+        # Keys under which sites publish blocks of records.
         self._block_keys = {
             key for key, (_, channel) in self._channels.items() if channel == topics.STATE
         }
@@ -111,19 +134,27 @@ class Recording:
             key: site.accounts[channel] for key, (site, channel) in self._channels.items()
         }
         self.accounts.update(self._recorder_accounts)
-        self._stored: set[str] = set()  # sites about which `stored` was published
-        self._gone: set[str] = set()  # sites whose token is not present
-        self._gone_ns: dict[str, int] = {}  # by site the time since when it is gone
+        # Sites about which "stored" was published.
+        self._stored: set[str] = set()
+        # Sites that have disappeared from the network.
+        self._gone: set[str] = set()
+        # Time at which these sites disappeared, on the monotonic clock.
+        self._gone_ns: dict[str, int] = {}
+        # Number of messages for which the queue had no room, at the end.
         self._overflowed = 0
 
     def join_late(self, now_ns: int) -> None:
-        """Announces that the recorder joins a running session, and requests all messages."""
+        """Announces that the recorder joins a running session and requests earlier messages.
+
+        Args:
+            now_ns: Present time on the monotonic clock, in ns.
+        """
         t_ns = now_ns - self.epoch.mono_ns
         sites = ", ".join(name for name in self._sites if name not in self._gone)
         self.publisher.publish(
             "late",
             f"the recorder joins at t = {t_ns / 1e9:.3f} s; "
-            f"what was before is asked of {sites}",
+            f"it requests the earlier messages from {sites}",
             t_ns=t_ns,
         )
         for name in self._gone:
@@ -132,11 +163,17 @@ class Recording:
             repair.probe()
 
     def assume_gone(self) -> None:
-        """Regards every site as gone until its token appears."""
+        """Regards every site as gone until the network reports that it is present."""
         self._gone = set(self._sites)
 
     def write(self, queue: InboundQueue, now_ns: int) -> None:
-        """Writes the messages of the queue, repairs gaps, and publishes `stored`."""
+        """Writes the waiting messages, requests missing ones, and publishes "stored".
+
+        Args:
+            queue: Queue of the received messages.
+            now_ns: Present time on the monotonic clock, in ns. Later messages stay in the
+                queue.
+        """
         self._drain(queue, now_ns)
         self._admit_starts()
         for name, repair in list(self._repairs.items()):
@@ -147,14 +184,21 @@ class Recording:
                 self._publish_stored(site, now_ns)
 
     def _repair_gaps(self, name: str, repair: GapRepair, now_ns: int) -> None:
-        """Writes the missing messages of a site that have arrived, and requests more."""
+        """Writes requested messages of a site that have arrived, and requests more.
+
+        Args:
+            name: Name of the site.
+            repair: Requests the missing messages of the site.
+            now_ns: Present time on the monotonic clock, in ns.
+        """
         t_ns = now_ns - self.epoch.mono_ns
         self._sites[name].since_ns = t_ns
         gone_since_ns = self._find_gone_since_ns(name, now_ns)
+        # If a message arrived after the site was reported as gone, the site can still reply.
         is_present = gone_since_ns is None or gone_since_ns > self._gone_ns[name]
         for channel, message, payload in repair.poll(now_ns, alive=is_present):
             key = topics.key(self.session, name, channel)
-            sent_ns = max(message.t_ns, 0)  # a log has no times before the epoch
+            sent_ns = max(message.t_ns, 0)  # a log contains no times before the epoch
             log_time_ns = self.epoch.unix_ns + t_ns
             self._writer.add(
                 key, payload, sent_ns, log_time_ns, message.sequence, message.content
@@ -162,6 +206,7 @@ class Recording:
             self._note_admission(message.content)
 
     def _publish_stored(self, site: SiteReception, now_ns: int) -> None:
+        """Publishes that all messages of a site that can be obtained are stored."""
         text = f"every record of {site.name} is stored"
         missing = site.describe_missing()
         if missing:
@@ -172,7 +217,12 @@ class Recording:
         )
 
     def _drain(self, queue: InboundQueue, until_ns: int | None) -> None:
-        """Writes the messages of the queue that arrived until a time; None: all messages."""
+        """Writes the messages of the queue, and counts those that cannot be written as dropped.
+
+        Args:
+            queue: Queue of the received messages.
+            until_ns: Messages that arrived later stay in the queue. None writes all messages.
+        """
         for message in queue.drain(until_ns):
             try:
                 if message.key in self._block_keys:
@@ -185,20 +235,22 @@ class Recording:
                 self.dropped[error.reason] += 1
 
     def _admit_starts(self) -> None:
-        """Begins to record the next start of each site that has a candidate.
+        """Begins to record the next start of each site that was started again.
 
-        The start before has to be gone or ended, or another site has to have admitted the
-        candidate.
+        A second start may also be a mistake. Therefore it is recorded only if the previous
+        start has disappeared or ended, or if another site has admitted the new start.
         """
         for name, boot in list(self._candidates.items()):
-            before = self._sites[name]
+            previous = self._sites[name]
             has_left = name in self._gone or name not in self._boots
-            has_ended = before.final_ticks is not None
-            if not (has_left or has_ended or boot in self._admitted):
+            has_ended = previous.final_ticks is not None
+            is_admitted = boot in self._admitted
+            if not (has_left or has_ended or is_admitted):
                 continue
+
             del self._candidates[name]
             self._boots[name] = boot
-            site = SiteReception(self._scenario, name, boot, before)
+            site = SiteReception(self._scenario, name, boot, previous)
             repair = GapRepair(self._bus, self.session, site, self.dropped)
             repair.probe()
             self._sites[name] = site
@@ -207,6 +259,7 @@ class Recording:
                 key = topics.key(self.session, name, channel)
                 self._channels[key] = (site, channel)
                 self.accounts[key] = site.accounts[channel]
+
             self._stored.discard(name)
             self._gone_ns.pop(name, None)
             if (name, str(boot)) in self._vanished:
@@ -215,7 +268,15 @@ class Recording:
                 self._gone.discard(name)
 
     def _note_start(self, name: str, payload: bytes) -> None:
-        """Notes a candidate if a payload is the event by which a site joins again."""
+        """Notes the next start of a site, if a message is its event of joining.
+
+        Args:
+            name: Name of the site under whose key the message arrived.
+            payload: The message.
+
+        Raises:
+            WireError: The message is not an event.
+        """
         event = decode(payload, Event)
         if event.kind not in ("coming", "join") or event.member != name:
             return
@@ -224,7 +285,11 @@ class Recording:
             self._admit_starts()
 
     def _note_admission(self, event: object) -> None:
-        """Notes a start that another site admits, or the last known tick before a start."""
+        """Evaluates an event by which a site reports about the start of another site.
+
+        The event "admit" states that the site has admitted the start. The event `LAST` states
+        how many ticks the site received before the start. Other messages are ignored.
+        """
         if not isinstance(event, Event) or event.about not in self._sites:
             return
         boot = event.boots.get(event.about)
@@ -239,7 +304,21 @@ class Recording:
             self._admit_starts()
 
     def _read(self, key: str, payload: bytes) -> tuple[SiteReception, SiteMessage]:
-        """Decodes a message of a site, which may be the first message of its next start."""
+        """Decodes a message of a site.
+
+        If the message is the first one of the site's next start, that start is recorded from
+        now on.
+
+        Args:
+            key: Key under which the message arrived.
+            payload: The message.
+
+        Returns:
+            The site that sent the message, and the message.
+
+        Raises:
+            WireError: The message is not valid.
+        """
         site, channel = self._channels[key]
         try:
             return site, site.read(channel, payload)
@@ -251,6 +330,16 @@ class Recording:
             return site, site.read(channel, payload)
 
     def _write_site_message(self, key: str, payload: bytes, mono_ns: int) -> None:
+        """Writes an event or statistics of a site, unless they were written before.
+
+        Args:
+            key: Key under which the message arrived.
+            payload: The message.
+            mono_ns: Time of the arrival on the monotonic clock, in ns.
+
+        Raises:
+            WireError: The message is not valid.
+        """
         since_ns = mono_ns - self.epoch.mono_ns
         if key not in self._channels:
             raise WireError("stranger", key)
@@ -261,14 +350,25 @@ class Recording:
             self._note_admission(message.content)
         if not site.accept(channel, message, mono_ns):
             return
+
         sent_ns = message.t_ns
         if sent_ns < 0 and channel == topics.EVENT:
-            sent_ns = since_ns  # an event before the epoch gets the time of its arrival
+            # An event from before the epoch is stored with the time of its arrival.
+            sent_ns = since_ns
         log_time_ns = self.epoch.unix_ns + since_ns
         self._writer.add(key, payload, sent_ns, log_time_ns, message.sequence, message.content)
 
     def _write_block(self, key: str, block: bytes, mono_ns: int) -> None:
-        """Writes the records of a block up to the first payload that is not a valid record."""
+        """Writes the records of a block up to the first payload that is not a valid record.
+
+        Args:
+            key: Key under which the block arrived.
+            block: The encoded records.
+            mono_ns: Time of the arrival on the monotonic clock, in ns.
+
+        Raises:
+            WireError: A payload is not a valid record.
+        """
         site = self._channels[key][0]
         since_ns = mono_ns - self.epoch.mono_ns
         site.since_ns = since_ns
@@ -278,13 +378,22 @@ class Recording:
             add(key, payload, record.sent_ns, log_time_ns, record.tick, record)
 
     def _write_recorder_message(self, key: str, payload: bytes, mono_ns: int) -> None:
-        """Writes an event or statistics of this recorder."""
+        """Writes an event or statistics of this recorder.
+
+        Args:
+            key: Key of the message.
+            payload: The message.
+            mono_ns: Time of the arrival on the monotonic clock, in ns.
+
+        Raises:
+            WireError: The message is from another recorder, or is not valid.
+        """
         account = self._recorder_accounts[key]
         since_ns = mono_ns - self.epoch.mono_ns
         content: Event | None = None
         if key.endswith(topics.STATS):
             boot = decode(payload, RecorderStats).boot
-            number = account.expected  # statistics state no number
+            number = account.expected  # statistics contain no number
         else:
             content = decode(payload, Event)
             if content.member != topics.RECORDER:
@@ -298,7 +407,12 @@ class Recording:
             self._writer.add(key, payload, since_ns, log_time_ns, number, content)
 
     def note_presence(self, key: str, alive: bool) -> None:
-        """Notes that the token of a member appeared or disappeared."""
+        """Notes that one start of a site appeared on the network or disappeared from it.
+
+        Args:
+            key: Key of the start's token, which contains the site and the boot.
+            alive: True if the token appeared.
+        """
         parts = topics.parse_key(key)
         if parts is None or parts.member not in self._sites:
             return
@@ -311,11 +425,19 @@ class Recording:
             self._gone.add(parts.member)
 
     def _find_gone_since_ns(self, site: str, now_ns: int) -> int | None:
-        """Returns the time since when a site is gone, ns; None while its token is present.
+        """Returns the time since when a site is gone. None if it is present.
 
-        After a reconnection the end of a token may be reported after its return. A message of
-        the site that arrives later than `UNDER_WAY_NS` proves that the site is still present;
-        then the arrival of that message is returned.
+        When a connection is established again, the network may report that a site disappeared
+        after it has reported the return. Therefore, if a message arrives so late that it cannot
+        have been in transit (`UNDER_WAY_NS`), the site is present nevertheless. It then counts
+        as gone since the arrival of that message.
+
+        Args:
+            site: Name of the site.
+            now_ns: Present time on the monotonic clock, in ns.
+
+        Returns:
+            The time on the monotonic clock, in ns.
         """
         if site not in self._gone:
             self._gone_ns.pop(site, None)
@@ -327,18 +449,24 @@ class Recording:
         return last_ns
 
     def is_over(self, now_ns: int) -> bool:
-        """True once every site has all its messages stored, or is gone for good."""
-        # asked of every site, because `_has_left` notes since when a site is gone
+        """Returns True if every site has all messages stored or is gone for good."""
+        # Every site is examined, because `_has_left` notes the time at which a site
+        # disappeared.
         left = [self._has_left(name, now_ns) for name in self._sites]
         return all(left)
 
     def _has_left(self, site: str, now_ns: int) -> bool:
-        """True if all messages of a site are stored, or if the site is gone for good."""
+        """Returns True if all messages of a site are stored, or if the site is gone for good.
+
+        How long the recorder waits for a site that is gone depends on whether its end and all
+        its messages are known.
+        """
         if site in self._stored:
             return True
         since_ns = self._find_gone_since_ns(site, now_ns)
         if since_ns is None:
             return False
+
         wait_ns = SETTLE_NS
         if self._sites[site].final_ticks is None:
             wait_ns = max(SETTLE_NS, min(AWAY_NS, self._end_ns - since_ns))
@@ -347,14 +475,15 @@ class Recording:
         return now_ns - since_ns > wait_ns
 
     def is_up_to_date(self, ending_ns: int, now_ns: int) -> bool:
-        """True once the recorder has every message that any site can send by now.
+        """Returns True if the recorder has every message that the sites have sent so far.
 
-        That holds for a site that has left, and for a site that still runs and lacks no message
-        `SETTLE_NS` after the recorder was asked to end.
+        This is used if the recorder is to end while the session runs. A site that still runs
+        must lack no message `SETTLE_NS` after the recorder was told to end.
 
         Args:
-            ending_ns: time at which the recorder was asked to end, on its monotonic clock, ns.
-            now_ns: the present time on that clock, ns.
+            ending_ns: Time at which the recorder was told to end, on the monotonic clock, in
+                ns.
+            now_ns: Present time on the monotonic clock, in ns.
         """
         for name, site in self._sites.items():
             if self._has_left(name, now_ns):
@@ -366,15 +495,15 @@ class Recording:
         return True
 
     def flush(self) -> None:
-        """Hands all written messages to the operating system."""
+        """Passes all written messages to the operating system."""
         self._writer.flush()
 
     def finish(self, queue: InboundQueue, *, rest: bool = True) -> None:
-        """Finishes the log with its accounts and its end mark.
+        """Finishes the log with the counts of messages and the end mark.
 
         Args:
-            queue: the queue of received messages.
-            rest: whether the messages that still wait in the queue are written before.
+            queue: Queue of the received messages.
+            rest: True to write the messages that still wait in the queue before.
         """
         if rest:
             self._drain(queue, None)
@@ -382,7 +511,14 @@ class Recording:
         self._writer.finish(self.render_accounts(queue))
 
     def render_accounts(self, queue: InboundQueue) -> dict[str, str]:
-        """Returns the accounts as texts of the file, by topic, and the dropped messages."""
+        """Returns the counts of messages as texts, as the log stores them.
+
+        Args:
+            queue: Queue of the received messages, which counts those for which it had no room.
+
+        Returns:
+            A line for each topic, and the number of dropped messages for each reason.
+        """
         event_accounts = {
             topics.key(self.session, name, topics.EVENT): site.event_accounts
             for name, site in self._sites.items()
@@ -396,7 +532,7 @@ class Recording:
         return texts
 
     def render_summary(self) -> list[str]:
-        """Returns lines of text on the sites and on messages that were not written."""
+        """Returns lines about the sites and the messages that were not written."""
         lines = [self._summarize_site(site) for site in self._sites.values()]
         if self._overflowed:
             messages = count_nouns(self._overflowed, "message")
@@ -406,6 +542,7 @@ class Recording:
         return lines
 
     def _summarize_site(self, site: SiteReception) -> str:
+        """Returns a line for the user about the records of a site."""
         account = site.accounts[topics.STATE]
         total = f" of {count_nouns(account.expected, 'record')}"
         if site.final_ticks is None:
@@ -421,7 +558,7 @@ class Recording:
         return line
 
     def describe_problem(self) -> str | None:
-        """Returns the first problem of the recording as text; None if it is complete."""
+        """Describes the first problem of the recording. None if every record is stored."""
         for name, site in self._sites.items():
             if site.final_ticks is None:
                 records = count_nouns(site.accounts[topics.STATE].received, "record")
@@ -433,22 +570,23 @@ class Recording:
 
 
 REPORT_EVERY_NS = 1_000_000_000
-"""Period of the statistics."""
+"""Period of the statistics, in ns."""
 MAX_GAPS_REPORTED = 20
-"""Largest number of gaps of a channel in the statistics; smaller if there are many channels."""
+"""Largest number of gaps of a channel that the statistics list."""
 _ALL_GAPS = 600
-"""Largest number of gaps of all channels together in the statistics."""
+"""Largest number of gaps of all channels together that the statistics list."""
 
 
 class RecorderReport:
-    """Publishes the statistics of one recording.
+    """Publishes the statistics of one recording once a second.
 
     Args:
-        bus: the connection to the session.
-        clock: the time.
-        recording: the recording.
-        queue: the queue of received messages, which gets the statistics as well.
-        size: returns the size of the log, bytes.
+        bus: Network connection of the recorder.
+        clock: Clock of the recorder.
+        recording: The recording.
+        queue: Queue of the received messages. The statistics are added, so that they are
+            recorded.
+        size: Function that returns the size of the log in bytes.
     """
 
     def __init__(
@@ -469,25 +607,27 @@ class RecorderReport:
         self._due_ns = clock.monotonic_ns() + REPORT_EVERY_NS
 
     def note_flush(self, duration_ns: int) -> None:
-        """Notes the duration of a flush, ns."""
+        """Notes the duration of a flush in ns. The statistics state the longest one."""
         self._flush_max_ns = max(self._flush_max_ns, duration_ns)
 
     def poll(self) -> None:
         """Publishes the statistics if they are due."""
         now_ns = self._clock.monotonic_ns()
         if now_ns >= self._due_ns:
-            on_time = now_ns - self._due_ns < REPORT_EVERY_NS
-            self._due_ns = (self._due_ns if on_time else now_ns) + REPORT_EVERY_NS
+            # After a long delay, the missed statistics are not published later.
+            is_on_time = now_ns - self._due_ns < REPORT_EVERY_NS
+            self._due_ns = (self._due_ns if is_on_time else now_ns) + REPORT_EVERY_NS
             self.publish()
 
     def publish(self) -> None:
-        """Publishes the statistics, and puts them into the queue."""
+        """Publishes the statistics, and adds them to the queue of the received messages."""
         payload = encode(self._make_stats())
         self._flush_max_ns = 0
         self._queue.receive(self._key, payload)
         self._publish(payload)
 
     def _make_stats(self) -> RecorderStats:
+        """Returns the present statistics, with the counts and gaps of every channel."""
         recording = self._recording
         now_ns = self._clock.monotonic_ns()
         stats = RecorderStats(
@@ -505,7 +645,8 @@ class RecorderReport:
         )
         gap_limit = max(1, min(MAX_GAPS_REPORTED, _ALL_GAPS // len(recording.accounts)))
         for key, account in recording.accounts.items():
-            name = "/".join(key.split("/")[2:])  # member and channel, as in "m1/state"
+            # A key is "trilat/SESSION/MEMBER/CHANNEL". The statistics use "MEMBER/CHANNEL".
+            name = "/".join(key.split("/")[2:])
             stats.expected[name] = account.expected
             stats.received[name] = account.received
             stats.missing[name] = account.missing

@@ -1,18 +1,19 @@
-"""Receive the messages of a recorder: one bounded queue, and per site the received messages.
+"""Receives the messages of a session, and finds out which messages of each site are missing.
 
-`InboundQueue` holds the messages between the bus and the writer. `SiteReception` decodes the
-messages of one site, checks them, and keeps the accounts that tell which messages are missing.
+`InboundQueue` holds the messages between the threads of the network and the thread that writes.
+`SiteReception` decodes and checks the messages of one site, a process that runs one arm, and
+counts them.
 
 Invariant (L6):
-    - The queue is bounded in messages and in bytes. Each key has a share of the bytes, so that
-      a flood of messages from one member does not displace the messages of other members.
-      Messages that do not fit are counted and reported.
-    - A message counts only if it can be decoded, is of this site and of this start, and has a
-      number that the scenario and the clock allow.
-    - A message may imply that other messages exist. Records and statistics are as many as the
-      scenario has ticks, and a message of a tick in the future is refused.
-    - Events are accepted up to a number of bytes, and the first end event is accepted even
-      beyond that.
+    - The queue is bounded in messages and in bytes. The bytes of each key are bounded as well,
+      so that a flood of messages from one member does not displace the messages of the others.
+      Messages for which there is no room are counted and reported.
+    - A message counts only if it can be decoded, is of this site and of this start of the site,
+      and has a number that the scenario and the clock allow.
+    - A message may show that other messages exist. The records and statistics that follow from
+      it are limited to the ticks of the scenario. A message of a tick in the future is refused.
+    - Events are accepted up to a number of bytes. The first "end" event is accepted even beyond
+      that limit.
 """
 
 import math
@@ -39,30 +40,30 @@ from trilat_net.scenario import Scenario
 from trilat_net.scenario.run_changes import count_skipped_ticks
 
 CAPACITY = 60_000
-"""Capacity of the queue in messages: minutes of three sites at 1 kHz, whose records come in
-blocks.
+"""Largest number of messages in the queue. It suffices for minutes of three sites at 1 kHz,
+which send their records in blocks.
 """
 CAPACITY_BYTES = 96 << 20
-"""Capacity of the queue in bytes."""
+"""Largest size of the queue, in bytes."""
 KEY_BYTES = 32 << 20
-"""Capacity in bytes for the messages of one key. A planar arm at 1 kHz sends half a megabyte
-per second.
+"""Largest size of the waiting messages of one key, in bytes. A planar arm at 1 kHz sends half a
+megabyte per second.
 """
 OVERHEAD_BYTES = 200
-"""Memory of a message besides its payload, bytes."""
+"""Memory of a waiting message besides its payload, in bytes."""
 KEYS = 1_000
-"""Largest number of keys that are counted separately; further keys share one count."""
+"""Largest number of keys that are counted separately. All further keys are counted together."""
 _OTHER_KEYS = "others"
-"""Under this name all keys beyond `KEYS` are counted."""
+"""Name under which the keys beyond `KEYS` are counted."""
 
 
 class InboundMessage(NamedTuple):
     """A received message.
 
     Attributes:
-        key: the key under which the message was published.
-        payload: the bytes of the message.
-        mono_ns: time of arrival on the monotonic clock, ns.
+        key: Key under which the message was published.
+        payload: Bytes of the message.
+        mono_ns: Time of the arrival on the monotonic clock, in ns.
     """
 
     key: str
@@ -71,40 +72,49 @@ class InboundMessage(NamedTuple):
 
 
 class InboundQueue:
-    """A bounded queue between the threads of the bus and the thread of the writer.
+    """Bounded queue between the threads of the network and the thread that writes the log.
 
     Args:
-        clock: stamps the messages.
+        clock: Clock that stamps the messages.
 
     Attributes:
-        overflowed: number of messages that did not fit, by key.
+        overflowed: Number of messages for which there was no room, by key.
     """
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
         self._queue: deque[InboundMessage] = deque()
-        # each counter is written by one side only, so the sides need no common lock
+        # The threads of the network write the counters of received bytes, and the other thread
+        # those of drained bytes. Therefore they need no common lock.
         self._received_bytes = Counter[str]()
         self._drained_bytes = Counter[str]()
         self._total_received_bytes = 0
         self._total_drained_bytes = 0
-        self._receive_lock = threading.Lock()  # a bus may have several threads
+        # The network may have several threads.
+        self._receive_lock = threading.Lock()
         self.overflowed: Counter[str] = Counter()
 
     def __len__(self) -> int:
         return len(self._queue)
 
     def receive(self, key: str, payload: bytes) -> None:
-        """Stamps a message and appends it, or counts it as overflowed. The bus calls this."""
+        """Adds a message with the time of its arrival, if there is room.
+
+        The network calls this.
+
+        Args:
+            key: Key under which the message was published.
+            payload: Bytes of the message.
+        """
         size = len(payload) + OVERHEAD_BYTES
         with self._receive_lock:
             counted_key = key
             if key not in self._received_bytes and len(self._received_bytes) >= KEYS:
                 counted_key = _OTHER_KEYS
-            waiting = self._total_received_bytes - self._total_drained_bytes
-            key_waiting = self._received_bytes[counted_key] - self._drained_bytes[counted_key]
-            is_full = len(self._queue) >= CAPACITY or waiting >= CAPACITY_BYTES
-            if is_full or key_waiting >= KEY_BYTES:
+            waiting_bytes = self._total_received_bytes - self._total_drained_bytes
+            key_bytes = self._received_bytes[counted_key] - self._drained_bytes[counted_key]
+            is_full = len(self._queue) >= CAPACITY or waiting_bytes >= CAPACITY_BYTES
+            if is_full or key_bytes >= KEY_BYTES:
                 self.overflowed[counted_key] += 1
                 return
             self._received_bytes[counted_key] += size
@@ -112,10 +122,11 @@ class InboundQueue:
             self._queue.append(InboundMessage(key, payload, self._clock.monotonic_ns()))
 
     def drain(self, until_ns: int | None = None) -> Iterator[InboundMessage]:
-        """Removes waiting messages from the queue and yields them, oldest first.
+        """Removes waiting messages from the queue and yields them, the oldest one first.
 
         Args:
-            until_ns: messages that arrived after this time stay; None: no message stays.
+            until_ns: Messages that arrived after this time stay in the queue, in ns on the
+                monotonic clock. None removes all messages.
         """
         queue = self._queue
         while queue and (until_ns is None or queue[0].mono_ns <= until_ns):
@@ -129,29 +140,31 @@ class InboundQueue:
 
 
 CHANNEL_NOUNS = {topics.STATE: "records", topics.LINK: "statistics", topics.EVENT: "events"}
+"""Name of the messages of each channel, for texts."""
 _LEAD_NS = 2_000_000_000
 _DRIFT = 1e-3
-"""The clock of a site may be ahead of the recorder's clock by `_LEAD_NS`, and by this share of
-the session's time.
+"""The clock of a site may be ahead of the recorder's clock by `_LEAD_NS`, plus this fraction of
+the time since the start of the session.
 """
 EVENT_BYTES = 512 << 10
 EVENT_BYTES_PER_S = 4 << 10
-"""Bytes of a site's events that a log accepts at all, and per second of the scenario (ten
-events per second).
+"""A log accepts `EVENT_BYTES` of events of a site, and `EVENT_BYTES_PER_S` more per second of
+the scenario, which is about ten events.
 """
 _LEAST_EVENT_BYTES = 128
-"""Smallest size of an event, bytes."""
+"""Smallest size of an event, in bytes."""
 
 
 class SiteMessage(NamedTuple):
     """A decoded message of a site.
 
     Attributes:
-        number: number of the message in its channel; -1 without a number.
-        sequence: tick of a record or of statistics; number of an event.
-        t_ns: time of sending, ns since the epoch on the sender's clock; negative before the
-            epoch.
-        content: the message.
+        number: Number of the message in its channel. It is -1 for an event without a number.
+        sequence: Sequence number in the log: the tick of a record or of statistics, or the
+            number of an event.
+        t_ns: Sending time after the start of the session, on the sender's clock, in ns. It is
+            negative before the start.
+        content: The message.
     """
 
     number: int
@@ -161,25 +174,28 @@ class SiteMessage(NamedTuple):
 
 
 class SiteReception:
-    """The messages received from one start of a site, and the accounts of missing messages.
+    """Messages that were received from one start of a site, and the counts of missing messages.
+
+    If a site is started again, a new object is created, which continues the counts of the
+    previous one.
 
     Args:
-        scenario: the scenario of the session.
-        name: name of the site.
-        boot: number of the start; None if the site has not started yet.
-        before: the reception of the previous start, whose ticks this start continues.
+        scenario: Scenario of the session.
+        name: Name of the site.
+        boot: Random number that identifies the start. None if the site has not appeared yet.
+        before: Reception of the previous start. None for the first start.
 
     Attributes:
-        name: name of the site.
-        accounts: account of the messages of each channel. Records and statistics are counted
-            over all starts, events begin at 0 with every start.
-        event_accounts: accounts of the events of previous starts.
-        final_ticks: number of ticks of the site, from its end event; None before that event.
-        last_received_ns: arrival of the last message on the recorder's clock, ns; None before
+        name: Name of the site.
+        accounts: Counts of the messages of each channel. Records and statistics are counted
+            over all starts. Events are counted from 0 for every start.
+        event_accounts: Counts of the events of the previous starts.
+        final_ticks: Number of ticks that the site executed. None until its "end" event arrives.
+        last_received_ns: Arrival of the last message on the monotonic clock, in ns. None before
             the first message.
-        since_ns: present time since the epoch on the recorder's clock, ns. Messages of later
-            ticks are refused.
-        period_ns: tick period of the site, ns.
+        since_ns: Present time after the start of the session, on the recorder's clock, in ns.
+            The caller sets it. Messages of later ticks are refused.
+        period_ns: Tick period of the site, in ns.
     """
 
     def __init__(
@@ -221,10 +237,14 @@ class SiteReception:
         self._largest_counts[topics.EVENT] = self._event_bytes_left // _LEAST_EVENT_BYTES
 
     def read(self, channel: str, payload: bytes) -> SiteMessage:
-        """Decodes and checks a payload, without counting the message.
+        """Decodes and checks a message, without counting it.
+
+        Args:
+            channel: Channel of the message.
+            payload: Bytes of the message.
 
         Raises:
-            WireError: the payload is not a valid message of this channel of the site.
+            WireError: The payload is not a valid message of this site in this channel.
         """
         if channel == topics.EVENT:
             return self._read_event(payload)
@@ -241,6 +261,11 @@ class SiteReception:
         return SiteMessage(number, content.tick, sent_ns, content)
 
     def _read_event(self, payload: bytes) -> SiteMessage:
+        """Decodes and checks an event, and subtracts its size from the permitted bytes.
+
+        Raises:
+            WireError: The payload is not a valid event of this site, or there were too many.
+        """
         event: Event = self._decoders[topics.EVENT](payload)
         if event.kind == "end" and not 0 <= event.ticks <= self._ticks:
             raise WireError(
@@ -258,14 +283,18 @@ class SiteReception:
         return SiteMessage(event.n, event.n, event.t_ns, event)
 
     def _check(self, channel: str, sender: str, boot: int, number: int, ticks: int) -> None:
-        """Refuses a message of another sender, an impossible number, or ticks in the future.
+        """Checks that a message comes from this start of the site and is possible by now.
 
         Args:
-            channel: channel of the message.
-            sender: name of the site that the message states.
-            boot: number of the start that the message states.
-            number: number of the message in its channel.
-            ticks: number of ticks that the site has executed if the message is true.
+            channel: Channel of the message.
+            sender: Name of the site that the message states.
+            boot: Number that identifies the sender's start, as the message states it.
+            number: Number of the message in its channel.
+            ticks: Number of ticks that the site has executed if the message is true.
+
+        Raises:
+            WireError: The sender is another one, the number is too large, or the ticks are in
+                the future.
         """
         if sender != self.name or boot != self._boot:
             raise WireError("stranger", f"{sender}, start {boot}, on a key of {self.name}")
@@ -277,16 +306,19 @@ class SiteReception:
     def accept_records(
         self, payloads: Iterable[bytes], received_ns: int
     ) -> Iterator[tuple[bytes, State]]:
-        """Counts the published records of one block, and yields records that are new.
+        """Counts the records of one block, and yields those that are new.
 
-        This does the work of `read` and `accept` for many records at once.
+        This is equivalent to `read` and `accept` for each record, but faster.
 
         Args:
-            payloads: the records.
-            received_ns: arrival of the block on the recorder's clock, ns.
+            payloads: The encoded records.
+            received_ns: Arrival of the block on the monotonic clock, in ns.
+
+        Yields:
+            The encoded and the decoded record.
 
         Raises:
-            WireError: a payload is not a record of this site; the records before it count.
+            WireError: A payload is not a valid record of this site. The previous ones count.
         """
         decode = self._decoders[topics.STATE]
         account = self.accounts[topics.STATE]
@@ -313,12 +345,22 @@ class SiteReception:
 
     @property
     def _possible_ticks(self) -> int:
-        """Largest number of ticks that the site can have executed by now."""
+        """Largest number of ticks that the site can have executed by now, given the clocks."""
         latest_ns = self.since_ns * (1.0 + _DRIFT) + _LEAD_NS
         return int(min(self._ticks, latest_ns * 1e-9 * self._rate_hz + 1.0))
 
     def _reserve_event_bytes(self, event: Event, size: int) -> None:
-        """Refuses events of a flood, which would fill the log with events alone."""
+        """Subtracts the size of an event from the bytes of events that are permitted.
+
+        Without this limit, a faulty site could fill the log with events.
+
+        Args:
+            event: The event.
+            size: Size of the event, in bytes.
+
+        Raises:
+            WireError: The site has sent too many events.
+        """
         is_first_end = event.kind == "end" and self.final_ticks is None
         is_exempt = is_first_end and size <= EVENT_BYTES_PER_S
         if size > self._event_bytes_left and not is_exempt:
@@ -328,10 +370,15 @@ class SiteReception:
         self._event_bytes_left -= size
 
     def accept(self, channel: str, message: SiteMessage, received_ns: int) -> bool:
-        """Counts a published message.
+        """Counts a message that the site published.
+
+        Args:
+            channel: Channel of the message.
+            message: The message.
+            received_ns: Arrival of the message on the monotonic clock, in ns.
 
         Returns:
-            True if the message is new; False if it is a duplicate.
+            True if the message is new. False if it was received before.
         """
         self.last_received_ns = received_ns
         account = self.accounts[channel]
@@ -340,20 +387,24 @@ class SiteReception:
         return is_new
 
     def refill(self, channel: str, message: SiteMessage) -> bool:
-        """Counts a backfilled message.
+        """Counts a message that the site sent again on request.
+
+        Args:
+            channel: Channel of the message.
+            message: The message.
 
         Returns:
-            True if the message is new; False if it is a duplicate.
+            True if the message is new. False if it was received before.
         """
         is_new = self.accounts[channel].refill(message.number)
         self._count_implied(message.content)
         return is_new
 
     def check_sender(self, reply: Backfill) -> None:
-        """Refuses a reply that does not come from this start of the site.
+        """Checks that a reply to a request comes from this start of the site.
 
         Raises:
-            WireError: the reply comes from another site or start.
+            WireError: The reply comes from another site, or from another start.
         """
         if reply.member != self.name or reply.boot != self._boot:
             raise WireError(
@@ -361,9 +412,10 @@ class SiteReception:
             )
 
     def add_expected(self, channel: str, count: int) -> None:
-        """Raises the number of messages of a channel that exist at least.
+        """States that at least `count` messages of a channel exist.
 
-        The scenario and the clock limit that number.
+        The number is limited by what is possible in the scenario by now, since a faulty site
+        could state any number.
         """
         largest = self._largest_counts[channel]
         if channel != topics.EVENT:
@@ -372,16 +424,19 @@ class SiteReception:
         self.accounts[channel].add_expected(min(count, largest))
 
     def count_previous_start(self, ticks: int) -> None:
-        """Counts the messages of the previous start, of which another site knows.
+        """States how many ticks the previous start executed at least, as another site reports.
 
-        Args:
-            ticks: number of ticks of the previous start that the other site knows.
+        The previous start may have been killed, so that it could not state this number itself.
         """
         for channel, gap in self._start_gaps.items():
             gap.note_published(number_message(channel, ticks, self._rate_hz))
 
     def _count_implied(self, content: State | LinkStats | Event) -> None:
-        """Counts the messages that must exist, or that cannot exist, because of a message."""
+        """Evaluates what a message shows about the existence of other messages.
+
+        A record states which ticks were skipped. Statistics show that all records up to their
+        tick exist. The events "join" and "end" state the first tick and the number of ticks.
+        """
         if isinstance(content, State):
             self._exclude_skipped_ticks(content)
         elif isinstance(content, LinkStats):
@@ -395,7 +450,7 @@ class SiteReception:
                 self.add_expected(channel, count)
 
     def _exclude_skipped_ticks(self, record: State) -> None:
-        """Excludes the messages of the ticks that the site skipped before a record."""
+        """States that no messages exist for the ticks that the site skipped before a record."""
         skipped = count_skipped_ticks(record.cmd) if record.cmd else 0
         if not skipped:
             return
@@ -404,7 +459,11 @@ class SiteReception:
             self.accounts[channel].mark_unpublished(*numbers)
 
     def _begin_start(self, first_tick: int) -> None:
-        """Excludes the messages of the ticks between the previous start and this start."""
+        """States that no messages exist for the ticks between the previous start and this one.
+
+        Args:
+            first_tick: First tick of this start.
+        """
         previous_ticks = 0
         if self._before is not None and self._before.final_ticks is not None:
             previous_ticks = self._before.final_ticks
@@ -415,21 +474,21 @@ class SiteReception:
 
     @property
     def lacks_messages(self) -> bool:
-        """True while a message is missing that the site can still send again."""
+        """True if a message is missing that the site can still send again."""
         return any(account.find_requestable_gap() for account in self.accounts.values())
 
     @property
     def is_complete(self) -> bool:
-        """True once the site has ended and can send no missing message again."""
+        """True if the site has ended and all messages that it can send were received."""
         return self.final_ticks is not None and not self.lacks_messages
 
     def give_up(self) -> None:
-        """Counts all missing messages as lost for good."""
+        """Stops requests for all missing messages, which the site cannot send."""
         for account in self.accounts.values():
             account.abandon_below(account.last + 1)
 
     def describe_missing(self) -> str:
-        """Returns the missing messages as text; "" if no message is missing."""
+        """Returns the missing messages as a text. Empty if no message is missing."""
         texts = []
         for channel, account in self.accounts.items():
             if account.missing:

@@ -1,14 +1,15 @@
-"""Hold messages in play order, as a table of numbers over a few large byte buffers.
+"""Stores messages compactly, and sorts them into the order in which they are played.
 
-A `BatchBuilder` collects messages in the order of a file and sorts them into a `MessageBatch`.
-A minute of 9000 messages/s takes some 100 MiB in this form, a third of its size as Python
-objects.
+A `BatchBuilder` collects messages in the order of a file and sorts them into a `MessageBatch`,
+a table of numbers with a buffer of bytes. A minute of 9000 messages/s takes some 100 MiB in
+this form, a third of its size as Python objects.
 
 Invariant:
-    - Messages play in order of time, and within a channel in order of their numbers.
-    - A backfilled message, which is later in the file than its number says, plays no later than
-      the next message of its channel.
-    - Messages of the same time keep the order of the file.
+    - Messages are played in the order of their times, and within a channel in the order of
+      their numbers.
+    - A message that a site sent again on request is later in the file than its number. It is
+      played no later than the next message of its channel.
+    - Messages with the same time keep the order of the file.
 """
 
 from array import array
@@ -21,19 +22,21 @@ import numpy as np
 from trilat_net.log.record_columns import Ints
 
 PlayedMessage = tuple[int, int, int, bytes]
-"""A message: time in ns since the epoch, channel, number in the channel, and payload.
+"""A message: time after the start of the session in ns, number of the channel, number of the
+message in the channel, and payload.
 
-The number of a record is its tick. Statistics and events of a site are numbered from 0, and the
-events of successive starts of a site differ by `NUMBERS_OF_A_START`. The number of any other
-message is its time.
+The number of a record is its tick. Statistics and events of a site are numbered from 0. If a
+site was started again, `NUMBERS_OF_A_START` is added to the numbers of its events for each
+earlier start. The number of any other message is its time.
 """
 PIECE_BYTES = 65_536
-"""Payload of a piece, bytes.
+"""Size of the payloads in a piece, in bytes.
 
-Preparing or receiving a piece of this size does not delay the player.
+Such a piece is received without delaying the player.
+
 """
 
-# columns of `MessageBatch.rows`
+# Columns of `MessageBatch.rows`.
 _TIME = 0
 _CHANNEL = 1
 _NUMBER = 2
@@ -43,18 +46,19 @@ _COLUMNS = 5
 
 
 def order_for_play(times_ns: Ints, channels: Ints, numbers: Ints) -> tuple[Ints, Ints]:
-    """Returns the play order of messages, and their deadlines.
+    """Computes the order in which messages are played, and their deadlines.
 
     Args:
-        times_ns: time of sending or of arrival, ns, shape (K,), in file order.
-        channels: channel of each message, shape (K,).
-        numbers: number of each message in its channel, shape (K,). Messages with equal numbers
-            stay in file order.
+        times_ns: Sending or arrival time of each message in the order of the file, shape (K,),
+            in ns.
+        channels: Channel of each message, shape (K,).
+        numbers: Number of each message in its channel, shape (K,). Messages with equal numbers
+            stay in the order of the file.
 
     Returns:
         The indices of the messages in play order, shape (K,), and their deadlines in that
-        order, ns, shape (K,). The deadlines ascend, and no deadline is later than the time of
-        its message.
+        order, shape (K,), in ns. The deadlines do not decrease, and no deadline is later than
+        the time of its message.
     """
     indices = np.arange(len(times_ns), dtype=np.int64)
     due_ns = times_ns.copy()
@@ -63,17 +67,17 @@ def order_for_play(times_ns: Ints, channels: Ints, numbers: Ints) -> tuple[Ints,
         members = np.flatnonzero(channels == channel)
         by_number = np.argsort(numbers[members], kind="stable")
         members = members[by_number]
-        # no message plays after the next message of its channel: not at a later time, and among
-        # messages of the same time not at a later position
+        # No message is played after the next message of its channel: neither at a later time,
+        # nor at a later position among messages with the same time.
         due_ns[members] = _limit_by_later(times_ns[members])
         positions[members] = _limit_by_later(indices[members])
-    # np.lexsort sorts by the last key first
+    # The last key of np.lexsort is the most important one.
     order = np.lexsort((numbers, positions, due_ns)).astype(np.int64)
     return order, due_ns[order]
 
 
 def _limit_by_later(values: Ints) -> Ints:
-    """Returns, for each value, the least of this value and of all later values, shape (K,)."""
+    """Returns for each value the smallest of it and all later values, shape (K,)."""
     return np.minimum.accumulate(values[::-1])[::-1]
 
 
@@ -81,10 +85,12 @@ def _limit_by_later(values: Ints) -> Ints:
 class MessageBatch:
     """K messages: a table of numbers, and the bytes of the payloads.
 
+    Several batches may share the same bytes.
+
     Attributes:
-        rows: for each message the time in ns since the epoch, the channel, the number in the
-            channel, and start and end of the payload in `data`; shape (K, 5).
-        data: the payloads, possibly with gaps.
+        rows: For each message the time after the start of the session in ns, the channel, the
+            number in the channel, and the start and end of the payload in `data`, shape (K, 5).
+        data: The payloads, possibly with other bytes between them.
     """
 
     rows: Ints
@@ -95,12 +101,12 @@ class MessageBatch:
 
     @property
     def times_ns(self) -> Ints:
-        """Deadline of each message, ns since the epoch of its log, shape (K,)."""
+        """Deadline of each message after the start of the session, shape (K,), in ns."""
         return self.rows[:, _TIME]
 
     @property
     def end_ns(self) -> int:
-        """Deadline of the last message, ns since the epoch of its log."""
+        """Deadline of the last message after the start of the session, in ns."""
         return int(self.times_ns[-1])
 
     @property
@@ -115,7 +121,7 @@ class MessageBatch:
 
     @property
     def _sizes(self) -> Ints:
-        """Size of each payload, bytes, shape (K,)."""
+        """Size of each payload, shape (K,), in bytes."""
         return self.rows[:, _END] - self.rows[:, _START]
 
     def payload(self, index: int) -> bytes:
@@ -130,13 +136,13 @@ class MessageBatch:
             yield t_ns, channel, number, bytes(view[start:end])
 
     def part(self, indices: slice | Ints) -> "MessageBatch":
-        """Returns the messages at some indices, over the same bytes."""
+        """Returns some of the messages, which share the bytes of this batch."""
         return MessageBatch(self.rows[indices], self.data)
 
     def pieces(self, size: int = PIECE_BYTES) -> Iterator["MessageBatch"]:
-        """Yields the messages in pieces of about `size` bytes, over the same bytes.
+        """Yields the messages in pieces of about `size` bytes, without copying the payloads.
 
-        A piece has at least one message.
+        A piece contains at least one message.
         """
         payload_ends = np.cumsum(self._sizes)
         piece_numbers = payload_ends // size
@@ -147,7 +153,7 @@ class MessageBatch:
                 yield self.part(slice(start, end))
 
     def compact(self) -> "MessageBatch":
-        """Returns the messages over a copy of their own bytes, without gaps."""
+        """Returns the messages with a copy of their payloads, without other bytes."""
         view = memoryview(self.data)
         spans = self.rows[:, _START:].tolist()
         payloads = [view[start:end] for start, end in spans]
@@ -163,15 +169,15 @@ class BatchBuilder:
     """Collects messages in the order of a file, and sorts them into play order.
 
     Args:
-        kept: messages that were sorted before but not played. They precede the messages that
-            are added.
+        kept: Messages that were sorted before but not played yet. They precede the messages
+            that are added.
     """
 
     def __init__(self, kept: MessageBatch | None = None) -> None:
         self._payloads = bytearray()
         self._rows = array("q")
         if kept is not None:
-            # payloads lie in the order in which their messages were added
+            # The payloads are in the order in which their messages were added.
             file_order = np.argsort(kept.rows[:, _START], kind="stable")
             earlier = kept.part(file_order).compact()
             self._payloads += earlier.data
@@ -179,7 +185,7 @@ class BatchBuilder:
 
     @property
     def memory(self) -> int:
-        """Memory of all messages, bytes."""
+        """Memory of all messages, in bytes."""
         return len(self._payloads) + 8 * len(self._rows)
 
     def add(self, t_ns: int, channel: int, number: int, payload: bytes) -> None:
@@ -190,7 +196,7 @@ class BatchBuilder:
         self._rows.extend((t_ns, channel, number, start, end))
 
     def ordered(self) -> MessageBatch:
-        """Returns the messages in play order, without repeated messages."""
+        """Returns the messages in play order, without repetitions."""
         rows = np.array(self._rows, dtype=np.int64).reshape(-1, _COLUMNS)
         repeats = self._find_repeats(rows)
         if repeats:
@@ -205,10 +211,13 @@ class BatchBuilder:
         return MessageBatch(rows, self._payloads)
 
     def _find_repeats(self, rows: Ints) -> list[int]:
-        """Returns the indices of repeated messages, as in two parts of a session.
+        """Finds messages that are repeated, as they are in two parts of a session.
 
         Args:
-            rows: the messages in file order, see `MessageBatch.rows`.
+            rows: The messages in the order of the file, see `MessageBatch.rows`.
+
+        Returns:
+            The indices of all repetitions except the first occurrence.
         """
         seen: set[tuple[int, int, bytes]] = set()
         repeats = []
@@ -222,7 +231,14 @@ class BatchBuilder:
 
 
 def _find_equal_numbers(rows: Ints) -> Ints:
-    """Returns the indices of messages that share channel and number with another message."""
+    """Finds the messages with the same channel and number as another message.
+
+    Args:
+        rows: The messages, see `MessageBatch.rows`.
+
+    Returns:
+        Their indices in ascending order.
+    """
     numbers = rows[:, _NUMBER]
     channels = rows[:, _CHANNEL]
     order = np.lexsort((numbers, channels))

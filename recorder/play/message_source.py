@@ -1,11 +1,14 @@
-"""Supply a player with messages: from a preloaded batch, or from a process that reads ahead.
+"""Supplies the player of a log with messages in the order in which they are played.
+
+Short logs are loaded into memory before. For long logs, a second process reads ahead and sends
+the messages through a pipe, so that the player never waits for the disk.
 
 Invariant:
     - Polling the source never waits.
-    - The memory of the reader process is bounded (L6), by `HORIZON_NS` of the log, the largest
-      distance of a message from its turn, and by `LIMIT_BYTES`.
-    - The reader process blocks on the pipe while the player does not read. The two processes
-      share only that pipe.
+    - The memory of the reader process is bounded (L6): by `HORIZON_NS` of the log, the largest
+      distance between a message's place in the file and its turn, and by `LIMIT_BYTES`.
+    - The reader process waits if the player does not read from the pipe. The two processes
+      share nothing except this pipe.
 """
 
 import multiprocessing
@@ -28,15 +31,15 @@ from .batch import BatchBuilder, MessageBatch, PlayedMessage
 from .session_reader import HORIZON_NS, PlaySelection, SessionHeader, SessionReader
 
 SIZE = struct.Struct("<Q")
-"""Number of bytes of the pickle that follows in the pipe of a reader process."""
+"""Encoding of the length that precedes each pickled item in the pipe."""
 READ_BYTES = 65_536
 """Largest number of bytes that are read from the pipe at once."""
 AHEAD_BYTES = 16 * 1024 * 1024
-"""Payloads that the player's process holds ahead of the present message, bytes."""
+"""Payloads that the player receives in advance, in bytes."""
 STEP_NS = 10_000_000_000
-"""Length of log that is put in order at a time, ns."""
+"""Duration of the part of a log that is sorted at a time, in ns."""
 LIMIT_BYTES = 512 * 1024 * 1024
-"""Largest memory of the messages that wait for their turn, bytes."""
+"""Largest memory of the messages that wait for their turn, in bytes."""
 NICENESS = -5
 """Priority of the reader process, if permitted: below the player, which waits for the reader,
 and above other processes.
@@ -44,11 +47,11 @@ and above other processes.
 
 
 class RoundEnd(NamedTuple):
-    """The end of a round.
+    """End of a round. A log that is played in a loop has several rounds.
 
     Attributes:
-        strays: number of messages that were too far from their turn.
-        torn: damaged files, with the reason.
+        strays: Number of messages that were too far from their turn to be played in order.
+        torn: Damaged files, with the reason.
     """
 
     strays: int
@@ -59,8 +62,9 @@ class ReadPiece(NamedTuple):
     """Messages that the reader process sends.
 
     Attributes:
-        topics: the topics of all channels that were found so far.
-        batch: the messages.
+        topics: Topics of all channels that were found so far. The number of a channel is its
+            index.
+        batch: The messages.
     """
 
     topics: list[str]
@@ -68,18 +72,18 @@ class ReadPiece(NamedTuple):
 
 
 class MessageSource:
-    """Messages in play order, round after round.
+    """Messages of a log in the order in which they are played, round after round.
 
     Args:
-        header: content of the files; receives the topics and damages that a reader process
-            finds.
-        batch: all messages; None: `start_reader` starts a process that reads the messages.
+        header: Description of the files. The topics and damages that the reader process finds
+            are added to it.
+        batch: All messages. None if they are too many. Then `start_reader` must be called.
 
     Attributes:
-        ended: True once `poll` has returned all messages of this round.
-        whole: True if one batch holds the whole round.
-        strays: number of messages that were so far from their turn in the file that they do not
-            play at their turn.
+        ended: True if `poll` has returned all messages of this round.
+        whole: True if all messages are in memory.
+        strays: Number of messages that were too far from their turn in the file to be played in
+            order.
     """
 
     def __init__(self, header: SessionHeader, batch: MessageBatch | None) -> None:
@@ -97,16 +101,17 @@ class MessageSource:
     def start_reader(
         self, paths: Sequence[Path], selection: PlaySelection, *, loop: bool
     ) -> None:
-        """Starts the reader process.
+        """Starts the process that reads the messages.
 
         Args:
-            paths: the files.
-            selection: the messages that are played.
-            loop: whether the process reads the files again and again.
+            paths: The files.
+            selection: Which messages are played.
+            loop: True if the process reads the files again and again.
         """
         context = multiprocessing.get_context("spawn")
         self._pipe, reader_pipe = context.Pipe(duplex=False)
-        # the methods of the pipe would wait for the rest of a piece
+        # The methods of the pipe would wait for the rest of an item. Therefore the bytes are
+        # read without waiting.
         os.set_blocking(self._pipe.fileno(), False)
         self._process = context.Process(
             target=feed_player, args=(reader_pipe, paths, selection, loop), daemon=True
@@ -116,10 +121,12 @@ class MessageSource:
         reader_pipe.close()
 
     def poll(self) -> MessageBatch | None:
-        """Returns the next messages; None if no messages have been read. Never waits.
+        """Returns the next messages.
+
+        None if no messages are available now, or the round has ended.
 
         Raises:
-            LogError: a file cannot be read any more.
+            LogError: A file can no longer be read.
         """
         if self.ended or not self._ahead:
             return None
@@ -136,13 +143,13 @@ class MessageSource:
         return None
 
     def fill(self) -> bool:
-        """Reads a little from the reader process.
+        """Reads some bytes from the reader process, without waiting.
 
         Returns:
-            False if there is nothing to read now, or enough has been read ahead.
+            False if there is nothing to read now, or enough has been read in advance.
 
         Raises:
-            RuntimeFault: the reader process failed.
+            RuntimeFault: The reader process failed.
         """
         if self._process is None or self._ahead_bytes > AHEAD_BYTES:
             return False
@@ -151,7 +158,7 @@ class MessageSource:
         except BlockingIOError:
             return False
         if not data:
-            # None while the process ends; the player has no time to wait for the exit code
+            # The exit code is None while the process is ending. The player has no time to wait.
             if self._process.exitcode:
                 raise RuntimeFault(
                     f"the process that reads the log ended with {self._process.exitcode}"
@@ -162,7 +169,7 @@ class MessageSource:
         return True
 
     def _unpickle_received(self) -> None:
-        """Moves the complete items of the received bytes to the queue."""
+        """Decodes the items that were received completely, and adds them to the queue."""
         while len(self._received) >= SIZE.size:
             end = SIZE.size + SIZE.unpack_from(self._received)[0]
             if len(self._received) < end:
@@ -174,14 +181,14 @@ class MessageSource:
                 self._ahead_bytes += len(item.batch.data)
 
     def restart(self) -> None:
-        """Starts another round."""
+        """Starts the next round."""
         self.ended = False
         if self._batch is not None:
             self._ahead.append(ReadPiece(self._header.topics, self._batch))
             self._ahead.append(RoundEnd(0, {}))
 
     def close(self) -> None:
-        """Ends the reader process; safe to call again."""
+        """Ends the reader process, if there is one. Further calls have no effect."""
         if self._process is not None:
             self._process.terminate()
             self._process.join()
@@ -194,16 +201,18 @@ def sort_messages(
     step_ns: int = STEP_NS,
     limit_bytes: int = LIMIT_BYTES,
 ) -> Iterator[tuple[MessageBatch, int]]:
-    """Sorts messages into play order, with bounded memory.
+    """Sorts messages into the order in which they are played, with bounded memory.
+
+    A message may be late in the file, because a site has sent it again on request.
 
     Args:
-        messages: the messages, in file order.
-        horizon_ns: largest distance of a message in the file from its turn, ns.
-        step_ns: length of log that is put in order at a time, ns.
-        limit_bytes: largest memory; if it is exceeded, messages are released earlier.
+        messages: The messages, in the order of the file.
+        horizon_ns: Largest distance between a message's place in the file and its turn, in ns.
+        step_ns: Duration of the part that is sorted at a time, in ns.
+        limit_bytes: Largest memory. If it is exceeded, messages are released earlier.
 
     Yields:
-        Messages in play order, and how many of them were too far from their turn.
+        Messages in play order, and the number of them that were too far from their turn.
     """
     sorter = _MessageSorter()
     newest_ns = -(2**62)
@@ -222,34 +231,40 @@ def sort_messages(
 
 
 class _MessageSorter:
-    """Messages that wait for their turn."""
+    """Messages that wait for their turn.
+
+    It counts the strays, messages that arrive when a later message of their channel has been
+    released already.
+    """
 
     def __init__(self) -> None:
         self._waiting = BatchBuilder()
-        self._last_numbers: dict[int, int] = {}  # by channel the largest released number
+        # Largest number that was released, by channel.
+        self._last_numbers: dict[int, int] = {}
 
     @property
     def memory(self) -> int:
-        """Memory of the waiting messages, bytes."""
+        """Memory of the waiting messages, in bytes."""
         return self._waiting.memory
 
     def add(self, message: PlayedMessage) -> None:
-        """Adds a message in file order."""
+        """Adds a message. The messages must be added in the order of the file."""
         t_ns, channel, number, payload = message
         self._waiting.add(t_ns, channel, number, payload)
 
     def release_until(self, until_ns: int) -> tuple[MessageBatch, int]:
-        """Returns the messages that are due until a time, and the number of strays."""
+        """Removes the messages up to a time, and returns them with the number of strays."""
         ordered = self._waiting.ordered()
         count = int(np.searchsorted(ordered.times_ns, until_ns, side="right"))
         return self._release(ordered, count)
 
     def release_half(self) -> tuple[MessageBatch, int]:
-        """Returns the first half of the messages, and the number of strays."""
+        """Removes the first half, and returns it with the number of strays."""
         ordered = self._waiting.ordered()
         return self._release(ordered, (len(ordered) + 1) // 2)
 
     def _release(self, ordered: MessageBatch, count: int) -> tuple[MessageBatch, int]:
+        """Keeps all messages but the first `count`, and returns those with their strays."""
         self._waiting = BatchBuilder(ordered.part(slice(count, None)))
         released = ordered.part(slice(count))
         strays = 0
@@ -264,18 +279,21 @@ class _MessageSorter:
 def feed_player(
     pipe: Connection, paths: Sequence[Path], selection: PlaySelection, loop: bool
 ) -> None:
-    """Sends rounds of messages until all files are read or the player has ended.
+    """Sends messages to the player until all files are read or the player has ended.
+
+    This is the main function of the reader process.
 
     Args:
-        pipe: connection to the player.
-        paths: the files.
-        selection: the messages that are played.
-        loop: whether the files are read again and again.
+        pipe: Pipe to the player.
+        paths: The files.
+        selection: Which messages are played.
+        loop: True if the files are read again and again.
     """
     with suppress(OSError, AttributeError):
         os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
 
     def send(item: ReadPiece | RoundEnd | LogError) -> None:
+        """Writes an item to the pipe, and waits until there is room."""
         pickled = pickle.dumps(item)
         sink.write(SIZE.pack(len(pickled)) + pickled)
         sink.flush()

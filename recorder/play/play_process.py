@@ -1,4 +1,4 @@
-"""Play a log as a process, from its first message to the summary of the playback.
+"""Plays a log as a process, from the start of the session to the summary for the user.
 
 Invariant:
     - The process stays until its recorders have every message, or send no more requests.
@@ -26,19 +26,19 @@ from .session_reader import HORIZON_NS, PlaySelection, SessionHeader
 from .site_stand_ins import PlayedHistory, SiteStandIns
 
 POLL_NS = 5_000_000
-"""Pause between two polls while the playback waits for recorders."""
+"""Pause between two polls while the playback waits for recorders, in ns."""
 AHEAD_NS = 500_000_000
-"""Time from the announcement of a playback to its first message."""
+"""Time from the announcement of a playback to its first message, in ns."""
 LISTEN_NS = 5_000_000_000
-"""Longest wait for a recorder that is present to reply."""
+"""Longest time to wait for the reply of a recorder that is present, in ns."""
 LINGER_NS = 5_000_000_000
-"""Time for which the playback stays at the end after the last query of a recorder."""
+"""Time for which the playback stays at the end after the last request of a recorder, in ns."""
 LAST_EVENT_NS = 100_000_000
-"""Time for which the playback stays after the recorders have stored everything."""
+"""Time for which the playback stays after the recorders have stored everything, in ns."""
 NICE = -10
-"""Priority of the process, if permitted."""
+"""Priority (niceness) of the process, if it is permitted."""
 PROGRESS_EVERY_NS = 500_000_000
-"""Period of progress reports."""
+"""Period of the progress reports, in ns."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,11 +46,12 @@ class PlayOptions:
     """Options of a playback.
 
     Attributes:
-        session: name of the playback's session.
-        rate: seconds of the log per second; `math.inf`: as fast as all receivers accept it.
-        loop: whether the log is played again and again.
-        low_cpu: whether the player sleeps until a deadline instead of polling the clock.
-        needs_recorder: whether the playback waits for a recorder before it starts.
+        session: Name of the session in which the log is played.
+        rate: Seconds of the log per second. With `math.inf`, messages are played as fast as all
+            receivers accept them.
+        loop: True if the log is played again and again.
+        low_cpu: True if the player sleeps until a deadline, instead of polling the clock.
+        needs_recorder: True if the playback waits for a recorder before it starts.
     """
 
     session: str
@@ -61,21 +62,21 @@ class PlayOptions:
 
 
 class PlaybackSummary(NamedTuple):
-    """The result of a playback.
+    """Result of a playback.
 
     Attributes:
-        counts: number of published messages, by topic of the file.
-        rounds: number of rounds that were started.
-        lateness: lateness of the messages; None if they had no deadlines.
-        took_s: duration of the play, s.
-        held_s: time spent waiting for receivers that did not keep up, s.
-        cut: how often a receiver accepted no message for 5 s and was disconnected.
-        strays: number of messages that were so far from their turn in the file that they did
-            not play at their turn.
-        recorders: number of recorders that were present after the last message.
-        stored: whether all these recorders reported that they stored everything.
-        refilled: number of messages that were sent to recorders by backfill.
-        torn: damaged files, with the reason.
+        counts: Number of published messages, by the topic in the file.
+        rounds: Number of rounds that were started.
+        lateness: Lateness of the messages. None if they had no deadlines.
+        took_s: Duration of the playback, in s.
+        held_s: Time for which the player waited for slow receivers, in s.
+        cut: How often a receiver accepted no message for 5 s and was disconnected.
+        strays: Number of messages that were too far from their turn in the file to be played in
+            order.
+        recorders: Number of recorders that were present after the last message.
+        stored: True if all these recorders reported that they stored everything.
+        refilled: Number of messages that were sent again to recorders.
+        torn: Damaged files, with the reason.
     """
 
     counts: dict[str, int]
@@ -93,17 +94,17 @@ class PlaybackSummary(NamedTuple):
 
 @dataclass
 class Playback:
-    """One playback in a session of its own.
+    """One playback, which runs as a session with a name of its own.
 
     Attributes:
-        bus: the connection to the session.
-        clock: the time.
-        header: content of the files.
-        source: supplies the messages.
-        options: the options.
-        stopped: returns True if the playback has to end.
-        say: prints a line for the user.
-        show: reports the progress to the user.
+        bus: Network connection of the player.
+        clock: The clock.
+        header: Description of the recorded session.
+        source: Supplies the messages.
+        options: Options of the playback.
+        stopped: Function that returns True if the playback must end.
+        say: Function that prints a line for the user.
+        show: Function that shows the progress to the user.
     """
 
     bus: Bus
@@ -136,12 +137,14 @@ class Playback:
         )
 
     def _make_publisher(self, channel: int) -> Callable[[bytes], None]:
+        """Returns the function that publishes messages of a channel, by its number."""
         key = map_key_to_session(
             self.header.topics[channel], self.header.session, self.options.session
         )
         return self.bus.publisher(key, patient=True)
 
     def _serve(self, progress: PlayProgress) -> None:
+        """Replies to queries, and shows the progress to the user twice a second."""
         self._stand_ins.serve_queries()
         now_ns = self.clock.monotonic_ns()
         if now_ns - self._reported_ns >= PROGRESS_EVERY_NS:
@@ -152,8 +155,8 @@ class Playback:
         """Plays the log to its end, and stays until all recorders have every message.
 
         Args:
-            start_ns: beginning of the play, ns since the epoch of the log; None: the first
-                message.
+            start_ns: Time at which the playback begins, in ns after the start of the recorded
+                session. None begins with the first message.
         """
         clock = self.clock
         options = self.options
@@ -165,13 +168,15 @@ class Playback:
             self._stand_ins.start_session(pace.due_ns(0))
             self._player.play(pace, loop=options.loop)
         duration_ns = max(0, clock.monotonic_ns() - origin_ns)
+
         self._stand_ins.serve_queries()
         recorders = set(self._stand_ins.recorders)
         self._linger()
+        has_deadlines = math.isfinite(options.rate)
         return PlaybackSummary(
             counts=dict(zip(self.header.topics, self._player.counts, strict=False)),
             rounds=self._player.rounds,
-            lateness=self._player.lateness.summary() if math.isfinite(options.rate) else None,
+            lateness=self._player.lateness.summary() if has_deadlines else None,
             took_s=duration_ns / NS_PER_S,
             held_s=self._player.held_ns / NS_PER_S,
             cut=self._player.stalls,
@@ -183,7 +188,10 @@ class Playback:
         )
 
     def _wait_for_recorders(self) -> None:
-        """Waits until every recorder that is present has replied, `LISTEN_NS` at most."""
+        """Waits until every recorder that is present has replied, at most `LISTEN_NS`.
+
+        If the options require a recorder, this time begins when the first one is present.
+        """
         clock = self.clock
         stand_ins = self._stand_ins
         if self.options.needs_recorder:
@@ -200,7 +208,7 @@ class Playback:
             clock.sleep_until(clock.monotonic_ns() + POLL_NS)
 
     def _linger(self) -> None:
-        """Replies to queries until the recorders have every message, or send no query."""
+        """Replies to requests until the recorders have every message, or send none."""
         clock = self.clock
         stand_ins = self._stand_ins
         give_up_ns = clock.monotonic_ns() + LINGER_NS
@@ -208,7 +216,7 @@ class Playback:
             if stand_ins.serve_queries():
                 give_up_ns = clock.monotonic_ns() + LINGER_NS
                 continue
-            # the last messages may still be in transit
+            # Messages of the recorders may still be in transit.
             if stand_ins.have_stored(stand_ins.recorders):
                 give_up_ns = min(give_up_ns, clock.monotonic_ns() + LAST_EVENT_NS)
             clock.sleep_until(clock.monotonic_ns() + POLL_NS)
@@ -225,29 +233,30 @@ def play_log(
     say: Callable[[str], None],
     show: Callable[[PlayProgress], None],
 ) -> PlaybackSummary | None:
-    """Plays a log over Zenoh.
+    """Plays a log over the network.
 
     Args:
-        loaded: content of the files, and the messages if they were preloaded.
-        paths: the files.
-        selection: the messages that are played.
-        options: the options.
-        connection: how to connect to the network.
-        clock: the time.
-        stopped: returns True if the playback has to end.
-        say: prints a line for the user.
-        show: reports the progress to the user.
+        loaded: Description of the recorded session, and its messages if they are in memory.
+        paths: The files.
+        selection: Which messages are played.
+        options: Options of the playback.
+        connection: How to connect to the network.
+        clock: The clock.
+        stopped: Function that returns True if the playback must end.
+        say: Function that prints a line for the user.
+        show: Function that shows the progress to the user.
 
     Returns:
-        The summary; None if the playback was stopped before it began.
+        The summary. None if the playback was stopped before it began.
 
     Raises:
-        SessionError: a session of that name is running.
-        UsageError: an endpoint cannot be used.
-        LogError: a file cannot be read any more.
+        SessionError: A session of that name is running.
+        UsageError: An endpoint cannot be used.
+        LogError: A file can no longer be read.
     """
     header, batch = loaded
-    # not SCHED_FIFO as for sites: polling the clock would starve the threads of Zenoh
+    # Sites use the scheduling class SCHED_FIFO. The player does not, because its polling of the
+    # clock would then starve the threads of Zenoh.
     with suppress(OSError, AttributeError):
         os.setpriority(os.PRIO_PROCESS, 0, NICE)
     with ExitStack() as stack:
@@ -280,10 +289,16 @@ def play_log(
 
 
 def map_key_to_session(topic: str, recorded_session: str, session: str) -> str:
-    """Returns the key of a channel in the playback's session.
+    """Returns the key under which a channel of the log is published in the playback's session.
 
-    The name of the recorded session is replaced. The topic of another session is placed below
-    the playback's session as a whole, so that it cannot collide with another topic.
+    The name of the recorded session is replaced. A topic that does not belong to this session
+    is appended to the name of the playback's session as a whole, so that it cannot be the same
+    as another one.
+
+    Args:
+        topic: Topic of the channel in the log.
+        recorded_session: Name of the recorded session.
+        session: Name of the playback's session.
     """
     chunks = topic.strip("/").split("/")
     if chunks[:2] == [topics.ROOT, recorded_session]:

@@ -1,14 +1,14 @@
-"""Play messages: publish each message once, in order, at its deadline.
+"""Plays messages: publishes each message once, in order, at its deadline.
 
-The player sleeps until shortly before a deadline and then polls the clock. Other work (replies,
-reading ahead, progress) is done in the slack between deadlines; without slack it gets short
-slices a hundred times a second.
+The player sleeps until shortly before a deadline and then polls the clock. It does other work
+(replies, reading in advance, progress) in the slack between deadlines. If there is no slack, it
+does some of this work a hundred times a second nevertheless.
 
 Invariant:
-    - Deadlines are a function of log time alone, counted from one origin, so that a late
-      message does not delay the messages after it.
-    - The memory of the histogram of lateness (in whole microseconds) is bounded for any length
-      of play (L6).
+    - The deadlines depend only on the times in the log and on one start time, so that a late
+      message does not delay the later ones.
+    - The memory of the histogram of lateness (in whole microseconds) is bounded, however long
+      the log is (L6).
 """
 
 import math
@@ -26,21 +26,25 @@ from .message_source import MessageSource
 from .site_stand_ins import PlayedHistory
 
 SPIN_NS = 150_000
-"""Time before a deadline at which the player stops sleeping. Sleep usually lasts some 60 us too
-long.
+"""Time before a deadline at which the player stops sleeping, in ns. A sleep usually lasts some
+60 us too long.
 """
 SLOWEST = 1e-3
+"""Smallest rate, in seconds of the log per second."""
 FASTEST = 1e3
+"""Largest rate, except for an unlimited one."""
 
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """A linear function from log time to time on the clock.
+    """Linear function from times in the log to times on the clock.
 
     Attributes:
-        origin_ns: time on the clock at which `start_ns` of the log is due, ns.
-        start_ns: beginning of the play, ns since the epoch of the log.
-        rate: seconds of the log per second; `math.inf`: all messages are due at the origin.
+        origin_ns: Time on the clock at which `start_ns` of the log is due, in ns.
+        start_ns: Time at which the playback begins, in ns after the start of the recorded
+            session.
+        rate: Seconds of the log per second. With `math.inf`, all messages are due at the
+            origin.
     """
 
     origin_ns: int
@@ -48,7 +52,7 @@ class Pace:
     rate: float = 1.0
 
     def due_ns(self, t_ns: int) -> int:
-        """Returns the deadline on the clock of a time of the log, ns."""
+        """Returns the deadline of a time of the log, in ns on the clock."""
         return self.origin_ns + round((t_ns - self.start_ns) / self.rate)
 
     def later(self, length_ns: int) -> "Pace":
@@ -57,10 +61,13 @@ class Pace:
 
 
 def parse_rate(text: str) -> float:
-    """Returns the rate that a user's text states; "max" and 0 mean as fast as possible.
+    """Parses the option `--rate`. The texts "max" and "0" mean as fast as possible.
+
+    Returns:
+        Seconds of the log per second, `math.inf` for as fast as possible.
 
     Raises:
-        UsageError: the text is not a rate from `SLOWEST` to `FASTEST`.
+        UsageError: The text is not a rate from `SLOWEST` to `FASTEST`.
     """
     if text.strip().lower() == "max":
         return math.inf
@@ -79,12 +86,16 @@ def parse_rate(text: str) -> float:
 
 
 def wait_until(clock: Clock, due_ns: int, spin_ns: int) -> int:
-    """Waits for a deadline and returns the time on the clock, ns.
+    """Waits until a deadline.
 
     Args:
-        clock: the clock.
-        due_ns: the deadline; if it has passed, the function returns at once.
-        spin_ns: time before the deadline from which the clock is polled; 0: no polling.
+        clock: The clock.
+        due_ns: The deadline. If it has passed, the function returns at once.
+        spin_ns: Time before the deadline from which the clock is polled, in ns. With 0, it is
+            not polled, and the function may return some 60 us late.
+
+    Returns:
+        The time on the clock, in ns.
     """
     clock.sleep_until(due_ns - spin_ns)
     now_ns = clock.monotonic_ns()
@@ -94,11 +105,11 @@ def wait_until(clock: Clock, due_ns: int, spin_ns: int) -> int:
 
 
 LATENESS_LIMIT_US = 100_000
-"""All higher values of lateness share one bin; the maximum is exact nevertheless."""
+"""Lateness from which all values are counted together. The maximum is exact nevertheless."""
 
 
 class LatenessSummary(NamedTuple):
-    """Median, 99th percentile and maximum of the lateness, us.
+    """Median, 99th percentile and maximum of the lateness, in us.
 
     A percentile above `LATENESS_LIMIT_US` is replaced by the maximum.
     """
@@ -109,55 +120,61 @@ class LatenessSummary(NamedTuple):
 
 
 class LatenessHistogram:
-    """Counts messages by lateness: from their deadline to the call that publishes them."""
+    """Histogram of the lateness: the time from the deadline of a message to its publication.
+
+    Attributes:
+        max_us: Largest lateness, in us.
+    """
 
     def __init__(self) -> None:
         self.max_us = 0
         self._counts = [0] * (LATENESS_LIMIT_US + 1)
 
     def add(self, late_ns: int) -> None:
-        """Counts one message by its lateness, ns."""
+        """Counts one message by its lateness in ns."""
         late_us = late_ns // 1000
-        # comparisons instead of `min` and `max`, which take longer for every message
+        # Comparisons are faster than `min` and `max`, which matters for every message.
         self._counts[late_us if late_us < LATENESS_LIMIT_US else LATENESS_LIMIT_US] += 1
         if late_us > self.max_us:
             self.max_us = late_us
 
     def summary(self) -> LatenessSummary | None:
-        """Returns median, 99th percentile and maximum; None without a message."""
+        """Returns median, 99th percentile and maximum. None if there is no message."""
         sums = np.cumsum(self._counts)
         if not sums[-1]:
             return None
+        # The first lateness up to which 50 % and 99 % of the messages were counted, in
+        # integers.
         percentiles = np.searchsorted(100 * sums, sums[-1] * np.array([50, 99])).tolist()
         p50_us, p99_us = (us if us < LATENESS_LIMIT_US else self.max_us for us in percentiles)
         return LatenessSummary(p50_us, p99_us, self.max_us)
 
 
 MIN_SLACK_NS = 400_000
-"""Smallest time before a deadline that is used for other work."""
+"""Smallest time before a deadline that is used for other work, in ns."""
 SERVICE_EVERY_NS = 10_000_000
-"""Longest time without other work."""
+"""Longest time without other work, in ns."""
 IDLE_NS = 1_000_000
-"""Pause while no message has been read."""
+"""Pause while there is nothing to do, in ns."""
 HELD_NS = 2_000_000
-"""A publication that takes longer waits for a receiver or for a processor."""
+"""Duration of a publication from which it counts as waiting for a receiver, in ns."""
 CUT_NS = 4_900_000_000
-"""A receiver that delays a publication for this time loses its connection and the messages on
-the connection.
+"""Duration of a publication after which the receiver that delays it has lost its connection, in
+ns. The messages on this connection are lost, too.
 """
 LOOP_PAUSE_NS = 100_000_000
-"""Pause between the last message of a round and the first message of the next round."""
+"""Pause between two rounds, in ns of the log."""
 
 Publish = Callable[[bytes], None]
 
 
 class PlayProgress(NamedTuple):
-    """Progress of a play.
+    """Progress of a playback.
 
     Attributes:
-        position_ns: time of the next message, ns since the epoch of the log.
-        published: number of messages published so far.
-        late_max_us: largest lateness of these messages, us.
+        position_ns: Time of the next message, in ns after the start of the recorded session.
+        published: Number of messages published so far.
+        late_max_us: Largest lateness of these messages, in us.
     """
 
     position_ns: int
@@ -166,23 +183,23 @@ class PlayProgress(NamedTuple):
 
 
 class Player:
-    """One play of a log.
+    """Plays a log once, or in a loop.
 
     Args:
-        source: supplies the messages.
-        history: receives the messages that are about to be played.
-        clock: the time.
-        publisher: returns the function that publishes messages of a channel, by its number.
-        serve: does a little other work.
-        stopped: returns True if the play has to end.
-        low_cpu: whether the player sleeps until a deadline instead of polling the clock.
+        source: Supplies the messages.
+        history: Receives the messages that will be played next.
+        clock: The clock.
+        publisher: Function that returns the publishing function of a channel, by its number.
+        serve: Function that does some other work.
+        stopped: Function that returns True if the playback must end.
+        low_cpu: True if the player sleeps until a deadline, instead of polling the clock.
 
     Attributes:
-        counts: number of published messages, by channel.
-        rounds: number of rounds that were started.
-        lateness: lateness of the messages.
-        stalls: number of publications that took so long that a receiver lost its connection.
-        held_ns: time that publications waited for receivers, ns.
+        counts: Number of published messages, by the number of the channel.
+        rounds: Number of rounds that were started.
+        lateness: Histogram of the lateness of the messages.
+        stalls: Number of publications that took so long that a receiver lost its connection.
+        held_ns: Time that publications waited for receivers, in ns.
     """
 
     def __init__(
@@ -208,7 +225,8 @@ class Player:
         self._serve_others = serve
         self._stopped = stopped
         self._spin_ns = 0 if low_cpu else SPIN_NS
-        self._publishers: list[Publish] = []  # by channel
+        # Publishing functions, by the number of the channel.
+        self._publishers: list[Publish] = []
         self._served_ns = 0
         self._position_ns = 0
         self._published = 0
@@ -218,8 +236,8 @@ class Player:
         """Waits for the first messages.
 
         Returns:
-            The time of the first message, ns since the epoch of the log; None if no message is
-            to be played.
+            The time of the first message, in ns after the start of the recorded session. None
+            if there is no message, or the playback was stopped.
         """
         self._first_batch = self._wait_for_batch()
         if self._first_batch is None:
@@ -228,11 +246,12 @@ class Player:
         return self._position_ns
 
     def play(self, pace: Pace, *, loop: bool = False) -> None:
-        """Plays all messages, until the end of the log or until stopped.
+        """Plays all messages, until the end of the log or until the playback is stopped.
 
         Args:
-            pace: the deadlines of the first round.
-            loop: whether the messages are played round after round, until stopped.
+            pace: Deadlines of the first round.
+            loop: True if the messages are played round after round, until the playback is
+                stopped.
         """
         while not self._stopped():
             self.rounds += 1
@@ -251,7 +270,7 @@ class Player:
                 self._history.clear()
 
     def _wait_for_batch(self) -> MessageBatch | None:
-        """Waits for the next messages; None at the end of the round, or if stopped."""
+        """Waits for the next messages. None at the end of the round, or if stopped."""
         batch = self._first_batch
         self._first_batch = None
         while batch is None and not (self._source.ended or self._stopped()):
@@ -262,7 +281,12 @@ class Player:
         return batch
 
     def _play_piece(self, piece: MessageBatch, pace: Pace) -> None:
-        """Publishes the messages of a piece at their deadlines."""
+        """Publishes some messages at their deadlines. Returns early if the playback is stopped.
+
+        Args:
+            piece: The messages.
+            pace: The deadlines.
+        """
         clock = self._clock
         read_clock = clock.monotonic_ns
         add_lateness = self.lateness.add
@@ -281,7 +305,9 @@ class Player:
                     return
                 start_ns = read_clock()
             add_lateness(start_ns - due_ns)
-            while len(self._publishers) <= channel:  # declared when first needed
+
+            # A channel is declared on the network before its first message.
+            while len(self._publishers) <= channel:
                 self._publishers.append(self._publisher(len(self._publishers)))
                 self.counts.append(0)
             self._publishers[channel](payload)
@@ -289,16 +315,21 @@ class Player:
             if duration_ns > HELD_NS:
                 self.held_ns += duration_ns
                 self.stalls += duration_ns > CUT_NS
+
             self._published += 1
             self.counts[channel] += 1
             if number >= next_numbers.get(channel, 0):
                 next_numbers[channel] = number + 1
 
     def _use_slack(self, due_ns: int, now_ns: int) -> bool:
-        """Uses the time before a deadline for other work.
+        """Does other work until shortly before a deadline.
+
+        Args:
+            due_ns: The deadline, in ns.
+            now_ns: Present time on the clock, in ns.
 
         Returns:
-            False if the play was stopped.
+            False if the playback was stopped.
         """
         while due_ns - now_ns > MIN_SLACK_NS:
             self._serve()
@@ -312,7 +343,7 @@ class Player:
         return True
 
     def _serve(self) -> None:
-        """Reads ahead, and lets the playback do its other work."""
+        """Reads messages in advance, and does some other work."""
         self._source.fill()
         self._serve_others(
             PlayProgress(self._position_ns, self._published, self.lateness.max_us)

@@ -1,12 +1,12 @@
-"""Read the messages of a log that are played, selected by channel and time.
+"""Reads the messages of a log that will be played, selected by channel and time.
 
 Invariant:
-    - Payloads pass through unchanged. Only the number of an event and the boot of a sender are
-      decoded.
-    - By default the messages of the sites are played, without the recorder's statistics and
-      without the channels for viewers.
-    - The memory of a preloaded log is bounded (L6). Another process reads a larger log during
-      play (`message_source`).
+    - Payloads are passed on unchanged. Only the number of an event and the random number (boot)
+      that identifies the start of a sender are decoded.
+    - By default the messages of the sites are played, but neither the recorder's statistics nor
+      the messages for viewers.
+    - The memory of a preloaded log is bounded (L6). Another process reads a larger log while it
+      is played (`message_source`).
 """
 
 import math
@@ -38,19 +38,20 @@ from trilat_net.scenario import Scenario, parse_embedded
 from .batch import BatchBuilder, MessageBatch, PlayedMessage
 
 PlayTime = Literal["publish", "log"]
-"""The time by which messages are played: the time of sending or of arrival."""
+"""The time at which a message is played: its sending time or its arrival time."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlaySelection:
-    """The messages of a log that are played.
+    """Selection of the messages of a log that are played.
 
     Attributes:
-        channels: the channels that are played; if the filter includes no channel by name, the
-            channels of the sites.
-        start_ns: time of the earliest message, ns since the epoch; None: no limit.
-        stop_ns: time of the latest message, ns since the epoch; None: no limit.
-        time: the time by which messages are played.
+        channels: Filter of the channels. If it includes no channel explicitly, the channels of
+            the sites are played.
+        start_ns: Time of the earliest message after the start of the session, in ns. None does
+            not limit it.
+        stop_ns: Time of the latest message, likewise.
+        time: The time at which messages are played.
     """
 
     channels: ChannelFilter = ALL_CHANNELS
@@ -59,11 +60,11 @@ class PlaySelection:
     time: PlayTime = "publish"
 
     def accepts(self, topic: str, sites: Collection[str]) -> bool:
-        """True if a channel is played.
+        """Returns True if the messages of a channel are played.
 
         Args:
-            topic: topic of the channel, as "/trilat/paper/m1/state".
-            sites: names of the sites of the scenario.
+            topic: Topic of the channel, such as "/trilat/paper/m1/state".
+            sites: Names of the sites of the scenario.
         """
         key = topic.strip("/")
         parts = topics.parse_key(key)
@@ -74,7 +75,7 @@ class PlaySelection:
         return is_candidate and self.channels.accepts(key)
 
     def contains(self, t_ns: int) -> bool:
-        """True if messages of a time are played, ns since the epoch."""
+        """Returns True if messages of a time (ns after the session's start) are played."""
         is_before = self.start_ns is not None and t_ns < self.start_ns
         is_after = self.stop_ns is not None and t_ns > self.stop_ns
         return not (is_before or is_after)
@@ -88,18 +89,18 @@ def parse_selection(
     duration_s: float | None,
     time: str,
 ) -> PlaySelection:
-    """Returns the selection that a user's options describe.
+    """Parses the options of a command that select messages.
 
     Args:
-        include: key expressions of `--include`.
-        exclude: key expressions of `--exclude`.
-        start_s: `--start`, s since the epoch.
-        stop_s: `--stop`, s since the epoch.
-        duration_s: `--duration`, s; in place of `stop_s`.
-        time: `--time`, see `PlayTime`.
+        include: Key expressions of `--include`.
+        exclude: Key expressions of `--exclude`.
+        start_s: Value of `--start`, in s after the start of the session. None if it is absent.
+        stop_s: Value of `--stop`, likewise.
+        duration_s: Value of `--duration`, in s, instead of `stop_s`. None if it is absent.
+        time: Value of `--time`, see `PlayTime`.
 
     Raises:
-        UsageError: the options contradict each other, or an option is not valid.
+        UsageError: The options contradict each other, or an option is not valid.
     """
     if time not in get_args(PlayTime):
         raise UsageError(
@@ -125,23 +126,23 @@ def parse_selection(
 
 
 HORIZON_NS = 70 * NS_PER_S
-"""Largest distance of a message in a file from its turn. Sites keep messages for a minute for
-recorders that missed them.
+"""Largest distance between a message's place in a file and its turn, in ns. Sites keep their
+messages for a minute, and send them again to recorders that missed them.
 """
 _LAST = 1 << 61
-"""Bound of times and numbers, also in damaged files."""
+"""Bound of times and numbers, so that those of damaged files do not overflow."""
 NUMBERS_OF_A_START = 1 << 40
-"""Offset between the event numbers of two successive starts of a site. Each start numbers its
-events from 0.
+"""Number that is added to the event numbers of each further start of a site. Without it they
+would repeat, because each start numbers its events from 0.
 """
 
 
 class _PayloadHeader(msgspec.Struct):
-    """The decoded part of a payload, of any schema version.
+    """The fields of a message that are decoded. They exist in all versions of the schema.
 
     Attributes:
-        boot: start of the sender; -1 if the payload cannot be decoded.
-        n: number of an event; -1 without a number.
+        boot: Number that identifies the start of the sender. It is -1 if it cannot be decoded.
+        n: Number of an event. It is -1 if there is no number.
     """
 
     boot: int = -1
@@ -152,6 +153,7 @@ _decoder = msgspec.msgpack.Decoder(_PayloadHeader)
 
 
 def _decode_header(payload: bytes) -> _PayloadHeader:
+    """Decodes the boot and the number of a message. Both are -1 if that is not possible."""
     try:
         return _decoder.decode(payload)
     except (ValueError, RecursionError):
@@ -160,19 +162,19 @@ def _decode_header(payload: bytes) -> _PayloadHeader:
 
 @dataclass(slots=True)
 class SessionHeader:
-    """The session of the files.
+    """Description of the session in the files, which grows while they are read.
 
     Attributes:
-        session: name of the session.
-        scenario: the scenario.
-        scenario_text: the scenario as it is in the file.
-        fingerprint: fingerprint of the platform that recorded the session.
-        version: schema version of the messages; 0 if unknown.
-        boots: first start of each site.
-        topics: topics of the channels that are played; the index is the number of the channel.
-        torn: damaged files, with the reason.
-        first_ns: time of the earliest message that was read, ns since the epoch.
-        last_ns: time of the latest message that was read, ns since the epoch.
+        session: Name of the session.
+        scenario: Scenario of the session.
+        scenario_text: Text of the scenario, as stored in the file.
+        fingerprint: Fingerprint of the platform that recorded the session.
+        version: Schema version of the messages. It is 0 if it is unknown.
+        boots: Number that identifies the first start of each site, by site.
+        topics: Topics of the channels that are played. The number of a channel is its index.
+        torn: Damaged files, with the reason.
+        first_ns: Time of the earliest message so far, in ns after the start of the session.
+        last_ns: Time of the latest message so far, likewise.
     """
 
     session: str
@@ -188,18 +190,18 @@ class SessionHeader:
 
 
 class _PlayedChannel:
-    """A channel of a file.
+    """A channel of a file, which numbers its messages.
 
     Args:
-        topic: topic of the channel.
-        header: the session; receives the topic if the channel is played.
-        selection: the messages that are played.
+        topic: Topic of the channel.
+        header: Description of the session. The topic is added to it if the channel is played.
+        selection: Which messages are played.
 
     Attributes:
-        site: name of the site; "" for the channel of another member or session.
-        kind: "state", "link" or "event" of a site; else "".
-        rate_hz: tick rate of the site, Hz; 0 without a site.
-        channel_number: number of the channel in `header.topics`; -1 if it is not played.
+        site: Name of the site. Empty if the channel belongs to another member or session.
+        kind: "state", "link" or "event" for a channel of a site. Otherwise empty.
+        rate_hz: Tick rate of the site, in Hz. It is 0 if the channel belongs to no site.
+        channel_number: Number of the channel in `header.topics`. It is -1 if it is not played.
     """
 
     def __init__(self, topic: str, header: SessionHeader, selection: PlaySelection) -> None:
@@ -219,17 +221,24 @@ class _PlayedChannel:
                 header.topics.append(topic)
             self.channel_number = header.topics.index(topic)
         self._event_count = 0
-        self._starts: dict[int, int] = {}  # by boot the number of the start
+        # Index of each start of the site, by its boot.
+        self._starts: dict[int, int] = {}
 
     def find_number(self, item: McapMessage, t_ns: int) -> int:
-        """Returns the number of a message in the channel, see `PlayedMessage`."""
+        """Returns the number of a message in its channel, see `PlayedMessage`.
+
+        Args:
+            item: The message.
+            t_ns: Time of the message after the start of the session, in ns.
+        """
         if self.kind in (topics.STATE, topics.LINK):
             return number_message(self.kind, item.sequence, self.rate_hz)
         if self.kind != topics.EVENT:
             return t_ns
         header = _decode_header(item.payload)
         self._event_count += 1
-        if header.n < 0:  # before version 3 events had no number
+        if header.n < 0:
+            # Events have no number before version 3 of the schema. They are counted instead.
             return self._event_count - 1
         start = self._starts.setdefault(header.boot, len(self._starts))
         number = min(header.n, NUMBERS_OF_A_START - 1)
@@ -237,15 +246,16 @@ class _PlayedChannel:
 
 
 class SessionReader:
-    """Reads the files of a session once.
+    """Reads the files of a session once, from the first to the last message.
 
     Args:
-        paths: the files; several files are the parts of a session, in their order.
-        selection: the messages that are played.
-        progress: called now and then with the number of bytes read and their total.
+        paths: The files. Several files are the parts of a session, in their order.
+        selection: Which messages are played.
+        progress: Function that is called now and then with the number of bytes read and their
+            total.
 
     Attributes:
-        header: the session; None before the first message.
+        header: Description of the session. None before the first message.
     """
 
     def __init__(
@@ -257,11 +267,11 @@ class SessionReader:
         self._progress = progress
 
     def messages(self) -> Iterator[PlayedMessage]:
-        """Yields the messages that are played, in file order.
+        """Yields the selected messages in the order of the files.
 
         Raises:
-            LogError: a file is missing, is no log of trilat-net, or is of another session than
-                the first file.
+            LogError: A file is missing, is no log of trilat-net, or belongs to another session
+                than the first file.
         """
         for path in self._paths:
             with reading(path) as stream:
@@ -269,15 +279,26 @@ class SessionReader:
                 yield from self._read_file(path, reader)
 
     def _read_file(self, path: Path, reader: McapReader) -> Iterator[PlayedMessage]:
+        """Yields the selected messages of one file, and completes the header.
+
+        Args:
+            path: The file.
+            reader: Reader of the file.
+
+        Raises:
+            LogError: The file is no log of trilat-net, or belongs to another session.
+        """
         epoch_ns: int | None = None
         channels: dict[str, _PlayedChannel] = {}
         stop_ns = self._selection.stop_ns
         for item in reader.messages():
             if epoch_ns is None:
+                # The reader has read the metadata when it yields the first message.
                 epoch_ns, header = self._read_session(path, reader)
             t_ns = self._find_time_ns(item, epoch_ns)
             if stop_ns is not None and item.log_time_ns - epoch_ns > stop_ns + HORIZON_NS:
                 return  # all further messages arrived even later
+
             channel = channels.get(item.topic)
             if channel is None:
                 channel = _PlayedChannel(item.topic, header, self._selection)
@@ -291,6 +312,7 @@ class SessionReader:
             number = channel.find_number(item, t_ns)
             if channel.channel_number >= 0 and self._selection.contains(t_ns):
                 yield t_ns, channel.channel_number, number, item.payload
+
         if epoch_ns is None:
             _, header = self._read_session(path, reader)
         if not reader.complete:
@@ -299,23 +321,28 @@ class SessionReader:
             header.torn[path] = f"damaged in {count_nouns(len(reader.damaged), 'place')}"
 
     def _find_time_ns(self, item: McapMessage, epoch_ns: int) -> int:
-        """Returns the time at which a message is played, ns since the epoch."""
+        """Returns the time at which a message is played, in ns after the start of the session.
+
+        Args:
+            item: The message.
+            epoch_ns: Start of the session, in Unix time, in ns.
+        """
         t_ns = item.log_time_ns
-        # an impossible time of sending is replaced by the time of arrival
+        # An impossible sending time is replaced by the arrival time.
         is_possible = abs(item.publish_time_ns - t_ns) <= HORIZON_NS
         if self._selection.time == "publish" and is_possible:
             t_ns = item.publish_time_ns
         return min(max(t_ns - epoch_ns, -_LAST), _LAST)
 
     def _read_session(self, path: Path, reader: McapReader) -> tuple[int, SessionHeader]:
-        """Reads the session of a file.
+        """Reads the metadata of a file's session, and creates the header for the first file.
 
         Returns:
-            The epoch of the file in Unix time, ns, and the session.
+            The start of the session in Unix time, in ns, and the header.
 
         Raises:
-            LogError: the file is no log of trilat-net, or is of another session than the files
-                before it.
+            LogError: The file is no log of trilat-net, or belongs to another session than the
+                previous files.
         """
         metadata = reader.metadata.get(SESSION, {})
         if "session" not in metadata or SCENARIO not in reader.attachments:
@@ -343,7 +370,8 @@ class SessionReader:
 
 
 SEARCH_LIMIT = 100_000
-"""Number of further messages that are searched for the boots of sites."""
+"""Number of messages, after those that fit into memory, that are searched for starts of sites.
+"""
 
 
 def preload_messages(
@@ -352,21 +380,22 @@ def preload_messages(
     limit_bytes: int,
     progress: Progress | None = None,
 ) -> tuple[SessionHeader, MessageBatch | None]:
-    """Reads the session of files, and the messages that are played if they fit in memory.
+    """Reads the description of a session, and its selected messages if they fit into memory.
 
     Args:
-        paths: the files.
-        selection: the messages that are played.
-        limit_bytes: largest memory of the messages, bytes.
-        progress: called now and then with the number of bytes read and their total.
+        paths: The files.
+        selection: Which messages are played.
+        limit_bytes: Largest memory of the messages, in bytes.
+        progress: Function that is called now and then with the number of bytes read and their
+            total.
 
     Returns:
-        The session, and the messages in play order; None in place of the messages if they need
-        more memory.
+        The description of the session, and the messages in play order. None instead of the
+        messages if they need more memory.
 
     Raises:
-        LogError: a file is missing, or is no log of trilat-net.
-        UsageError: no message is selected.
+        LogError: A file is missing, or is no log of trilat-net.
+        UsageError: No message is selected.
     """
     reader = SessionReader(paths, selection, progress)
     waiting = BatchBuilder()
@@ -392,6 +421,7 @@ def preload_messages(
 def _describe_empty_selection(
     path: Path, selection: PlaySelection, header: SessionHeader
 ) -> str:
+    """Explains to the user why no message is selected."""
     if header.last_ns < header.first_ns:
         return f"{path}: holds no message"
     span = f"from {header.first_ns / NS_PER_S:.3f} s to {header.last_ns / NS_PER_S:.3f} s"

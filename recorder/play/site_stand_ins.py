@@ -1,16 +1,16 @@
-"""Stand in for the sites of a session that is played back from its log.
+"""Stands in for the sites of a session while its log is played.
 
-The stand-ins announce the tokens of the sites, reply to queries for their identities and to
-pings, and send messages again that recorders request (backfill). `PlayedHistory` keeps the
-messages for this.
+To other programs, a log that is played looks like a running session. The stand-ins announce the
+sites on the network, reply to queries for their identities and to pings, and send messages
+again to recorders that missed them (backfill). `PlayedHistory` keeps the messages for this.
 
 Invariant:
     - Recorders, viewers and pings see everything that a running session shows to a member that
       joins late.
-    - Apart from identities, no message is published in the name of a site that the log does not
-      hold.
-    - Backfill covers the messages that were played: the last minute if the log is read during
-      play (L6), all messages if it is preloaded.
+    - Except for identities, no message is published in the name of a site that is not in the
+      log.
+    - The messages that were played can be requested again: those of the last minute if the log
+      is read while it is played (L6), and all of them if it is in memory.
 """
 
 from bisect import bisect_left
@@ -46,9 +46,9 @@ class _ChannelMessages(NamedTuple):
     """The messages of one channel in a batch.
 
     Attributes:
-        numbers: numbers of the messages, ascending, shape (K,).
-        indices: indices of the messages in the batch, shape (K,).
-        batch: the batch.
+        numbers: Numbers of the messages in ascending order, shape (K,).
+        indices: Indices of the messages in the batch, shape (K,).
+        batch: The batch.
     """
 
     numbers: Ints
@@ -56,9 +56,9 @@ class _ChannelMessages(NamedTuple):
     batch: MessageBatch
 
     def list_from(self, number: int) -> list[tuple[int, int]]:
-        """Returns number and index of the messages from a number on.
+        """Returns the numbers and indices of the messages from a number on.
 
-        There are at most as many messages as a reply holds, and a further one.
+        There are at most as many messages as one reply contains, and one more.
         """
         start = int(np.searchsorted(self.numbers, number))
         selected = slice(start, start + BACKFILL_MESSAGES + 1)
@@ -68,13 +68,13 @@ class _ChannelMessages(NamedTuple):
 
 
 class PlayedHistory:
-    """The messages that the player received, by channel, for backfill.
+    """The messages that were played, by channel, so that they can be sent again.
 
     Args:
-        kept_ns: length of the log that is kept, ns; None to keep all messages.
+        kept_ns: Duration of the log that is kept, in ns. None keeps all messages.
 
     Attributes:
-        next_numbers: by channel, the number that follows that of the last played message.
+        next_numbers: Number after that of the last played message, by channel.
     """
 
     def __init__(self, kept_ns: int | None = None) -> None:
@@ -83,7 +83,7 @@ class PlayedHistory:
         self._messages: dict[int, deque[_ChannelMessages]] = {}
 
     def add(self, batch: MessageBatch) -> None:
-        """Adds messages that are about to be played, and drops the oldest messages."""
+        """Adds messages that will be played next, and removes the oldest messages."""
         for channel in np.unique(batch.channels).tolist():
             indices = np.flatnonzero(batch.channels == channel)
             numbers = batch.numbers[indices]
@@ -95,23 +95,23 @@ class PlayedHistory:
                     parts.popleft()
 
     def clear(self) -> None:
-        """Drops all messages before another round; `next_numbers` is kept."""
+        """Removes all messages before the next round. `next_numbers` stays."""
         self._messages.clear()
 
     def find_messages(self, channel: int, first: int, last: int) -> tuple[int, list[bytes]]:
-        """Returns successive messages for one reply to a backfill request.
+        """Finds consecutive messages for one reply to a recorder.
 
-        A reply has no gaps. It is limited to `BACKFILL_MESSAGES` messages and, unless a single
-        message is larger, to `BACKFILL_BYTES` bytes.
+        A reply has no gaps. It contains at most `BACKFILL_MESSAGES` messages and, unless a
+        single message is larger, at most `BACKFILL_BYTES` bytes.
 
         Args:
-            channel: the channel.
-            first: number of the first requested message. If that message is not kept, the reply
-                begins with the next message.
-            last: number of the last requested message.
+            channel: Number of the channel.
+            first: Number of the first requested message. If it is not kept, the reply begins
+                with the next message that is kept.
+            last: Number of the last requested message.
 
         Returns:
-            The number of the first message of the reply, and the payloads.
+            The number of the first message in the reply, and the payloads.
         """
         played = self.next_numbers.get(channel, 0)
         last_available = min(last, played - 1)
@@ -126,6 +126,7 @@ class PlayedHistory:
                     next_number = reply_first
                 if number < next_number:
                     continue  # a repeated number
+
                 payload = part.batch.payload(index)
                 size += len(payload)
                 is_beyond = number > last_available
@@ -136,24 +137,27 @@ class PlayedHistory:
                     return reply_first, payloads
                 payloads.append(payload)
                 next_number = number + 1
-        # no requested message is kept: all of them count as unavailable
+
         if not payloads and first < played:
+            # No requested message is kept. The empty reply states that they are not available.
             reply_first = played
         return reply_first, payloads
 
     def _list_parts(self, channel: int, first: int) -> list[_ChannelMessages]:
-        """Returns the kept messages of a channel, without parts that end before `first`."""
+        """Returns the kept messages of a channel, without the parts that end before `first`."""
         parts = list(self._messages.get(channel, ()))
         index = bisect_left(parts, first, key=lambda part: int(part.numbers[-1]))
         return parts[index:]
 
 
 _MAX_RECORDER_EVENTS = 256
-"""Capacity of the inbox for events of recorders."""
+"""Largest number of waiting events of recorders."""
 REFRESH_NS = 500_000_000
-"""Longest age of an encoded identity, ns.
+"""Time for which an encoded identity is used again, in ns.
 
-An identity holds a whole scenario, whose encoding takes long.
+An identity contains a whole scenario,
+
+so that its encoding takes long.
 """
 
 
@@ -161,15 +165,16 @@ class SiteStandIns:
     """The stand-ins for all sites of a session.
 
     Args:
-        bus: the connection to the playback's session.
-        clock: the time.
-        session: name of the playback's session.
-        header: content of the files.
-        history: the messages that were played.
+        bus: Network connection of the player.
+        clock: Clock of the player.
+        session: Name of the session in which the log is played.
+        header: Description of the recorded session.
+        history: The messages that were played.
 
     Attributes:
-        recorders: boots of the recorders that are present.
-        refilled: number of messages that were sent to recorders by backfill.
+        recorders: Boots of the recorders that are present, as text. A boot is a random number
+            that identifies one start of a process.
+        refilled: Number of messages that were sent again to recorders.
     """
 
     def __init__(
@@ -189,13 +194,13 @@ class SiteStandIns:
         recorder_events = topics.key(session, topics.RECORDER, topics.EVENT)
         self._recorder_events = bus.inbox(recorder_events, _MAX_RECORDER_EVENTS)
         self._recorder_query = MemberQuery(bus, clock, session, topics.RECORDER)
-        # by recorder, the sites that the recorder has stored
+        # Sites whose messages are stored completely, by the boot of the recorder.
         self._stored: dict[str, set[str]] = {}
-        # recorders that sent their identity
+        # Boots of the recorders that have sent their identity.
         self._listening: set[str] = set()
-        # by site, the number of its start and its boot, see `_find_start`
+        # Index and boot of the start of each site that is played, see `_find_start`.
         self._boots: dict[str, tuple[int, int]] = {}
-        # by site, the time at which its identity was encoded, and the identity
+        # Time at which the identity of each site was encoded, and the encoded identity.
         self._encoded: dict[str, tuple[int, bytes]] = {}
         self._infos = {}
         for site, boot in header.boots.items():
@@ -213,7 +218,11 @@ class SiteStandIns:
             bus.announce(liveliness_token(session, site, info.boot))
 
     def start_session(self, epoch_mono_ns: int) -> None:
-        """Announces the session as running, with tick 0 at a time of the clock, ns."""
+        """Announces the session as running.
+
+        Args:
+            epoch_mono_ns: Time of tick 0 on the monotonic clock, in ns.
+        """
         unix_ns = self._clock.unix_ns()
         epoch_unix_ns = unix_ns + epoch_mono_ns - self._clock.monotonic_ns()
         for site, info in self._infos.items():
@@ -227,12 +236,12 @@ class SiteStandIns:
         self._encoded.clear()
 
     def serve_queries(self) -> bool:
-        """Replies to all identity queries and to one backfill query.
+        """Replies to all queries for identities and to one request of a recorder.
 
         Also receives the presence and the events of recorders.
 
         Returns:
-            True if there was a backfill query.
+            True if there was a request of a recorder.
         """
         for site, queries in self._identity_queries.items():
             while (query := queries.poll()) is not None:
@@ -246,7 +255,7 @@ class SiteStandIns:
         return False
 
     def _receive_recorders(self) -> None:
-        """Receives the presence of recorders, and their events on sites that they stored."""
+        """Notes which recorders are present, and which sites they have stored completely."""
         for token, is_alive in topics.read_presence(self._presence):
             if is_alive:
                 self.recorders.add(token.boot)
@@ -258,7 +267,7 @@ class SiteStandIns:
                 stored_sites.add(event.about)
 
     def _encode_identity(self, site: str) -> bytes:
-        """Returns the identity of a site, encoded at most `REFRESH_NS` ago."""
+        """Returns the encoded identity of a site, which may be up to `REFRESH_NS` old."""
         encoded_ns, identity = self._encoded.get(site, (0, b""))
         now_ns = self._clock.monotonic_ns()
         if not identity or now_ns - encoded_ns >= REFRESH_NS:
@@ -270,12 +279,16 @@ class SiteStandIns:
         return identity
 
     def are_recorders_listening(self) -> bool:
-        """Queries the identities of recorders; True once all recorders have replied."""
+        """Queries the identities of recorders. Returns True if all of them have replied."""
         self._listening |= {str(info.boot) for info in self._recorder_query.poll()}
         return not self.recorders - self._listening
 
     def have_stored(self, recorders: Collection[str]) -> bool:
-        """True if each of the recorders has published the event `stored` about every site."""
+        """Returns True if each of the recorders has stored all messages of every site.
+
+        Args:
+            recorders: Boots of the recorders, as text.
+        """
         for boot in recorders:
             stored_sites = self._stored.get(boot, set())
             if not stored_sites >= self._infos.keys():
@@ -285,16 +298,16 @@ class SiteStandIns:
     def _find_channel(self, site: str, channel: str) -> int:
         """Returns the number of a site's channel among the played channels.
 
-        Returns -1 if the log has no such channel.
+        It is -1 if the log has no such channel.
         """
         topic = "/" + topics.key(self._header.session, site, channel)
         played_topics = self._header.topics
         return played_topics.index(topic) if topic in played_topics else -1
 
     def _find_start(self, site: str) -> tuple[int, int]:
-        """Returns the number from 0 of the start of a site that is played, and the site's boot.
+        """Returns the index of the start of a site that is being played, and its boot.
 
-        The newest played event of the site determines both.
+        The first start has the index 0. The newest played event of the site determines both.
         """
         channel = self._find_channel(site, topics.EVENT)
         newest = self._history.next_numbers.get(channel, 0) - 1
@@ -310,14 +323,20 @@ class SiteStandIns:
         return self._boots.get(site, first_start)
 
     def _reply_backfill(self, site: str, query: Query) -> None:
-        """Replies to a backfill query in the name of a site."""
+        """Replies to the request of a recorder in the name of a site.
+
+        Args:
+            site: Name of the site.
+            query: The request.
+        """
         start, boot = self._find_start(site)
 
         def find_requested(request: BackfillRequest) -> tuple[int, list[bytes], int]:
+            """Returns the first number, the payloads, and the number of played messages."""
             channel = self._find_channel(site, request.channel)
             offset = 0
             if request.channel == topics.EVENT:
-                # a recorder numbers the events of the present start from 0
+                # The recorder numbers the events of the present start from 0.
                 offset = start * NUMBERS_OF_A_START
             played = self._history.next_numbers.get(channel, 0) - offset
             first, payloads = self._history.find_messages(

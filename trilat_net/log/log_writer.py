@@ -503,7 +503,7 @@ class LogParts:
         number: int,
         message: Decoded = None,
     ) -> None:
-        """Adds one message, and begins a new part before it if needed, see `LogWriter.add`."""
+        """Adds one message, in a new part if necessary, see `LogWriter.add`."""
         if self._storage.splits and not self._writer.ended:
             if self._part_start_ns is None:
                 self._part_start_ns = log_time_ns

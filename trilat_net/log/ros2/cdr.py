@@ -1,13 +1,14 @@
-"""Pack and read standard ROS 2 messages without a ROS installation.
+"""Encodes and decodes standard ROS 2 messages without a ROS installation.
 
-A message is encoded as little-endian CDR, the Common Data Representation of OMG. It begins with
-a header of four bytes. Each field is aligned to its size, counted from the end of the header;
-the padding before it is zero. A string or list begins with its length, a number of 32 bits.
+A message is encoded as little-endian CDR, the Common Data Representation of the OMG. It begins
+with a header of four bytes. Each field is aligned to its size, counted from the end of the
+header, and the padding before it is zero. A string or list begins with its length, a number of
+32 bits.
 
 Invariant:
-    - The bytes of a message equal those of any other serializer.
-    - The layout of a message that sites publish at a high rate is computed once, so that
-      packing is one call of `struct`.
+    - The bytes of a message are the same as those of any other serializer.
+    - The layout of a message that sites publish at a high rate is computed once, so that it is
+      encoded by one call of `struct`.
 """
 
 import math
@@ -20,7 +21,9 @@ from typing import Any, NamedTuple
 from ...core.ticks import NS_PER_S
 
 ENCODING = "cdr"
+"""Encoding of the messages, as MCAP calls it."""
 SCHEMA_ENCODING = "ros2msg"
+"""Encoding of the message definitions, as MCAP calls it."""
 JOINT_STATE = "sensor_msgs/msg/JointState"
 FLOAT64_ARRAY = "std_msgs/msg/Float64MultiArray"
 STRING = "std_msgs/msg/String"
@@ -34,7 +37,8 @@ DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 _HEAD = b"\x00\x01\x00\x00"
 """Header of a message: plain CDR, little-endian, no options."""
 _LAST_S = (1 << 31) - 1
-"""Latest stamp of ROS 2, in s: a stamp has its seconds as a signed number of 32 bits."""
+"""Latest time stamp of ROS 2, in s. A stamp contains the seconds in a signed number of 32 bits.
+"""
 _POSE_BYTES = 7 * 8
 """Size of a transform: position and quaternion, seven floats of 8 bytes."""
 
@@ -54,19 +58,24 @@ _PACKED_TYPES = (
 
 
 def _read_definition(type_name: str) -> bytes:
-    """Returns the text of a message type, such as "std_msgs/msg/String"."""
+    """Reads the definition of a message type, such as "std_msgs/msg/String"."""
     short_name = type_name.rpartition("/")[2]
     return (DEFINITIONS / f"{short_name}.msg").read_bytes()
 
 
 ROS2_SCHEMAS = {type_name: _read_definition(type_name) for type_name in _PACKED_TYPES}
-"""Complete definitions of the packed message types, by name."""
+"""Complete definitions of the message types that this module encodes, by name."""
 
 
 def _pack_fields(offset: int, *values: int | str) -> bytes:
-    """Returns packed uint32 numbers and strings, for a position `offset` bytes after the head.
+    """Encodes numbers of 32 bits and strings.
 
-    A string is packed as its length with the terminating zero, then its bytes.
+    A string is encoded as its length with the terminating zero, then its bytes.
+
+    Args:
+        offset: Position of the first field, in bytes after the header. It determines the
+            padding.
+        *values: The numbers and strings.
     """
     data = b""
     for value in values:
@@ -80,24 +89,32 @@ def _pack_fields(offset: int, *values: int | str) -> bytes:
 
 
 def _count_padding(offset: int, size: int) -> int:
-    """Returns how many bytes of padding align a field of `size` bytes at `offset`."""
+    """Returns the number of bytes of padding before a field of `size` bytes at `offset`."""
     return -offset % size
 
 
 def _split_stamp(stamp_ns: int) -> tuple[int, int]:
-    """Returns the seconds and nanoseconds of a ROS 2 stamp."""
+    """Splits a time into the seconds and nanoseconds of a ROS 2 stamp."""
     seconds, rest_ns = divmod(stamp_ns, NS_PER_S)
     return min(seconds, _LAST_S), rest_ns
 
 
 def _pack_stamp(stamp_ns: int) -> bytes:
-    """Returns a ROS 2 stamp of a time in Unix ns."""
+    """Encodes a time in Unix ns as a ROS 2 stamp."""
     seconds, rest_ns = _split_stamp(stamp_ns)
     return struct.pack("<iI", seconds, rest_ns)
 
 
 def _format_floats(offset: int, count: int) -> tuple[str, int]:
-    """Returns the `struct` format of a list of floats that begins at `offset`, and its end."""
+    """Returns the format of a list of floats, as the module `struct` defines it.
+
+    Args:
+        offset: Position of the list, in bytes after the header.
+        count: Number of floats.
+
+    Returns:
+        The format, and the position after the list.
+    """
     length_padding = _count_padding(offset, 4)
     length_end = offset + length_padding + 4
     # An empty list has no float to align.
@@ -107,10 +124,10 @@ def _format_floats(offset: int, count: int) -> tuple[str, int]:
 
 
 class JointStatePacker:
-    """Packer of `sensor_msgs/msg/JointState`.
+    """Encoder of `sensor_msgs/msg/JointState` for fixed joints.
 
     Args:
-        names: names of the joints.
+        names: Names of the joints.
         velocity: True if the messages contain velocities.
         effort: True if the messages contain efforts.
     """
@@ -139,13 +156,13 @@ class JointStatePacker:
         velocity: Sequence[float] = (),
         effort: Sequence[float] = (),
     ) -> bytes:
-        """Returns one message.
+        """Encodes one message.
 
         Args:
             stamp_ns: Unix time of the message, in ns, 0 or more.
-            position: joint angles, in rad.
-            velocity: joint speeds, in rad/s.
-            effort: joint torques, in N m.
+            position: Joint angles, in rad.
+            velocity: Joint velocities, in rad/s.
+            effort: Joint torques, in N m.
         """
         position_count, velocity_count, effort_count = self._counts
         return self._pack(
@@ -162,7 +179,11 @@ class JointStatePacker:
 
 
 class TransformPacker:
-    """Packer of `tf2_msgs/msg/TFMessage` for frames given as pairs of parent and child."""
+    """Encoder of `tf2_msgs/msg/TFMessage` for fixed frames.
+
+    Args:
+        frames: Pairs of the names of the parent frame and the child frame.
+    """
 
     def __init__(self, frames: Sequence[tuple[str, str]]) -> None:
         self._names: list[bytes] = []
@@ -180,11 +201,12 @@ class TransformPacker:
         self._pack = struct.Struct(struct_format).pack
 
     def pack(self, stamp_ns: int, numbers: Sequence[float]) -> bytes:
-        """Returns one message.
+        """Encodes one message.
 
         Args:
             stamp_ns: Unix time of the message, in ns, 0 or more.
-            numbers: for each frame, x, y, z in m and a quaternion x, y, z, w.
+            numbers: For each frame, x, y, z in m and the quaternion x, y, z, w, in one
+                sequence.
         """
         seconds, rest_ns = _split_stamp(stamp_ns)
         fields: list[object] = []
@@ -196,17 +218,19 @@ class TransformPacker:
 
 
 def make_float_array_packer(*dimensions: tuple[str, int]) -> Callable[..., bytes]:
-    """Returns a packer of `std_msgs/msg/Float64MultiArray` of a fixed shape.
-
-    The packer takes the numbers row by row.
+    """Creates an encoder of `std_msgs/msg/Float64MultiArray` for a fixed shape.
 
     Args:
-        dimensions: label and size of each dimension.
+        dimensions: Label and size of each dimension.
+
+    Returns:
+        A function that encodes a message from the numbers, row by row.
     """
     sizes = [size for _, size in dimensions]
     count = math.prod(sizes)
     layout: list[int | str] = []
     for index, (label, size) in enumerate(dimensions):
+        # The stride of a dimension is the number of floats from it on.
         stride = math.prod(sizes[index:])
         layout += [label, size, stride]
     data_offset = 0
@@ -217,12 +241,12 @@ def make_float_array_packer(*dimensions: tuple[str, int]) -> Callable[..., bytes
 
 
 def pack_string(text: str) -> bytes:
-    """Returns a `std_msgs/msg/String`."""
+    """Encodes a `std_msgs/msg/String`."""
     return _HEAD + _pack_fields(0, text)
 
 
 class RosLogLevel(IntEnum):
-    """Severity of a log line, with the numbers of ROS 2."""
+    """Severity of a log line, with the numbers that ROS 2 defines."""
 
     INFO = 20
     WARN = 30
@@ -230,13 +254,13 @@ class RosLogLevel(IntEnum):
 
 
 def pack_log(stamp_ns: int, level: RosLogLevel, name: str, text: str) -> bytes:
-    """Returns an `rcl_interfaces/msg/Log`.
+    """Encodes a line for the log of ROS, `rcl_interfaces/msg/Log`.
 
     Args:
         stamp_ns: Unix time of the line, in ns, 0 or more.
-        level: severity of the line.
-        name: name of the member that logs.
-        text: content of the line.
+        level: Severity of the line.
+        name: Name of the member of the session that logs.
+        text: Text of the line.
     """
     seconds, rest_ns = _split_stamp(stamp_ns)
     head = struct.pack("<iIB", seconds, rest_ns, level)
@@ -246,14 +270,14 @@ def pack_log(stamp_ns: int, level: RosLogLevel, name: str, text: str) -> bytes:
 
 
 def pack_frame_vectors(stamp_ns: int, frame: str, *numbers: float) -> bytes:
-    """Returns a `PoseStamped`, `TwistStamped` or `WrenchStamped`, depending on the numbers.
+    """Encodes a `PoseStamped`, `TwistStamped` or `WrenchStamped`, depending on the numbers.
 
     Args:
         stamp_ns: Unix time of the message, in ns, 0 or more.
-        frame: frame of the vectors.
-        numbers: of a pose x, y, z in m and the quaternion x, y, z, w; of a twist the velocity
-            in m/s and the angular velocity in rad/s; of a wrench the force in N and the torque
-            in N m.
+        frame: Frame in which the vectors are given.
+        numbers: For a pose, x, y, z in m and the quaternion x, y, z, w. For a twist, the
+            velocity in m/s and the angular velocity in rad/s. For a wrench, the force in N and
+            the torque in N m.
     """
     data = _pack_stamp(stamp_ns) + _pack_fields(8, frame)
     data += b"\0" * _count_padding(len(data), 8)
@@ -262,18 +286,18 @@ def pack_frame_vectors(stamp_ns: int, frame: str, *numbers: float) -> bytes:
 
 
 def pack_trigger_response(*, success: bool, text: str) -> bytes:
-    """Returns the response of the service `std_srvs/srv/Trigger`."""
+    """Encodes the response of the service `std_srvs/srv/Trigger`."""
     return _HEAD + bytes([success]) + _pack_fields(1, text)
 
 
 class Diagnosis(NamedTuple):
-    """One status in a message of `/diagnostics`.
+    """Status of one component in a message of `/diagnostics`.
 
     Attributes:
-        level: 0 ok, 1 warning, 2 error, 3 stale.
-        name: name of the diagnosed component.
-        text: description of the status.
-        values: further values, by key.
+        level: 0 for ok, 1 for a warning, 2 for an error, 3 for an outdated status.
+        name: Name of the component.
+        text: Description of the status.
+        values: Further values, by key.
     """
 
     level: int
@@ -283,11 +307,11 @@ class Diagnosis(NamedTuple):
 
 
 def pack_diagnostics(stamp_ns: int, diagnoses: Sequence[Diagnosis]) -> bytes:
-    """Returns a `diagnostic_msgs/msg/DiagnosticArray`.
+    """Encodes a `diagnostic_msgs/msg/DiagnosticArray`.
 
     Args:
         stamp_ns: Unix time of the message, in ns, 0 or more.
-        diagnoses: the statuses.
+        diagnoses: The status of each component.
     """
     frame = ""
     hardware_id = ""
@@ -303,10 +327,15 @@ def pack_diagnostics(stamp_ns: int, diagnoses: Sequence[Diagnosis]) -> bytes:
 
 
 class CdrReader:
-    """Reader of the fields of a message, one after another.
+    """Decoder of the fields of a message, one after another.
+
+    All methods raise a ValueError if the message ends before the field does.
+
+    Args:
+        payload: The message with its header.
 
     Raises:
-        ValueError: the message is not plain CDR, little-endian, or ends before a field does.
+        ValueError: The message is not plain, little-endian CDR.
     """
 
     def __init__(self, payload: bytes) -> None:
@@ -316,7 +345,12 @@ class CdrReader:
         self._position = 0
 
     def numbers(self, code: str, count: int = 1) -> tuple[Any, ...]:
-        """Returns the next `count` numbers of the `struct` format `code`."""
+        """Decodes the next numbers.
+
+        Args:
+            code: Type of the numbers, as the module `struct` defines it.
+            count: How many numbers.
+        """
         size = struct.calcsize(f"<{code}")
         padding = _count_padding(self._position, size) if count else 0
         start = self._position + padding
@@ -326,15 +360,15 @@ class CdrReader:
         return struct.unpack_from(f"<{count}{code}", self._data, start)
 
     def count(self) -> int:
-        """Returns the length of the next list, whose entries have at least one byte each."""
+        """Decodes the length of the next list, whose entries have at least one byte each."""
         (count,) = self.numbers("I")
-        # A wrong length must not make the reader reserve memory for entries that do not exist.
+        # A wrong length would let the caller reserve memory for entries that do not exist.
         if count > len(self._data) - self._position:
             raise ValueError("ends in the middle of a field")
         return int(count)
 
     def text(self) -> str:
-        """Returns the next string."""
+        """Decodes the next string."""
         length = self.count()
         if not length:
             return ""
@@ -342,11 +376,11 @@ class CdrReader:
         return bytes(data).removesuffix(b"\0").decode()
 
     def floats(self) -> tuple[float, ...]:
-        """Returns the next list of floats."""
+        """Decodes the next list of floats."""
         return self.numbers("d", self.count())
 
     def header(self) -> tuple[int, str]:
-        """Returns the stamp of the next header, in ns of the sender's clock, and its frame."""
+        """Decodes the next header: its stamp in ns on the sender's clock, and its frame."""
         (whole_s,) = self.numbers("i")
         (rest_ns,) = self.numbers("I")
         return whole_s * NS_PER_S + rest_ns, self.text()
@@ -356,11 +390,11 @@ class RosJoints(NamedTuple):
     """Content of a `JointState`.
 
     Attributes:
-        stamp_ns: time of the message, in ns of the sender's clock.
-        names: names of the joints.
-        position: joint angles, in rad; empty if unknown.
-        velocity: joint speeds, in rad/s; empty if unknown.
-        effort: joint torques, in N m; empty if unknown.
+        stamp_ns: Time of the message on the sender's clock, in ns.
+        names: Names of the joints.
+        position: Joint angles, in rad. Empty if they are not known.
+        velocity: Joint velocities, in rad/s. Empty if they are not known.
+        effort: Joint torques, in N m. Empty if they are not known.
     """
 
     stamp_ns: int
@@ -371,10 +405,10 @@ class RosJoints(NamedTuple):
 
 
 def read_joint_state(payload: bytes) -> RosJoints:
-    """Returns the content of a `sensor_msgs/msg/JointState`.
+    """Decodes a `sensor_msgs/msg/JointState`.
 
     Raises:
-        ValueError: the message cannot be read.
+        ValueError: The message cannot be decoded.
     """
     reader = CdrReader(payload)
     stamp_ns, _ = reader.header()
@@ -389,10 +423,10 @@ def read_joint_state(payload: bytes) -> RosJoints:
 
 
 def read_float_array(payload: bytes) -> tuple[float, ...]:
-    """Returns the numbers of a `std_msgs/msg/Float64MultiArray` of any shape.
+    """Decodes the numbers of a `std_msgs/msg/Float64MultiArray` of any shape.
 
     Raises:
-        ValueError: the message cannot be read.
+        ValueError: The message cannot be decoded.
     """
     reader = CdrReader(payload)
     # Each dimension has a label, a size and a stride; the offset of the data follows.
@@ -404,14 +438,14 @@ def read_float_array(payload: bytes) -> tuple[float, ...]:
 
 
 def read_frame_vectors(payload: bytes, count: int) -> tuple[str, tuple[float, ...]]:
-    """Returns the frame and the numbers of a `PoseStamped` or `WrenchStamped`.
+    """Decodes the frame and the numbers of a `PoseStamped` or `WrenchStamped`.
 
     Args:
-        payload: bytes of the message.
-        count: 7 numbers for a pose, 6 for a wrench.
+        payload: The message.
+        count: Number of numbers: 7 for a pose, 6 for a wrench.
 
     Raises:
-        ValueError: the message cannot be read.
+        ValueError: The message cannot be decoded.
     """
     reader = CdrReader(payload)
     _, frame = reader.header()

@@ -1,15 +1,15 @@
-"""The topics of a session in ROS 2, and their messages, for the live bridge and for bags.
+"""Defines the topics of a session in ROS 2, and encodes their messages.
 
-`trilat ros2` publishes a running session in the graph of ROS 2, and the export `ros2` converts
-a log to a bag. Both call this module. A bag has a message for every record; the live bridge
-publishes a part of these messages.
+`trilat ros2` publishes a running session as ROS 2 topics, and the export `ros2` converts a log
+to a bag, a recording of ROS 2. Both use this module. A bag contains a message for every record.
+The live bridge publishes a part of these messages.
 
 Invariant:
     - The live bridge and a bag have the same topics with the same types and the same numbers,
-      because this module makes the messages of both.
-    - The signs of a topic's quaternions are continuous: each quaternion has the sign that is
-      nearest to its predecessor.
-    - A message is packed only if its topic is wanted.
+      because this module encodes the messages of both.
+    - The quaternions of a topic do not jump: of the two signs, which are the same orientation,
+      the one is chosen that is nearest to the previous quaternion.
+    - A message is encoded only if its topic is wanted.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -24,19 +24,20 @@ from .ros2_messages import SESSION_CHANNELS, Ros2Channel, Ros2SiteChannels, stac
 from .topic_names import DIAGNOSTICS, FRAMES, TopicTable
 
 Topics = dict[str, Ros2Channel]
-"""Topics by name: trilat-net's own names for one site, full names for a session."""
+"""Topics by name: by the name within trilat-net for one site, by the full name for a session.
+"""
 
 IsWanted = Callable[[str], bool]
-"""Returns True if the message of a topic, by trilat-net's own name, is needed."""
+"""Function that returns True if the message of a topic is needed, by its name in trilat-net."""
 
 _OK = 0
 _WARNING = 1
 _ERROR = 2
 _LEVELS = {"run": _OK, "fault": _ERROR, "diverged": _ERROR}
-"""Levels of `/diagnostics` by mode; other modes have the level `_WARNING`."""
+"""Levels in `/diagnostics` by mode. Other modes have the level `_WARNING`."""
 _QUATERNION_TEXT = "unit quaternion, each nearest to the one before"
 _NO_ROTATION = (0.0, 0.0, 0.0)
-"""Angular part of a velocity or force that a site shares without a rotation."""
+"""Angular part of a velocity or wrench, if the sites share only positions."""
 
 COMMON_TOPICS = {
     FRAMES: Ros2Channel(
@@ -47,11 +48,17 @@ COMMON_TOPICS = {
         cdr.DIAGNOSTICS, {"content": "modes and loops of the sites, once a second"}
     ),
 }
-"""Topics that all sessions share, by their full names."""
+"""Topics that all sessions have in common, by their full names."""
 
 
 def list_topics(scenario: Scenario, session: str, table: TopicTable) -> Topics:
-    """Returns all topics that a session publishes, by their full names."""
+    """Lists all topics that a session publishes, by their full names.
+
+    Args:
+        scenario: Scenario of the session.
+        session: Name of the session.
+        table: Names of the topics in ROS 2.
+    """
     topics = {**COMMON_TOPICS}
     for name, channel in SESSION_CHANNELS.items():
         topics[f"{session}/{name}"] = channel
@@ -63,18 +70,18 @@ def list_topics(scenario: Scenario, session: str, table: TopicTable) -> Topics:
 
 
 class SiteMessages:
-    """The messages of one site.
+    """Encodes the messages of one site.
 
     Args:
-        scenario: the scenario that runs.
-        site: the site.
-        epoch_unix_ns: Unix time of tick 0, in ns; 0 in virtual time.
+        scenario: Scenario of the session.
+        site: Name of the site.
+        epoch_unix_ns: Unix time of tick 0, in ns. It is 0 in virtual time.
 
     Attributes:
-        topics: the site's topics by trilat-net's own names, without the topics of the session
+        topics: Topics of the site by their names in trilat-net, without those of the session
             and `/tf`.
-        frame: frame of the poses of the end effector.
-        description: message of the topic `robot_description`.
+        frame: Frame in which the poses of the end effector are given.
+        description: Message of the topic `robot_description`.
     """
 
     def __init__(self, scenario: Scenario, site: str, epoch_unix_ns: int) -> None:
@@ -88,7 +95,7 @@ class SiteMessages:
         self._robot = RobotModel(scenario, site)
         self._signs = {"tip_pose": QuaternionSigns(), "reference_pose": QuaternionSigns()}
         self._link_signs = [QuaternionSigns() for _ in self._robot.frames]
-        # Mode and dominance are published when they change.
+        # The mode and the dominance factors are published when they change.
         self._mode = ""
         self._shares = tuple[float, ...]()
 
@@ -106,7 +113,7 @@ class SiteMessages:
         self.topics = self._list_topics(peers)
 
     def _list_topics(self, peers: Sequence[str]) -> Topics:
-        """Returns the topics of the site by trilat-net's own names."""
+        """Lists the topics of the site, by their names in trilat-net."""
         channels = self._channels
         topics: Topics = {"joint_states": channels.joint_states(channels.joints)}
         if self._arm.shares_pose:
@@ -131,7 +138,7 @@ class SiteMessages:
         return topics | self._list_array_topics()
 
     def _describe_pose(self, subject: str) -> Ros2Channel:
-        """Returns the topic of a pose of the end effector or its reference."""
+        """Returns a topic with poses of the end effector or of its reference."""
         about = {
             "content": f"pose of {subject}",
             "unit": "m",
@@ -141,7 +148,7 @@ class SiteMessages:
         return Ros2Channel(cdr.POSE, about)
 
     def _describe_twist(self, subject: str) -> Ros2Channel:
-        """Returns the topic of a velocity of the end effector or its reference."""
+        """Returns a topic with velocities of the end effector or of its reference."""
         about = {
             "content": f"velocity of {subject}",
             "unit": "m/s, rad/s",
@@ -150,7 +157,7 @@ class SiteMessages:
         return Ros2Channel(cdr.TWIST, about)
 
     def _list_array_topics(self) -> Topics:
-        """Returns the topics of the site's arrays."""
+        """Lists the topics that contain arrays of numbers, such as the error."""
         topics: Topics = {}
         for name, array in self._channels.arrays.items():
             topics[_name_array_topic(name)] = array.channel
@@ -162,7 +169,7 @@ class SiteMessages:
         return topics
 
     def stamp_ns(self, record: State) -> int:
-        """Returns the nominal time of a record, in Unix ns."""
+        """Returns the nominal time of a record, in Unix time, in ns."""
         return max(0, self._epoch_unix_ns + record.t_ns)
 
     def pack_record(
@@ -171,14 +178,16 @@ class SiteMessages:
         shares: Sequence[float],
         is_wanted: IsWanted = lambda _topic: True,
     ) -> Iterator[tuple[str, bytes]]:
-        """Yields topic and message for the messages of a record.
-
-        The topics have trilat-net's own names.
+        """Encodes the messages of a record.
 
         Args:
-            record: the record; calls must be in the order of the records' times.
-            shares: the site's shares of its peers at the time of the record.
-            is_wanted: returns False for topics whose messages are not needed.
+            record: The record. The calls must be in the order of the records' times.
+            shares: Dominance factors at the time of the record, the weights with which the site
+                follows its peers.
+            is_wanted: Function that returns False for topics whose messages are not needed.
+
+        Yields:
+            The name of the topic in trilat-net, and the message.
         """
         stamp_ns = self.stamp_ns(record)
         if is_wanted("joint_states"):
@@ -200,9 +209,9 @@ class SiteMessages:
     def _pack_joint_reference(
         self, record: State, stamp_ns: int, is_wanted: IsWanted
     ) -> Iterator[tuple[str, bytes]]:
-        """Yields the reference of the joints and the pose of the end effector.
+        """Encodes the reference of the joints, and the pose of the end effector.
 
-        The sites share joint angles and no pose: the pose follows from the angles.
+        This applies if the sites share joint angles. The pose is computed from them.
         """
         if is_wanted("reference"):
             data = self._pack_reference(stamp_ns, record.q_des, record.qd_des)
@@ -213,7 +222,10 @@ class SiteMessages:
     def _pack_shared_motion(
         self, record: State, stamp_ns: int, is_wanted: IsWanted
     ) -> Iterator[tuple[str, bytes]]:
-        """Yields the messages of a shared pose, of its reference, and of the wrench."""
+        """Encodes the pose of the end effector, its reference, and the wrench.
+
+        This applies if the sites share the position or pose of the end effector.
+        """
         motions = [("tip", record.x, record.xd), ("reference", record.q_des, record.qd_des)]
         for subject, pose, rate in motions:
             pose_topic = f"{subject}_pose"
@@ -226,7 +238,7 @@ class SiteMessages:
                 data = cdr.pack_frame_vectors(stamp_ns, self.frame, *linear, *angular)
                 yield twist_topic, data
         if is_wanted("tip_wrench"):
-            # A record has the wrench that Eq. (8) subtracts, the reaction of this wrench.
+            # A record contains the wrench that Eq. (8) subtracts, the negative of this wrench.
             force = [-self._scale * component for component in record.wrench[:POSITION]]
             torque = [-component for component in _fill_rotation(record.wrench)]
             data = cdr.pack_frame_vectors(stamp_ns, self.frame, *force, *torque)
@@ -235,7 +247,14 @@ class SiteMessages:
     def _pack_pose(
         self, topic: str, record: State, pose: Sequence[float], stamp_ns: int
     ) -> bytes:
-        """Returns the message of a shared pose, which is empty in joint space."""
+        """Encodes a pose of the end effector.
+
+        Args:
+            topic: Name of the topic, for the continuity of its quaternions.
+            record: The record.
+            pose: The pose that the sites share. Empty if they share joint angles.
+            stamp_ns: Time of the message, in Unix time, in ns.
+        """
         rotation_vector = self._compute_rotation_vector(record, pose)
         # Only packed quaternions are aligned: the sign is continuous from message to message.
         quaternion = self._signs[topic].align(compute_quaternion(rotation_vector))
@@ -243,9 +262,9 @@ class SiteMessages:
         return cdr.pack_frame_vectors(stamp_ns, self.frame, *position, *quaternion)
 
     def _compute_position(self, record: State, pose: Sequence[float]) -> Sequence[float]:
-        """Returns the position of a shared pose, in m.
+        """Returns the position of a pose, in m.
 
-        In joint space no pose is shared, and the position is that of the end effector.
+        If the sites share joint angles, it is computed from the angles.
         """
         if pose:
             return [coordinate / self._scale for coordinate in pose[:POSITION]]
@@ -258,14 +277,14 @@ class SiteMessages:
     ) -> tuple[float, float, float]:
         """Returns the rotation vector of a pose, in rad.
 
-        For a pose without orientation, the rotation vector is that of the end effector.
+        If the pose contains no orientation, it is computed from the joint angles.
         """
         if len(pose) == POSE:
             return pose[POSITION], pose[POSITION + 1], pose[POSITION + 2]
         return self._arm.end_effector_orientation(record.q)
 
     def _pack_arrays(self, record: State, is_wanted: IsWanted) -> Iterator[tuple[str, bytes]]:
-        """Yields the wanted arrays of a record."""
+        """Encodes the wanted arrays of a record."""
         channels = self._channels
         topics = [_name_array_topic(name) for name in channels.record_arrays]
         if not any(is_wanted(topic) for topic in topics):
@@ -280,7 +299,7 @@ class SiteMessages:
                 yield topic, data
 
     def pack_frames(self, record: State) -> Iterable[bytes]:
-        """Yields the messages of a record on `/tf`."""
+        """Yields the messages of a record for the topic `/tf`, with the poses of all links."""
         stamp_ns = self.stamp_ns(record)
         transforms = self._robot.compute_transforms(record.q)
         aligned: list[tuple[Sequence[float], Sequence[float]]] = []
@@ -292,17 +311,17 @@ class SiteMessages:
             yield self._pack_shared_frame(stamp_ns, [*origin, *rotation])
 
     def pack_statistics(self, stats: LinkStats) -> Iterator[tuple[str, bytes]]:
-        """Yields topic, by trilat-net's own name, and message of link statistics."""
+        """Yields the topic's name in trilat-net and the message, for statistics of links."""
         yield from self._channels.pack_statistics(stats)
 
 
 def _name_array_topic(name: str) -> str:
-    """Returns the topic of an array; the topic `mode` holds the mode as text, not as number."""
+    """Returns the topic of an array. The topic `mode` contains the mode as a text already."""
     return "mode_number" if name == "mode" else name
 
 
 def _fill_rotation(values: Sequence[float]) -> list[float]:
-    """Returns the angular part of a shared velocity or wrench, zeros if it has none."""
+    """Returns the angular part of a velocity or wrench. It is zero if there is none."""
     angular = [*values[POSITION:], *_NO_ROTATION]
     return angular[:POSITION]
 
@@ -310,12 +329,12 @@ def _fill_rotation(values: Sequence[float]) -> list[float]:
 def pack_session_diagnostics(
     session: str, epoch_unix_ns: int, records: Sequence[State]
 ) -> bytes:
-    """Returns a message for `/diagnostics`.
+    """Encodes a message for the topic `/diagnostics`, with a status for each site.
 
     Args:
-        session: the session's name.
-        epoch_unix_ns: Unix time of tick 0, in ns; 0 in virtual time.
-        records: the newest record of each site that has published one.
+        session: Name of the session.
+        epoch_unix_ns: Unix time of tick 0, in ns. It is 0 in virtual time.
+        records: Newest record of each site that has published any.
     """
     newest_ns = max((record.t_ns for record in records), default=0)
     diagnoses: list[cdr.Diagnosis] = []

@@ -1,11 +1,11 @@
-"""The model of a site's arm for viewers: its URDF, and the poses of its links.
+"""Builds the model of a site's arm for viewers: its URDF, and the poses of its links.
 
-A viewer draws the arms of a session in one scene. The arms stand in a row, `SPACING_M` apart,
-below a common frame `WORLD` whose z axis points up. A URDF without shapes gets plain ones, so
-that the arm can be seen; meshes are never opened.
+A viewer draws the arms of all sites in one scene. The arms stand in a row, `SPACING_M` apart,
+in a common frame `WORLD` whose z axis points up. If a URDF contains no shapes, plain ones are
+added, so that the arm can be seen. The files of meshes are never opened.
 
 Invariant:
-    - The frame of a link is named "<site>/<link>", in the URDF as well as in the transforms, so
+    - The frame of a link is named "<site>/<link>", both in the URDF and in the transforms, so
       that arms with the same URDF can be shown together.
     - The transforms place the end effector where the site computes it.
 """
@@ -21,7 +21,7 @@ from ...scenario.arms import read_arm
 from .cdr import DEFINITIONS, TransformPacker
 
 WORLD = "world"
-"""Name of the frame in which all arms of a session stand."""
+"""Name of the common frame of all arms of a session."""
 SPACING_M = 1.5
 """Distance between the bases of neighbouring sites, in m."""
 _RADIUS_M = 0.035
@@ -45,15 +45,15 @@ _PLANAR_DOWN = (0.0, -1.0, 0.0)
 
 
 class _JointFrame(NamedTuple):
-    """A joint of the arm, which places the frame of its child link.
+    """A joint of the arm, which determines the frame of its child link.
 
     Attributes:
-        origin_m: origin of the link's frame in the parent link's frame, at joint position 0.
-        rotation: rotation of the link's frame, at joint position 0.
-        axis: axis of the joint in the frame of the link, a unit vector.
+        origin_m: Origin of the link's frame in the parent link's frame, in m.
+        rotation: Rotation of the link's frame at the joint position 0.
+        axis: Axis of the joint in the frame of the link, a unit vector.
         is_prismatic: True if the joint slides along its axis instead of turning about it.
-        q_index: index of the joint's position in q; -1 for a joint that does not move, such as
-            a finger of a gripper.
+        q_index: Index of the joint's position in q. It is -1 for a joint that does not move,
+            such as a finger of a gripper.
     """
 
     origin_m: Vector
@@ -64,7 +64,11 @@ class _JointFrame(NamedTuple):
 
 
 def multiply_quaternions(a: Quaternion, b: Quaternion) -> Quaternion:
-    """Returns the product a b: the rotation b followed by the rotation a."""
+    """Multiplies two quaternions.
+
+    The product a b is the rotation b, followed by the rotation a.
+
+    """
     ax, ay, az, aw = a
     bx, by, bz, bw = b
     return (
@@ -76,7 +80,7 @@ def multiply_quaternions(a: Quaternion, b: Quaternion) -> Quaternion:
 
 
 def rotate_vector(rotation: Quaternion, vector: Vector) -> Vector:
-    """Returns a vector v after a rotation q, which is q v q*."""
+    """Rotates a vector v by a unit quaternion q. The result is q v q*, with the conjugate q*."""
     x, y, z, w = rotation
     conjugate = (-x, -y, -z, w)
     half_product = multiply_quaternions(rotation, (*vector, 0.0))
@@ -85,14 +89,14 @@ def rotate_vector(rotation: Quaternion, vector: Vector) -> Vector:
 
 
 def _rotate_about(axis: Vector, angle: float) -> Quaternion:
-    """Returns the rotation by an angle in rad about a unit vector."""
+    """Returns the quaternion of a rotation about a unit vector by an angle in rad."""
     sine = math.sin(angle / 2.0)
     cosine = math.cos(angle / 2.0)
     return axis[0] * sine, axis[1] * sine, axis[2] * sine, cosine
 
 
 def compute_quaternion(rotation_vector: Vector) -> Quaternion:
-    """Returns the rotation by a rotation vector, in rad."""
+    """Returns the unit quaternion of a rotation vector in rad."""
     angle = math.hypot(*rotation_vector)
     if not angle:
         return _rotate_about(_X_AXIS, angle)
@@ -101,20 +105,24 @@ def compute_quaternion(rotation_vector: Vector) -> Quaternion:
 
 
 def _rotate_upright(down: Sequence[float]) -> Quaternion:
-    """Returns the shortest rotation that turns the direction `down` to -z."""
+    """Returns the shortest rotation that turns a direction to -z.
+
+    Args:
+        down: The direction of gravity. It need not be a unit vector.
+    """
     length = math.hypot(*down)
     x, y, z = (component / length for component in down)
-    # The direction is opposite to -z: any half turn about a horizontal axis will do.
+    # If the direction is +z, any half turn about a horizontal axis is a shortest rotation.
     if z > 1.0 - 1e-12:
         return 1.0, 0.0, 0.0, 0.0
-    # For unit vectors a and b, the shortest rotation is (a x b, 1 + a . b), normalized. With
-    # b = -z the cross product is (-y, x, 0) and the scalar part 1 - z.
+    # For unit vectors a and b, the shortest rotation is the quaternion (a x b, 1 + a . b),
+    # normalised. With b = -z, the cross product is (-y, x, 0), and the scalar part is 1 - z.
     norm = math.sqrt(x * x + y * y + (1.0 - z) ** 2)
     return -y / norm, x / norm, 0.0, (1.0 - z) / norm
 
 
 def _convert_rpy(rpy: Sequence[float]) -> Quaternion:
-    """Returns the rotation by roll, pitch and yaw in rad about the fixed x, y and z axes."""
+    """Returns the rotation by roll, pitch and yaw in rad, about the fixed x, y and z axes."""
     roll, pitch, yaw = rpy
     yaw_rotation = _rotate_about(_Z_AXIS, yaw)
     pitch_rotation = _rotate_about(_Y_AXIS, pitch)
@@ -128,12 +136,17 @@ _PLANAR = (DEFINITIONS / "planar.urdf").read_text(encoding="utf-8")
 
 
 class RobotModel:
-    """The arm of one site as a chain of links: the arm of a URDF, or the planar arm.
+    """The arm of one site as a tree of links, from a URDF or from the built-in planar arm.
+
+    Args:
+        scenario: Scenario of the session.
+        site: Name of the site.
 
     Attributes:
-        description: the URDF, with the site's name in the names of the links.
-        frames: pairs of parent and child frame, from `WORLD` to the last link.
-        shared: pose in `WORLD` of the frame in which the scenario places the arm's base.
+        description: The URDF, with the site's name in the names of the links.
+        frames: Pairs of parent and child frame, from `WORLD` to the last link.
+        shared: Pose in `WORLD` of the frame in which the scenario places the arm's base. All
+            sites of the session exchange positions in this frame.
     """
 
     def __init__(self, scenario: Scenario, site: str) -> None:
@@ -169,10 +182,10 @@ class RobotModel:
         self.description = _describe_robot(root, site, site_number)
 
     def compute_transforms(self, q: Sequence[float]) -> list[Transform]:
-        """Returns the pose of each frame in its parent, in the order of `frames`.
+        """Computes the pose of each frame in its parent frame, in the order of `frames`.
 
         Args:
-            q: positions of the joints, in rad or m.
+            q: Positions of the joints, in rad or m.
         """
         transforms: list[Transform] = [self._base]
         for joint in self._joints:
@@ -192,22 +205,23 @@ class RobotModel:
         return transforms
 
     def pack(self, stamp_ns: int, q: Sequence[float]) -> bytes:
-        """Returns the poses of all frames as one message of `/tf`.
+        """Encodes the poses of all frames as one message of the topic `/tf`.
 
         Args:
             stamp_ns: Unix time of the message, in ns, 0 or more.
-            q: positions of the joints, in rad or m.
+            q: Positions of the joints, in rad or m.
         """
         return self.pack_transforms(stamp_ns, self.compute_transforms(q))
 
     def pack_transforms(
         self, stamp_ns: int, transforms: Iterable[tuple[Sequence[float], Sequence[float]]]
     ) -> bytes:
-        """Returns computed poses as one message of `/tf`.
+        """Encodes computed poses as one message of the topic `/tf`.
 
         Args:
             stamp_ns: Unix time of the message, in ns, 0 or more.
-            transforms: origin in m and quaternion x, y, z, w of each of `frames`.
+            transforms: For each frame of `frames` the origin in m, and the quaternion x, y, z,
+                w.
         """
         numbers: list[float] = []
         for origin, rotation in transforms:
@@ -216,7 +230,12 @@ class RobotModel:
 
 
 def _list_joints(root: Element, base: str) -> list[Element]:
-    """Returns the joints of a URDF that hang on the link `base`, parents before children."""
+    """Lists the joints of a URDF below a link, parents before children.
+
+    Args:
+        root: The URDF.
+        base: Name of the link.
+    """
     joints_of_parent: dict[str, list[Element]] = {}
     for joint in root.findall("joint"):
         parent = _get_link(joint, "parent")
@@ -232,16 +251,27 @@ def _list_joints(root: Element, base: str) -> list[Element]:
 
 
 def _get_link(joint: Element, end: str) -> str:
-    """Returns the name of the link at an end of a joint: "parent" or "child"."""
+    """Returns the name of the link at one end of a joint.
+
+    Args:
+        joint: The joint's element in the URDF.
+        end: "parent" or "child".
+    """
     element = joint.find(end)
     return "" if element is None else element.get("link", "")
 
 
 def _parse_vector(element: Element | None, key: str, default: Vector) -> Vector:
-    """Returns three numbers of an attribute.
+    """Parses an attribute with three numbers.
 
-    Returns the default if the attribute does not hold three finite numbers. That occurs only in
-    branches of the URDF that are not part of the arm, because `read_urdf` checks the arm.
+    The default is returned if the attribute does not contain three finite numbers. That is
+    possible only in branches of the URDF that are not part of the arm, because `read_urdf`
+    checks the arm.
+
+    Args:
+        element: Element of the URDF. None if it is absent.
+        key: Name of the attribute.
+        default: The default.
     """
     text = "" if element is None else element.get(key, "")
     try:
@@ -252,11 +282,11 @@ def _parse_vector(element: Element | None, key: str, default: Vector) -> Vector:
 
 
 def _read_joint_frame(joint: Element, joint_names: Sequence[str]) -> _JointFrame:
-    """Returns the frame of a joint, with the same defaults as `read_urdf`.
+    """Reads the frame of a joint, with the same defaults as `read_urdf`.
 
     Args:
-        joint: the joint's element in the URDF.
-        joint_names: names of the joints in the order of q.
+        joint: The joint's element in the URDF.
+        joint_names: Names of the joints in the order of q.
     """
     name = joint.get("name", "")
     origin = joint.find("origin")
@@ -272,10 +302,15 @@ def _read_joint_frame(joint: Element, joint_names: Sequence[str]) -> _JointFrame
 
 
 def _describe_robot(root: Element, site: str, site_number: int) -> str:
-    """Returns the URDF of a site's arm as text.
+    """Returns the URDF of a site's arm as a text for viewers.
 
-    The function changes `root`: the names of the links get the site's name in front, and links
-    get plain shapes if the URDF has none.
+    The elements are changed: the site's name is put in front of the names of the links, and
+    links get plain shapes if the URDF contains none.
+
+    Args:
+        root: The URDF.
+        site: Name of the site.
+        site_number: Index of the site, which determines the colour.
     """
     has_shapes = root.find("link/visual") is not None
     colour = _SHAPE_COLOURS[site_number % len(_SHAPE_COLOURS)]
@@ -296,10 +331,19 @@ def _describe_robot(root: Element, site: str, site_number: int) -> str:
 
 
 def _add_shape(link: Element, end_m: Vector, colour: str, site: str) -> None:
-    """Adds a cylinder from the origin of a link to `end_m`, or a sphere if both are equal."""
+    """Adds a plain shape to a link: a cylinder from its origin to a point.
+
+    If the point is the origin, the shape is a sphere.
+
+    Args:
+        link: The link's element in the URDF.
+        end_m: The point in the frame of the link, in m.
+        colour: Red, green, blue and opacity, from 0 to 1.
+        site: Name of the site, which makes the name of the material unique.
+    """
     length_m = math.hypot(*end_m)
     centre_text = " ".join(f"{coordinate / 2.0:.9g}" for coordinate in end_m)
-    # A cylinder of URDF lies along z: it is tilted from z, and then turned about z.
+    # The axis of a cylinder is z in a URDF. It is tilted from z, and then turned about z.
     tilt = math.atan2(math.hypot(end_m[0], end_m[1]), end_m[2])
     azimuth = math.atan2(end_m[1], end_m[0])
     rpy_text = f"0 {tilt:.9g} {azimuth:.9g}"

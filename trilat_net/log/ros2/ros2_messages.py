@@ -1,15 +1,15 @@
-"""The standard ROS 2 messages that stand for a session's own messages.
+"""Converts the messages of a session to standard ROS 2 messages for general viewers.
 
-A log contains the session's own messages, which only trilat-net can read. Beside them it has
-channels of standard ROS 2 messages for general viewers such as Foxglove and PlotJuggler. This
-module defines the channels with their units and names, and converts the messages.
+Only trilat-net can decode the session's own messages in a log. Therefore a log may also contain
+channels of standard ROS 2 messages, which viewers such as Foxglove and PlotJuggler display.
+This module defines these channels with their units and names, and converts the messages.
 
 Invariant:
     - Numbers are copied. Only times are converted, to the unit that the channel's metadata
-      states.
+      state.
     - A value that was not measured is NaN.
-    - Viewers find the name of each curve: the name of a joint is in the message, any other name
-      is in the label of the array's dimension.
+    - Viewers find the name of each curve. The name of a joint is in the message, and any other
+      name is in the label of the array's dimension.
 """
 
 import math
@@ -51,8 +51,8 @@ class Ros2Channel(NamedTuple):
     """A channel of standard ROS 2 messages.
 
     Attributes:
-        kind: type of the messages.
-        about: metadata of the channel.
+        kind: Type of the messages.
+        about: Metadata of the channel.
         latched: True if late subscribers receive the last message.
     """
 
@@ -64,11 +64,11 @@ class Ros2Channel(NamedTuple):
 class StandardChannels:
     """Numbers of the standard channels of a file, by topic.
 
-    A channel is registered in the file when its number is first looked up.
+    A channel is registered in the file when its number is needed for the first time.
 
     Args:
-        file: the file.
-        known: the channels that can be registered, by topic.
+        file: The file.
+        known: Channels that can be registered, by topic.
     """
 
     def __init__(self, file: McapWriter, known: Mapping[str, Ros2Channel]) -> None:
@@ -115,7 +115,7 @@ _LEVELS = {
     "refused": cdr.RosLogLevel.WARN,
     "clock fault": cdr.RosLogLevel.WARN,
 }
-"""Level of an event by its kind; events of other kinds are informative."""
+"""Level of an event in the log of ROS by its kind. Other kinds have the level INFO."""
 _MODE_NUMBERS: dict[Mode | str, float] = {
     **{mode: float(mode) for mode in MODE_WORDS},
     **{word: float(mode) for mode, word in MODE_WORDS.items()},
@@ -124,11 +124,14 @@ _MODE_NUMBERS: dict[Mode | str, float] = {
 
 
 def pack_event(event: Event, stamp_ns: int) -> Iterator[tuple[str, bytes]]:
-    """Yields channel and message of an event, for each channel of the session.
+    """Encodes an event for each channel of the session.
 
     Args:
-        event: the event.
+        event: The event.
         stamp_ns: Unix time of the event, in ns, 0 or more.
+
+    Yields:
+        The name of the channel and the message.
     """
     text = describe_event(event.kind, event.text, event.command)
     level = _LEVELS.get(event.kind, cdr.RosLogLevel.INFO)
@@ -137,17 +140,17 @@ def pack_event(event: Event, stamp_ns: int) -> Iterator[tuple[str, bytes]]:
 
 
 class ArrayChannel:
-    """A channel of `std_msgs/msg/Float64MultiArray`.
+    """A channel of `std_msgs/msg/Float64MultiArray`, whose arrays have a fixed shape.
 
     Args:
-        content: description of the numbers.
-        unit: unit of the numbers.
-        axes: names of the entries along each axis.
+        content: Description of the numbers.
+        unit: Unit of the numbers.
+        axes: Names of the entries along each axis of the array.
 
     Attributes:
-        channel: the channel and its metadata.
-        size: how many numbers an array has.
-        pack: returns the message of an array, from its numbers row by row.
+        channel: The channel with its metadata.
+        size: Number of entries of an array.
+        pack: Function that encodes an array, from its numbers row by row.
     """
 
     def __init__(self, content: str, unit: str, *axes: Sequence[str]) -> None:
@@ -165,17 +168,21 @@ class ArrayChannel:
 
 
 class Ros2SiteChannels:
-    """The standard channels of one site with its peers in scenario order.
+    """The standard channels of one site, with its peers in the order of the scenario.
+
+    Args:
+        scenario: Scenario of the session.
+        site: Name of the site.
 
     Attributes:
-        joints: names of the joints, from the URDF; numbered names for a planar arm.
-        arrays: the array channels, by the last part of their topic.
-        record_arrays: names of the arrays that are made from records; the others are made from
-            statistics.
-        error_row: slice of the error e = q - q_des, Eq. (9), in a row of `stack_signals`.
-        slow_row: slice of the remaining numbers of the row: tau_x, theta_hat, the vectors that
-            the law sends, and the mode.
-        robot: the arm for viewers; None for a planar arm.
+        joints: Names of the joints, from the URDF or numbered for a planar arm.
+        arrays: The array channels, by the last part of their topic.
+        record_arrays: Names of the arrays that are computed from records. The others are
+            computed from statistics.
+        error_row: Slice of the error e = q - q_des, Eq. (9), in a row of `stack_signals`.
+        slow_row: Slice of the remaining numbers of the row: tau_x, theta_hat, the vectors that
+            the control law sends, and the mode.
+        robot: Model of the arm for viewers. None for a planar arm.
     """
 
     def __init__(self, scenario: Scenario, site: str) -> None:
@@ -184,7 +191,7 @@ class Ros2SiteChannels:
         self._peers = scenario.peers(site)
         n = arm.counts.joints
         shared = arm.counts.shared
-        # A row begins with q, q_des, qd and tau, n numbers each; then come the shared errors.
+        # A row begins with q, q_des, qd and tau, n numbers each. The errors follow.
         self.error_row = slice(4 * n, 4 * n + shared)
         self.slow_row = slice(4 * n + shared, None)
         self.robot = RobotModel(scenario, site) if arm.chain is not None else None
@@ -208,11 +215,11 @@ class Ros2SiteChannels:
         }
 
     def _list_joint_labels(self) -> list[str]:
-        """Returns the names of the joints without spaces, which separate names in a label."""
+        """Returns the names of the joints without spaces, which separate them in a label."""
         return [_replace_spaces(name) for name in self.joints]
 
     def _make_error_array(self) -> ArrayChannel:
-        """Returns the array of the error of a shared pose, or of the joints."""
+        """Returns the array of the synchronisation error, of a pose or of the joints."""
         if self._arm.shares_pose:
             axes = TASK_AXES[: self._arm.counts.shared]
             return ArrayChannel("x - x_des", "m or rad", axes)
@@ -227,7 +234,7 @@ class Ros2SiteChannels:
         return ArrayChannel("estimate of Eq. (24)", units, parameters)
 
     def _make_statistics_arrays(self) -> dict[str, ArrayChannel]:
-        """Returns the arrays that are made from link statistics."""
+        """Returns the arrays that are computed from the statistics of links."""
         peers = self._peers
         return {
             "link_age": ArrayChannel("age of the sample in use", "ms", peers),
@@ -244,12 +251,17 @@ class Ros2SiteChannels:
 
     @property
     def channels(self) -> dict[str, Ros2Channel]:
-        """Array channels and channels of the robot, by the last part of their topic."""
+        """Channels of the arrays and of the robot, by the last part of their topic."""
         arrays = {name: array.channel for name, array in self.arrays.items()}
         return arrays if self.robot is None else arrays | ROBOT_CHANNELS
 
     def joint_states(self, names: Sequence[str], *, effort: bool = True) -> Ros2Channel:
-        """Returns a channel of joint states for joints with these names."""
+        """Returns a channel of joint states.
+
+        Args:
+            names: Names of the joints.
+            effort: True if the messages contain torques.
+        """
         revolute_units = ["rad", "rad/s", "N m"] if effort else ["rad", "rad/s"]
         units = ", ".join(self._join_units(unit) for unit in revolute_units)
         # The names are separated by spaces and cannot contain any.
@@ -257,16 +269,20 @@ class Ros2SiteChannels:
         return Ros2Channel(cdr.JOINT_STATE, {"unit": units, "names": joined_names})
 
     def _join_units(self, revolute_unit: str) -> str:
-        """Returns the units of all joints as text, such as "rad or m".
+        """Returns the units of all joints as a text, such as "rad or m".
 
         Args:
-            revolute_unit: unit of the quantity at a revolute joint.
+            revolute_unit: Unit of the quantity for a revolute joint.
         """
         different_units = dict.fromkeys(self._arm.joint_units(revolute_unit))
         return " or ".join(different_units)
 
     def pack_slow_arrays(self, row: Sequence[float]) -> Iterator[tuple[str, bytes]]:
-        """Yields name and message of a record's arrays, from the numbers of its `slow_row`."""
+        """Yields the names and messages of a record's arrays.
+
+        Args:
+            row: Numbers of the record, the slice `slow_row` of `stack_signals`.
+        """
         start = 0
         for name in self._slow_names:
             array = self.arrays[name]
@@ -275,9 +291,9 @@ class Ros2SiteChannels:
             start = end
 
     def pack_statistics(self, stats: LinkStats) -> Iterator[tuple[str, bytes]]:
-        """Yields name and message of the arrays of link statistics.
+        """Yields the names and messages of the arrays of link statistics.
 
-        The arrays of delays, clock offsets and timing exist in a live session only.
+        There are delays, clock offsets and timing only in a live session.
         """
         peers = self._peers
         if not peers:
@@ -308,10 +324,10 @@ def _replace_spaces(name: str) -> str:
 
 
 def _make_sent_arrays(scenario: Scenario, site: str) -> dict[str, ArrayChannel]:
-    """Returns an array for each vector that a site's law sends, in the order of its record."""
+    """Returns an array for each vector that a site's law sends, in the record's order."""
     arrays: dict[str, ArrayChannel] = {}
     for vector, peer, index in scenario.channel(site).entries(scenario.peers(site)):
-        # A vector has several entries; the first entry stands for the whole vector.
+        # A vector has an entry per number. The first entry stands for the whole vector.
         if index:
             continue
         suffix = f"_to_{peer}" if peer else ""
@@ -323,17 +339,17 @@ def _make_sent_arrays(scenario: Scenario, site: str) -> dict[str, ArrayChannel]:
 
 
 def _convert_to_ms(us: int) -> float:
-    """Returns a time in ms; NaN for -1, which stands for a time that was not measured."""
+    """Converts a time to ms. The value -1, a time that was not measured, becomes NaN."""
     return us / 1e3 if us != -1 else math.nan
 
 
 def read_ros2_channels(path: Path) -> dict[str, Ros2Channel]:
-    """Returns the standard channels of a finished file by topic.
+    """Reads the standard channels of a finished file, by topic.
 
-    Returns {} for a file without a readable index.
+    The result is empty if the file has no readable index.
 
     Raises:
-        LogError: the file cannot be opened.
+        LogError: The file cannot be opened.
     """
     with reading(path) as stream:
         try:
@@ -353,15 +369,19 @@ def read_ros2_channels(path: Path) -> dict[str, Ros2Channel]:
 Record = State | TickRecord
 """A record as a site publishes it, or as the kernel returns it."""
 SignalRow = Sequence[float]
-"""Values of all curves at one time, or values of one curve at all times."""
+"""The values of all curves at one time, or the values of one curve at all times."""
 
 
 def stack_signals(records: Sequence[Record]) -> list[SignalRow]:
     """Returns the values of each curve in some records.
 
-    The curves are q, q_des, qd, tau, e, tau_x, theta_hat, the numbers that the law sends, and
-    the mode. The mode has a single value if all records have the same mode. In task space the
-    joints have no reference: the curves of q_des repeat q, and e is x - x_des.
+    The curves are q, q_des, qd, tau, e, tau_x, theta_hat, the numbers that the control law
+    sends, and the mode. The mode has only one value if all records have the same mode. If the
+    sites share the pose of the end effector, the joints have no reference: then q is repeated
+    in place of q_des, and e is x - x_des.
+
+    Args:
+        records: The records, at least one.
     """
     first = records[0]
     is_task_space = bool(first.x)
@@ -379,7 +399,7 @@ def stack_signals(records: Sequence[Record]) -> list[SignalRow]:
         actual = [*zip(*(record.x for record in records), strict=True)]
     desired = [*zip(*(record.q_des for record in records), strict=True)]
     errors = _compute_errors(actual, desired)
-    # A pose has an orientation, whose error is not a difference of numbers.
+    # The error of an orientation is not a difference of numbers.
     if is_task_space and len(errors) > POSITION:
         x = np.array(actual).T
         x_des = np.array(desired).T
@@ -391,7 +411,7 @@ def stack_signals(records: Sequence[Record]) -> list[SignalRow]:
 def _compute_errors(
     actual: Sequence[SignalRow], desired: Sequence[SignalRow]
 ) -> list[list[float]]:
-    """Returns the differences of actual and desired curves."""
+    """Returns the differences between actual and desired curves."""
     errors: list[list[float]] = []
     for actual_curve, desired_curve in zip(actual, desired, strict=True):
         pairs = zip(actual_curve, desired_curve, strict=True)
@@ -400,7 +420,7 @@ def _compute_errors(
 
 
 def _list_modes(records: Sequence[Record]) -> list[float]:
-    """Returns the mode of each record as a number, or one number if all modes are equal."""
+    """Returns the mode of each record as a number, or only one number if all are equal."""
     modes = [record.mode for record in records]
     if modes.count(modes[0]) == len(modes):
         del modes[1:]

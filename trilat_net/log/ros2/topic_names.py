@@ -1,9 +1,11 @@
-"""Names of a session's topics in ROS 2, in one table for the live bridge and for bags.
+"""Defines the names of a session's topics in ROS 2, for the live bridge and for bags.
+
+The user chooses one of two conventions, or changes names with a TOML file.
 
 Invariant:
-    - A name that begins with / is a full name; other names are below `/<session>/<site>`.
+    - A name that begins with / is a full name. Other names are below `/<session>/<site>`.
     - No two topics have the same name.
-    - A topic has the same name in a bag as in the live bridge.
+    - A topic has the same name in a bag, a recording of ROS 2, as in the live bridge.
 """
 
 import re
@@ -20,7 +22,7 @@ from ...files import open_regular
 from ...net.ros2_names import check_ros_name
 
 NAMINGS = ("crisp", "crtk")
-"""The two built-in namings: CRISP's, and that of the Collaborative Robotics Toolkit (CRTK)."""
+"""The two built-in conventions: CRISP, and the Collaborative Robotics Toolkit (CRTK)."""
 TOPICS = {
     "joint_states": ("joint_states", "measured_js"),
     "reference": ("reference", "setpoint_js"),
@@ -47,27 +49,27 @@ TOPICS = {
     "robot_states": ("robot/joint_states", "robot/measured_js"),
     "robot_commands": ("robot/commands", "robot/commands"),
 }
-"""Name of each topic below `/<session>/<site>`, in each of `NAMINGS`, by trilat-net's own name.
+"""Name of each topic below `/<session>/<site>` in each of `NAMINGS`, by its name in trilat-net.
 
-CRISP is a set of ROS 2 controllers; CRTK is the convention of the da Vinci Research Kit. A
-vector that a law sends has the same name in both: "sent_" and the name of the vector.
+CRISP is a set of ROS 2 controllers. CRTK is the convention of the da Vinci Research Kit. A
+vector that a control law sends has the same name in both: "sent_" and the name of the vector.
 """
 FRAMES = "tf"
-"""Topic of all frames, with the name that tools of ROS expect."""
+"""Topic with the poses of all links, under the name that tools of ROS expect."""
 DIAGNOSTICS = "diagnostics"
-"""Topic of all diagnostics, with the name that tools of ROS expect."""
+"""Topic with the status of all sites, under the name that tools of ROS expect."""
 
 
 class RobotTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The settings of a names file for the robot that is the arm of a site.
+    """Settings in a names file for a real robot that is the arm of a site.
 
     Attributes:
-        joints: the robot's names of the joints, in the scenario's order; if empty, the names of
-            the scenario.
-        controller: the same names in the order of the robot's controller; if empty, in the
-            scenario's order.
-        safe: command to the controller while the arm brakes, in the controller's order; if
-            empty, zeros.
+        joints: Names that the robot gives the joints, in the order of the scenario. If empty,
+            the names are those of the scenario.
+        controller: The same names in the order of the robot's controller. If empty, the order
+            is that of the scenario.
+        safe: Command to the controller while the arm brakes, in the order of the controller. If
+            empty, it is zero.
     """
 
     joints: list[str] = []
@@ -79,9 +81,9 @@ class TopicTable(NamedTuple):
     """Names of the topics in ROS 2, and the robots.
 
     Attributes:
-        names: names in ROS 2 at every site, by trilat-net's own names.
-        of_site: names that differ at a site, by site and trilat-net's own name.
-        robots: the robots, by site.
+        names: Names in ROS 2, by the name in trilat-net.
+        of_site: Names that differ at a site, by site and by the name in trilat-net.
+        robots: The robots, by site.
     """
 
     names: Mapping[str, str]
@@ -89,7 +91,13 @@ class TopicTable(NamedTuple):
     robots: Mapping[str, RobotTable] = {}
 
     def find(self, session: str, site: str, topic: str) -> str:
-        """Returns the full name, without the first /, of a site's topic."""
+        """Returns the full name of a site's topic in ROS 2, without the first /.
+
+        Args:
+            session: Name of the session.
+            site: Name of the site.
+            topic: Name of the topic in trilat-net.
+        """
         common_name = self.names.get(topic, topic)
         name = self.of_site.get(site, {}).get(topic, common_name)
         if name.startswith("/"):
@@ -98,22 +106,24 @@ class TopicTable(NamedTuple):
 
 
 def make_session_name(text: str) -> str:
-    """Returns a session's name as a valid name in ROS 2: other characters become _."""
+    """Converts the name of a session to a valid name in ROS 2. Other characters become _."""
     name = re.sub(r"[^A-Za-z0-9_]", "_", text)
     return name if name[:1].isalpha() else f"_{name}"
 
 
 def read_topic_table(source: str) -> TopicTable:
-    """Returns the table of a naming, or of a TOML file that changes names of CRISP.
+    """Returns the names of a built-in convention, or of a TOML file.
+
+    The file states which names differ from those of CRISP.
 
     A line of the file is, for example, `joint_states = "arm/joint_states"`. A table `[sites.s]`
-    is for the site `s` alone, and also holds the fields of a `RobotTable`.
+    applies only to the site `s`, and may also contain the fields of a `RobotTable`.
 
     Args:
         source: "crisp", "crtk" or the path of a file.
 
     Raises:
-        UsageError: the file cannot be read, or a name in it is not valid.
+        UsageError: The file cannot be read, or a name in it is not valid.
     """
     if source in NAMINGS:
         return TopicTable(_list_names(source))
@@ -128,13 +138,17 @@ def read_topic_table(source: str) -> TopicTable:
 
 
 def _list_names(naming: str) -> dict[str, str]:
-    """Returns the name of each topic in a built-in naming."""
+    """Returns the name of each topic in a built-in convention."""
     naming_index = NAMINGS.index(naming)
     return {topic: names[naming_index] for topic, names in TOPICS.items()}
 
 
 def _read_names_file(source: str) -> TopicTable:
-    """Returns the content of a names file: changed names, and robots by site."""
+    """Reads a names file: the changed names, and the robots by site.
+
+    Raises:
+        UsageError: The file cannot be read, or is no valid TOML.
+    """
     try:
         with open_regular(Path(source)) as stream:
             names = tomllib.loads(stream.read().decode())
@@ -155,7 +169,15 @@ def _read_names_file(source: str) -> TopicTable:
 
 
 def _check_names(source: str, names: Mapping[str, object]) -> None:
-    """Raises UsageError if a topic does not exist, or its name is not valid in ROS 2."""
+    """Checks that all topics exist and that their names are valid in ROS 2.
+
+    Args:
+        source: Name of the file, for the error message.
+        names: Names in ROS 2, by the name in trilat-net.
+
+    Raises:
+        UsageError: A topic does not exist, or a name is not valid.
+    """
     for topic, name in names.items():
         if topic not in TOPICS:
             suggestion = suggest_nearest(topic, list(TOPICS))
@@ -164,8 +186,16 @@ def _check_names(source: str, names: Mapping[str, object]) -> None:
 
 
 def _check_unique_names(source: str, table: TopicTable) -> None:
-    """Raises UsageError if two topics have the same full name."""
-    # The states of several arms may be in one message, so `robot_states` may repeat.
+    """Checks that no two topics have the same full name.
+
+    Args:
+        source: Name of the file, for the error message.
+        table: The names.
+
+    Raises:
+        UsageError: Two topics have the same name.
+    """
+    # The states of several robots may be in one message, so that `robot_states` may repeat.
     topics = [topic for topic in TOPICS if topic != "robot_states"]
     # Two invented sites stand for the sites without changed names. They show whether a full
     # name, which begins with /, is used by several sites.

@@ -1,18 +1,19 @@
-"""Decimated ROS 2 channels of a log, from which general viewers draw its curves.
+"""Writes the curves of a session for general viewers, with fewer points than the log.
 
-A site publishes about 1000 records a second, more than a viewer can draw smoothly. The records
-of a site are therefore collected in buckets of equal length on the tick grid. A bucket becomes
-two messages, which hold the minimum and the maximum of each curve in the bucket, in the order
-in which the two occurred. The joints and their error have `views_hz` messages a second; the
-exogenous torque, the estimate and the mode are decimated once more, to `SLOW_VIZ_HZ`.
+A site publishes about 1000 records a second, more than a viewer such as Foxglove can draw
+smoothly. Therefore the records of a site are collected in buckets, intervals of equal length. A
+bucket becomes two messages of ROS 2, which contain the minimum and the maximum of each curve in
+the bucket, in the order in which the two occurred. Thus no peak is lost. The joints and their
+error have `views_hz` messages a second. The exogenous torque, the estimated parameters and the
+mode are reduced once more, to `SLOW_VIZ_HZ`.
 
 Invariant:
-    - The file holds the exact minimum and maximum of every curve in every bucket.
+    - The file contains the exact minimum and maximum of every curve in every bucket.
     - The first message of a bucket has the time of the bucket's first record, and is written at
       the end of the bucket.
     - The second message has the time of the bucket's middle record, and is written half a
       bucket later.
-    - Records that arrive after their bucket was closed form a bucket of their own.
+    - Records that arrive after their bucket was written form a bucket of their own.
 """
 
 import math
@@ -31,37 +32,40 @@ from .cdr import JointStatePacker, pack_string
 from .ros2_messages import Record, SignalRow
 
 VIZ_HZ = 100.0
-"""Default rate of the joints and their error, in messages per second."""
+"""Default rate of the messages with the joints and their error, in Hz."""
 SLOW_VIZ_HZ = 10.0
-"""Rate of exogenous torque, estimate and mode, in messages per second.
+"""Rate of the messages with exogenous torque, estimate and mode, in Hz.
 
-If the joints have a message per record, so have these channels.
+If there is a message for every record with the joints, the same applies to these channels.
 """
 FULL_RATE_HZ = math.inf
-"""Rate of the joints that stands for a message per record."""
+"""Rate that means a message for every record."""
 
 MAX_PENDING_BYTES = 1 << 13
-"""Largest size of the messages that a site has still to write, for two joints of its arm."""
+"""Largest size of a site's messages that are not written yet, in bytes, for two joints."""
 SENT_PENDING_BYTES = 512
-"""Additional size for each number that the site's law sends, which may be an array alone."""
+"""Additional size for each number that the site's control law sends, in bytes. Each may be an
+array of its own.
+"""
 
 PutMessage = Callable[[str, bytes, int, int], None]
-"""Writes one message: topic, bytes, publish time and log time, both in Unix ns."""
+"""Function that writes one message: topic, bytes, sending and arrival time in Unix ns."""
 ReceiveMessage = Callable[[Any, int], None]
-"""Receives one message of the log, and its log time in Unix ns."""
+"""Function that receives one message of the log, and its arrival time in Unix ns."""
 StampedRow = tuple[int, SignalRow]
-"""Values of curves, and their time in Unix ns."""
+"""Time in Unix ns, and the values of all curves at this time."""
 
 _get_tick = attrgetter("tick")
 
 
 class _BucketOutput:
-    """Writes the two rows of a bucket: the first at once, the second half a bucket later.
+    """Writes the two rows of a bucket: one at once, and one half a bucket later.
 
-    The second row is written by `flush`, or before the first row of the next bucket.
+    A row contains the values of all curves at one time. The second row is written by `flush`,
+    or before the first row of the next bucket.
 
     Args:
-        write: writes a row: time, values, and log time in Unix ns.
+        write: Function that writes a row: time, values, and arrival time in Unix ns.
     """
 
     def __init__(self, write: Callable[[int, SignalRow, int], None]) -> None:
@@ -69,19 +73,19 @@ class _BucketOutput:
         self._waiting_rows: Sequence[StampedRow] = ()
 
     def add(self, rows: Sequence[StampedRow], log_ns: int) -> None:
-        """Writes the first row of a bucket, and keeps the second row."""
+        """Writes the first row of a bucket, and keeps the second one."""
         self.flush(log_ns)
         stamp_ns, row = rows[0]
         self._write(stamp_ns, row, log_ns)
         self._waiting_rows = rows[1:]
 
     def flush(self, log_ns: int) -> None:
-        """Writes the row that waits, if there is one."""
+        """Writes the row that was kept, if there is one."""
         self.write_all(self._waiting_rows, log_ns)
         self._waiting_rows = ()
 
     def write_all(self, rows: Sequence[StampedRow], log_ns: int) -> None:
-        """Writes all rows of a bucket at once, as for records that arrived late."""
+        """Writes all rows of a bucket at once, if its records arrived late."""
         for stamp_ns, row in rows:
             self._write(stamp_ns, row, log_ns)
 
@@ -89,19 +93,19 @@ class _BucketOutput:
 class _SiteBuckets:
     """The buckets of one site.
 
-    A fast bucket holds records, and yields two messages of the joints. A slow bucket holds the
-    messages of several fast buckets, and yields two messages of the slower curves.
+    A fast bucket contains records, and becomes two messages with the joints. A slow bucket
+    contains the rows of several fast buckets, and becomes two messages with the other curves.
 
     Args:
-        scenario: the scenario that runs.
-        site: the site.
-        views_hz: rate of the joints, in messages per second.
-        epoch_unix_ns: Unix time of tick 0, in ns; 0 in virtual time.
-        put: writes a message.
+        scenario: Scenario of the session.
+        site: Name of the site.
+        views_hz: Rate of the messages with the joints, in Hz.
+        epoch_unix_ns: Unix time of tick 0, in ns. It is 0 in virtual time.
+        put: Function that writes a message.
 
     Attributes:
-        channels: the channels of the site, by topic.
-        max_pending_bytes: largest size of the messages that are still to be written.
+        channels: Channels of the site, by topic.
+        max_pending_bytes: Largest size of the messages that are not written yet, in bytes.
     """
 
     def __init__(
@@ -119,14 +123,15 @@ class _SiteBuckets:
         site_channels = ros2_messages.Ros2SiteChannels(scenario, site)
         self._site_channels = site_channels
         joint_count = len(site_channels.joints)
-        joint_pairs = -(-joint_count // 2)
+        joint_pairs = (joint_count + 1) // 2
         sent_numbers = scenario.channel(site).record_size
         self.max_pending_bytes = (
             MAX_PENDING_BYTES * joint_pairs + SENT_PENDING_BYTES * sent_numbers
         )
 
-        # The reference of a joint is a joint of its own, named after the joint. Only its angle
-        # is written: with velocity and effort the messages would be twice as large.
+        # The reference of each joint is written as another joint, named after it. Only its
+        # angle is written, because the messages would be twice as large with velocity and
+        # effort.
         references = [f"{name}_ref" for name in site_channels.joints]
         joint_names = [*site_channels.joints, *references]
         self._joint_state_packer = JointStatePacker(joint_names)
@@ -146,8 +151,8 @@ class _SiteBuckets:
             self._slow_ratio = max(1, round(messages_hz / SLOW_VIZ_HZ))
         self._fast_output = _BucketOutput(self._write_fast)
         self._slow_output = _BucketOutput(self._write_slow)
-        # The open bucket: its number on the tick grid, its first tick, and the end of its half
-        # that is being filled.
+        # The open bucket: its number, its first tick, and the end of the half that is being
+        # filled.
         self._bucket = 0
         self._first_tick = 0
         self._half_end_tick = 0
@@ -157,7 +162,7 @@ class _SiteBuckets:
         self._late_records: list[Record] = []
 
     def _write_fast(self, stamp_ns: int, row: SignalRow, log_ns: int) -> None:
-        """Writes the joint states, their error and, for an arm with a URDF, its frames."""
+        """Writes the joints, their error and, for an arm with a URDF, its frames."""
         n = len(self._not_measured)
         velocity = [*row[2 * n : 3 * n], *self._not_measured]
         effort = [*row[3 * n : 4 * n], *self._not_measured]
@@ -177,12 +182,17 @@ class _SiteBuckets:
         self._put(self._topics[ros2_messages.FRAMES], frames, stamp_ns, log_ns)
 
     def _write_slow(self, stamp_ns: int, row: SignalRow, log_ns: int) -> None:
-        """Writes the exogenous torque, the estimate, the vectors of the law, and the mode."""
+        """Writes the exogenous torque, the estimate, the law's numbers, and the mode."""
         for name, data in self._site_channels.pack_slow_arrays(row):
             self._put(self._topics[name], data, stamp_ns, log_ns)
 
     def add_record(self, record: Record, log_ns: int) -> None:
-        """Adds a record to its bucket, and writes the messages that are then complete."""
+        """Adds a record to its bucket, and writes the messages that are complete now.
+
+        Args:
+            record: The record.
+            log_ns: Arrival time, in Unix time, in ns.
+        """
         tick = record.tick
         if tick < self._first_tick:
             self._add_late_record(record, log_ns)
@@ -197,7 +207,7 @@ class _SiteBuckets:
         self._records.append(record)
 
     def _add_late_record(self, record: Record, log_ns: int) -> None:
-        """Keeps a record of a closed bucket until the next record of another closed bucket."""
+        """Keeps a record of a bucket that was written, until one of another bucket arrives."""
         bucket = record.tick // self._bucket_ticks
         if self._late_records:
             late_bucket = self._late_records[0].tick // self._bucket_ticks
@@ -206,20 +216,23 @@ class _SiteBuckets:
         self._late_records.append(record)
 
     def add_statistics(self, stats: LinkStats, log_ns: int) -> None:
-        """Writes link statistics, which are not decimated."""
+        """Writes the statistics of the links, all of them."""
         stamp_ns = max(0, self._epoch_unix_ns + stats.t_ns)
         for name, data in self._site_channels.pack_statistics(stats):
             self._put(self._topics[name], data, stamp_ns, log_ns)
 
     def finish(self, log_ns: int) -> None:
-        """Writes everything that waits."""
+        """Writes everything that was not written yet."""
         # Two slow buckets further on, both the fast and the slow bucket are closed.
         self._close_bucket(self._bucket + 2 * self._slow_ratio, log_ns)
         self._fast_output.flush(log_ns)
         self._slow_output.flush(log_ns)
 
     def _close_bucket(self, next_bucket: int, log_ns: int) -> None:
-        """Writes the first message of the open bucket, and opens the bucket `next_bucket`."""
+        """Writes the first message of the open bucket, and opens the bucket `next_bucket`.
+
+        The slow bucket is closed as well, if the next bucket is in another slow one.
+        """
         self._flush_late_records(log_ns)
         if self._records:
             rows = self._decimate(self._records)
@@ -247,14 +260,15 @@ class _SiteBuckets:
             self._late_records = []
 
     def _select_slow_columns(self, rows: Iterable[StampedRow]) -> list[StampedRow]:
-        """Returns the values of the slower curves in each row."""
+        """Returns the values of the slow curves in each row."""
         slow_row = self._site_channels.slow_row
         return [(stamp_ns, row[slow_row]) for stamp_ns, row in rows]
 
     def _decimate(self, records: list[Record]) -> list[StampedRow]:
-        """Returns the extremes of a bucket's records, which it sorts by time.
+        """Reduces the records of a bucket to the extremes of each curve. Sorts them by time.
 
-        Returns two rows, or one row for a single record.
+        Returns:
+            Two rows, or one row for a single record.
         """
         # Records nearly always arrive in order, so that sorting costs little.
         records.sort(key=_get_tick)
@@ -267,13 +281,16 @@ class _SiteBuckets:
 
 
 def parse_viz_rate(text: str) -> float:
-    """Returns the rate that the option `--views` requests, in messages per second.
+    """Parses the option `--views`, the rate of the messages for viewers.
 
     Args:
-        text: a number from 1 on, "off" or "full".
+        text: A number from 1 on, "off" or "full".
+
+    Returns:
+        The rate in Hz. It is 0 for "off" and `FULL_RATE_HZ` for "full".
 
     Raises:
-        UsageError: the text is neither a number in range nor a keyword.
+        UsageError: The text is neither a number in range nor one of these words.
     """
     keywords = {"off": 0.0, "full": FULL_RATE_HZ}
     if text in keywords:
@@ -288,11 +305,11 @@ def parse_viz_rate(text: str) -> float:
 
 
 def _stamp_extremes(stamps_ns: Sequence[int], curves: Iterable[SignalRow]) -> list[StampedRow]:
-    """Returns the extremes of curves, stamped with the first and the middle time.
+    """Returns the extremes of curves, with the first and the middle time as their times.
 
     Args:
-        stamps_ns: times of the values, in Unix ns.
-        curves: values of each curve, in the order of the times.
+        stamps_ns: Times of the values, in Unix ns.
+        curves: Values of each curve, in the order of the times.
 
     Returns:
         Two rows, or one row for a single time.
@@ -305,19 +322,19 @@ def _stamp_extremes(stamps_ns: Sequence[int], curves: Iterable[SignalRow]) -> li
 
 
 class VizChannels:
-    """The decimated channels of a log while the log is written.
+    """Channels for viewers, which are written while the log is written.
 
     Args:
-        scenario: the scenario that runs.
-        session: the session's name.
-        epoch_unix_ns: Unix time of tick 0, in ns; 0 in virtual time.
-        views_hz: rate of the joints, in messages per second; `FULL_RATE_HZ` for one message per
-            record.
-        put: writes a message.
+        scenario: Scenario of the session.
+        session: Name of the session.
+        epoch_unix_ns: Unix time of tick 0, in ns. It is 0 in virtual time.
+        views_hz: Rate of the messages with the joints, in Hz. `FULL_RATE_HZ` writes a message
+            for every record.
+        put: Function that writes a message.
 
     Attributes:
-        channels: all channels that may occur, by topic.
-        receivers: functions that receive the messages of the log, by the key of the messages.
+        channels: All channels that may occur, by topic.
+        receivers: Functions that receive the messages of the log, by the key of the messages.
     """
 
     def __init__(
@@ -352,7 +369,7 @@ class VizChannels:
             self.receivers[topics.key(session, site, topics.LINK)] = buckets.add_statistics
 
     def _add_event(self, event: Event, log_ns: int) -> None:
-        """Writes an event; an event before the session's epoch gets its log time."""
+        """Writes an event. One from before the start of the session gets its arrival time."""
         stamp_ns = log_ns
         if event.t_ns >= 0:
             stamp_ns = max(0, self._epoch_unix_ns + event.t_ns)
@@ -360,25 +377,26 @@ class VizChannels:
             self._put(f"{VIZ_ROOT}{name}", data, log_ns, log_ns)
 
     def finish(self, log_ns: int) -> None:
-        """Writes everything that waits.
+        """Writes everything that was not written yet.
 
         Args:
-            log_ns: log time of the last message, in Unix ns.
+            log_ns: Arrival time of the last message, in Unix time, in ns.
         """
         for buckets in self._buckets:
             buckets.finish(log_ns)
 
     @property
     def most_bytes(self) -> int:
-        """Largest size of the messages that are still to be written."""
+        """Largest size of the messages that are not written yet, in bytes."""
         return sum(buckets.max_pending_bytes for buckets in self._buckets)
 
 
 def decimate_min_max(curves: Iterable[SignalRow]) -> tuple[list[float], list[float]]:
-    """Returns the minimum and the maximum of each curve, in the order of their times.
+    """Finds the minimum and the maximum of each curve, in the order in which they occur.
 
     Args:
-        curves: the values of each curve by time, at least one and all finite.
+        curves: Values of each curve in the order of time. They are finite, and there is at
+            least one.
 
     Returns:
         The earlier extreme of each curve, and the later extreme of each curve.
@@ -386,7 +404,8 @@ def decimate_min_max(curves: Iterable[SignalRow]) -> tuple[list[float], list[flo
     earlier: list[float] = []
     later: list[float] = []
     for values in curves:
-        # Smooth curves are nearly sorted: sorting takes a third of the time of min and max.
+        # Smooth curves are nearly sorted, so that sorting takes a third of the time of min and
+        # max.
         ordered = sorted(values)
         minimum = ordered[0]
         maximum = ordered[-1]
