@@ -1,18 +1,34 @@
-"""A serial chain of revolute and prismatic joints: kinematics and dynamics by recursion.
+"""Computes the kinematics and dynamics of a serial chain of revolute and prismatic joints.
 
-Each link has ten inertial parameters, pi = (m, m c, Ixx, Ixy, Iyy, Ixz, Iyz, Izz), about the
-origin of its own frame. All dynamics are linear in them; theta lists the parameters of one link
-after the other, shape (10 n,). A link's frame is that of its joint, and the joint's axis is
-constant in this frame. A spatial vector has its linear half first, at the frame's origin.
+Symbols: q, qd and qdd are positions, velocities and accelerations of the n joints; M(q) is the
+inertia matrix, C the Coriolis matrix, G the gravity torque and tau the joint torque; theta are
+the inertial parameters. The chain starts at the base. The link's frame is the frame of the
+joint that moves the link, and the joint's axis is constant in this frame.
 
-The Newton-Euler recursion uses two separate velocities, as Eq. (12) of the paper requires:
+Each link has ten inertial parameters about the origin of its own frame,
+
+    pi = (m, m c, Ixx, Ixy, Iyy, Ixz, Iyz, Izz)
+
+with the mass m, the centre of mass c and the moments of inertia. All dynamics are linear in
+them; theta lists the parameters of one link after the other, shape (10 n,).
+
+A spatial vector combines a linear and an angular part, the linear part first, at the frame's
+origin. With the transformation X from the previous link p to link i, the joint's axis S as a
+spatial vector, the spatial inertia I of the link, and the products x of two velocities and x*
+of a velocity and a force, the Newton-Euler recursion computes for each link
 
     V_i = X V_p + S qd      W_i = X W_p + S v      A_i = X A_p + S a + V_i x (S v)
     f_i = I A_i + 1/2 (V_i x* I W_i + W_i x* I V_i - I (V_i x W_i))      tau_i = S' f_i
 
-This product of velocities corresponds to the Christoffel symbols, so that dM/dt - 2 C is skew,
-Eq. (4). With s = V - W, the gradient of r' tau with respect to pi is Y' r of Eq. (15), which is
-computed link by link without a regressor.
+V is the velocity of the link, W its velocity for the reference velocities v of the joints, A
+its acceleration for the reference accelerations a, and f the spatial force. The result is tau =
+M a + C v + G with two separate velocities qd and v, as the regressor of the paper's Eq. (12)
+requires. The symmetric product of V and W corresponds to the Christoffel symbols, so that dM/dt
+- 2 C is skew, Eq. (4).
+
+The adaptive law needs Y' r, Eq. (15), where Y is the regressor and r = qd - v. It is the
+gradient of r' tau with respect to pi. With s = V - W it is computed link by link without a
+regressor.
 
 Source: R. Featherstone, "Rigid Body Dynamics Algorithms" (2008), for spatial vectors,
 Newton-Euler and composite bodies; G. Niemeyer and J.-J. Slotine, "Performance in adaptive
@@ -20,8 +36,8 @@ manipulator control", Int. J. Robotics Research 10 (1991), for the recursion of 
 law.
 
 Invariant:
-    - Functions of the kernel allocate nothing.
-    - Each sum has a fixed order.
+    - Functions of the kernel allocate nothing. They write into the rows of the joints.
+    - Each sum has a fixed order, so that results are the same on every machine.
 """
 
 from collections.abc import Sequence
@@ -92,10 +108,10 @@ _TIP = ("J_lin", "J_ang", "p_base", "axis_base")
 
 @cache
 def chain_dtype(joints: int) -> np.dtype[np.void]:
-    """Returns the layout of a joint's row, with constants and work space.
+    """Returns the layout of a joint's row, which contains its constants and work space.
 
     Args:
-        joints: the number of joints of the chain.
+        joints: Number of joints of the chain.
     """
     matrices = ("at_rest", "by_sine", "by_cosine", "R", "R_base")
     vectors = ("axis", "origin", "slide", "p", *_MOTIONS, *_TIP)
@@ -110,16 +126,16 @@ def chain_dtype(joints: int) -> np.dtype[np.void]:
 
 
 def build_chain(joints: Sequence[ChainJoint], width: int = 0) -> RowArray:
-    """Returns the rows of a chain, shape (n,), see `chain_dtype`.
+    """Returns the rows of the joints of a chain, shape (n,), see `chain_dtype`.
 
     The rotation of a joint by the angle q about its axis a (Rodrigues) uses three constant
-    matrices, where F is the rotation at q = 0:
+    matrices, where F is the rotation at q = 0 and [a] the matrix of the cross product with a:
 
         R = F + sin(q) F [a] + (1 - cos(q)) F [a]^2
 
     Args:
-        joints: the joints.
-        width: number of joints for which the rows have room; by default that of the chain.
+        joints: The joints.
+        width: Number of joints for which the rows have room; by default that of the chain.
     """
     rows = np.zeros(len(joints), chain_dtype(width or len(joints)))
     row: Row
@@ -233,9 +249,14 @@ def multiply(a: Matrix, b: Matrix) -> Matrix:
 
 @leaf
 def place_joints(chain: RowArray, q: Vector) -> None:
-    """Writes R and p of each link in the previous link's frame, at joint positions q.
+    """Writes the rotation R and origin p of each link in the previous link's frame.
 
-    See `build_chain` for the rotation of a joint.
+    See `build_chain` for the rotation of a joint. Most other functions of this module need
+    these results.
+
+    Args:
+        chain: Rows of the joints.
+        q: Positions of the joints, shape (n,).
     """
     for i in range(chain.shape[0]):
         row: Row = chain[i]
@@ -254,13 +275,13 @@ def place_joints(chain: RowArray, q: Vector) -> None:
 
 @leaf
 def _move(row: Row, linear: Three, angular: Three, rate: float) -> Spatial:
-    """Returns X V_p + S rate, a spatial velocity of a link from that of the previous link.
+    """Returns X V_p + S rate: the spatial velocity of a link from that of the previous link.
 
     Args:
-        row: the joint's row.
-        linear: linear half of V_p, in the previous link's frame.
-        angular: angular half of V_p, in the previous link's frame.
-        rate: velocity of the joint.
+        row: Row of the joint.
+        linear: Linear part of V_p, in the previous link's frame.
+        angular: Angular part of V_p, in the previous link's frame.
+        rate: Velocity of the joint.
     """
     velocity_at_p = add(linear, cross(angular, three(row.p)))
     link_linear = rotate_back(row.R, velocity_at_p)
@@ -273,13 +294,13 @@ def _move(row: Row, linear: Three, angular: Three, rate: float) -> Spatial:
 
 @leaf
 def _momentum(pi: Vector, first: int, linear: Three, angular: Three) -> Spatial:
-    """Returns the spatial momentum I(pi) V.
+    """Returns the spatial momentum I(pi) V of a link.
 
     Args:
-        pi: inertial parameters of the links.
-        first: index of the link's first parameter.
-        linear: linear half of V.
-        angular: angular half of V.
+        pi: Inertial parameters of the links.
+        first: Index of the link's first parameter.
+        linear: Linear part of V.
+        angular: Angular part of V.
     """
     m = pi[first]
     mc = (pi[first + 1], pi[first + 2], pi[first + 3])
@@ -301,16 +322,28 @@ def _momentum(pi: Vector, first: int, linear: Three, angular: Three) -> Spatial:
 
 @leaf
 def _along_axis(row: Row, linear: Three, angular: Three) -> float:
-    """Returns S' f, the component of a spatial force along a joint's axis."""
+    """Returns S' f, the component of a spatial force along a joint's axis.
+
+    It is the torque of a revolute joint or the force of a prismatic joint.
+
+    Args:
+        row: Row of the joint.
+        linear: Linear part of f, the force.
+        angular: Angular part of f, the torque.
+    """
     along = angular if row.prismatic == 0 else linear
     return dot(three(row.axis), along)
 
 
 @leaf
 def friction_torque(row: Row, speed: float) -> float:
-    """Returns the friction torque at a speed, N m or N; it increases with the speed.
+    """Returns the friction torque of a joint, N m or N; it increases with the speed.
 
-    f(v) = viscous v + coulomb x / sqrt(1 + x^2),    x = v / COULOMB_SPEED
+        f(v) = viscous v + coulomb x / sqrt(1 + x^2),    x = v / COULOMB_SPEED
+
+    Args:
+        row: Row of the joint.
+        speed: Velocity v of the joint, rad/s or m/s.
     """
     x = speed / COULOMB_SPEED
     viscous: float = row.viscous * speed
@@ -320,7 +353,12 @@ def friction_torque(row: Row, speed: float) -> float:
 
 @leaf
 def _pass_force(row: Row, before: Row) -> None:
-    """Adds a link's spatial force to that of the previous link, in the previous frame."""
+    """Adds a link's spatial force to that of the previous link, in the previous link's frame.
+
+    Args:
+        row: Row of the link's joint.
+        before: Row of the previous joint, which is changed.
+    """
     force = rotate(row.R, three(row.f_lin))
     lever_torque = cross(three(row.p), force)
     torque = add(rotate(row.R, three(row.f_ang)), lever_torque)
@@ -332,14 +370,16 @@ def _pass_force(row: Row, before: Row) -> None:
 def propagate_motion(
     chain: RowArray, gravity: Vector, qd: Vector, v: Vector, a: Vector
 ) -> None:
-    """Writes V, W and A of each link, after `place_joints`.
+    """Writes the spatial velocities V and W and acceleration A of each link.
+
+    `place_joints` must have been called for the same positions.
 
     Args:
-        chain: the chain's rows.
-        gravity: gravitational acceleration in the base's frame, m/s^2, shape (3,).
-        qd: velocities of the joints, shape (n,).
-        v: reference velocities, which C multiplies, shape (n,).
-        a: reference accelerations, which M multiplies, shape (n,).
+        chain: Rows of the joints.
+        gravity: Gravitational acceleration in the base's frame, m/s^2, shape (3,).
+        qd: Velocities of the joints, shape (n,).
+        v: Reference velocities, which C multiplies, shape (n,).
+        a: Reference accelerations, which M multiplies, shape (n,).
     """
     still = (0.0, 0.0, 0.0)
     V_lin = still
@@ -391,12 +431,19 @@ def _force_cross(V: Spatial, f: Spatial) -> Spatial:
 def inverse_dynamics(
     chain: RowArray, theta: Vector, v: Vector, a: Vector, torque: Array
 ) -> None:
-    """Writes the torque of the inverse dynamics, shape (n,), after `propagate_motion`.
+    """Writes the joint torque that the reference motion requires, shape (n,).
 
         M a + C(q, qd) v + G + armature a + friction(v)
 
     With friction at the reference velocity, r' (friction(qd) - friction(v)) >= 0: friction can
-    only dissipate energy.
+    only dissipate energy. `propagate_motion` must have been called for the same motion.
+
+    Args:
+        chain: Rows of the joints.
+        theta: Inertial parameters, shape (10 n,).
+        v: Reference velocities, shape (n,).
+        a: Reference accelerations, shape (n,).
+        torque: Written, shape (n,), N m or N.
     """
     n = chain.shape[0]
     for i in range(n):
@@ -461,7 +508,14 @@ def _add_products(factor: float, x: Spatial, y: Spatial, first: int, gradient: A
 
 @leaf
 def parameter_gradient(chain: RowArray, gradient: Array) -> None:
-    """Writes Y' r, Eq. (15), for r = qd - v, shape (10 n,), after `propagate_motion`."""
+    """Writes Y' r, Eq. (15), for r = qd - v.
+
+    `propagate_motion` must have been called for the same motion.
+
+    Args:
+        chain: Rows of the joints.
+        gradient: Written, shape (10 n,).
+    """
     for i in range(chain.shape[0]):
         row: Row = chain[i]
         V = (three(row.V_lin), three(row.V_ang))
@@ -487,7 +541,12 @@ def parameter_gradient(chain: RowArray, gradient: Array) -> None:
 def _add_composite(row: Row, before: Row) -> None:
     """Adds a composite body to that of the previous link, about the previous link's origin.
 
-    The parallel-axis theorem is written out for the ten parameters of a body.
+    A composite body is a link together with all links after it, as if they were rigidly
+    connected. The parallel-axis theorem is written out for the ten parameters of a body.
+
+    Args:
+        row: Row of the joint of the body.
+        before: Row of the previous joint, whose composite body is changed.
     """
     pi = row.composite
     total = before.composite
@@ -525,9 +584,14 @@ def _add_composite(row: Row, before: Row) -> None:
 
 @leaf
 def mass_matrix(chain: RowArray, theta: Vector) -> None:
-    """Writes M(q) with the drives' inertia into the rows' `M`, after `place_joints`.
+    """Writes M(q) with the drives' inertia into the field `M` of the rows.
 
-    Only the lower triangle is written. Method: composite rigid bodies (Featherstone).
+    Only the lower triangle is written. The method is that of composite rigid bodies
+    (Featherstone). `place_joints` must have been called for the same positions.
+
+    Args:
+        chain: Rows of the joints.
+        theta: Inertial parameters, shape (10 n,).
     """
     n = chain.shape[0]
     for i in range(n):
@@ -556,7 +620,13 @@ def mass_matrix(chain: RowArray, theta: Vector) -> None:
 
 @leaf
 def _stop_torque(row: Row, q: float, qd: float) -> float:
-    """Returns the torque of a joint's stops, a spring and a damper that never pull."""
+    """Returns the torque of a joint's stops, a spring and a damper that never pull.
+
+    Args:
+        row: Row of the joint.
+        q: Position of the joint, rad or m.
+        qd: Velocity of the joint, rad/s or m/s.
+    """
     damper = row.stop_damping * qd
     if q < row.lower:
         push: float = row.stop_stiffness * (row.lower - q) - damper
@@ -569,7 +639,17 @@ def _stop_torque(row: Row, q: float, qd: float) -> float:
 
 @leaf
 def _bias(chain: RowArray, theta: Vector, gravity: Vector, q: Vector, qd: Vector) -> None:
-    """Writes C qd + G + friction - stops into the rows' `bias`, after `place_joints`."""
+    """Writes C qd + G + friction - stops into the field `bias` of the rows.
+
+    `place_joints` must have been called for the same positions.
+
+    Args:
+        chain: Rows of the joints.
+        theta: Inertial parameters, shape (10 n,).
+        gravity: Gravitational acceleration in the base's frame, m/s^2, shape (3,).
+        q: Joint positions, shape (n,).
+        qd: Joint velocities, shape (n,).
+    """
     n = chain.shape[0]
     still = (0.0, 0.0, 0.0)
     V_lin = still
@@ -643,16 +723,27 @@ def find_acceleration(
     torque: Vector,
     qdd: Array,
 ) -> None:
-    """Writes the joint accelerations qdd, Eq. (8), shape (n,), after `place_joints`.
+    """Writes the joint accelerations qdd, Eq. (8).
 
         M qdd = torque - C qd - G - friction + stops
 
-    `torque` is the whole torque on the joints. M is factored in place as L D L', which needs no
-    square roots.
+    M is factored in place as L D L', which needs no square roots. `place_joints` must have been
+    called for the same positions.
+
+    Args:
+        chain: Rows of the joints.
+        theta: Inertial parameters, shape (10 n,).
+        gravity: Gravitational acceleration in the base's frame, m/s^2, shape (3,).
+        q: Joint positions, shape (n,).
+        qd: Joint velocities, shape (n,).
+        torque: The whole torque on the joints, shape (n,), N m or N.
+        qdd: Written, shape (n,).
     """
     n = chain.shape[0]
     _bias(chain=chain, theta=theta, gravity=gravity, q=q, qd=qd)
     mass_matrix(chain, theta)
+
+    # Factor row i of M, and substitute forwards.
     for i in range(n):
         row: Row = chain[i]
         M_i = row.M
@@ -669,6 +760,8 @@ def find_acceleration(
         for k in range(i):
             total -= M_i[k] * qdd[k]
         qdd[i] = total
+
+    # Divide by D, and substitute backwards.
     for i in range(n - 1, -1, -1):
         qdd[i] /= chain[i].M[i]
         for k in range(i + 1, n):

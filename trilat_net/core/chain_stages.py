@@ -1,4 +1,4 @@
-"""The stages of a tick that depend on the arm, for a chain of n joints.
+"""Computes the stages of a tick that depend on the arm, for a chain of n joints.
 
 The dynamics are recursions over the joints. `chain` holds the rows of the site's joints, see
 `chain_dtype`.
@@ -31,7 +31,12 @@ _ADAPTIVE = int(Law.ADAPTIVE)
 
 @leaf
 def place_chain(s: Row, chain: RowArray) -> None:
-    """Updates the frames of the joints and, in task space, the end effector's pose."""
+    """Updates the frames of the joints and, in task space, the end effector's pose.
+
+    Args:
+        s: Row of the site.
+        chain: Rows of the joints; written.
+    """
     place_joints(chain, s.q)
     if s.task:
         update_pose(s, chain)
@@ -39,7 +44,14 @@ def place_chain(s: Row, chain: RowArray) -> None:
 
 @leaf
 def update_errors(s: Row, chain: RowArray) -> None:
-    """Writes e, ed, r, the reference velocity and acceleration v and a, and Y' r."""
+    """Writes the errors e and ed, the filtered error r, and the reference motion v and a.
+
+    For the adaptive law, Y' r is written as well, which drives the estimate, Eq. (15).
+
+    Args:
+        s: Row of the site.
+        chain: Rows of the joints, after `place_chain`.
+    """
     if s.task:
         update_task_errors(s)
     else:
@@ -62,7 +74,13 @@ def _update_joint_errors(s: Row, joints: int) -> None:
 
 @leaf
 def advance_estimate(s: Row, gain_s: float, Yr: Vector) -> None:
-    """Advances the estimate by the time `gain_s`, Eq. (15), within its box."""
+    """Advances the estimate of the arm's parameters by a step of Eq. (15), within its box.
+
+    Args:
+        s: Row of the site.
+        gain_s: Duration of the step, s.
+        Yr: Y' r, shape (P,).
+    """
     for p in range(s.parameters):
         step = gain_s * s.Gamma[p] * Yr[p]
         estimate = s.theta_hat[p] - step
@@ -177,7 +195,15 @@ def put_source_torque(
 def update_external_torque(
     t_s: float, s: Row, chain: RowArray, actors: TorqueSourceRows, table: TorqueTable
 ) -> None:
-    """Writes the torque of operators and environments, its held part, and the wall force."""
+    """Writes the torque of operators and environments, its held part, and the wall force.
+
+    Args:
+        t_s: Time since the epoch, s.
+        s: Row of the site.
+        chain: Rows of the joints.
+        actors: Operators and environments.
+        table: Their tables.
+    """
     place_joints(chain, s.q)
     held_n = put_torque_on_chain(
         t_s=t_s,
@@ -288,6 +314,7 @@ def advance_arm(
     _use_stage(s, n, 2.0, h_s)
     _put_acceleration(t_s=t_s + h_s, s=s, chain=chain, actors=actors, table=table)
     _use_stage(s, n, 1.0, 0.0)
+
     sixth = h_s / 6.0
     are_finite = True
     for i in range(n):
@@ -296,6 +323,7 @@ def advance_arm(
         s.stage_q[i] = q
         s.stage_qd[i] = qd
         are_finite = are_finite and isfinite(q) and isfinite(qd)
+
     if are_finite:
         for i in range(n):
             s.q[i] = s.stage_q[i]

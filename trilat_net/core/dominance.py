@@ -1,7 +1,9 @@
-"""Dominance: the shares with which sites follow each other, and the reference of a site.
+"""Computes with dominance factors, the weights with which sites follow each other.
 
-Site i follows site j with the share alpha_ij (the dominance factor). Its reference is the sum
-of alpha_ij q_j over its peers, Eq. (6). Upsilon = I - alpha is the matrix of the coupling.
+Site i follows site j with the dominance factor alpha_ij, also called its share. Its reference,
+the position that its control law aims at, is the sum of alpha_ij q_j over its peers, Eq. (6).
+Upsilon = I - alpha is the matrix of the coupling, and beta are the weights of the sites in V,
+the energy function of the stability proof.
 
 Invariant:
 
@@ -31,11 +33,11 @@ ROW_SUM_TOLERANCE = 1e-9
 
 
 def find_row_problem(row: Array, site: int) -> str | None:
-    """Returns the violation of Eq. (7) by a row of alpha, or None.
+    """Returns the violation of Eq. (7) by a row of the dominance matrix, or None.
 
     Args:
-        row: the shares of one site, shape (N,).
-        site: the index of that site.
+        row: Dominance factors of one site, shape (N,).
+        site: Index of that site.
     """
     if not np.isfinite(row).all():
         return "shares must be finite numbers"
@@ -49,10 +51,10 @@ def find_row_problem(row: Array, site: int) -> str | None:
 
 
 def find_reach(alpha: Array) -> NDArray[np.bool_]:
-    """Returns the sites that each site reaches along links with a share above 0.
+    """Returns the sites that each site reaches along links with a dominance factor above 0.
 
     Args:
-        alpha: the shares, shape (N, N).
+        alpha: Dominance matrix, shape (N, N).
 
     Returns:
         Shape (N, N): true at [i, j] if site i follows site j, directly or through others.
@@ -65,7 +67,11 @@ def find_reach(alpha: Array) -> NDArray[np.bool_]:
 
 
 def is_irreducible(alpha: Array) -> bool:
-    """True if every site reaches every other site along links with a share above 0."""
+    """Returns True if every site follows every other site, directly or through others.
+
+    Args:
+        alpha: Dominance matrix, shape (N, N).
+    """
     return bool(find_reach(alpha).all())
 
 
@@ -146,7 +152,15 @@ end.
 def _interpolate(
     t_ns: float, start_ns: float, end_ns: float, before: float, after: float
 ) -> float:
-    """Returns the factor at time t of a linear change from `before` to `after`."""
+    """Returns the factor at time t of a linear change from `before` to `after`.
+
+    Args:
+        t_ns: Time t, ns since the epoch.
+        start_ns: Start of the change.
+        end_ns: End of the change.
+        before: Factor at the start.
+        after: Factor at the end.
+    """
     if t_ns >= end_ns:
         return after
     progress = (t_ns - start_ns) / (end_ns - start_ns)
@@ -237,9 +251,15 @@ _ACT_BRAKE = int(StaleAction.BRAKE)
 
 @leaf
 def any_peer_stale(t_ns: int, age_ns: int, links: RowArray) -> bool:
-    """True if the sample in use of a peer with a share is older than `age_ns` at time t.
+    """Returns True if the sample in use of a peer that the site follows is too old.
 
-    Before the first sample of a peer its age is the time since the epoch.
+    Before the first sample of a peer its age is the time since the epoch, the common start of
+    the session.
+
+    Args:
+        t_ns: Time, ns since the epoch.
+        age_ns: Largest age, ns.
+        links: Rows of the site's links.
     """
     for j in range(links.shape[0]):
         link: LinkRow = links[j]
@@ -253,9 +273,14 @@ def any_peer_stale(t_ns: int, age_ns: int, links: RowArray) -> bool:
 def update_stale_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
     """Applies the rule for stale peers: changes the mode, and the reference for the mode.
 
-    In HOLD the reference is that of the previous tick, in BRAKE the pose of the arm. In RETURN
-    it is q_held + s (q_des - q_held), with s = 3 x^2 - 2 x^3 and x the part of `return_ns` that
-    has passed.
+    A peer is stale if its last sample is too old. In HOLD the reference is that of the previous
+    tick, in BRAKE the pose of the arm. In RETURN it is q_held + s (q_des - q_held), with
+    s = 3 x^2 - 2 x^3 and x the part of `return_ns` that has passed.
+
+    Args:
+        t_ns: Time, ns since the epoch.
+        site: Row of the site, with the peers' reference.
+        links: Rows of the site's links.
     """
     if site.on_stale == _USE or site.mode == _DIVERGED:
         return
@@ -272,11 +297,13 @@ def update_stale_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
     elif not stale and stopped:
         site.mode = _RETURN
         site.return_from_ns = t_ns
+
     elapsed_ns = t_ns - site.return_from_ns
     if site.mode == _RETURN and elapsed_ns >= site.return_ns:
         site.mode = _RUN
     if site.mode == _RUN:
-        return
+        return  # the reference is that of the peers
+
     x = elapsed_ns / site.return_ns if site.mode == _RETURN else 0.0
     share = x * x * (3.0 - 2.0 * x)
     share_rate = 6.0 * x * (1.0 - x) / (site.return_ns * 1e-9)
@@ -295,7 +322,14 @@ def update_reference(t_ns: int, site: SiteRow, links: RowArray, ramps: Array) ->
         qd_des = sum_j (alpha_ij qd_j + alpha_ij' q_j)
         felt   = -sum_j alpha_ij tau_x_j
 
-    The order of the sums is that of the scenario: their bits depend on it.
+    Here q_j, qd_j and tau_x_j are the position, velocity and exogenous torque in the sample of
+    peer j. The order of the sums is that of the scenario: their bits depend on it.
+
+    Args:
+        t_ns: Time, ns since the epoch.
+        site: Row of the site.
+        links: Rows of the site's links.
+        ramps: Changes of the dominance factors, see `apply_ramps`.
     """
     if site.ramps > 1 or site.degrades:
         apply_ramps(t_ns, site.ramps, ramps, links)

@@ -1,4 +1,4 @@
-"""Sine, cosine and hyperbolic tangent by plain arithmetic: the same bits on every machine.
+"""Computes sine, cosine and hyperbolic tangent with the same bits on every machine.
 
 The platform's own functions differ in the last bit from one C library to the next, and a replay
 must not.

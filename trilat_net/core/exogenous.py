@@ -1,5 +1,6 @@
-"""Exogenous torque: the effect of operators and environments on the arm.
+"""Computes the exogenous torque, the effect of operators and environments on an arm.
 
+An operator is a person or program that moves the arm; an environment is, for example, a wall.
 Scenarios state the torque ON the arm; the paper's tau_x, which Eq. (8) subtracts, is the
 negative of this torque. In the code an actor is an operator or an environment.
 
@@ -116,13 +117,13 @@ _NUMBERS = ("a", "b", "K", "B")
 
 @cache
 def torque_source_dtype(width: int) -> np.dtype[np.void]:
-    """Returns the layout of an actor's row.
+    """Returns the layout of the row of an actor, an operator or environment.
 
-    A user's function, at the address `call`, reads t_s, coordinates, at and speed, and writes
-    effort.
+    A user's function, at the address `call`, reads the fields t_s, coordinates, at and speed,
+    and writes effort.
 
     Args:
-        width: largest length of the actors' vectors.
+        width: Largest length of the actors' vectors.
     """
     integers = ("kind", "sampled", "table_first", "table_count", "call", "coordinates")
     scalars = (*_SCALARS, "t_s")
@@ -154,12 +155,12 @@ _LIVE_TIP, _LIVE_FORCE, _LIVE_JOINT = map(int, LIVE_KINDS)
 def torque_source_rows(
     actors: tuple[TorqueSource, ...], joints: int = 2, axes: int = 2
 ) -> tuple[TorqueSourceRows, TorqueTable]:
-    """Returns a row per actor, and one table with the tables of all actors.
+    """Returns a row per actor, and one table that joins the tables of all actors.
 
     Args:
-        actors: operators and environments.
-        joints: the number of joints of the arm.
-        axes: the number of axes of its space.
+        actors: Operators and environments.
+        joints: Number of joints of the arm.
+        axes: Number of axes of its space.
     """
     width = 1 + joints
     rows = np.zeros(len(actors), torque_source_dtype(max(joints, axes)))
@@ -201,6 +202,11 @@ def minimum_jerk(t_s: float, start_s: float, end_s: float) -> Pair:
         10 x^3 - 15 x^4 + 6 x^5,    x = (t - start) / (end - start)
 
     After Flash and Hogan, "The coordination of arm movements", J. Neuroscience 5 (1985).
+
+    Args:
+        t_s: Time, s.
+        start_s: Start of the motion, s.
+        end_s: End of the motion, s.
     """
     if t_s <= start_s:
         return 0.0, 0.0
@@ -240,7 +246,12 @@ def _spring_along(
 
 @leaf
 def _target_progress(actor: Row, t_s: float) -> Pair:
-    """Returns the progress of a target from `a` to `b`, and its rate, 1/s."""
+    """Returns the progress of a target from `a` to `b`, and its rate, 1/s.
+
+    Args:
+        actor: Row of the actor.
+        t_s: Time since the epoch, s.
+    """
     if actor.kind >= _LIVE_TIP:
         # `a` is the present target, and `b` the target one second later.
         return 0.0, 1.0
@@ -249,11 +260,11 @@ def _target_progress(actor: Row, t_s: float) -> Pair:
 
 @leaf
 def _live_share(actor: Row, square: float) -> float:
-    """Returns the share of a live hand's force that acts: its grip, reduced to its limit.
+    """Returns the factor of a live hand's force that acts: its grip, reduced to its limit.
 
     Args:
-        actor: the actor's row.
-        square: the square of the norm of the whole force.
+        actor: Row of the actor.
+        square: Square of the norm of the whole force.
     """
     share: float = actor.grip
     if square > actor.limit * actor.limit:
@@ -263,7 +274,14 @@ def _live_share(actor: Row, square: float) -> float:
 
 @leaf
 def _spring_force(actor: Row, t_s: float, at: Vector, speed: Vector) -> Pair:
-    """Returns the force of a hand along two coordinates, N or N m."""
+    """Returns the force of an operator's spring and damper along two coordinates, N or N m.
+
+    Args:
+        actor: Row of the actor.
+        t_s: Time since the epoch, s.
+        at: Position of the arm along the coordinates, rad or m.
+        speed: Derivative of the position.
+    """
     progress, rate = _target_progress(actor, t_s)
     x = _spring_along(actor=actor, i=0, progress=progress, rate=rate, at=at[0], speed=speed[0])
     y = _spring_along(actor=actor, i=1, progress=progress, rate=rate, at=at[1], speed=speed[1])
@@ -280,7 +298,13 @@ def _spring_force(actor: Row, t_s: float, at: Vector, speed: Vector) -> Pair:
 def _find_table_rows(actor: Row, t_s: float, table: TorqueTable) -> tuple[int, int, float]:
     """Returns the two rows of a table around a time, and the fraction between them.
 
-    The rows are -1 outside of the table.
+    Args:
+        actor: Row of the actor.
+        t_s: Time since the epoch, s.
+        table: Tables of all actors.
+
+    Returns:
+        The indices of the rows, which are -1 outside of the table, and the fraction, 0 to 1.
     """
     first = actor.table_first
     count = actor.table_count
@@ -298,7 +322,7 @@ def _find_table_rows(actor: Row, t_s: float, table: TorqueTable) -> tuple[int, i
 
 @leaf
 def _recorded_torque(actor: Row, t_s: float, table: TorqueTable) -> Pair:
-    """Returns the torque of a table by linear interpolation, and 0 outside of the table."""
+    """Returns the torque of a table by linear interpolation; zero outside of the table."""
     low, high, x = _find_table_rows(actor, t_s, table)
     if low < 0:
         return 0.0, 0.0
@@ -318,9 +342,16 @@ def _sine_of_turns(turns: float) -> float:
 
 @leaf
 def _chirp_size(actor: Row, t_s: float) -> float:
-    """Returns the sine of a chirp, where x is the time within the present sweep.
+    """Returns the sine of a chirp, a sine whose frequency changes linearly within a sweep.
 
-    sin(2 pi x (f0 + (f1 - f0) x / (2 span)))
+    With the frequencies f0 and f1 at the start and the end of a sweep, and the time x within
+    the present sweep, this is
+
+        sin(2 pi x (f0 + (f1 - f0) x / (2 span)))
+
+    Args:
+        actor: Row of the actor.
+        t_s: Time since the epoch, s.
     """
     first_hz = actor.b[0]
     last_hz = actor.b[1]
@@ -334,7 +365,13 @@ def _chirp_size(actor: Row, t_s: float) -> float:
 
 @leaf
 def _multisine_size(actor: Row, t_s: float, table: TorqueTable) -> float:
-    """Returns the sum of the sines of a multisine, each with amplitude 1."""
+    """Returns the sum of the sines of a multisine, each with amplitude 1.
+
+    Args:
+        actor: Row of the actor.
+        t_s: Time since the epoch, s.
+        table: Tables of all actors, here rows of frequency, Hz, and phase, turns.
+    """
     total = 0.0
     first = actor.table_first
     elapsed_s = t_s - actor.start_s
@@ -367,6 +404,11 @@ def _wall_force(actor: Row, at: Pair, speed: Pair) -> Pair:
     """Returns the force of a wall on the end effector, N.
 
     The force acts along the wall's normal and never pulls.
+
+    Args:
+        actor: Row of the wall.
+        at: Position of the end effector, m.
+        speed: Its velocity, m/s.
     """
     normal_x = actor.b[0]
     normal_y = actor.b[1]
@@ -382,14 +424,20 @@ def _wall_force(actor: Row, at: Pair, speed: Pair) -> Pair:
 
 @leaf
 def _is_at_end_effector(actor: Row) -> bool:
-    """True if an actor acts on the end effector, False if it acts on the joints."""
+    """Returns True if an actor acts on the end effector, False if it acts on the joints."""
     kind: int = actor.kind
     return kind in (_TASK_HAND, _WALL, _OWN_TIP, _LIVE_TIP, _LIVE_FORCE)
 
 
 @leaf
 def _call_user_function(actor: Row, t_s: float, table: TorqueTable) -> None:
-    """Calls a user's function, which reads `at` and `speed` and writes `effort`."""
+    """Calls a user's function, which reads `at` and `speed` of the row and writes `effort`.
+
+    Args:
+        actor: Row of the actor.
+        t_s: Time since the epoch, s.
+        table: Tables of all actors, which contain the numbers of the user's model.
+    """
     actor.t_s = t_s
     for i in range(actor.coordinates):
         actor.effort[i] = 0.0
@@ -413,7 +461,16 @@ def _user_effort(actor: Row, t_s: float, at: Vector, speed: Vector, table: Torqu
 def _end_effector_torque(
     actor: Row, t_s: float, q: Vector, qd: Vector, lengths: Vector, table: TorqueTable
 ) -> SourceTorque:
-    """Returns the joint torque J' F of an actor at the end effector, and |F| of a wall, N."""
+    """Returns the joint torque J' F of an actor at the end effector, and |F| of a wall, N.
+
+    Args:
+        actor: Row of the actor.
+        t_s: Time since the epoch, s.
+        q: Joint angles, rad.
+        qd: Joint velocities, rad/s.
+        lengths: Lengths of the two links, m.
+        table: Tables of all actors.
+    """
     _, at = forward_kinematics(lengths, q)
     J_x, J_y = end_effector_jacobian(lengths, q)
     speed_x = J_x[0] * qd[0] + J_x[1] * qd[1]
@@ -436,7 +493,16 @@ def _end_effector_torque(
 def source_torque(
     t_s: float, q: Vector, qd: Vector, lengths: Vector, actor: Row, table: TorqueTable
 ) -> SourceTorque:
-    """Returns the torque of one actor ON the planar arm, N m, and its wall force, N."""
+    """Returns the torque of one actor ON the planar arm, N m, and its wall force, N.
+
+    Args:
+        t_s: Time since the epoch, s.
+        q: Joint angles, rad.
+        qd: Joint velocities, rad/s.
+        lengths: Lengths of the two links, m.
+        actor: Row of the actor.
+        table: Tables of all actors.
+    """
     if not actor.start_s <= t_s < actor.end_s:
         return 0.0, 0.0, 0.0
     if actor.kind == _HAND or actor.kind == _LIVE_JOINT:
@@ -497,7 +563,15 @@ def torque_on_arm(
 def _force_in_space(
     actor: Row, t_s: float, at: Three, speed: Three, table: TorqueTable
 ) -> Three:
-    """Returns the force of an actor on an end effector in three dimensions, N."""
+    """Returns the force of an actor on an end effector in three dimensions, N.
+
+    Args:
+        actor: Row of the actor.
+        t_s: Time since the epoch, s.
+        at: Position of the end effector, m.
+        speed: Its velocity, m/s.
+        table: Tables of all actors.
+    """
     if actor.kind == _OWN_TIP:
         for i in range(3):
             actor.at[i] = at[i]
@@ -522,6 +596,8 @@ def _force_in_space(
         square = x * x + y * y + z * z
         share = _live_share(actor, square)
         return share * x, share * y, share * z
+
+    # A wall.
     normal = three(actor.b)
     point = three(actor.a)
     depth = dot(point, normal) - dot(at, normal)
@@ -542,7 +618,17 @@ def _add_joint_torque(
     table: TorqueTable,
     torque: Array,
 ) -> None:
-    """Adds the torque of an actor that acts on the joints of a chain."""
+    """Adds the torque of an actor that acts on the joints of a chain.
+
+    Args:
+        actor: Row of the actor.
+        t_s: Time since the epoch, s.
+        q: Joint positions, shape (n,).
+        qd: Joint velocities, shape (n,).
+        joints: Number n of joints.
+        table: Tables of all actors.
+        torque: Changed, shape (n,), N m.
+    """
     if actor.kind == _HAND or actor.kind == _LIVE_JOINT:
         progress, rate = _target_progress(actor, t_s)
         share = 1.0
@@ -587,6 +673,11 @@ def _tip_motion(qd: Vector, tip: Vector, chain: RowArray) -> tuple[Three, Three]
     """Returns position and velocity of a chain's end effector, m and m/s.
 
     Its Jacobian remains in the chain's rows.
+
+    Args:
+        qd: Joint velocities, shape (n,).
+        tip: End effector in the last link's frame, m.
+        chain: Rows of the joints, after `place_joints`.
     """
     position = place_end_effector(chain, tip)
     velocity = (0.0, 0.0, 0.0)

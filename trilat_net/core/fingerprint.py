@@ -1,4 +1,6 @@
-"""A fingerprint of the platform's arithmetic, computed from its results.
+"""Computes a fingerprint of the platform's arithmetic from its results.
+
+Simulations are reproducible to the last bit only on platforms whose arithmetic is equal.
 
 Invariant (L5):
     - Two platforms with the same fingerprint gave the same bits for many sines and cosines, and
@@ -76,7 +78,10 @@ def _build_setup(name: str, peer: str, q0: tuple[float, float]) -> SiteSetup:
 
 @cache
 def compute_fingerprint() -> str:
-    """Returns sixteen hexadecimal digits that identify this platform's arithmetic."""
+    """Returns sixteen hexadecimal digits that identify this platform's arithmetic.
+
+    They are a hash of many sines and cosines and of a short run of two sites.
+    """
     angles = np.linspace(-12.0, 12.0, 4001)
     results = np.empty((2, len(angles)))
     _compute_sines(angles, results)

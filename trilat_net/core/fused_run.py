@@ -1,4 +1,7 @@
-"""A run of all sites in virtual time, compiled as a whole and reduced to peaks and sums.
+"""Runs all sites in virtual time in one compiled call, and reduces the run to peaks and sums.
+
+A site is an arm with its control loop. Such a run writes no log. It keeps only the largest
+errors and speeds and a few sums.
 
 Invariant:
 
@@ -32,13 +35,13 @@ PROGRESS_DTYPE = row_dtype("progress", {})
 
 
 class RecentRecords(NamedTuple):
-    """The last records of a site, kept while a peer may still need them, as a ring.
+    """Last records of a site, kept as a ring while a peer may still need them.
 
     The records of all sites have one more axis in front.
 
     Attributes:
-        t_ns: their nominal times, ns since the epoch, shape (a power of two,).
-        rows: their floats, see `Layout.columns`, one row per record.
+        t_ns: Nominal times of the records, ns since the epoch, shape (a power of two,).
+        rows: Floats of the records, see `Layout.columns`, one row per record.
     """
 
     t_ns: IntArray
@@ -55,10 +58,10 @@ _DIVERGED = int(Mode.DIVERGED)
 
 
 def max_over_joints(buckets: Array) -> Array:
-    """Returns the largest |e| and the largest |qd| over the joints, per bucket.
+    """Returns the largest |e| and the largest |qd| over the joints, per bucket of time.
 
     Args:
-        buckets: the peaks of a site, see `run_until`, shape (K, 3 n).
+        buckets: Peaks of a site, see `run_until`, shape (K, 3 n).
 
     Returns:
         Shape (K, 2), rad and rad/s.
@@ -98,9 +101,17 @@ class ReplayedInputs(NamedTuple):
 def _accept_record(
     k: int, rate_hz: int, peer: SiteRow, sample: int, sent: RecentRecords, link: LinkArrays
 ) -> None:
-    """Accepts the record of a peer's tick `sample` as an arrival at tick k.
+    """Accepts the record of a peer's tick as an arrival at tick k.
 
-    The columns are those of `TickRecord.shared`.
+    The columns of the record are those of `TickRecord.shared`.
+
+    Args:
+        k: Tick of the receiver.
+        rate_hz: Tick rate of the receiver, Hz.
+        peer: Row of the peer.
+        sample: Tick of the peer.
+        sent: Last records of the peer.
+        link: Arrays of the link from the peer.
     """
     n = peer.joints
     m = peer.shared
@@ -163,7 +174,14 @@ def _accept_prompt_records(
 def _apply_recorded_hand(
     i: int, k: int, actors: TorqueSourceRows, feed: ReplayedInputs
 ) -> None:
-    """Writes the recorded action of the live hand of site i at tick k into its row."""
+    """Writes the recorded action of the live hand of a site into its row.
+
+    Args:
+        i: Index of the site.
+        k: The tick.
+        actors: Operators and environments of the site.
+        feed: Inputs of the recorded run.
+    """
     if feed.hand_indices[i] < 0 or k >= feed.hands.shape[1]:
         return
     hand: Row = actors[feed.hand_indices[i]]
@@ -246,7 +264,18 @@ def _put_source_torque(
     sampled: int,
     torque: Array,
 ) -> None:
-    """Writes the torque of the actors with this `sampled` at the state of a record, N m."""
+    """Writes the torque of some actors at the state of a record, N m.
+
+    Args:
+        t_s: Time since the epoch, s.
+        s: Row of the site.
+        chain: Rows of the chain, or None for the planar arm.
+        row: Floats of the record.
+        actors: Operators and environments.
+        table: Their tables.
+        sampled: 1: the actors that are held over a tick; 0: the others.
+        torque: Written, shape (n,).
+    """
     if chain is None:
         two_link_stages.put_source_torque(
             t_s=t_s, s=s, state=row, actors=actors, table=table, sampled=sampled, torque=torque
@@ -277,8 +306,19 @@ def _update_sums(
 ) -> None:
     """Adds a record to the effort, and the period before it to the work of the environments.
 
-    The work over a period is the mean of the present torque at both ends (trapezoid rule), plus
-    the torque held over the period, times the change of q.
+    The effort is the squared torque beyond gravity. The work over a period is the mean of the
+    present torque at both ends (trapezoid rule), plus the torque held over the period, times
+    the change of q.
+
+    Args:
+        k: The tick.
+        t_ns: Nominal time of the tick, ns since the epoch.
+        s: Row of the site.
+        chain: Rows of the chain, or None for the planar arm.
+        actors: Operators and environments, the operators first.
+        table: Their tables.
+        row: Floats of the record.
+        sums: Sums of the site.
     """
     n = s.joints
     t_s = t_ns * 1e-9
@@ -291,7 +331,8 @@ def _update_sums(
         effort += beyond_gravity * beyond_gravity
     sums.effort += effort
     if first < 0:
-        return
+        return  # the site has no environment
+
     for i in range(n):
         sums.held[i] = s.held[i]
         sums.now[i] = s.on_arm[i] - s.held[i]
@@ -351,7 +392,15 @@ def _compute_torque(
     chain: RowArray | None,
     laws: LawArrays | None,
 ) -> None:
-    """Runs stage 6 of site i; the driver has already called a law in plain Python."""
+    """Runs stage 6, the torque, of a site.
+
+    Args:
+        i: Index of the site.
+        progress: Progress of the site.
+        arrays: Arrays of all sites.
+        chain: Rows of the site's chain, or None for the planar arm.
+        laws: The users' compiled laws. A law in plain Python was called by the driver before.
+    """
     if laws is None:
         torque_stage(arrays.site[i], chain)
         return
@@ -374,7 +423,14 @@ def _compute_torque(
 
 @leaf
 def _record_sent(s: SiteRow, i: int, row: Array, laws: LawArrays | None) -> None:
-    """Writes the numbers that the law of site i sends into its record."""
+    """Writes the numbers that the law of a site sends into its record.
+
+    Args:
+        s: Row of the site.
+        i: Index of the site.
+        row: Floats of the record; changed.
+        laws: The users' compiled laws, or None.
+    """
     if laws is not None:
         first = _first_sent(s)
         for c in range(s.sent):

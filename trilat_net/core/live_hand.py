@@ -1,4 +1,8 @@
-"""A live hand: the action of a person at an arm in each tick, by the messages received.
+"""Computes the action of an operator on an arm in each tick, from the operator's messages.
+
+A live hand is a person or program that moves an arm while the session runs. It sends messages
+with goals. The arm is pulled by a spring towards a target, which follows the goals, with a
+force that is multiplied by the grip, a number from 0 to 1.
 
 A new hold starts with no force at the arm's pose, and the grip grows from 0 to 1 within
 `GRIP_NS`. If an earlier grip is still fading, the hold starts from that grip, its target and
@@ -52,14 +56,14 @@ SILENT = "is silent: let go"
 
 
 class HandReach(NamedTuple):
-    """The goals that an arm can reach, or a bound of them: a shell and a box.
+    """Region of the goals that an arm can reach, or a bound of it: a shell and a box.
 
     Attributes:
-        centre: centre of the shell, m; () without a shell.
-        inner_m: inner radius of the shell, m.
-        outer_m: outer radius of the shell, m.
-        low: least coordinates of the box, rad or m; () without a box.
-        high: largest coordinates of the box, rad or m.
+        centre: Centre of the shell, m; () without a shell.
+        inner_m: Inner radius of the shell, m.
+        outer_m: Outer radius of the shell, m.
+        low: Least coordinates of the box, rad or m; () without a box.
+        high: Largest coordinates of the box, rad or m.
     """
 
     centre: Vector = ()
@@ -69,7 +73,13 @@ class HandReach(NamedTuple):
     high: Vector = ()
 
     def find_nearest(self, goal: Sequence[float]) -> tuple[float, ...]:
-        """Returns the nearest reachable goal; a reachable goal is returned unchanged."""
+        """Returns the nearest reachable goal; a reachable goal is returned unchanged.
+
+        The goal is moved into the box first, then into the shell.
+
+        Args:
+            goal: The goal, rad or m.
+        """
         nearest = tuple(goal)
         if self.low:
             nearest = tuple(
@@ -134,19 +144,19 @@ class HandCommand(NamedTuple):
 
 
 class HandMemory(NamedTuple):
-    """The state of a live hand from tick to tick.
+    """State of a live hand from tick to tick.
 
     Attributes:
-        source: the holder of the arm; 0: nobody, though a grip may still fade.
-        number: number of the newest accepted message; -1 without a message.
-        grip: firmness of the grip, 0 to 1.
-        target: position of the target, m or rad, or the force, N.
-        rate: velocity of the target.
-        goal: the goal of the target.
-        arrives_ns: time at which the target arrives at the goal, ns since the epoch.
-        sent_ns: time of sending of the goal's message, ns.
-        received_ns: time of the tick that accepted the newest message, ns since the epoch.
-        before: the last holder that released the arm, and the number of its last message.
+        source: Sender that holds the arm; 0: nobody, though a grip may still fade.
+        number: Number of the newest accepted message; -1 without a message.
+        grip: Firmness of the grip, 0 to 1.
+        target: Position of the target, m or rad, or the force, N.
+        rate: Velocity of the target.
+        goal: Goal of the target.
+        arrives_ns: Time at which the target arrives at the goal, ns since the epoch.
+        sent_ns: Time of sending of the goal's message, ns.
+        received_ns: Time of the tick that accepted the newest message, ns since the epoch.
+        before: The last sender that released the arm, and the number of its last message.
     """
 
     source: int = 0
@@ -180,7 +190,11 @@ class HandInForce(NamedTuple):
 
     @classmethod
     def read(cls, vector: Sequence[float]) -> "HandInForce":
-        """Returns the action that the field `hand` of a record describes."""
+        """Returns the action that the field `hand` of a record describes.
+
+        Args:
+            vector: Numbers of the field.
+        """
         size = (len(vector) - 3) // 2
         grip, number, source, *numbers = vector
         return cls(
@@ -225,14 +239,17 @@ def advance_hand(
     commands: Sequence[HandCommand],
     locate: Callable[[], Sequence[float]],
 ) -> HandStep:
-    """Returns the action of a hand in a tick.
+    """Returns the action of a live hand in a tick, and the state for the next tick.
+
+    The steps are: move the target by one period; accept the messages; release a silent hand;
+    choose the velocity of the target.
 
     Args:
-        rules: the limits of the hand.
-        memory: its state after the previous tick.
-        t_ns: the nominal time of the tick, ns since the epoch.
-        commands: the messages received since the previous tick, in order.
-        locate: returns the arm's pose now, in the coordinates of the target.
+        rules: Limits of the hand.
+        memory: State after the previous tick.
+        t_ns: Nominal time of the tick, ns since the epoch, the common start of the session.
+        commands: Messages received since the previous tick, in order.
+        locate: Function that returns the arm's pose now, in the coordinates of the target.
     """
     refused: list[str] = []
     changes: list[tuple[int, str]] = []
@@ -245,10 +262,12 @@ def advance_hand(
             changes.append((command.source, outcome))
         elif outcome:
             refused.append(outcome)
+
     if now.source and t_ns - now.received_ns > SILENCE_NS:
         changes.append((now.source, SILENT))
         # One less: the silent holder may repeat its number and so take hold again.
         now = _release(now, now.number - 1)
+
     if not now.target:
         return HandStep(now, empty_hand_vector(rules.size), tuple(refused), tuple(changes))
     rate = _find_rate(rules, now, t_ns) if now.source else _find_fading_rate(rules, now)
@@ -258,7 +277,12 @@ def advance_hand(
 
 
 def _move_target(rules: HandRules, memory: HandMemory) -> HandMemory:
-    """Returns the state one period later: target moved, grip firmer or weaker."""
+    """Returns the state one period later: target moved, grip firmer or weaker.
+
+    Args:
+        rules: Limits of the hand.
+        memory: State after the previous tick.
+    """
     h_s = 1.0 / rules.rate_hz
     grip_step = 1e9 / (GRIP_NS * rules.rate_hz)
     # A list instead of a generator: it is faster, and this runs in each tick.
@@ -395,8 +419,8 @@ def _glide_tick(
         change = desired_rate - rate[i]
         square += change * change
     change_norm = math.sqrt(square)
-    most = acceleration * h_s
-    factor = most / change_norm if change_norm > most else 1.0
+    largest_change = acceleration * h_s
+    factor = largest_change / change_norm if change_norm > largest_change else 1.0
     for i in range(size):
         desired_rate = speed_per_distance * (goal[i] - target[i])
         rate[i] += factor * (desired_rate - rate[i])
@@ -409,18 +433,30 @@ def _accept_command(
     command: HandCommand,
     locate: Callable[[], Sequence[float]],
 ) -> tuple[HandMemory, str]:
-    """Returns the state after a message, and the outcome.
+    """Returns the state after a message, and the outcome of the message.
 
-    The outcome is a reason why the message has no effect, a change of the holder, or "".
+    Args:
+        rules: Limits of the hand.
+        memory: State before the message.
+        t_ns: Nominal time of the tick, ns since the epoch.
+        command: The message.
+        locate: Function that returns the arm's pose now.
+
+    Returns:
+        The state, and the outcome: a reason why the message has no effect, a change of the
+        holder, or "" for an ordinary message.
     """
     if memory.source not in (0, command.source):
         return memory, ANOTHER_HOLDS
+
+    # Messages may arrive out of order or twice.
     last = memory.number if memory.source else memory.before[1]
     is_known = memory.source or memory.before[0] == command.source
     if is_known:
         is_repeated = command.number == last and not memory.source
         if command.number < last or is_repeated:
             return memory, OUT_OF_ORDER
+
     if not command.grip:
         if not memory.source:
             return memory, ""
@@ -430,6 +466,7 @@ def _accept_command(
     memory = memory._replace(received_ns=t_ns)
     if command.number == memory.number:
         return memory, ""
+
     period_ns = 1_000_000_000 // rules.rate_hz
     between_messages_ns = command.sent_ns - memory.sent_ns
     # A quarter more, so that the target does not stop when the next message is a little late.
@@ -445,7 +482,15 @@ def _take_hold(
     command: HandCommand,
     locate: Callable[[], Sequence[float]],
 ) -> HandMemory:
-    """Returns the state after a message with which a source takes hold of a free arm."""
+    """Returns the state after a message by which a sender takes hold of a free arm.
+
+    Args:
+        rules: Limits of the hand.
+        memory: State before the message. An earlier grip may still fade.
+        t_ns: Nominal time of the tick, ns since the epoch.
+        command: The message.
+        locate: Function that returns the arm's pose now.
+    """
     zeros = (0.0,) * rules.size
     target = memory.target
     if not target:
@@ -465,7 +510,14 @@ def _take_hold(
 def _aim(
     rules: HandRules, memory: HandMemory, command: HandCommand, arrives_ns: int
 ) -> HandMemory:
-    """Returns the state with the goal of a message, moved within reach."""
+    """Returns the state with the goal of a message, moved within reach.
+
+    Args:
+        rules: Limits of the hand.
+        memory: State before the message.
+        command: The message.
+        arrives_ns: Time at which the target arrives at the goal, ns since the epoch.
+    """
     goal = rules.reach.find_nearest(command.target)
     return memory._replace(
         number=command.number, goal=goal, arrives_ns=arrives_ns, sent_ns=command.sent_ns
@@ -473,7 +525,12 @@ def _aim(
 
 
 def _release(memory: HandMemory, number: int) -> HandMemory:
-    """Returns the state of a fading grip; the source's messages up to `number` are outdated."""
+    """Returns the state of a fading grip.
+
+    Args:
+        memory: State before the release.
+        number: Messages of the sender up to this number are outdated.
+    """
     before = (memory.source, number)
     return HandMemory(grip=memory.grip, target=memory.target, rate=memory.rate, before=before)
 
@@ -515,13 +572,19 @@ def _find_limited_rate(
     for change in changes:
         square += change * change
     change_norm = math.sqrt(square)
-    most = rules.acceleration_limit * h_s
-    factor = most / change_norm if change_norm > most else 1.0
+    largest_change = rules.acceleration_limit * h_s
+    factor = largest_change / change_norm if change_norm > largest_change else 1.0
     return tuple(v + factor * change for v, change in zip(memory.rate, changes, strict=True))
 
 
 def _find_rate(rules: HandRules, memory: HandMemory, t_ns: int) -> tuple[float, ...]:
-    """Returns the velocity of a target towards its goal, within its limits."""
+    """Returns the velocity of a target towards its goal, within the limits of the hand.
+
+    Args:
+        rules: Limits of the hand.
+        memory: State, with the target already moved.
+        t_ns: Nominal time of the tick, ns since the epoch.
+    """
     left_s = max((memory.arrives_ns - t_ns) * 1e-9, 1.0 / rules.rate_hz)
     if rules.acceleration_limit < math.inf:
         return _find_limited_rate(rules, memory, left_s)

@@ -1,4 +1,8 @@
-"""Lost peers: a site goes on without a lost master, whose share goes to the other peers.
+"""Lets a site go on without a lost peer, whose dominance factor goes to the other peers.
+
+A peer is another site whose states this site receives. It is lost if none of its samples came
+into use for some time. The dominance factor, or share, is the weight with which a site follows
+a peer.
 
 Invariant:
 
@@ -29,12 +33,18 @@ _RESTORED = int(LifeReason.RESTORED)
 
 @leaf
 def _can_drop(lost: int, t_ns: int, site: SiteRow, links: RowArray) -> bool:
-    """True if the site may go on without a peer.
+    """Returns True if the site may go on without a peer.
 
     The remaining sites must reach each other, and this site must still follow at least one
     peer. Sets of sites are numbers with one bit per site. `forward` are the sites that this
     site reaches, and `backward` the sites that reach this site; both must be all remaining
     sites.
+
+    Args:
+        lost: Index of the peer.
+        t_ns: Time, ns since the epoch.
+        site: Row of the site.
+        links: Rows of the site's links.
     """
     remaining = site.bit
     followed = 0
@@ -60,10 +70,15 @@ def _can_drop(lost: int, t_ns: int, site: SiteRow, links: RowArray) -> bool:
 
 @leaf
 def _is_orientation_near(back: int, site: SiteRow, links: RowArray) -> bool:
-    """True if the share of peer `back` turns the reference by at most the alignment limit.
+    """Returns True if a returning peer turns the reference by at most the alignment limit.
 
     The turn between two orientations is at most as long as the difference of their rotation
     vectors from the site's own orientation.
+
+    Args:
+        back: Index of the returning peer.
+        site: Row of the site.
+        links: Rows of the site's links.
     """
     orientation = rotation_matrix(three(site.x[3:]))
     total = 0.0
@@ -86,7 +101,13 @@ def _is_orientation_near(back: int, site: SiteRow, links: RowArray) -> bool:
 
 @leaf
 def _is_near(back: int, site: SiteRow, links: RowArray) -> bool:
-    """True if the share of peer `back` moves the reference by at most the alignment limit."""
+    """Returns True if a returning peer moves the reference by at most the alignment limit.
+
+    Args:
+        back: Index of the returning peer.
+        site: Row of the site.
+        links: Rows of the site's links.
+    """
     if has_orientation(site) and not _is_orientation_near(back, site, links):
         return False
     for i in range(count_linear_coordinates(site)):
@@ -125,10 +146,12 @@ def _redistribute_shares(links: RowArray) -> bool:
             total_rate += link.alpha_rate
         else:
             any_lost = True
+
     if not any_lost:
         return True
     if total <= 0.0:
         return False
+
     for j in range(links.shape[0]):
         link = links[j]
         if link.gone == 0.0:
@@ -143,9 +166,14 @@ def _redistribute_shares(links: RowArray) -> bool:
 
 @leaf
 def regroup(t_ns: int, site: SiteRow, links: RowArray) -> None:
-    """Drops lost peers, takes returned peers back, and redistributes the shares.
+    """Drops lost peers, restores peers that returned, and redistributes the dominance factors.
 
-    Before the call `alpha` of a link is the planned share, afterwards the share in force.
+    Before the call `alpha` of a link is the planned factor, afterwards the factor in force.
+
+    Args:
+        t_ns: Time, ns since the epoch, the common start of the session.
+        site: Row of the site.
+        links: Rows of the site's links.
     """
     site.regrouped = 0
     for j in range(links.shape[0]):

@@ -1,4 +1,6 @@
-"""Counter-based random numbers: pure functions of their arguments, without state or order.
+"""Draws random numbers as pure functions of their arguments, without state or order.
+
+A counter-based generator encrypts a counter instead of updating a state.
 
 Invariant (L4):
     - A draw is a function of (seed, link, sample index, purpose) alone, and is therefore the
@@ -121,11 +123,17 @@ def standard_normal(key: DrawKey, sample: int, purpose: int, attempt: int) -> fl
 
 @leaf
 def standard_gamma(key: DrawKey, sample: int, purpose: int, shape: float) -> float:
-    """Returns a gamma number of this shape and of scale 1.
+    """Returns a gamma-distributed number of scale 1.
 
     The method is rejection after Marsaglia and Tsang, "A Simple Method for Generating Gamma
     Variables", ACM TOMS 26 (2000). For shapes below 1 a number of shape + 1 is multiplied by
     u^(1 / shape). The draws use `purpose`, `purpose + 1` and `purpose + 2`.
+
+    Args:
+        key: Key of the link.
+        sample: Index of the sample.
+        purpose: Purpose of the draw.
+        shape: Shape of the distribution.
     """
     boost = 1.0
     k = shape

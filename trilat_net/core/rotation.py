@@ -1,4 +1,4 @@
-"""Rotations as vectors (axis times angle, rad), with the same bits on any machine.
+"""Computes with rotations as vectors (axis times angle, rad), with equal bits on any machine.
 
 The angular velocity of a changing rotation vector u is J(u) u', where J is the left Jacobian of
 the rotation group (J. Sola, J. Deray and D. Atchuthan, "A micro Lie theory for state estimation
@@ -148,7 +148,12 @@ def _times_rows(row: Three, a: Three, b: Three, c: Three) -> Three:
 
 @leaf
 def compose_rotations(turn: Three, vector: Three) -> Three:
-    """Returns the rotation `vector` followed by the rotation `turn` in base axes, rad."""
+    """Returns the rotation `vector` followed by the rotation `turn` in base axes, rad.
+
+    Args:
+        turn: Rotation vector of the second rotation.
+        vector: Rotation vector of the first rotation.
+    """
     turn_matrix = rotation_matrix(turn)
     inverse = rotation_matrix(scale(-1.0, vector))
     return relative_rotation(turn_matrix, inverse)
@@ -169,7 +174,12 @@ def length(vector: Three) -> float:
 
 @leaf
 def angular_velocity(turn: Three, rate: Three) -> Three:
-    """Returns the angular velocity of a rotation vector with this derivative, rad/s."""
+    """Returns the angular velocity of a changing rotation vector, rad/s.
+
+    Args:
+        turn: The rotation vector, rad.
+        rate: Its derivative, rad/s.
+    """
     angle = length(turn)
     a2 = angle * angle
     if angle < _SHORT:
@@ -188,9 +198,13 @@ def angular_velocity(turn: Three, rate: Three) -> Three:
 
 @leaf
 def rotation_vector_rate(turn: Three, velocity: Three) -> Three:
-    """Returns the derivative of a rotation vector at this angular velocity, rad/s.
+    """Returns the derivative of a rotation vector at an angular velocity, rad/s.
 
     The function is the inverse of `angular_velocity`.
+
+    Args:
+        turn: The rotation vector, rad.
+        velocity: The angular velocity, rad/s.
     """
     angle = length(turn)
     a2 = angle * angle

@@ -1,4 +1,4 @@
-"""The fields of the core's rows: shape, unit, meaning, and the stage that writes each field.
+"""Lists the fields of the core's rows: shape, unit, meaning, and the stage that writes each.
 
 A row is one record of a NumPy structured array. Each class below is a row at once as a reader
 and mypy see it (its attributes and their types) and as NumPy lays it out: `row_dtype` reads the
@@ -21,17 +21,17 @@ from .vectors import Array
 
 
 class Field(NamedTuple):
-    """One field of a row.
+    """Description of a field of a row.
 
     Attributes:
-        shape: the axes, of words such as "joints" or of numbers, joined by " x "; "": a scalar.
-        unit: its unit; the name of an enumeration for its members; "": a number, an index or a
+        shape: Axes, of words such as "joints" or of numbers, joined by " x "; "": a scalar.
+        unit: Unit; the name of an enumeration for its members; "": a number, an index or a
             flag.
-        meaning: the quantity that it holds.
-        stage: the stage that writes it (see README.md), "setup" for constants, "input" for what
-            is written before a tick, "scratch" for intermediate results.
-        chain_only: true: only the row of a chain of joints has the field.
-        kind: NumPy's code of its numbers.
+        meaning: Quantity that the field contains.
+        stage: Stage that writes the field (see README.md), "setup" for constants, "input" for
+            what is written before a tick, "scratch" for intermediate results.
+        chain_only: True: only the row of a chain of joints has the field.
+        kind: NumPy's code of the field's numbers.
     """
 
     shape: str
@@ -364,7 +364,11 @@ _KINDS = {int: "i8", float: "f8", np.uint64: "u8", Array: "f8"}
 
 
 def _read_fields(row: type) -> dict[str, Field]:
-    """Returns the fields of a row's class by name, in their order."""
+    """Returns the fields of a row's class by name, in the order of the class.
+
+    Args:
+        row: The class, for example `SiteRow`.
+    """
     fields = {}
     for name, hint in get_type_hints(row, include_extras=True).items():
         kind, field = get_args(hint)
@@ -387,8 +391,8 @@ def field_shape(field: Field, lengths: Mapping[str, int]) -> tuple[int, ...]:
     """Returns the shape of a field.
 
     Args:
-        field: the field.
-        lengths: the lengths of the axes that are words: joints, shared, parameters.
+        field: The field.
+        lengths: Lengths of the axes that are words: joints, shared, parameters.
     """
     axes = field.shape.split(" x ") if field.shape else []
     return tuple(int(axis) if axis.isdigit() else lengths[axis] for axis in axes)
@@ -397,12 +401,12 @@ def field_shape(field: Field, lengths: Mapping[str, int]) -> tuple[int, ...]:
 def row_dtype(
     row: str, lengths: Mapping[str, int], *, chain: bool = False
 ) -> np.dtype[np.void]:
-    """Returns the layout of a row.
+    """Returns the layout of a row, a NumPy structured type.
 
     Args:
-        row: its name in `FIELDS`.
-        lengths: the lengths of the axes that are words: joints, shared, parameters.
-        chain: true: with the fields that only a chain of joints has.
+        row: Name of the row in `FIELDS`.
+        lengths: Lengths of the axes that are words: joints, shared, parameters.
+        chain: True: with the fields that only a chain of joints has.
     """
     columns: list[Any] = [
         (name, field.kind, field_shape(field, lengths))

@@ -1,4 +1,6 @@
-"""Limits of the reference's speed, and the return of the torque from rest to that of the law.
+"""Limits the speed of the reference, and blends the torque from rest to that of the law.
+
+The reference is the position that the control law of a site aims at.
 
 Invariant:
 
@@ -24,6 +26,10 @@ def limit_reference(k: int, site: SiteRow) -> None:
 
     A reference that was held back catches up later. At the first tick the reference starts from
     the pose of the arm.
+
+    Args:
+        k: The tick.
+        site: Row of the site, whose reference is changed.
     """
     if k == site.first:
         for i in range(site.shared):
@@ -37,10 +43,10 @@ def limit_reference(k: int, site: SiteRow) -> None:
             continue
         q_before = site.q_followed[i]
         step = site.q_des[i] - q_before
-        most = limit / site.rate_hz
-        if abs(step) > most:
+        largest_step = limit / site.rate_hz
+        if abs(step) > largest_step:
             sign = 1.0 if step > 0.0 else -1.0
-            site.q_des[i] = q_before + sign * most
+            site.q_des[i] = q_before + sign * largest_step
             site.qd_des[i] = sign * limit
         else:
             rate = site.qd_des[i]
@@ -52,17 +58,17 @@ def _limit_turn(site: SiteRow) -> None:
     """Limits the angular velocity of the reference about each axis, keeping the turn's axis."""
     vector_before = three(site.q_followed[3:])
     before = rotation_matrix(vector_before)
-    wanted = rotation_matrix(three(site.q_des[3:]))
-    turn = relative_rotation(wanted, before)
-    share = 1.0
+    desired = rotation_matrix(three(site.q_des[3:]))
+    turn = relative_rotation(desired, before)
+    factor = 1.0
     for i in range(3):
         size = abs(turn[i])
-        most = site.qd_des_limit[3 + i] / site.rate_hz
-        if size * share > most:
-            share = most / size
-    if share < 1.0:
-        limited_turn = scale(share, turn)
-        velocity = scale(share * site.rate_hz, turn)
+        largest_turn = site.qd_des_limit[3 + i] / site.rate_hz
+        if size * factor > largest_turn:
+            factor = largest_turn / size
+    if factor < 1.0:
+        limited_turn = scale(factor, turn)
+        velocity = scale(factor * site.rate_hz, turn)
         put_three(site.q_des[3:], compose_rotations(limited_turn, vector_before))
         put_three(site.qd_des[3:], velocity)
     for i in range(3, 6):
@@ -73,7 +79,7 @@ def _limit_turn(site: SiteRow) -> None:
 
 @leaf
 def is_torque_finite(site: SiteRow) -> bool:
-    """True if the law's torque is finite for each joint."""
+    """Returns True if the law's torque is finite for each joint."""
     finite = True
     for i in range(site.joints):
         finite = finite and isfinite(site.tau[i])
@@ -82,9 +88,14 @@ def is_torque_finite(site: SiteRow) -> bool:
 
 @leaf
 def return_to_law(t_ns: int, site: SiteRow) -> None:
-    """Blends the torque from the last torque at rest to that of the law, within BLEND_S."""
+    """Blends the torque from the last torque at rest to that of the law, within BLEND_S.
+
+    Args:
+        t_ns: Time, ns since the epoch.
+        site: Row of the site, whose torque is changed.
+    """
     elapsed_s = (t_ns - site.return_from_ns) * 1e-9
-    share = min(elapsed_s / BLEND_S, 1.0)
+    progress = min(elapsed_s / BLEND_S, 1.0)
     for i in range(site.joints):
         at_rest = site.tau_held[i]
-        site.tau[i] = at_rest + share * (site.tau[i] - at_rest)
+        site.tau[i] = at_rest + progress * (site.tau[i] - at_rest)

@@ -1,4 +1,8 @@
-"""The arrays of a running site: how a setup fills them, and how they grow during a run.
+"""Builds the arrays of a running site from its setup, and enlarges them during a run.
+
+A site is a process that runs one arm and its control loop. It receives samples, the states of
+other sites, over links with a delay. A calendar stores the samples of a link until they are
+due.
 
 The state of a site is one row of a structured array (`SiteRow`, in `row_fields`). As an
 argument of compiled code, a row costs a quarter of a microsecond, and its fields have the
@@ -103,15 +107,15 @@ class TickBuffers(NamedTuple):
 
 
 def build_tick_buffers(setup: SiteSetup) -> TickBuffers:
-    """Returns the buffers of a site."""
+    """Returns empty buffers for the input and output of a tick of a site."""
     layout = setup.layout
-    most_received = 0
+    largest_received = 0
     if setup.law_factory is not None:
-        most_received = max(link.channel.received_size for link in setup.links)
+        largest_received = max(link.channel.received_size for link in setup.links)
     return TickBuffers(
         arrivals=np.zeros(MAX_ARRIVALS, arrival_dtype(layout.shared)),
         forces=np.zeros((MAX_ARRIVALS, layout.shared)),
-        sent=np.zeros((MAX_ARRIVALS, most_received)),
+        sent=np.zeros((MAX_ARRIVALS, largest_received)),
         record=np.zeros(layout.floats),
     )
 
@@ -171,16 +175,24 @@ def build_site_arrays(
 
 
 def needed_pages(setup: SiteSetup) -> int:
-    """Returns the number of pages of a calendar for the delays of a setup.
+    """Returns the number of pages of a calendar that the delays of a setup need.
 
     Senders may be up to `_NEAR_NS` ahead of the site.
+
+    Args:
+        setup: Setup of the site.
     """
     longest_us = max(max_delay_us(link.models, link.traces) for link in setup.links)
     return calendar_pages(setup.rate_hz, longest_us, _NEAR_NS)
 
 
 def links_bytes(setup: SiteSetup, pages: int) -> int:
-    """Returns the memory of a site's links whose calendars have `pages` pages, bytes."""
+    """Returns the memory of a site's links, bytes.
+
+    Args:
+        setup: Setup of the site.
+        pages: Number of pages of each calendar.
+    """
     numbers = 0
     if setup.law_factory is not None:
         numbers = sum(vector.length for vector in setup.received_vectors)
@@ -248,11 +260,16 @@ class CalendarSizer:
             self.most_pages *= 2
 
     def clear(self) -> None:
-        """Forgets which stamps fit."""
+        """Forgets which stamps fit, so that the next sample of each peer is checked again."""
         self.newest = [-1] * len(self.newest)
 
     def add_model(self, peer: int, model: LinkModel) -> None:
-        """Makes room for the delays of another model of a link."""
+        """Takes the delays of another model of a link into account.
+
+        Args:
+            peer: Index of the peer.
+            model: The model.
+        """
         longest_us = max_delay_us([model], [None])
         self._delay_us[peer] = max(self._delay_us[peer], longest_us)
         self.newest[peer] = -1
@@ -261,17 +278,21 @@ class CalendarSizer:
         """Returns the arrays with pages for a peer's sample, if its stamp is in range.
 
         Args:
-            arrays: the arrays at tick k.
-            k: the present tick of the site.
-            peer: the peer's index.
-            tick: the sample's stamp.
+            arrays: Arrays of the site at tick k.
+            k: Present tick of the site.
+            peer: Index of the peer.
+            tick: Stamp of the sample, a tick of the peer.
+
+        Returns:
+            The same arrays, or arrays with larger calendars.
         """
         rate_hz = self._rate_hz
         peer_hz = self._peer_hz[peer]
         wait = span_ticks(self._delay_us[peer] * 1000, rate_hz) + _SLACK
         ahead = tick * rate_hz // peer_hz - k
         if ahead > span_ticks(AHEAD_LIMIT_NS, rate_hz):
-            return arrays
+            return arrays  # the sample will be refused
+
         needed = ahead + wait
         pages = arrays.calendars.shape[1]
         if needed > pages < self.most_pages:
@@ -285,7 +306,12 @@ class CalendarSizer:
 
 
 def add_ramp(arrays: SiteArrays, ramp: DominanceRamp) -> None:
-    """Inserts a change of the dominance factors into the planned ones, ordered by start."""
+    """Inserts a change of the dominance factors into the planned ones, ordered by start.
+
+    Args:
+        arrays: Arrays of the site, which have a free row.
+        ramp: The change.
+    """
     site: Row = arrays.site[0]
     count = int(site.ramps)
     ramps = arrays.ramps
@@ -297,7 +323,13 @@ def add_ramp(arrays: SiteArrays, ramp: DominanceRamp) -> None:
 
 
 def add_model(arrays: SiteArrays, peer: int, model: LinkModel) -> None:
-    """Inserts a change of a link into the planned ones, ordered by first stamp."""
+    """Inserts a change of a link into the planned ones, ordered by first stamp.
+
+    Args:
+        arrays: Arrays of the site, which have a free row.
+        peer: Index of the peer.
+        model: The new model of the link.
+    """
     link: Row = arrays.links[peer]
     models = arrays.models[peer]
     count = int(link.models)
@@ -408,7 +440,7 @@ def stack_site_arrays(
 
 
 def _share_tables(sites: Sequence[SiteArrays]) -> None:
-    """Shifts the rows of each site's points and torques to their rows in the joined tables."""
+    """Shifts the indices of each site's points and torques to the rows of joined tables."""
     first_point = 0
     first_torque = 0
     for site in sites:
@@ -420,7 +452,15 @@ def _share_tables(sites: Sequence[SiteArrays]) -> None:
 
 
 def select_site(stacked: SiteArrays, i: int, layout: Layout) -> SiteArrays:
-    """Returns the arrays of site `i` of a stack; its rows may be longer than its layout."""
+    """Returns the arrays of one site of a stack, as views.
+
+    The rows may be longer than the site's layout.
+
+    Args:
+        stacked: Arrays of all sites.
+        i: Index of the site.
+        layout: Layout of the site.
+    """
     channel = stacked.channel
     if channel is not None:
         channel = ChannelArrays(channel.waiting[i], channel.received[i], channel.columns[i])
@@ -445,8 +485,12 @@ def _stack_channels(
 ) -> ChannelArrays:
     """Returns the channels of several sites stacked.
 
-    Their columns become those of the peer's record, which holds what the peer sends to all
-    sites and then what it sends to each of them.
+    Their columns become those of the peer's record, which contains the numbers that the peer
+    sends to all sites and then those for each site.
+
+    Args:
+        setups: Setups of the sites.
+        channels: Channels of the sites; their columns are changed.
     """
     for setup, channel in zip(setups, channels, strict=True):
         for link, columns in zip(setup.links, channel.columns, strict=True):
@@ -477,6 +521,10 @@ def _build_site(setup: SiteSetup, layout: Layout) -> RowArray:
     """Returns the row of a site before its first tick, shape (1,).
 
     The layout may be larger than the site's: the numbers beyond stay zero.
+
+    Args:
+        setup: Setup of the site.
+        layout: Layout of the row.
     """
     site = np.zeros(1, site_dtype(layout))
     s: Row = site[0]
@@ -541,7 +589,12 @@ def _list_vectors(setup: SiteSetup) -> dict[str, Any]:
 
 
 def _build_channel(setup: SiteSetup, pages: int) -> ChannelArrays:
-    """Returns the channels of a site's peers, with zeros for all received numbers."""
+    """Returns the arrays of the numbers that the peers' laws send, before the first sample.
+
+    Args:
+        setup: Setup of the site.
+        pages: Number of pages of each calendar.
+    """
     vectors = setup.received_vectors
     peers = len(setup.links)
     numbers = sum(vector.length for vector in vectors)
@@ -560,6 +613,11 @@ def _build_links(
     """Returns the links' rows, their models, and the points of their traces and outages.
 
     In the table of points all traces come first, then all outages.
+
+    Args:
+        links: Setups of the links.
+        spare: Free rows for later changes of each link's model.
+        shared: Number of coordinates of a sample.
     """
     most_models = max(len(link.models) for link in links)
     rows = np.zeros(len(links), link_dtype(shared))
@@ -572,6 +630,7 @@ def _build_links(
                 trace_points.extend(trace)
         outages.extend(link.outages)
     points = np.array(trace_points + outages, dtype=np.int64).reshape(-1, 2)
+
     trace_first = 0
     outage_first = len(trace_points)
     row: Row

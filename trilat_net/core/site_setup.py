@@ -1,4 +1,7 @@
-"""The setup of a site: the resolved numbers and names from which a site is built.
+"""Defines the setup of a site: the resolved numbers and names from which a site is built.
+
+A site is a process that runs one arm and its control loop. Its setup is derived from a
+scenario, the file that describes an experiment.
 
 Invariant:
     - Besides the setup, only the inputs of the ticks influence a site's numbers.
@@ -54,7 +57,7 @@ LEAST_STOP_S = 0.1
 
 
 class StaleAction(IntEnum):
-    """The action of a site while a peer that it follows is stale.
+    """Action of a site while a peer that it follows is stale, which means silent for too long.
 
     USE continues with the last sample. HOLD keeps the last reference, BRAKE the pose of the
     arm. GLIDE lets the reference come to rest, and starts by waiting for all peers, see
@@ -68,16 +71,16 @@ class StaleAction(IntEnum):
 
 
 class StaleRule(NamedTuple):
-    """The condition under which a peer is stale, and the consequence.
+    """Condition under which a peer is stale, and the action of the site.
 
     Attributes:
-        action: the action of the site while a peer is stale.
-        age_ns: largest age of the sample in use, ns; for GLIDE the largest time since a sample
+        action: Action of the site while a peer is stale.
+        age_ns: Largest age of the sample in use, ns; for GLIDE the largest time since a sample
             of the peer came into use.
-        return_ns: duration of the return to the peers, ns.
-        align_speed: for GLIDE, the largest speed of an alignment, rad/s (of a position m/s).
-        align_limit: for GLIDE, the longest distance of an alignment, rad (of a position m).
-        degrades: for GLIDE, true: the site goes on without a lost peer, see `lost_peers`.
+        return_ns: Duration of the return to the peers, ns.
+        align_speed: For GLIDE, the largest speed of an alignment, rad/s (of a position m/s).
+        align_limit: For GLIDE, the longest distance of an alignment, rad (of a position m).
+        degrades: For GLIDE, true: the site goes on without a lost peer, see `lost_peers`.
     """
 
     action: StaleAction = StaleAction.USE
@@ -133,7 +136,10 @@ class RestGains(NamedTuple):
         """Returns the time in which the reference comes to rest from joint velocities, s.
 
         Args:
-            qd: joint velocities, shape (..., n), rad/s.
+            qd: Joint velocities, shape (..., n), rad/s.
+
+        Returns:
+            A time per row of velocities, shape (...).
         """
         slowest_s = (np.abs(qd) / self.deceleration).max(axis=-1)
         duration_s: Array = np.maximum(LEAST_STOP_S, slowest_s)
@@ -141,26 +147,26 @@ class RestGains(NamedTuple):
 
 
 class LinkSetup(NamedTuple):
-    """The setup of the link from one peer to a site.
+    """Setup of the link, the directed connection, from one peer to a site.
 
     Attributes:
-        peer: the peer's name.
-        alpha: its dominance factor in this site's reference, Eq. (6), dimensionless.
-        rate_hz: the peer's tick rate, Hz.
-        q0: the start pose of the peer, rad, or of its end effector; in use until the first
-            sample is due (L7).
-        key: the key of the link's draws, see `link_key`.
-        models: the models of the link in the order of their first stamps; the first one applies
+        peer: Name of the peer.
+        alpha: Its dominance factor, the weight of the peer in this site's reference, Eq. (6).
+        rate_hz: Tick rate of the peer, Hz.
+        q0: Start pose of the peer, rad, or of its end effector; in use until the first sample
+            is due (L7).
+        key: Key of the link's random numbers, see `link_key`.
+        models: Models of the delay in the order of their first stamps; the first one applies
             from stamp 0.
-        traces: per model the points of its trace, shape (n, 2), see `Points`, or None.
-        outages: the interruptions of the link: pairs of first stamp and end, ns.
-        channel: the numbers that the peer's law sends besides its motion.
-        index_at_peer: the index of the site among the peers of its peer, in scenario order.
-        speed_limit: largest speeds of the peer's joints, rad/s, beyond which its samples are
+        traces: Per model the points of its trace, shape (n, 2), see `Points`, or None.
+        outages: Interruptions of the link: pairs of first stamp and end, ns.
+        channel: Numbers that the peer's law sends besides its motion.
+        index_at_peer: Index of the site among the peers of its peer, in scenario order.
+        speed_limit: Largest speeds of the peer's joints, rad/s, beyond which its samples are
             dropped; (): no limit.
-        bit: the bit of the peer in sets of sites.
-        followed: the set of sites that the peer follows.
-        dispensable: true: a site that degrades may go on without the peer.
+        bit: Bit of the peer in sets of sites, which are integers with a bit per site.
+        followed: Set of the sites that the peer follows.
+        dispensable: True: a site that degrades may go on without the peer.
     """
 
     peer: str
@@ -180,17 +186,17 @@ class LinkSetup(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """The lengths of a site's vectors.
+    """Lengths of a site's vectors.
 
     Attributes:
-        joints: joints of the arm.
-        shared: coordinates that sites exchange.
-        parameters: dynamic parameters of the arm.
-        chain: true: the arm is a chain of joints; false: the planar two-link arm.
-        task: true: the shared coordinates are those of the end effector; false: joint angles.
-        sent: numbers that the law sends in a record, see `LawChannel.record_size`.
-        hand: numbers of a live hand in a record, see `live_hand`; 0: no live hand.
-        bodies: numbers of the poses of the plant's bodies, see `TickRecord.bodies`.
+        joints: Joints of the arm.
+        shared: Coordinates that sites exchange.
+        parameters: Dynamic parameters of the arm.
+        chain: True: the arm is a chain of joints; false: the planar two-link arm.
+        task: True: the shared coordinates are those of the end effector; false: joint angles.
+        sent: Numbers that the law sends in a record, see `LawChannel.record_size`.
+        hand: Numbers of a live hand in a record, see `live_hand`; 0: no live hand.
+        bodies: Numbers of the poses of the plant's bodies, see `TickRecord.bodies`.
     """
 
     joints: int = JOINTS
@@ -209,11 +215,13 @@ class Layout(NamedTuple):
         """Returns the layout of an arm.
 
         Args:
-            chain: the chain of joints; None: the planar two-link arm.
-            sent: numbers that the law sends in a record.
-            actors: operators and environments, among them a live hand or none.
+            chain: The chain of joints; None: the planar two-link arm.
+            sent: Numbers that the law sends in a record.
+            actors: Operators and environments. At most one of them is a live hand, which a
+                person moves during the run.
         """
         joints = JOINTS if chain is None else len(chain.joints)
+
         live = next((actor.kind for actor in actors if actor.kind in LIVE_KINDS), None)
         if live is None:
             hand = 0
@@ -221,6 +229,7 @@ class Layout(NamedTuple):
             hand = count_hand_numbers(joints)
         else:
             hand = count_hand_numbers(2 if chain is None else 3)
+
         if chain is None:
             return cls(sent=sent, hand=hand)
         task = chain.task
@@ -235,11 +244,14 @@ class Layout(NamedTuple):
         )
 
     def axes(self) -> dict[str, int]:
-        """Returns the lengths of the axes that the fields of rows name, see `row_fields`."""
+        """Returns the lengths to which the fields of rows refer by name, see `row_fields`."""
         return {"joints": self.joints, "shared": self.shared, "parameters": self.parameters}
 
     def lengths(self) -> dict[str, int]:
-        """Returns the lengths of the vectors of a record, in their order."""
+        """Returns the lengths of the vectors of a record by name, in their order.
+
+        Vectors that the site does not have are left out.
+        """
         n = self.joints
         m = self.shared
         lengths = {"q": n, "qd": n, "q_des": m, "qd_des": m, "tau": n, "tau_x": n}
@@ -251,7 +263,10 @@ class Layout(NamedTuple):
         return lengths
 
     def columns(self) -> dict[str, slice]:
-        """Returns the columns of each vector in the row of floats that a tick computes."""
+        """Returns the columns of each vector in the row of floats that a tick computes.
+
+        Vectors that are inputs of the tick have no columns.
+        """
         lengths = self.lengths()
         for name in ("hand", "bodies"):  # inputs of the tick
             lengths.pop(name, None)
@@ -262,29 +277,37 @@ class Layout(NamedTuple):
         }
 
     def count_life_memory(self, peers: int, *, degrades: bool = False) -> int:
-        """Returns the length of the memory of `session_life` in a record's `mem`.
+        """Returns the count of numbers of `session_life` in a record's field `mem`.
 
-        In task space it contains the pose and the velocities of `rest_columns`. The memory of a
-        site that degrades ends with `gone` of its peers.
+        In task space they contain the pose and the velocities of `rest_columns`. The numbers of
+        a site that degrades end with `gone` of its peers.
 
         Args:
-            peers: the number of peers.
-            degrades: true: the site goes on without lost peers.
+            peers: Number of peers.
+            degrades: True: the site goes on without lost peers.
         """
         end: int = self.rest_columns(peers).stop
         return end + peers * degrades
 
     def rest_columns(self, peers: int) -> slice:
-        """Returns the columns of the rest reference in the `mem` of a site in task space.
+        """Returns the columns of the rest reference in the field `mem` of a site in task space.
 
-        They hold the pose of the joints and then their velocities. In joint space there are no
-        such columns.
+        They contain the pose of the joints and then their velocities. In joint space there are
+        no such columns.
+
+        Args:
+            peers: Number of peers.
         """
         first = 2 * (self.shared + 1) + peers + self.joints
         return slice(first, first + 2 * self.joints * self.task)
 
     def list_lost_peers(self, mem: Sequence[float], peers: Sequence[str]) -> list[str]:
-        """Returns the names of the lost peers of a degrading site, from a record's `mem`."""
+        """Returns the names of the peers that a degrading site has lost, from its record.
+
+        Args:
+            mem: Field `mem` of the record.
+            peers: Names of the site's peers, in scenario order.
+        """
         end = self.count_life_memory(len(peers), degrades=True)
         all_gone = mem[end - len(peers) : end]
         # A record of another rule has a shorter memory, and then no lost peers.
@@ -292,7 +315,7 @@ class Layout(NamedTuple):
 
     @property
     def floats(self) -> int:
-        """The length of the row of floats that a tick computes."""
+        """Length of the row of floats that a tick computes."""
         shared_vectors = 5 if self.task else 2
         return 4 * self.joints + shared_vectors * self.shared + self.parameters + self.sent
 
@@ -435,18 +458,18 @@ class SiteSetup(NamedTuple):
 
     @property
     def layout(self) -> Layout:
-        """The lengths of the site's vectors."""
+        """Lengths of the site's vectors."""
         layout = Layout.of_arm(self.chain, self.channel.record_size, self.actors)
         return layout._replace(bodies=7 * self.bodies)
 
     @property
     def received_vectors(self) -> tuple[SentVector, ...]:
-        """The vectors that the law reads of each peer; zero if the peer does not send them."""
+        """Vectors that the law reads from each peer; zero if the peer does not send them."""
         channels = [link.channel for link in self.links]
         return join_received([*channels, self.channel])
 
     def law_context(self) -> LawContext:
-        """Returns the facts that a user's law gets when it is created."""
+        """Returns the facts that a user's law receives when it is created."""
         return LawContext(
             site=self.name,
             rate_hz=self.rate_hz,

@@ -1,4 +1,8 @@
-"""A site, and `Site.step`, which computes each tick of a site.
+"""Computes each tick of a site, by `Site.step`.
+
+A site is a process that runs one arm and its control loop; a tick is one period of the loop. A
+site receives samples from its peers, the other sites: a sample is the state that a site
+publishes in a tick.
 
 `Site` is thin Python around `kernel.site_tick`: it packs the arrivals into arrays, calls the
 compiled tick, and unpacks the record. A user's law runs between two compiled halves of the
@@ -66,17 +70,21 @@ _NO_SHARED: tuple[tuple[float, ...], ...] = ((), (), ())
 
 
 class Site:
-    """A manipulator with its controller and the receiving ends of its links.
+    """Manipulator with its controller and the receiving ends of its links.
+
+    The process of a site creates this object and calls `step` once per tick. The simulation
+    in virtual time does the same for each site.
 
     Args:
-        setup: the setup of the site.
+        setup: Setup of the site.
 
     Attributes:
-        name: the site's name.
-        rate_hz: the tick rate, Hz.
-        peers: the names of the peers, in scenario order.
-        layout: the lengths of the site's vectors.
-        law_failure: the last failure of a user's law under the rule `glide`; None: no failure.
+        name: Name of the site.
+        rate_hz: Tick rate, Hz.
+        peers: Names of the peers, in scenario order.
+        layout: Lengths of the site's vectors.
+        law_failure: Last failure of a user's law under the rule `glide`; None if it never
+            failed.
     """
 
     def __init__(self, setup: SiteSetup) -> None:
@@ -134,9 +142,13 @@ class Site:
         self._keeps_forces = self._reflects or self._hand is not None
 
     def _find_hand(self, index: int) -> tuple[Array, Array, Array]:
-        """Returns the fields of the live hand at `index` among the actors.
+        """Returns the fields of the live hand (an operator who moves the arm during the run).
 
-        The fields are the grip, the target, and the target one second later.
+        Args:
+            index: Index of the live hand among the operators and environments.
+
+        Returns:
+            The grip, the target, and the target one second later, as views of the row.
         """
         actors = self._arrays.actors
         size = (self.layout.hand - 3) // 2
@@ -147,7 +159,11 @@ class Site:
         )
 
     def _plug_law(self, setup: SiteSetup) -> None:
-        """Creates the user's law of a setup, if any, and compiles the stages around it."""
+        """Creates the user's law of a setup, if any, and compiles the stages around it.
+
+        A user's law runs between two compiled halves of the tick, in which all other stages
+        are.
+        """
         self._user_law = None
         if setup.law_factory is not None:
             self._user_law = setup.law_factory(setup.law_context())
@@ -168,21 +184,24 @@ class Site:
         """Applies a change, or adds it to the planned ones; other planned changes stay planned.
 
         Args:
-            command: the change.
-            t_ns: a time before which the site makes no more ticks, ns since the epoch.
+            command: The change.
+            t_ns: A time before which the site makes no more ticks, ns since the epoch.
 
         Raises:
-            ValueError: the arrays have no free row for the change.
+            ValueError: The arrays have no free row for the change.
         """
         apply_change(self._arrays, command, t_ns)
         if command.model is not None:
             self._sizer.add_model(command.peer, command.model)
 
     def start_at(self, k: int) -> None:
-        """Makes tick k the first tick of a site that joins a running session.
+        """Makes tick `k` the first tick of a site that joins a running session.
 
         The site must not have made a tick. Its arm stands at the start pose, no sample of a
         peer is in use or waits, and the channels of its links are in the state of tick k - 1.
+
+        Args:
+            k: The first tick.
         """
         if k <= self._site["first"]:
             self.restore_links(k, [None] * len(self.peers), ())
@@ -197,24 +216,27 @@ class Site:
         """Computes one tick and returns its record.
 
         Args:
-            tick: its number, which follows that of the last tick, and the input since then.
+            tick: Number of the tick, which follows that of the last tick, and the input since
+                then.
 
         Raises:
-            ValueError: there are more than MAX_ARRIVALS arrivals, or more changes than
+            ValueError: There are more than MAX_ARRIVALS arrivals, or more changes than
                 `apply_change` accepts.
-            LawFailed: a user's law failed, and the site is not under the rule `glide`.
+            LawFailed: A user's law failed, and the site is not under the rule `glide`.
         """
         t_ns = tick.k * NS_PER_S // self.rate_hz
         count = len(tick.arrivals)
         for command in tick.commands:
             self.apply_change(command, t_ns)
         packed_bytes = self._pack(tick.k, tick.arrivals)
+
         bodies: Sequence[float] = ()
         if tick.measured is not None and self._external:
             bodies = tick.measured.bodies
             self._write_measurement(tick.measured)
         hand = self._apply_hand(tick.hand)
         law_memory = self._compute_tick(tick.k, t_ns, count)
+
         row = self._buffers.record.tolist()
         mode = self._mode.item()
         memory: list[float] = []
@@ -249,7 +271,16 @@ class Site:
         )
 
     def _compute_tick(self, k: int, t_ns: int, count: int) -> list[float]:
-        """Runs the eight stages of tick k with `count` arrivals; returns the law's memory."""
+        """Runs the eight stages of a tick on the buffers.
+
+        Args:
+            k: The tick.
+            t_ns: Nominal time of the tick, ns since the epoch.
+            count: Number of arrivals in the buffers.
+
+        Returns:
+            The memory of the user's law. Empty without such a law.
+        """
         if self._law is None:
             if self._tick is None:
                 self._tick = bind_leaf(site_tick, 0, 0, 0, *self._tick_arrays)
@@ -270,11 +301,14 @@ class Site:
         s.sensed = [-torque for torque in measured.tau_x] or 0.0
 
     def _compute_law(self, k: int, t_ns: int) -> list[float]:
-        """Runs stage 6 of a user's law; returns the law's memory.
+        """Runs stage 6 of a user's law, and returns the law's memory.
 
         Under the rule `glide` a law that fails gives NaN as torque, which leads to FAULT. The
         law is not called again until the fault is reset, and then continues from the memory
         that it had before the failure.
+
+        Raises:
+            LawFailed: The law failed, and the site is not under the rule `glide`.
         """
         assert self._law is not None
         s: Row = self._site[0]
@@ -293,28 +327,28 @@ class Site:
 
     @property
     def speed_limits(self) -> list[float]:
-        """The largest speed of each joint, rad/s."""
+        """Largest speed of each joint, rad/s."""
         limits: list[float] = self._site[0]["qd_limit"].tolist()
         return limits
 
     @property
     def mode(self) -> Mode:
-        """The mode of the site at the last tick."""
+        """Mode of the site at the last tick."""
         return _MODES[self._mode.item()]
 
     @property
     def life_reason(self) -> LifeReason:
-        """The reason of the last change of mode under the rule `glide`."""
+        """Reason of the last change of mode under the rule `glide`."""
         return LifeReason(self._reason.item())
 
     @property
     def arrays(self) -> SiteArrays:
-        """The arrays of the site before the next tick, to be read and not written."""
+        """Arrays of the site before the next tick, to be read and not written."""
         return self._arrays
 
     @property
     def q(self) -> list[float]:
-        """The joint angles at the next tick, rad."""
+        """Joint angles at the next tick, rad."""
         angles: list[float] = self._site[0]["q"][: self.layout.joints].tolist()
         return angles
 
@@ -322,10 +356,10 @@ class Site:
         """Writes the action of a live hand into its row, and returns the `hand` of the record.
 
         Args:
-            vector: the action, see `live_hand`; empty: nobody holds the arm.
+            vector: The action, see `live_hand`. Empty if nobody holds the arm.
 
         Returns:
-            The action in force; () if the site has no live hand.
+            The action in force. Empty if the site has no live hand.
         """
         if self._hand is None:
             return ()
@@ -338,7 +372,12 @@ class Site:
         return action
 
     def _compute_crc(self, packed_bytes: int, arrivals: int) -> int:
-        """Returns `TickRecord.rx_crc` of the arrivals in the buffers."""
+        """Returns the checksum of the arrivals in the buffers, `TickRecord.rx_crc`.
+
+        Args:
+            packed_bytes: Number of bytes of the packed arrivals.
+            arrivals: Number of arrivals.
+        """
         crc = zlib.crc32(self._arrival_bytes[:packed_bytes])
         if self._reflects:
             force_bytes = arrivals * 8 * self.layout.shared
@@ -369,27 +408,40 @@ class Site:
         return memory
 
     def counts(self) -> tuple[LinkCounts, ...]:
-        """Returns the counts of each link since the start, in scenario order."""
+        """Returns the counts of samples of each link since the start, in scenario order."""
         return tuple(
             LinkCounts(*(int(link[field]) for field in LinkCounts._fields))
             for link in self._links
         )
 
     def release_tick(self, peer: int, tick: int) -> int | None:
-        """Returns the site's tick that brings a peer's sample into use if it arrives in time.
+        """Returns the tick that brings a peer's sample into use if it arrives in time.
 
-        The result is None if the link loses the sample or has forgotten its due time.
+        Args:
+            peer: Index of the peer.
+            tick: Stamp of the sample, a tick of the peer.
+
+        Returns:
+            The tick. None if the link loses the sample or has forgotten its due time.
         """
         release = int(find_release(peer, tick, self._arrays))
         return None if release == LOST else release
 
     def is_measured(self, peer: int) -> bool:
-        """True if the link to this peer injects no delay, so that no sample is late."""
+        """Returns True if the link from this peer injects no delay, so that no sample is late.
+
+        Args:
+            peer: Index of the peer.
+        """
         link: Row = self._links[peer]
         return bool(self._arrays.models[peer, link.model]["kind"] == DelayKind.MEASURED)
 
     def peer_rate_hz(self, peer: int) -> int:
-        """Returns the tick rate of a peer, Hz."""
+        """Returns the tick rate of a peer, Hz.
+
+        Args:
+            peer: Index of the peer.
+        """
         return int(self._links[peer]["rate_hz"])
 
     def restore_state(self, before: TickRecord, last: TickRecord) -> None:
@@ -398,8 +450,8 @@ class Site:
         `restore_links` restores the links.
 
         Args:
-            before: the record of the tick before the last one; any record if that is tick 0.
-            last: the record of the last tick.
+            before: Record of the tick before the last one; any record if that is tick 0.
+            last: Record of the last tick.
         """
         s: Row = self._site[0]
         shared = self.layout.shared
@@ -425,7 +477,16 @@ class Site:
         resume_stages(last.tick, self._arrays)
 
     def _restore_life(self, memory: list[float]) -> list[float]:
-        """Restores the memory of `session_life` from `mem`; returns the remaining numbers."""
+        """Restores the memory of `session_life` from the field `mem` of a record.
+
+        The numbers are read in the order in which `_held_memory` writes them.
+
+        Args:
+            memory: Numbers of the record, after those of the held reference.
+
+        Returns:
+            The remaining numbers, which belong to the user's law.
+        """
         s: Row = self._site[0]
         shared = self.layout.shared
         peers = len(self.peers)
@@ -450,18 +511,18 @@ class Site:
     def restore_links(
         self, k: int, in_use: Sequence[Arrival | None], waiting: Sequence[Arrival]
     ) -> None:
-        """Restores the links before tick k.
+        """Restores the links before tick `k`.
 
         The memory of a channel is not restored but computed again: it is a function of the
         samples before k (L4).
 
         Args:
-            k: the next tick.
-            in_use: per peer the sample in use, or None before the first.
-            waiting: arrivals that are not in use yet.
+            k: The next tick.
+            in_use: Per peer the sample in use, or None before the first.
+            waiting: Arrivals that are not in use yet.
 
         Raises:
-            ValueError: more than MAX_ARRIVALS samples wait.
+            ValueError: More than MAX_ARRIVALS samples wait.
         """
         self._arrays.calendars["tick"] = -1
         self._sizer.clear()
@@ -483,11 +544,17 @@ class Site:
                 link.qd = sample.qd
                 link.tau_x = sample.tau_x or 0.0
             self._restore_received(n, sample)
+
         self._pack(k, waiting)
         accept_stage(k, len(waiting), self._arrays, self._buffers)
 
     def _restore_received(self, peer: int, sample: Arrival | None) -> None:
-        """Restores the numbers that a peer's law sent with the sample in use."""
+        """Restores the numbers that a peer's law sent with the sample in use.
+
+        Args:
+            peer: Index of the peer.
+            sample: The sample in use, or None before the first.
+        """
         channel = self._arrays.channel
         if channel is None:
             return
@@ -500,13 +567,19 @@ class Site:
         channel.received[peer] = sent[channel.columns[peer]]
 
     def _pack(self, k: int, arrivals: Sequence[Arrival]) -> int:
-        """Writes the arrivals of tick k into the buffers, and makes room for them in calendars.
+        """Writes the arrivals of a tick into the buffers, and makes room in the calendars.
+
+        A calendar keeps each sample until its delay has passed.
+
+        Args:
+            k: The tick.
+            arrivals: Samples that arrived since the previous tick.
 
         Returns:
             The number of bytes written into the buffer of arrivals.
 
         Raises:
-            ValueError: there are more than MAX_ARRIVALS arrivals.
+            ValueError: There are more than MAX_ARRIVALS arrivals.
         """
         if len(arrivals) > MAX_ARRIVALS:
             raise ValueError(

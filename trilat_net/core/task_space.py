@@ -1,4 +1,6 @@
-"""Following in task space: the end effectors of unlike arms agree on a position or a pose.
+"""Lets the end effectors of unlike arms agree on a position or a pose (task space).
+
+Without task space, sites compare joint angles, which requires equal arms.
 
 Let J be the Jacobian of the followed axes, Jd its derivative, x the pose of the end effector
 and e = x - x_des. The reference velocity v of the joints and its derivative a are
@@ -38,7 +40,7 @@ TINY = 1e-12
 
 @leaf
 def has_orientation(s: Row) -> bool:
-    """True if the sites agree on an orientation in addition to a position."""
+    """Returns True if the sites agree on an orientation in addition to a position."""
     is_pose: bool = s.task != 0 and s.shared == POSE
     return is_pose
 
@@ -54,7 +56,12 @@ def count_linear_coordinates(s: Row) -> int:
 
 @leaf
 def update_pose(s: Row, chain: RowArray) -> None:
-    """Writes x, xd, J and its derivative from q and qd, after `place_joints`."""
+    """Writes the pose x, its velocity xd, the Jacobian J and the derivative of J.
+
+    Args:
+        s: Row of the site, with q and qd.
+        chain: Rows of the chain, after `place_joints`.
+    """
     position = place_end_effector(chain, s.tip)
     put_three(s.x[:3], scale(s.scale, position))
     if s.shared == POSE:
@@ -132,6 +139,10 @@ def update_orientation_reference(s: Row, links: RowArray) -> None:
     The reference is the site's own orientation R_i, turned back by the weighted differences
     from its peers, sum_j alpha_ij Log(R_i R_j'). The velocity sum_j alpha_ij w_j is exact only
     if the orientations agree.
+
+    Args:
+        s: Row of the site, with its pose.
+        links: Rows of the site's links.
     """
     orientation = rotation_matrix(three(s.x[3:]))
     difference = (0.0, 0.0, 0.0)
@@ -155,6 +166,10 @@ def _factor(s: Row, damping: float) -> None:
     """Writes the factors L D L' of J J' + damping I into the lower part of `s.A`.
 
     An axis that is not followed has a row of zeros in J, and gets a unit pivot.
+
+    Args:
+        s: Row of the site.
+        damping: The damping.
     """
     J = s.J
     A = s.A
@@ -176,7 +191,13 @@ def _factor(s: Row, damping: float) -> None:
 
 @leaf
 def _solve(s: Row, b: Array, y: Array) -> None:
-    """Writes the solution y of L D L' y = b, with the factors in `s.A`."""
+    """Writes the solution y of L D L' y = b, with the factors in `s.A`.
+
+    Args:
+        s: Row of the site.
+        b: Right-hand side, shape (m,).
+        y: Written, shape (m,).
+    """
     A = s.A
     m = s.shared
     for j in range(m):

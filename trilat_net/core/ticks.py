@@ -1,4 +1,7 @@
-"""Ticks: their nominal times, the input and the record of a tick, and texts about them.
+"""Defines ticks: their nominal times, the input and record of a tick, and texts about modes.
+
+A tick is one period of a site's control loop. Its input are the samples that arrived from other
+sites and the commands since the previous tick; its record is the stored result.
 
 Invariant:
 
@@ -21,15 +24,25 @@ BUCKETS_PER_S = 20
 
 @leaf
 def tick_ns(tick: int, rate_hz: int) -> int:
-    """Returns the nominal time of a tick, ns since the epoch."""
+    """Returns the nominal time of a tick, ns since the epoch, the common start of the session.
+
+    Args:
+        tick: The tick.
+        rate_hz: Tick rate, Hz.
+    """
     return tick * 1_000_000_000 // rate_hz
 
 
 @leaf
 def first_tick_at(due_ns: int, rate_hz: int) -> int:
-    """Returns the first tick whose nominal time is at or after `due_ns`, ns since the epoch.
+    """Returns the first tick whose nominal time is at or after a due time.
 
-    The result is exact: floor(k 10^9 / rate) >= due if and only if k 10^9 >= due rate.
+    The result is exact: floor(k 10^9 / rate) >= due if and only if k 10^9 >= due rate. The
+    division of the negative number rounds up.
+
+    Args:
+        due_ns: The due time, ns since the epoch.
+        rate_hz: Tick rate, Hz.
     """
     return -(-due_ns * rate_hz // 1_000_000_000)
 
@@ -90,7 +103,7 @@ class LifeReason(IntEnum):
 
 
 class LifeOrder(IntEnum):
-    """An order to a site under the rule `glide`, see `session_life`.
+    """Order to a site under the rule `glide`, see `session_life`.
 
     STOP leads to STOPPED, and ENABLE back to WAITING. RESET leads from FAULT to WAITING. The
     site itself gives the other orders if its arm is outside of the program:
@@ -101,8 +114,8 @@ class LifeOrder(IntEnum):
     - HELD: somebody holds the dead-man switch again.
     - OVERRUN: the site missed ticks.
 
-    Of several orders in one tick the one with the highest number counts. OVERRUN counts
-    besides.
+    If several orders come in one tick, the order with the highest number counts. OVERRUN is
+    applied in addition.
     """
 
     ENABLE = 1
@@ -117,16 +130,16 @@ class LifeOrder(IntEnum):
 
 
 class Arrival(NamedTuple):
-    """One sample as it arrived.
+    """Sample of a peer, the state that it published in one tick, as it arrived at a site.
 
     Attributes:
-        peer: index of the peer among the site's links.
-        tick: the stamp of the sample, a tick at the peer's rate.
-        q: the peer's joint angles, rad.
-        qd: the peer's joint velocities, rad/s.
-        latency_us: the measured latency, us; telemetry that enters no formula.
-        tau_x: the exogenous torque of the peer's record, N m, for laws that reflect force.
-        ch: the numbers that the peer's law sent to this site, see `LawChannel.part`.
+        peer: Index of the peer among the site's links.
+        tick: Stamp of the sample, a tick at the peer's rate.
+        q: The peer's joint angles, rad.
+        qd: The peer's joint velocities, rad/s.
+        latency_us: Measured latency, us; telemetry that enters no formula.
+        tau_x: Exogenous torque of the peer's record, N m, for laws that reflect force.
+        ch: Numbers that the peer's law sent to this site, see `LawChannel.select_for_peer`.
     """
 
     peer: int
@@ -139,12 +152,12 @@ class Arrival(NamedTuple):
 
 
 class DominanceRamp(NamedTuple):
-    """A linear change of a site's dominance factors over a time.
+    """Linear change over time of a site's dominance factors, the weights of its peers.
 
     Attributes:
-        start_ns: its start, ns since the epoch.
-        end_ns: its end, ns since the epoch, not before `start_ns`.
-        alpha: the factors at its end, per peer in scenario order.
+        start_ns: Start of the change, ns since the epoch.
+        end_ns: End of the change, ns since the epoch, not before `start_ns`.
+        alpha: Factors at the end, per peer in scenario order.
     """
 
     start_ns: int
@@ -153,15 +166,17 @@ class DominanceRamp(NamedTuple):
 
 
 class CoreChange(NamedTuple):
-    """A change of a running site by a command from outside: of a link, of shares, or an order.
+    """Change of a running site by a command from outside.
+
+    A command changes the model of a link or the dominance factors, or gives an order.
 
     Attributes:
-        text: the text in the record, from which all readers derive the same change.
-        peer: the index of the peer whose link changes; -1 for other changes.
-        model: the new model of the link.
-        ramp: the change of the dominance factors.
-        order: the order to the site.
-        skipped: with OVERRUN, the number of ticks before this one that the site missed.
+        text: Text in the record, from which all readers derive the same change.
+        peer: Index of the peer whose link changes; -1 for other changes.
+        model: New model of the link.
+        ramp: Change of the dominance factors.
+        order: Order to the site.
+        skipped: With OVERRUN, the number of ticks before this one that the site missed.
     """
 
     text: str
@@ -190,15 +205,15 @@ class PlantState(NamedTuple):
 
 
 class TickInput(NamedTuple):
-    """The input of one call of `Site.step`.
+    """Input of one call of `Site.step`.
 
     Attributes:
-        k: the tick.
-        arrivals: the samples that arrived since the previous tick, in order.
-        commands: the changes that were commanded since the previous tick.
-        measured: the present state of an external arm; None: unchanged.
-        hand: the action of a live hand in this tick, see `live_hand.empty_hand_vector`; empty:
-            nobody holds the arm.
+        k: The tick.
+        arrivals: Samples that arrived since the previous tick, in order.
+        commands: Changes that were commanded since the previous tick.
+        measured: Present state of an external arm; None: unchanged.
+        hand: Action of a live hand, an operator who moves the arm during the run, in this tick,
+            see `live_hand.empty_hand_vector`. Empty if nobody holds the arm.
     """
 
     k: int
@@ -265,7 +280,7 @@ class TickRecord(NamedTuple):
     bodies: Sequence[float] = ()
 
     def shared(self) -> tuple[Sequence[float], Sequence[float], Sequence[float]]:
-        """Returns the motion and the exogenous torque that peers receive.
+        """Returns the position, the velocity and the exogenous torque that peers receive.
 
         They are in shared coordinates: those of the end effector in task space, else the
         joints.
@@ -317,22 +332,22 @@ _REASONS = {
 
 
 def find_life_reason(output: TickRecord) -> LifeReason:
-    """Returns the reason in a record for the last change of mode of a gliding site."""
+    """Returns the reason in a record for the last change of mode of a site under `glide`."""
     shared = len(output.q_des)
     return LifeReason(int(output.mem[2 * shared + 1]))
 
 
 class LifeAlarm(NamedTuple):
-    """An alarm about the mode of a site, which nobody may overlook.
+    """Alarm about the mode of a site, which nobody may overlook.
 
     Attributes:
-        word: the mode, in capitals.
-        reason: the reason for the mode.
-        advice: the remedy at a terminal.
-        order: the order that ends the alarm, "enable" or "reset", where a page has a button for
-            it; "" if no order ends it.
-        before: the remedy that has to precede the order, a clause that ends in ", then"; "" if
-            none is needed.
+        word: The mode, in capitals.
+        reason: Reason for the mode.
+        advice: Remedy, for a user at a terminal.
+        order: Order that ends the alarm, "enable" or "reset", for which a page has a button.
+            Empty if no order ends the alarm.
+        before: Remedy that has to precede the order, a clause that ends in ", then". Empty if
+            no remedy is needed.
     """
 
     word: str
@@ -371,15 +386,20 @@ def find_alarm(
     shared: int,
     lost: Sequence[str] = (),
 ) -> LifeAlarm | None:
-    """Returns the alarm of a site under the rule `glide`, or None.
+    """Returns the alarm that a site under the rule `glide` requires, from its record.
 
     Args:
-        session: the name of the session, for the advice.
-        site: the name of the site, for the advice.
-        mode: the mode in the site's record.
-        mem: the memory in the site's record.
-        shared: the number of coordinates that sites share.
-        lost: the names of the peers without which the site goes on.
+        session: Name of the session, for the advice.
+        site: Name of the site, for the advice.
+        mode: Mode in the site's record.
+        mem: Memory in the site's record.
+        shared: Number of coordinates that sites share.
+        lost: Names of the peers without which the site goes on.
+
+    Returns:
+        The alarm. None if the site needs no attention, or if the record is not from a site
+            under
+        this rule.
     """
     try:
         reason = LifeReason(int(mem[2 * shared + 1]))
@@ -388,6 +408,7 @@ def find_alarm(
     is_too_far = (mode, reason) == ("waiting", LifeReason.ALIGN_LIMIT)
     if mode not in _ALARM_MODES and not is_too_far:
         return _find_lost_alarm(lost)
+
     # The dead-man switch ends a release, and no order does.
     order = "" if reason is LifeReason.RELEASED else _ORDERS.get(mode, "")
     before = _REMEDIES.get(reason, "") if mode == "fault" else ""
@@ -400,7 +421,7 @@ def find_alarm(
 
 
 def _find_lost_alarm(lost: Sequence[str]) -> LifeAlarm | None:
-    """Returns the alarm of a site that goes on without lost peers, or None if it has all."""
+    """Returns the alarm of a site that goes on without lost peers, or None."""
     if not lost:
         return None
     names = ", ".join(lost)
@@ -425,13 +446,13 @@ _ACTIVITIES = {
 def describe_mode(
     site: str, output: TickRecord, *, glides: bool = False, law_failure: Exception | None = None
 ) -> str:
-    """Returns the text of the event that a site changes its mode.
+    """Returns the text of the event by which a site reports a change of its mode.
 
     Args:
-        site: the name of the site.
-        output: the record of the first tick in the mode.
-        glides: true: the site is under the rule `glide`, and the text gives the reason.
-        law_failure: the error with which the user's law failed, or None.
+        site: Name of the site.
+        output: Record of the first tick in the mode.
+        glides: True: the site is under the rule `glide`, and the text gives the reason.
+        law_failure: Error with which the user's law failed, or None.
     """
     if glides:
         reason = find_life_reason(output)
@@ -450,7 +471,12 @@ def describe_mode(
 
 
 def describe_divergence(site: str, output: TickRecord) -> str:
-    """Returns the text of the event that a site diverged."""
+    """Returns the text of the event by which a site reports that it diverged.
+
+    Args:
+        site: Name of the site.
+        output: Record of the tick.
+    """
     speed = max(abs(v) for v in output.qd)
     t_s = output.t_ns * 1e-9
     return f"{site} diverged at t = {t_s:.3f} s: a joint moves at {speed:.4g} rad/s"

@@ -1,4 +1,4 @@
-"""The planar two-link arm: dynamics, regressor and kinematics.
+"""Computes the dynamics, the regressor and the kinematics of the planar two-link arm.
 
 Symbols: q are the joint angles, rad, qd their velocities, rad/s, g is the gravitational
 acceleration, m/s^2, and `lengths` are the lengths of the two links, m. Angles are measured from
@@ -51,9 +51,12 @@ class ArmLinks(NamedTuple):
 
 
 def theta_from_links(links: ArmLinks) -> Array:
-    """Returns theta of Eq. (24), shape (5,).
+    """Returns the parameters theta of Eq. (24), on which the arm's dynamics depend, shape (5,).
 
     The first three entries are inertial, in kg m^2; the last two belong to gravity, in kg m.
+
+    Args:
+        links: Lengths, masses and inertias of the two links.
     """
     l1, m1, lc1, I1, _, m2, lc2, I2 = links
     theta_1 = m1 * lc1**2 + m2 * (l1**2 + lc2**2) + I1 + I2
@@ -65,10 +68,13 @@ def theta_from_links(links: ArmLinks) -> Array:
 
 
 def is_positive_definite(theta: Array) -> bool:
-    """True if M(q) is positive definite in any pose, with a margin (Property 1).
+    """Returns True if M(q) is positive definite in any pose, with a margin (Property 1).
 
     The determinant of M, theta_1 theta_3 - theta_3^2 - theta_2^2 cos^2 q_2, is smallest for the
     stretched arm.
+
+    Args:
+        theta: Parameters of the arm, shape (5,).
     """
     least_determinant = theta[0] * theta[2] - theta[2] ** 2 - theta[1] ** 2
     margin = 1e-9 * theta[0] * theta[2]
@@ -86,7 +92,13 @@ def inertia(theta: Vector, q: Vector) -> tuple[Pair, Pair]:
 
 @leaf
 def gravity(theta: Vector, g: float, q: Vector) -> Pair:
-    """Returns the gravity torque G(q), N m."""
+    """Returns the gravity torque G(q), N m.
+
+    Args:
+        theta: Parameters of the arm, shape (5,).
+        g: Gravitational acceleration, m/s^2.
+        q: Joint angles, rad.
+    """
     s1, c1 = sincos(q[0])
     s2, c2 = sincos(q[1])
     c12 = c1 * c2 - s1 * s2

@@ -1,4 +1,4 @@
-"""The stages of a tick that depend on the arm, for the planar two-link arm.
+"""Computes the stages of a tick that depend on the arm, for the planar two-link arm.
 
 The loops over two joints are unrolled, so that the numbers stay in registers.
 
@@ -21,7 +21,11 @@ _ADAPTIVE = int(Law.ADAPTIVE)
 
 @leaf
 def update_errors(s: Row) -> None:
-    """Writes e, ed, r, the regressor of Eq. (12) and Y' r from q, qd and the reference."""
+    """Writes the errors e and ed, the filtered error r, the regressor of Eq. (12) and Y' r.
+
+    Args:
+        s: Row of the site, with q, qd and the reference.
+    """
     q = pair(s.q)
     qd = pair(s.qd)
     Lambda = pair(s.Lambda)
@@ -39,7 +43,13 @@ def update_errors(s: Row) -> None:
 
 @leaf
 def advance_estimate(s: Row, gain_s: float, Yr: Vector) -> None:
-    """Advances the estimate by the time `gain_s`, Eq. (15), within its box."""
+    """Advances the estimate of the arm's parameters by a step of Eq. (15), within its box.
+
+    Args:
+        s: Row of the site.
+        gain_s: Duration of the step, s.
+        Yr: Y' r, shape (5,).
+    """
     estimate = control.update_estimate(s.theta_hat, gain_s, s.Gamma, Yr)
     put(s.theta_hat, control.project_estimate(estimate, s.low, s.high))
 
@@ -87,6 +97,11 @@ def put_gravity(s: Row, theta: Array, torque: Array) -> None:
     """Writes the gravity torque for these parameters, N m.
 
     The last columns of the regressor are g cos q_1 and g cos(q_1 + q_2).
+
+    Args:
+        s: Row of the site, after `update_errors`.
+        theta: Parameters of the arm, shape (5,).
+        torque: Written, shape (2,).
     """
     inner = s.Y[0, 3] * theta[3]
     outer = s.Y[1, 4] * theta[4]
@@ -149,7 +164,14 @@ def put_source_torque(
 def update_external_torque(
     t_s: float, s: Row, actors: TorqueSourceRows, table: TorqueTable
 ) -> None:
-    """Writes the torque of operators and environments, its held part, and the wall force."""
+    """Writes the torque of operators and environments, its held part, and the wall force.
+
+    Args:
+        t_s: Time since the epoch, s.
+        s: Row of the site.
+        actors: Operators and environments.
+        table: Their tables.
+    """
     q = pair(s.q)
     qd = pair(s.qd)
     lengths = pair(s.lengths)

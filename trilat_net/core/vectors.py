@@ -1,4 +1,6 @@
-"""Types of the core's numbers: arrays, rows of structured arrays, and vectors as tuples.
+"""Defines types of the core's numbers: arrays, rows of structured arrays, vectors as tuples.
+
+A leaf is a compiled function of the core.
 
 Invariant:
 
