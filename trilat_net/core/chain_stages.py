@@ -126,7 +126,16 @@ def update_torque(s: Row, chain: RowArray) -> None:
 
 @leaf
 def put_gravity(s: Row, chain: RowArray, theta: Array, torque: Array) -> None:
-    """Writes the gravity torque for these parameters, N m, shape (n,), after `place_joints`."""
+    """Writes the gravity torque for these parameters, after `place_joints`.
+
+    It is the torque of the inverse dynamics without motion.
+
+    Args:
+        s: Row of the site.
+        chain: Rows of the joints.
+        theta: Inertial parameters, shape (10 n,).
+        torque: Written, shape (n,), N m.
+    """
     zeros = s.zeros
     propagate_motion(chain=chain, gravity=s.gravity, qd=zeros, v=zeros, a=zeros)
     inverse_dynamics(chain=chain, theta=theta, v=zeros, a=zeros, torque=torque)
@@ -134,7 +143,14 @@ def put_gravity(s: Row, chain: RowArray, theta: Array, torque: Array) -> None:
 
 @leaf
 def put_gravity_torque(s: Row, chain: RowArray, q: Array, torque: Array) -> None:
-    """Writes the gravity torque G(q), N m, shape (n,)."""
+    """Writes the gravity torque G(q) of the true parameters.
+
+    Args:
+        s: Row of the site.
+        chain: Rows of the joints.
+        q: Joint positions, shape (n,).
+        torque: Written, shape (n,), N m.
+    """
     place_joints(chain, q)
     put_gravity(s, chain, s.theta, torque)
 
@@ -239,9 +255,16 @@ def update_external_torque(
 def _put_acceleration(
     t_s: float, s: Row, chain: RowArray, actors: TorqueSourceRows, table: TorqueTable
 ) -> None:
-    """Writes `stage_qdd`, the acceleration at a stage of the integrator.
+    """Writes the acceleration at a stage of the integrator into `stage_qdd`.
 
     The torque is the held u plus the torque of the actors at the time and state of the stage.
+
+    Args:
+        t_s: Time of the stage, s since the epoch.
+        s: Row of the site, with `stage_q` and `stage_qd`.
+        chain: Rows of the joints.
+        actors: Operators and environments.
+        table: Their tables.
     """
     place_joints(chain, s.stage_q)
     put_torque_on_chain(
@@ -295,6 +318,14 @@ def advance_arm(
     table: TorqueTable,
 ) -> bool:
     """Advances q and qd by one period under the torque `s.u` (Runge-Kutta, fourth order).
+
+    Args:
+        t_s: Time at the beginning of the period, s since the epoch.
+        h_s: The period, s.
+        s: Row of the site.
+        chain: Rows of the joints.
+        actors: Operators and environments.
+        table: Their tables.
 
     Returns:
         False if the result is not finite; q and qd are unchanged then.

@@ -194,6 +194,7 @@ def _compile_law(torque: Callable[..., Any], form: _Form) -> Any:
     compute = numba.njit(**_CHECKED)(torque)
 
     def call(law: Any, site: Any, links: Any, received: Any, sent: Any) -> None:
+        """Builds the law's input from views of the rows, and calls the law's `torque`."""
         s = site[0]
         # Conditional expressions: Numba removes the branch whose type does not apply.
         from_peers = () if received_dtype is None else received.reshape(-1).view(received_dtype)
@@ -397,7 +398,10 @@ class CompiledLaw:
         arrays.site["remembered"] = self._remembered
 
     def bind(self) -> None:
-        """Compiles the stage that `compute` calls, before the first tick needs it."""
+        """Compiles the stage that `compute` calls.
+
+        The compilation takes seconds. Without this call, the first tick would wait for it.
+        """
         a = self._arrays
         assert a.channel is not None
         self._stage = bind_leaf(

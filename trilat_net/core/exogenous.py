@@ -322,7 +322,13 @@ def _find_table_rows(actor: Row, t_s: float, table: TorqueTable) -> tuple[int, i
 
 @leaf
 def _recorded_torque(actor: Row, t_s: float, table: TorqueTable) -> Pair:
-    """Returns the torque of a table by linear interpolation; zero outside of the table."""
+    """Returns the torque of a table by linear interpolation; zero outside of the table.
+
+    Args:
+        actor: Row of the actor.
+        t_s: Time since the epoch, s.
+        table: Tables of all actors.
+    """
     low, high, x = _find_table_rows(actor, t_s, table)
     if low < 0:
         return 0.0, 0.0
@@ -388,6 +394,11 @@ def _scripted_size(actor: Row, t_s: float, table: TorqueTable) -> float:
 
     A pulse is sin^2(pi (t - start) / (end - start)), which is smooth at both ends as in Fig. 3
     of the paper. The paper does not print the numbers of its pulses.
+
+    Args:
+        actor: Row of the actor.
+        t_s: Time since the epoch, s.
+        table: Tables of all actors.
     """
     if actor.kind == _PULSE:
         elapsed_s = t_s - actor.start_s
@@ -449,7 +460,15 @@ def _call_user_function(actor: Row, t_s: float, table: TorqueTable) -> None:
 
 @leaf
 def _user_effort(actor: Row, t_s: float, at: Vector, speed: Vector, table: TorqueTable) -> Pair:
-    """Returns the effort of a user's function along two joints or axes, N m or N."""
+    """Returns the effort of a user's function along two joints or axes, N m or N.
+
+    Args:
+        actor: Row of the actor.
+        t_s: Time since the epoch, s.
+        at: Position along the joints or axes, rad or m.
+        speed: Its derivative.
+        table: Tables of all actors.
+    """
     for i in range(2):
         actor.at[i] = at[i]
         actor.speed[i] = speed[i]

@@ -35,7 +35,13 @@ def _compute_sines(angles: Array, results: Array) -> None:
 
 
 def _build_setup(name: str, peer: str, q0: tuple[float, float]) -> SiteSetup:
-    """Returns the setup of a site with its start pose and the name of its peer."""
+    """Returns the setup of a site of the short run whose results are hashed.
+
+    Args:
+        name: Name of the site.
+        peer: Name of its only peer.
+        q0: Start pose, rad.
+    """
     theta = theta_from_links(
         ArmLinks(
             l1_m=1.0,

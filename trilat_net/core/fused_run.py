@@ -246,7 +246,14 @@ def _update_peaks(
 
 @leaf
 def _put_gravity_torque(s: SiteRow, chain: RowArray | None, row: Array, torque: Array) -> None:
-    """Writes the gravity torque at the pose of a record, N m."""
+    """Writes the gravity torque at the pose of a record, N m.
+
+    Args:
+        s: Row of the site.
+        chain: Rows of the chain, or None for the planar arm.
+        row: Floats of the record.
+        torque: Written, shape (n,).
+    """
     if chain is None:
         two_link_stages.put_gravity_torque(s, torque)
     else:
@@ -447,7 +454,20 @@ def sense_site(
     arrays: SiteArrays,
     chain: RowArray | None,
 ) -> None:
-    """Runs stages 1 to 5 of the next tick of site i; the arguments are those of `run_until`."""
+    """Runs stages 1 to 5 of the next tick of a site.
+
+    The peers' records arrive as in the recorded run, or without delay if there is no recorded
+    run. The remaining arguments are those of `run_until`.
+
+    Args:
+        i: Index of the site.
+        progress: Progress of the sites.
+        next_samples: Next sample of each peer to accept, shape (N, P).
+        sent: Last records of the sites.
+        feed: Inputs of a recorded run.
+        arrays: Arrays of all sites.
+        chain: Rows of the site's chain, or None for the planar arm.
+    """
     site_progress: ProgressRow = progress[i]
     k = site_progress.tick
     t_ns = site_progress.t_ns
@@ -514,12 +534,21 @@ def finish_site(
     chain: RowArray | None,
     laws: LawArrays | None,
 ) -> int:
-    """Runs stages 6 to 8 of the next tick of site i, and adds its record to peaks and sums.
+    """Runs stages 6 to 8 of the next tick of a site, and adds its record to peaks and sums.
 
-    The arguments are those of `run_until`.
+    Args:
+        i: Index of the site.
+        settled_rad: Errors below this are settled, rad.
+        progress: Progress of the sites.
+        sent: Last records of the sites; the new record is written.
+        peaks: Peaks of the sites, see `run_until`.
+        sums: Sums of the sites.
+        arrays: Arrays of all sites.
+        chain: Rows of the site's chain, or None for the planar arm.
+        laws: The users' compiled laws, or None.
 
     Returns:
-        The site's mode.
+        The mode of the site.
     """
     site_progress: ProgressRow = progress[i]
     k = site_progress.tick

@@ -205,7 +205,11 @@ class _LeafCacheImpl(CompileResultCacheImpl):
     _locator_classes = cast(Any, [_LeafLocator])
 
     def rebuild(self, context: Any, kept: Any) -> Any:
-        """Returns the compiled leaf of a kept tuple, as `CompileResult._reduce` wrote it."""
+        """Returns the compiled leaf of a stored tuple, as `CompileResult._reduce` wrote it.
+
+        Machine code is loaded by Numba. For an inner leaf, Numba's objects are built here
+        around the LLVM code.
+        """
         name, kind, code = kept[0]
         if kind != _INNER:
             return super().rebuild(context, kept)
@@ -241,6 +245,7 @@ class _CompressedFiles(IndexDataCacheFile):
     """
 
     def save(self, key: Any, code: Any) -> None:
+        """Writes compiled code for a key, and adds the file to the index."""
         names = self._load_index()
         first, _, last = self._data_name(0).rpartition(".0.")
         digest = hashlib.sha256(repr(key).encode()).hexdigest()[:8]
@@ -261,7 +266,11 @@ class _CompressedFiles(IndexDataCacheFile):
 
 
 class _LeafCache(FunctionCache):
-    """The machine code of a leaf: from the user's folder, else from the wheel."""
+    """Store of the machine code of a leaf.
+
+    Code is read from the user's folder, else from the wheel, and written into the user's
+    folder.
+    """
 
     _impl_class = _LeafCacheImpl
 
@@ -359,6 +368,7 @@ class _LeafCompiler(Compiler):
     depth = 0
 
     def compile_extra(self, function: Any) -> Any:
+        """Compiles a function, as an inner leaf while another leaf is being compiled."""
         state = self.state
         is_inner = _LeafCompiler.depth > 0
         state.library = _LeafLibrary(state.targetctx.codegen(), function.__qualname__)
@@ -382,7 +392,11 @@ class _LeafCompiler(Compiler):
 
 
 class _Leaf(CPUDispatcher):
-    """A leaf; an inner leaf is compiled again for calls from Python."""
+    """Numba's dispatcher of a leaf, which compiles the leaf for the types of its arguments.
+
+    An inner leaf, which was compiled as a part of another leaf, is compiled again for calls
+    from Python.
+    """
 
     _cache: Any
     _compiler: Any
@@ -402,7 +416,11 @@ class _Leaf(CPUDispatcher):
             super().add_overload(result)
 
     def compile(self, signature: Any) -> Any:
-        """Returns the entry point for arguments of these types, compiled or loaded."""
+        """Returns the entry point for arguments of these types, compiled or loaded.
+
+        While another leaf is compiled, the result is an inner leaf; otherwise it is machine
+        code that Python can call.
+        """
         with global_compiler_lock:
             argument_types, return_type = normalize_signature(signature)
             known: Any = self.overloads.get(argument_types)

@@ -98,12 +98,17 @@ def _adapts(s: SiteRow) -> bool:
 
 @leaf
 def _update_estimate(k: int, s: SiteRow, chain: RowArray | None) -> None:
-    """Runs stage 5: the trapezoid rule for Eq. (15).
+    """Runs stage 5, the estimate: the trapezoid rule for Eq. (15).
 
         theta_k = theta_{k-1} - h/2 Gamma (Y'r_{k-1} + Y'r_k)
 
     The rule is explicit, because Y' r does not depend on the estimate. The sum of both ends of
     the period is multiplied by h/2. DIGITAL advances the estimate in stage 8 instead.
+
+    Args:
+        k: The tick.
+        s: Row of the site.
+        chain: Rows of the chain, or None.
     """
     if s.scheme == _DIGITAL or k == s.first or s.law != _ADAPTIVE or not _adapts(s):
         return
@@ -223,7 +228,15 @@ def _write_record(s: SiteRow, row: Array) -> None:
 def _update_external_torque(
     t_s: float, s: SiteRow, chain: RowArray | None, actors: TorqueSourceRows, table: TorqueTable
 ) -> None:
-    """Writes the torque of operators and environments at time t_k, which stage 6 may use."""
+    """Writes the torque of operators and environments at time t_k, which stage 6 may use.
+
+    Args:
+        t_s: Time since the epoch, s.
+        s: Row of the site.
+        chain: Rows of the chain, or None.
+        actors: Operators and environments.
+        table: Their tables.
+    """
     if chain is None:
         two_link_stages.update_external_torque(t_s, s, actors, table)
     else:
@@ -242,6 +255,14 @@ def _advance_arm(
     table: TorqueTable,
 ) -> bool:
     """Advances q and qd by one period.
+
+    Args:
+        t_s: Time at the beginning of the period, s since the epoch.
+        h_s: The period, s.
+        s: Row of the site.
+        chain: Rows of the chain, or None.
+        actors: Operators and environments.
+        table: Their tables.
 
     Returns:
         False, without a change, if the result is not finite.
@@ -269,6 +290,14 @@ def _advance(
         u = 1.5 tau_k - 0.5 tau_{k-1}, within the limit
 
     At the first tick, and under DIGITAL, u = tau_k.
+
+    Args:
+        k: The tick.
+        t_ns: Nominal time of the tick, ns since the epoch.
+        s: Row of the site.
+        chain: Rows of the chain, or None.
+        actors: Operators and environments.
+        table: Their tables.
     """
     h_s = 1.0 / s.rate_hz
     # Evaluate this before the arm moves: whether an arm at rest is fast depends on its speed.
@@ -334,7 +363,14 @@ def find_release(peer: int, tick: int, arrays: SiteArrays) -> int:
 
 @leaf
 def accept_stage(k: int, count: int, arrays: SiteArrays, buffers: TickBuffers) -> None:
-    """Runs stage 1: files the first `count` arrivals of the buffers in their links."""
+    """Runs stage 1: files the samples that arrived in the calendars of their links.
+
+    Args:
+        k: The tick.
+        count: Number of arrivals in the buffers.
+        arrays: Arrays of the site.
+        buffers: Arrivals of the tick.
+    """
     rate_hz = arrays.site[0].rate_hz
     for n in range(count):
         arrival: ArrivalRow = buffers.arrivals[n]
@@ -438,9 +474,18 @@ def act_stages(
     chain: RowArray | None,
     record: Array,
 ) -> None:
-    """Runs the end of stage 6 and stages 7 and 8 of a tick, after the law wrote its torque.
+    """Runs the end of stage 6, and stages 7 and 8, after the law wrote its torque.
 
     Without the rule `glide` a joint beyond its limit of speed makes the site DIVERGED here.
+
+    Args:
+        k: The tick.
+        t_ns: Nominal time of the tick, ns since the epoch.
+        site: Row of the site.
+        actors: Operators and environments.
+        table: Their tables.
+        chain: Rows of the chain, or None.
+        record: Floats of the record; written.
     """
     s: SiteRow = site[0]
     _guard_torque(k, t_ns, s, chain)

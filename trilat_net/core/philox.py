@@ -113,7 +113,11 @@ def uniforms(key: DrawKey, sample: int, purpose: int, attempt: int) -> tuple[flo
 def standard_normal(key: DrawKey, sample: int, purpose: int, attempt: int) -> float:
     """Returns a standard normal number by the method of Box and Muller.
 
-    The arguments are those of `uniforms`.
+    Args:
+        key: Key of the link.
+        sample: Index of the sample.
+        purpose: Purpose of the draw.
+        attempt: Attempt of a method that rejects draws, from 0.
     """
     u, v = uniforms(key, sample, purpose, attempt)
     radius = math.sqrt(-2.0 * math.log(u))

@@ -28,7 +28,10 @@ closed forms.
 
 @leaf
 def arctan(x: float) -> float:
-    """Returns the arc tangent of a number from 0 to 1, rad (Cephes, `atan`)."""
+    """Returns the arc tangent of a number from 0 to 1, rad (Cephes, `atan`).
+
+    The method is a rational function P / Q of x^2. Numbers above 0.66 are transformed first.
+    """
     offset = 0.0
     if x > 0.66:
         # arctan(x) = pi / 4 + arctan((x - 1) / (x + 1))
@@ -50,7 +53,10 @@ def arctan(x: float) -> float:
 
 @leaf
 def rotation_matrix(vector: Three) -> Matrix:
-    """Returns the rotation matrix of a rotation vector, three rows (Rodrigues)."""
+    """Returns the rotation matrix of a rotation vector, three rows.
+
+    The formula is that of Rodrigues, with limits for small angles.
+    """
     x, y, z = vector
     angle = math.sqrt(x * x + y * y + z * z)
     s, c = sincos(angle)

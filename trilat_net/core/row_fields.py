@@ -321,7 +321,7 @@ class ArrivalRow(Protocol):
 
 
 class ProgressRow(Protocol):
-    """The row of a site's progress in the fused run."""
+    """The row of a site's progress in the fused run of all sites."""
 
     tick: Annotated[int, Field("", "tick", "next tick", "fused run")]
     t_ns: Annotated[int, Field("", "ns", "its nominal time; NEVER_NS at the end", "fused run")]
@@ -339,7 +339,7 @@ class ProgressRow(Protocol):
 
 
 class SumsRow(Protocol):
-    """The row of a site's sums over its records in the fused run."""
+    """The row of a site's sums over its records in the fused run, from which metrics follow."""
 
     first_environment: Annotated[
         int, Field("", "", "index of the first environment; -1: no environment", "setup")

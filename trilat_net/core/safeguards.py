@@ -55,7 +55,10 @@ def limit_reference(k: int, site: SiteRow) -> None:
 
 @leaf
 def _limit_turn(site: SiteRow) -> None:
-    """Limits the angular velocity of the reference about each axis, keeping the turn's axis."""
+    """Limits the angular velocity of the reference about each axis.
+
+    The axis of the turn since the previous tick is kept: the turn is shortened as a whole.
+    """
     vector_before = three(site.q_followed[3:])
     before = rotation_matrix(vector_before)
     desired = rotation_matrix(three(site.q_des[3:]))

@@ -170,7 +170,13 @@ def _start_alignment(t_ns: int, site: SiteRow, reason: int, q: Array, qd: Array)
 
 @leaf
 def _leave_rest(t_ns: int, site: SiteRow, reason: int) -> None:
-    """Starts an alignment from the reference of an arm at rest."""
+    """Starts an alignment from the reference of an arm at rest.
+
+    Args:
+        t_ns: Time, ns since the epoch.
+        site: Row of the site.
+        reason: Reason of the change of mode.
+    """
     put_rest_reference(site, site.q_followed, site.qd_followed)
     _start_alignment(
         t_ns=t_ns, site=site, reason=reason, q=site.q_followed, qd=site.qd_followed
@@ -370,7 +376,14 @@ def _find_offset(t_ns: int, duration_s: float, site: SiteRow, i: int) -> tuple[f
 
 @leaf
 def _add_offset(t_ns: int, site: SiteRow) -> None:
-    """Adds the offset of an alignment and its rate to the peers' reference."""
+    """Adds the offset of an alignment and its rate to the peers' reference.
+
+    Linear coordinates are added. An orientation is composed with the turn of the offset.
+
+    Args:
+        t_ns: Time, ns since the epoch.
+        site: Row of the site, with the peers' reference.
+    """
     duration_s = _alignment_s(site)
     for i in range(count_linear_coordinates(site)):
         offset, rate = _find_offset(t_ns, duration_s, site, i)

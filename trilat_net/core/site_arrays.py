@@ -571,7 +571,11 @@ def _build_site(setup: SiteSetup, layout: Layout) -> RowArray:
 
 
 def _list_vectors(setup: SiteSetup) -> dict[str, Any]:
-    """Returns the vectors of a site's row before its first tick, by field."""
+    """Returns the vectors of a site's row before its first tick, by the name of the field.
+
+    A law of known gravity starts with its known parameters as estimate, other laws with their
+    first estimate.
+    """
     gains = setup.gains
     vectors: dict[str, Any] = {name: getattr(gains, name) for name in _GAINS}
     vectors |= setup.limits._asdict()

@@ -56,7 +56,11 @@ def advance_estimate(s: Row, gain_s: float, Yr: Vector) -> None:
 
 @leaf
 def update_torque(s: Row) -> None:
-    """Writes the torque of the site's law, within its limits."""
+    """Writes the torque of the site's law, within its limits.
+
+    The law is Eq. (13) with its robust term, or the law of known gravity
+    (`control.damped_torque`).
+    """
     if s.law == _ADAPTIVE:
         Y = (five(s.Y[0]), five(s.Y[1]))
         tau = control.adaptive_torque(
@@ -210,6 +214,17 @@ def _acceleration(
     """Returns qdd at a stage of the integrator, rad/s^2.
 
     The torque is the held u plus the torque of the actors at the time and state of the stage.
+
+    Args:
+        t_s: Time of the stage, s since the epoch.
+        q: Joint angles, rad.
+        qd: Joint velocities, rad/s.
+        u: Held torque, shape (2,), N m.
+        theta: Parameters of the arm, shape (5,).
+        g: Gravitational acceleration, m/s^2.
+        lengths: Lengths of the two links, m.
+        actors: Operators and environments.
+        table: Their tables.
     """
     on_arm = torque_on_arm(
         t_s=t_s, q=q, qd=qd, lengths=lengths, actors=actors, table=table, sampled=0
@@ -305,6 +320,13 @@ def advance_arm(
     t_s: float, h_s: float, s: Row, actors: TorqueSourceRows, table: TorqueTable
 ) -> bool:
     """Advances q and qd by one period under the torque `s.u`.
+
+    Args:
+        t_s: Time at the beginning of the period, s since the epoch.
+        h_s: The period, s.
+        s: Row of the site.
+        actors: Operators and environments.
+        table: Their tables.
 
     Returns:
         False if the result is not finite; q and qd are unchanged then.

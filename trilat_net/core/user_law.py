@@ -63,6 +63,7 @@ def _make_operator(operate: Callable[[Any, Any], Any]) -> Any:
     """
 
     def compute(numbers: "LawVector", other: Any) -> Any:
+        """Applies the operation to each number, and to the other operand's number."""
         if isinstance(other, Real):
             return LawVector([operate(number, other) for number in numbers])
         if not isinstance(other, list | tuple):
@@ -78,7 +79,10 @@ def _make_operator(operate: Callable[[Any, Any], Any]) -> Any:
 
 
 class LawVector(list[Any]):
-    """List with arithmetic by number: `-5.0 * (now.q - now.q_des) - 2.0 * now.qd`."""
+    """List of numbers with arithmetic by number: `-5.0 * (now.q - now.q_des) - 2.0 * now.qd`.
+
+    The other operand is a number, or a list with as many numbers.
+    """
 
     __add__ = __radd__ = __iadd__ = _make_operator(operator.add)
     __sub__ = _make_operator(operator.sub)
@@ -374,7 +378,14 @@ def law_name(law: UserLaw) -> str:
 
 
 def _law_error(law: UserLaw, site: str, tick: int | None, problem: str) -> LawFailed:
-    """Returns the error for a problem with the results of a law."""
+    """Returns the error for a problem with the results of a law.
+
+    Args:
+        law: The law.
+        site: Name of the site.
+        tick: The tick; None outside of a tick.
+        problem: The problem, a sentence for the user.
+    """
     return LawFailed(problem, site=site, code=law_name(law), tick=tick)
 
 

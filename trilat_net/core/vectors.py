@@ -46,10 +46,15 @@ def put(a: Any, values: Any) -> None:
 
 @leaf
 def count_started(table: Any, first: int, count: int, now: float) -> int:
-    """Returns how many rows of a table start at the time `now` or before.
+    """Returns how many rows of a table start at a time or before.
 
-    The rows `first` to `first + count - 1` are ordered by time, which is their first column.
-    The method is bisection.
+    The rows are ordered by time, which is their first column. The method is bisection.
+
+    Args:
+        table: The table.
+        first: Index of the first row.
+        count: Number of rows.
+        now: The time.
     """
     low = first
     high = first + count

@@ -115,7 +115,10 @@ class FourChannel(ControlLaw):
         self.rows = [0.0] * (facts.joints * (facts.joints + 1))
 
     def torque(self, now: LawInput) -> None:
-        """Writes the torque of each joint, and sends the acceleration that it causes."""
+        """Writes the torque of each joint, and sends the acceleration that it causes.
+
+        The equation is that of the class. Without the acceleration channel nothing is sent.
+        """
         n = now.joints
         for i in range(n):
             gravity = self.gravity * now.gravity[i]

@@ -212,6 +212,7 @@ class LawSettings(Frozen, frozen=True):
             return None
 
         def make_law(context: LawContext) -> UserLaw:
+            """Returns an instance of the law, after checking that its class suits the site."""
             check_law_class(
                 kind=self.kind, code=self.tag, context=context, sites=sites, scheme=scheme
             )
