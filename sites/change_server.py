@@ -93,11 +93,18 @@ class ChangeServer:
         self._rate_hz = scenario.sites[site].rate_hz
         self._ticks = scenario.ticks(site)
         self._links = LinkTables(scenario.links, scenario.timeline)
+
+        # Request that waits for a tick without other orders.
         self._deferred: Query | None = None
+
+        # Accepted changes: their number per link, and the start times of weight changes.
         self._accepted_counts: Counter[str] = Counter()
         self._pending_ramps_ns: deque[int] = deque()
+
+        # First tick after the end that a user has requested.
         self._stop_tick: int | None = None
         self.stopped = False
+
         self.marks: list[tuple[int, str]] = []
         self.sources: dict[str, str] = {}
 

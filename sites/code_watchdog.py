@@ -86,14 +86,18 @@ class WatchedCode:
         self.hiccups = 0
         self.longest_ns = 0
         self.longest_tick = -1
+
         self._name = name
         self._fail = fail
         self._clock = clock
         self._usage = usage
         self._period_ns = NS_PER_S // rate_hz
+
         self._overtime_ns = 0
         self._total_ns = 0  # duration of all calls
         self._calls = 0
+
+        # State of the checks for a call that does not return.
         self._same_call_checks = 0  # checks in a row that have seen the same call
         self._running_tick = -1  # the tick of the running call
         self._first_tick = -1

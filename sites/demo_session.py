@@ -139,6 +139,7 @@ class SessionProcess:
             # The signal has interrupted the start of the process, which may then end with any
             # exit code.
             return None
+
         if code in (0, None):
             return None
         if self._signalled and code in (128 + signal.SIGINT, -signal.SIGINT):
@@ -146,6 +147,7 @@ class SessionProcess:
             return None
         if code is not None and code < 0:
             return f"{self.name} was killed by {signal.Signals(-code).name}"
+
         lines = self.output.read_text(encoding="utf-8", errors="replace").strip().splitlines()
         last_line = lines[-1].removeprefix("error: ") if lines else "it printed nothing"
         return f"{self.name} ended with code {code}: {last_line}"
@@ -507,6 +509,7 @@ def _end_group(
     """
     for process in group:
         process.end(signal.SIGINT)
+
     begun_ns = clock.monotonic_ns()
     is_announced = False
     is_repeated = False
@@ -516,6 +519,7 @@ def _end_group(
             is_repeated = True
             for process in group:
                 process.end(signal.SIGINT)
+
         if waited_ns > NS_PER_S and not is_announced:
             is_announced = True
             announce()

@@ -81,12 +81,14 @@ class DeviceHand:
         self._reach = reach
         # The axes of the arm in the coordinates of the device, a row per axis of the arm.
         self._axes = settings.rows(len(hand.pose))
+
         self.states = 0
         self.jumps = 0
         self.unreadable = 0
         self.trips_ns = deque[int](maxlen=TRIPS_KEPT)
         # Number and sending time of the targets to which the arm has not responded yet.
         self._sent = deque[tuple[int, int]](maxlen=TRIPS_KEPT)
+
         self._period_ns = 1_000_000_000 // device.rate_hz
         self._due_ns = 0
         self.release()

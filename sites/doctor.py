@@ -149,16 +149,19 @@ def examine_keys(folder: Path | None) -> Generator[DoctorFinding, None, MemberKe
     except UsageError as error:
         yield DoctorFinding("keys", "fail", str(error))
         return None
+
     names = ", ".join(member_keys.members)
     text = f"{member_keys.member} of {names}, until {member_keys.ends:%Y-%m-%d %H:%M} UTC"
     if member_keys.ends - datetime.now(UTC) < ENDS_SOON:
         yield DoctorFinding("keys", "warn", f"{text}: soon; renew them with trilat keys renew")
     else:
         yield DoctorFinding("keys", "ok", text)
+
     if read_foreign_permissions(folder):
         yield DoctorFinding(
             "keys", "warn", f"others can look into {folder}: chmod 700 {folder}"
         )
+
     authority = folder.resolve().parent / "authority" / PRIVATE_KEY
     if authority.exists():
         text = f"{authority} lies here too: with it anybody makes keys; keep it elsewhere"
@@ -186,12 +189,14 @@ def examine_links(
     except UsageError as error:
         yield DoctorFinding("links", "fail", str(error))
         return
+
     for endpoint in find_endpoint_addresses(safe.reach(safe.listen)):
         address = _split_address(endpoint)
         if address is None:
             yield _describe_untried(endpoint)
         else:
             yield _examine_listening(endpoint, address)
+
     for endpoint in find_endpoint_addresses(safe.reach(safe.connect or ())):
         address = _split_address(endpoint)
         if endpoint.startswith("quic/"):
@@ -200,6 +205,7 @@ def examine_links(
             yield _describe_untried(endpoint)
         else:
             yield _examine_reaching(endpoint, address, folder if member_keys else None)
+
     if not safe.listen and not safe.connect:
         yield DoctorFinding(
             "links", "ok", "no endpoints given: --listen and --connect are tried if given"
@@ -222,6 +228,7 @@ def _examine_listening(endpoint: str, address: tuple[str, int]) -> DoctorFinding
     is_quic = endpoint.startswith("quic/")
     family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
     kind = socket.SOCK_DGRAM if is_quic else socket.SOCK_STREAM
+
     try:
         with socket.socket(family, kind) as probe:
             if not is_quic:  # with this option, two UDP sockets could share the port
@@ -232,6 +239,7 @@ def _examine_listening(endpoint: str, address: tuple[str, int]) -> DoctorFinding
     except OSError as error:
         text = f"cannot listen at {endpoint}: {error.strerror or error}"
         return DoctorFinding("links", "fail", text)
+
     if endpoint.startswith(ENCRYPTED) or is_loopback(endpoint):
         return DoctorFinding("links", "ok", f"can listen at {endpoint}")
     text = f"{endpoint} would listen unencrypted, to anybody who reaches it"
@@ -346,7 +354,10 @@ def examine_clock(clock: Clock) -> Iterator[DoctorFinding]:
         backward_steps += now_ns < previous_ns
         longest_gap_ns = max(longest_gap_ns, now_ns - previous_ns)
         previous_ns = now_ns
+
+    # If both clocks run steadily, they have advanced by the same time.
     step_ns = abs(clock.unix_ns() - wall_ns - (clock.monotonic_ns() - begun_ns))
+
     if backward_steps:
         times = count_nouns(backward_steps, "time")
         text = f"the monotonic clock went back {times} in 0.1 s"
@@ -476,6 +487,7 @@ class Rehearsal(LoopStats):
         """
         inbox = PeerInbox(links=(), rings=(), boots=(), monitors=(), dropped=self.dropped)
         epoch_ns = clock.monotonic_ns() + NS_PER_S // 10
+
         timing = SiteTiming(epoch_ns, self._site.rate_hz, (), "")
         site_io: Any = self
         run_loop(
@@ -565,9 +577,11 @@ def examine_rate() -> DoctorFinding:
         return DoctorFinding(
             "rate", "warn", "not measured: the core is not yet compiled, see below"
         )
+
     results: list[tuple[int, int, int]] | None = _run_in_process(_RATES_CODE)
     if results is None:
         return DoctorFinding("rate", "warn", "could not be measured")
+
     # All rates before the last one were not achieved.
     rate_hz, late_us, largest_us = results[-1]
     missed = results[:-1]
@@ -576,6 +590,7 @@ def examine_rate() -> DoctorFinding:
         f"{share} of the ticks began within {late_us / 1e3:.2f} ms of their time, "
         f"all within {largest_us / 1e3:.1f} ms"
     )
+
     if not is_held(rate_hz, late_us):
         text = f"a site alone holds not even {rate_hz} Hz: {text}; end other programs"
         return DoctorFinding("rate", "fail", text)
@@ -595,6 +610,7 @@ def examine_room(folder: Path) -> Iterator[DoctorFinding]:
     candidates = (folder.absolute(), *folder.absolute().parents)
     existing = next(path for path in candidates if path.is_dir())
     free = shutil.disk_usage(existing).free
+
     state: FindingState = "ok"
     if free < MIN_FREE_BYTES:
         state = "fail"
@@ -603,6 +619,7 @@ def examine_room(folder: Path) -> Iterator[DoctorFinding]:
     if not os.access(existing, os.W_OK):
         yield DoctorFinding("disk", "fail", f"{existing} cannot be written to")
     yield DoctorFinding("disk", state, f"{free / 1e9:.1f} GB are free in {existing}")
+
     cores = process.count_cores()
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
     text = f"{count_nouns(cores, 'processor')}, of which {load:.1f} are busy"
@@ -611,6 +628,7 @@ def examine_room(folder: Path) -> Iterator[DoctorFinding]:
         text = f"{text}; {warning}"
     is_short = cores < 2 or load >= cores or bool(warning)
     yield DoctorFinding("processors", "warn" if is_short else "ok", text)
+
     if is_core_cached():
         yield DoctorFinding("core", "ok", "compiled")
     else:

@@ -84,6 +84,7 @@ class ExternalArm:
     ) -> None:
         self.newest: PlantState | None = None
         self.accepted = 0
+
         self._site = site.name
         self._layout = site.layout
         self._ring = ring
@@ -93,11 +94,15 @@ class ExternalArm:
         self._reported_order = ""
         self._clock = clock
         self._address = address
+
         # Start of the driver that is followed, and number of its newest measurement.
         self._boot = -1
         self._n = -1
+
         self._is_bound = False  # True once the session has started, see `bind`
         self._is_counting = False  # True once missing measurements are counted
+
+        # Time without an accepted measurement, and time of the last poll.
         self._silent_ns = 0
         self._polled_ns: int | None = None
 

@@ -72,11 +72,13 @@ class HandProcess(SiteClient):
         super().__init__(bus, clock, session, hand_site.name)
         self.answered = 0
         self.skipped = 0
+
         self._program = program
         self._code = hand_site.source
         self._pushes = hand_site.spec.mode == "force"
         site_rate_hz = hand_site.scenario.sites[hand_site.name].rate_hz
         self._ticks_per_view = site_rate_hz // hand_site.rate_hz
+
         self._sender = make_hand_sender(bus, clock, session, hand_site.name)
         self._views = bus.inbox(topics.key(session, hand_site.name, topics.VIEW), VIEWS_KEPT)
         self._announced_ns = 0
@@ -192,6 +194,7 @@ def run_hand(
         raise UsageError(
             f"{name} {problem}: its site runs such a hand itself, or there is none"
         )
+
     program = make_hand_program(hand_site)
     clock = SystemClock()
     stopped = interrupt.is_requested
@@ -201,6 +204,7 @@ def run_hand(
     )
     if bus is None:
         return
+
     with HandProcess(
         hand_site=hand_site, program=program, bus=bus, clock=clock, session=session
     ) as hand:

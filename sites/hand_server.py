@@ -127,6 +127,7 @@ class HandServer:
         commands = [command for command in parsed if command is not None]
         if not commands and not self._memory.target:
             return self._free_state
+
         t_ns = tick_ns(k, self._rules.rate_hz)
         step = advance_hand(
             rules=self._rules,
@@ -136,6 +137,7 @@ class HandServer:
             locate=self._compute_pose,
         )
         self._memory = step.memory
+
         for reason in step.refused:
             self._dropped[reason] += 1
         for source, change in step.changes:

@@ -81,8 +81,10 @@ def describe_site(
             "late": f"{stats.late_max_us} us",
             "overruns": f"{stats.overruns}",
         }
+
     if record is not None:
         row |= _describe_record(scenario, name, record)
+
     if ended:
         row["mode"] = "ended"
     elif silent_s > 0.0:
@@ -110,6 +112,7 @@ def _describe_record(scenario: Scenario, name: str, record: State) -> SiteRow:
     else:
         unit = "rad"
         error = position - desired
+
     hand = HandInForce.read(record.hand) if record.hand else None
     return {
         "time": f"{record.t_ns / NS_PER_S:.1f} s",
@@ -300,6 +303,7 @@ class SessionMonitor:
         for name, states in self._states.items():
             for record in read_records(states, scenario.layout(name)):
                 self.records[name] = record
+
         if self._display.due:
             rows = [
                 describe_site(scenario, name, self.records.get(name), self.latest.get(name))

@@ -219,6 +219,7 @@ def _open(
         raise UsageError(
             f"--keys: a benchmark goes as samples go, so it takes a site's, not {keys.member}'s"
         )
+
     used_keys = keys if is_encrypted else None
     if listens:
         connection = Connection(listen=[endpoint])
@@ -226,6 +227,7 @@ def _open(
     else:
         connection = Connection(connect=[endpoint])
         name = NEAR
+
     bus = secure_connection(connection, used_keys, insecure=insecure).open()
     return bus, used_keys.member if used_keys else name
 

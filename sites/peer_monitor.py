@@ -75,15 +75,18 @@ class PeerMonitor:
         self.departed: dict[str, tuple[int, str]] = {}
         self.admitted: list[Event] = []
         self.changed = False
+
         self._site = site
         self._admits = admits
         self._events: dict[str, Inbox] = {}
         for peer in peers:
             event_key = topics.key(session, peer, topics.EVENT)
             self._events[peer] = bus.inbox(event_key, _INBOX_CAPACITY)
+
         recorder_key = topics.key(session, topics.RECORDER, topics.EVENT)
         self._recorder_events = bus.inbox(recorder_key, _INBOX_CAPACITY)
         self._presence = bus.presence(topics.presence_key(session, "*"))
+
         # Members and boots whose tokens are alive.
         self._alive: set[tuple[str, str]] = set()
         # Boots whose end event was received.
@@ -211,6 +214,7 @@ class PeerMonitor:
                     )
             elif event.kind == "admit" and event.about == self._site:
                 admitted_boot = event.boots.get(self._site, local_boot)
+
         if admitted_boot != local_boot and self.boots.get(self._site) == local_boot:
             self.ended_by = f"another start of {self._site} has replaced this site"
             self.ended_member = self._site

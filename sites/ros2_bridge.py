@@ -270,10 +270,12 @@ class RobotArm:
         self._make_client = make_client
         self._client = make_client()
         self._joints = joints
+
         controller = robot.controller or [names[0] for names in joints]
         self._safe_command = robot.safe or [0.0] * len(joints)
         self._joint_order = _order_joints(joints, controller, self._safe_command)
         self._pack = cdr.make_float_array_packer((" ".join(controller), len(controller)))
+
         self._commands = commands
         self._clock = clock
         self._sender = SingleSender(clock)
@@ -488,12 +490,16 @@ class Bridge:
         self._ends = ends
         self._scenario = scenario
         self._epoch_unix_ns = epoch_unix_ns
+
+        # Messages from the session.
         self._records = bus.inbox(topics.key(session, "*", topics.STATE), 4096)
         self._events = bus.inbox(topics.key(session, "*", topics.EVENT), 4096)
         self._links = bus.inbox(topics.key(session, "*", topics.LINK), 4096)
         self._presence = bus.presence(topics.presence_key(session, "*"))
         self._present = set[topics.KeyParts]()
         self._has_seen_site = False
+
+        # Publishers of the ROS topics: of the session, and of each site.
         frames = graph.publisher(FRAMES, COMMON_TOPICS[FRAMES].kind, RELIABLE)
         self._diagnostics = graph.publisher(
             DIAGNOSTICS, COMMON_TOPICS[DIAGNOSTICS].kind, RELIABLE
@@ -510,6 +516,8 @@ class Bridge:
                 epoch_unix_ns=epoch_unix_ns,
                 frames=frames,
             )
+
+        # Subscriptions and services through which ROS programs influence the session.
         running = RunningSession(session, Connection(), bus)
         self.targets: dict[str, TargetTopic] = {}
         self.dominance: dict[str, DominanceTopic] = {}
@@ -542,9 +550,11 @@ class Bridge:
             scenario=self._scenario,
             source="ros2",
         )
+
         frame = self._sites[site].frame
         topic_name, kind, read, apply = describe_target(self._scenario, site, hand, frame)
         topic = ends.topic(site, topic_name)
+
         target = TargetTopic(hand, read, apply, ends.clock)
         self.targets[topic] = target
         ends.graph.subscribe(topic, kind, target.receive)

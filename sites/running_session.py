@@ -385,6 +385,7 @@ class RunningSession:
         infos: dict[str, Info] = {}
         scenario: Scenario | None = None
         first_reply_ns: int | None = None  # time of the first reply of a site
+
         for info in self._find_members(bus):
             if scenario is None and info.scenario:
                 scenario = parse_embedded(info.scenario, self.name)
@@ -822,6 +823,7 @@ def open_hand(
             f"nobody can take hold of {site}: "
             f"the scenario has no operator of kind 'live' there{remedy}"
         )
+
     compute_pose = tuple if live.mode == "joint" else scenario.arms[site].end_effector
     return Hand(
         bus=bus,

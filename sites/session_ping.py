@@ -130,6 +130,7 @@ class SessionPing:
     def report(self) -> PingReport:
         """Returns the results of the measurement."""
         members = [self._describe_member(info) for _, info in sorted(self.infos.items())]
+
         links = []
         for site, stats in sorted(self.links.items()):
             for peer in stats.delay_us:
@@ -143,6 +144,7 @@ class SessionPing:
                     "bound_us": stats.bound_us.get(peer, 0),
                 }
                 links.append(link)
+
         return PingReport(self._session, members, links)
 
     def _describe_member(self, info: Info) -> dict[str, Any]:
@@ -328,11 +330,13 @@ def _describe_delays(samples: Sequence[tuple[int, int]], lasted_s: float) -> dic
     """
     numbers = {number for number, _ in samples}
     sent = max(numbers) - min(numbers) + 1
+
     delays_us = np.array([delay_ns for _, delay_ns in samples]) / 1e3
     counts, edges_us = np.histogram(delays_us, bins=20)
     quantiles_us = {}
     for name, percent in (("min", 0.0), ("p50", 50.0), ("p99", 99.0), ("max", 100.0)):
         quantiles_us[name] = float(np.percentile(delays_us, percent))
+
     return {
         "messages": len(samples),
         "lost": sent - len(numbers),

@@ -107,11 +107,13 @@ class PeerInbox:
         self._boots = list(boots)
         self._monitors = monitors
         self._dropped = dropped
+
         # For each peer: the newest tick that was received or need not be received, and the last
         # tick before the first that was expected from the peer's present boot.
         self._last = [first_tick_at(from_ns, link.rate_hz) - 1 for link in links]
         self._skipped_until = list(self._last)
         self._newest: list[PeerSample | None] = [None] * len(links)
+
         if from_ns:
             # Discard the samples that arrived during the wait. Otherwise the first tick would
             # have to process all of them.
@@ -244,6 +246,7 @@ class PeerInbox:
             is_within_limit = abs(speed) <= speed_limit
             if not is_within_limit:
                 return False
+
         if newest is not None:
             elapsed_s = abs(sample.tick - newest.tick) / link.rate_hz
             joints = zip(sample.q, newest.q, link.speed_limit, strict=True)
@@ -252,6 +255,7 @@ class PeerInbox:
                 is_within_limit = abs(angle - newest_angle) <= distance_limit
                 if not is_within_limit:
                     return False
+
         if newest is None or sample.tick > newest.tick:
             self._newest[index] = sample
         return True

@@ -132,16 +132,22 @@ class SiteParts:
         self.clock = clock
         self.interrupt = interrupt
         self.say: Callable[[str], None] = lambda text: say(f"{name}: {text}")
+
+        # The site in the simulation kernel, and the function that computes a tick.
         self.setup = scenario.setup(name)
         self.site = Site(self.setup)
         self.boot = new_boot()
         self.stats = LoopStats(self.site, self.boot)
         self.watchdog, self.step = watch_law(scenario, self.site, clock)
+
+        # Queues of the samples from the peers.
         readers = make_sample_readers(self.setup)
         self.rings = [
             bus.stamped_inbox(self._key(topics.SAMPLE, link.peer), clock.monotonic_ns, reader)
             for link, reader in zip(self.setup.links, readers, strict=True)
         ]
+
+        # The arm, its simulation by the user, and its operator.
         self.arm: ExternalArm | None = None
         self.switch: DeadManSwitch | None = None
         self._connect_outside_arm()
@@ -152,9 +158,13 @@ class SiteParts:
             self.plant = PlantPlayer(scenario, name, plant, run_plant)
         self.hand: HandServer | HandPlayer | None = None
         self._connect_hand()
+
+        # What the site publishes.
         past_queries = bus.query_inbox(self._key(topics.PAST))
         self.buffer = RetransmitBuffer(self.site, self.boot, past_queries)
         self._make_publishers()
+
+        # Members of the session, and requests of users.
         self.monitor = PeerMonitor(
             bus, options.session, name, self.site.peers, admits=scenario.sites_may_return
         )
@@ -167,6 +177,7 @@ class SiteParts:
             held=lambda: self.switch is None or self.switch.held,
             stops=bus.query_inbox(self._key(topics.STOP)),
         )
+
         warm_up(scenario, name, clock)
 
     def _key(self, channel: str, member: str = "") -> str:
@@ -231,11 +242,13 @@ class SiteParts:
         live_hand = self.scenario.sites[name].find_live_hand()
         if live_hand is None:
             return
+
         own_hand = find_own_hand(self.scenario, name)
         if own_hand is not None and not own_hand.has_separate_process:
             run_hand = self._watch_code(f"the hand {own_hand.program}", own_hand.rate_hz)
             self.hand = HandPlayer(own_hand, make_hand_program(own_hand), run_hand)
             return
+
         inbox = self.bus.inbox(self._key(topics.HAND), MESSAGES_KEPT)
         if own_hand is not None:
             self.hand = RemoteHand(
@@ -247,6 +260,7 @@ class SiteParts:
                 clock=self.clock,
             )
             return
+
         self.hand = HandServer(
             site=self.site,
             hand=live_hand,
@@ -272,6 +286,7 @@ class SiteParts:
                 dropped=self.stats.dropped,
                 address=" at ".join([key, *map(str, endpoints[:1])]),
             )
+
         if self.scenario.sites[name].arm.dead_man:
             ring = self.bus.stamped_inbox(
                 self._key(topics.ENABLE), read_clock, bytes, MEASUREMENTS_KEPT
@@ -422,6 +437,7 @@ def _run_warm_up(setup: SiteSetup, site: Site, step: Callable[[TickInput], TickR
     site.release_tick(0, 0)  # as when a site joins late
     estimator = OffsetEstimator()
     measured = PlantState(setup.q0, setup.qd0) if setup.external else None
+
     for k in range(WARM_UP_TICKS):
         arrivals = []
         if k > 0:
@@ -429,6 +445,7 @@ def _run_warm_up(setup: SiteSetup, site: Site, step: Callable[[TickInput], TickR
                 speeds = (0.0,) * len(link.q0)
                 channel = (0.0,) * link.channel.received_size
                 arrivals.append(Arrival(index, k - 1, link.q0, speeds, ch=channel))
+
         output = step(TickInput(k, arrivals, (), measured))
         echo = [(arrival.peer, arrival.tick, k) for arrival in arrivals]
         sample = encode_sample(site=setup.name, boot=0, output=output, sent_ns=k, echo=echo)
@@ -445,4 +462,5 @@ def _run_warm_up(setup: SiteSetup, site: Site, step: Callable[[TickInput], TickR
             echo=echo,
         )
         estimator.add(OffsetLimit(k, 1), OffsetLimit(k, -1))
+
     estimator.estimate(WARM_UP_TICKS)

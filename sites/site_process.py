@@ -287,6 +287,7 @@ class RunningSite:
         self._parts = parts
         self._publisher = publisher
         self._epoch = epoch
+
         self._failure: RunFailed | None = None
         self._mode = Mode.RUN
         self._skipped = list[str]()  # ranges of skipped ticks that are not published yet
@@ -298,9 +299,12 @@ class RunningSite:
         self._alarm_s = -1
         self._has_given_up = False
         self._rejoined_ns = tick_ns(epoch.first, site.rate_hz)
+
+        # Methods of the parts that the loop calls.
         self.publish_sample = parts.publish_sample
         self.publish_link = parts.publish_link
         self.use_slack = parts.buffer.answer_query
+
         parts.monitor.boots = epoch.boots
         site.start_at(epoch.first)
         parts.buffer.start_at(epoch.first)
@@ -314,6 +318,7 @@ class RunningSite:
             dropped=parts.stats.dropped,
             from_ns=tick_ns(epoch.first, site.rate_hz),
         )
+
         publisher.update(
             running=True,
             epoch_mono_ns=epoch.mono_ns,
@@ -362,6 +367,7 @@ class RunningSite:
         parts = self._parts
         # Samples may wait for the next block only if all peers share this machine.
         parts.states.holds_samples &= all(meter.peer.is_own for meter in self._timing.monitors)
+
         self._publish_setup()
         stop_request = ChangeRequest(order="stop", source="the operator")
         known_site = make_site_known(
@@ -372,6 +378,7 @@ class RunningSite:
             parts.options.connection,
             encode(stop_request),
         )
+
         with known_site, parts.watchdog:
             self._output = run_loop(
                 site=parts.site,
@@ -386,6 +393,7 @@ class RunningSite:
                 first=self._epoch.first,
                 catches_up=parts.arm is None,
             )
+
         output = self._output
         self._ticks = 0 if output is None else output.tick + 1
         self._t_ns = -1 if output is None else output.t_ns
@@ -472,6 +480,7 @@ class RunningSite:
         parts = self._parts
         measured = None if parts.arm is None else parts.arm.newest
         hand = () if parts.hand is None else parts.hand.track(parts.site, k)
+
         try:
             if parts.plant is not None:
                 measured = parts.plant.state
@@ -696,9 +705,11 @@ class RunningSite:
         else:
             unit = "rad"
             error = position - desired
+
         largest_error = np.abs(error).max()
         torque_nm = max(map(abs, output.tau))
         dropped = sum(parts.stats.dropped.values())
+
         return (
             f"t = {output.t_ns / NS_PER_S:.0f} s, {MODE_WORDS[output.mode]}, "
             f"|e| {largest_error:.3g} {unit}, torque {torque_nm:.3g} N m, "
@@ -719,6 +730,7 @@ class RunningSite:
         skipped = count_skipped_ticks(output.cmd)
         if skipped:
             self._skipped.append(f"{output.tick - skipped}-{output.tick - 1}")
+
         for change in output.cmd:
             if count_skipped_ticks([change]):
                 continue
@@ -728,6 +740,7 @@ class RunningSite:
                 "change", sentence, command=change, t_ns=output.t_ns, ticks=output.tick
             )
             parts.say(sentence)
+
         if output.mode is not self._mode:
             self._mode = output.mode
             text = describe_mode(
@@ -756,11 +769,14 @@ class RunningSite:
             if second <= self._alarm_s:
                 return
             self._alarm_s = second
+
         if rule.action is not StaleAction.GLIDE:
             return
+
         lost: Sequence[str] = ()  # peers without which the arm continues
         if rule.degrades and mode is Mode.RETURN:
             lost = parts.site.layout.list_lost_peers(output.mem, parts.site.peers)
+
         alarm = find_alarm(
             parts.options.session,
             parts.name,

@@ -72,6 +72,7 @@ class HaplyInverse3:
         # away for a while.
         if not self._was_connected:
             check_hosts([self._address])
+
         try:
             connection = connect(self._address, open_timeout=2.0, **_CONNECT_OPTIONS)
             self._socket = self._open.enter_context(connection)
@@ -79,6 +80,7 @@ class HaplyInverse3:
             raise ConnectionError(
                 f"no service of an Inverse3 at {self._address}: {error}"
             ) from None
+
         self._was_connected = True
         # The first message also names this program to the service.
         self._configuration = {"session": {"configure": {"profile": {"name": "trilat-net"}}}}
@@ -121,9 +123,11 @@ class HaplyInverse3:
         """
         if not message.get("inverse3"):
             raise ConnectionError(f"the service at {self._address} has no Inverse3")
+
         device = message["inverse3"][0]
         self._id = str(device["device_id"])
         state = device["state"]
+
         buttons: dict[str, bool] = {}
         for grip in message.get("wireless_verse_grip", []):
             for name, is_pressed in grip["state"].get("buttons", {}).items():

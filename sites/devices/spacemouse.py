@@ -82,8 +82,10 @@ class SpaceMouse:
         now_ns = self._clock.monotonic_ns()
         while self._read_report(now_ns):
             pass
+
         if now_ns - self._reported_ns > STILL_NS:
             self._velocity_m_s = (0.0, 0.0, 0.0)
+
         elapsed_s = (now_ns - self._read_ns) * 1e-9
         self._read_ns = now_ns
         x, y, z = self._position_m
@@ -93,6 +95,7 @@ class SpaceMouse:
             y + elapsed_s * vy,
             z + elapsed_s * vz,
         )
+
         buttons = {"a": bool(self._button_bits & 1), "b": bool(self._button_bits & 2)}
         return DeviceState(self._position_m, self._velocity_m_s, buttons)
 
@@ -115,6 +118,7 @@ class SpaceMouse:
             return False
         if not report:
             raise ConnectionError("the SpaceMouse is gone")
+
         kind = report[0]
         if kind == _MOTION_REPORT and len(report) >= 7:
             # The axes of the device point to the right, towards the person, and down.

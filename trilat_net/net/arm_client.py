@@ -584,6 +584,7 @@ class Hand(SiteClient):
         record = self._wait_for_record()
         operator = self._operator
         hand = HandInForce.read(record.hand)
+
         pull = list(hand.target)  # for an operator who pushes, the target is the force
         if operator.kind is not TorqueKind.LIVE_FORCE:
             pose = self._compute_pose(record.q)
@@ -595,6 +596,7 @@ class Hand(SiteClient):
                 K * (target - position) + B * (target_rate - rate)
                 for K, B, target, target_rate, position, rate in coordinates
             ]
+
         magnitude = math.hypot(*pull)
         limitation = operator.limit / magnitude if magnitude > operator.limit else 1.0
         scale = hand.grip * limitation

@@ -447,10 +447,13 @@ def resolve_member_connection(
             listen_else=listen_else,
             connect_else=(),
         )
+
     if file.mode == "router":
         raise UsageError(
             f"{file.source}: mode: router is for `trilat router`; here it is peer or client"
         )
+
+    # Without a router, the process connects to the other members.
     if not routers and file.mode != "client":
         return _join_options(
             listen=listen,
@@ -460,6 +463,8 @@ def resolve_member_connection(
             listen_else=listen_else,
             connect_else=connect_else,
         )
+
+    # The process is a client of a router.
     client_source = "--router" if routers else f"{file.source}: mode: client"
     if routers and file.mode == "peer":
         raise UsageError(
@@ -472,6 +477,7 @@ def resolve_member_connection(
         )
     if routers and connect is not None:
         raise UsageError("--router: a client connects to a router only; leave out --connect")
+
     for endpoint in routers or ():
         if not re.fullmatch(
             r"(tcp|tls|quic|udp|ws)/[^/]+:\d+([?#].*)?|unixsock-stream/.+", endpoint
@@ -479,6 +485,7 @@ def resolve_member_connection(
             raise UsageError(
                 f"--router: an endpoint is like tcp/192.0.2.1:7447, not {endpoint!r}"
             )
+
     endpoints = _merge_endpoints(routers or connect, file, "client", ())
     if not endpoints:
         raise UsageError(
@@ -609,6 +616,7 @@ def run_router(
     present: set[topics.KeyParts] = set()
     idle_ns = math.inf if until_idle_s is None else until_idle_s * 1e9
     empty_since_ns: int | None = None  # None before the first member
+
     while not stopped():
         for parts, is_alive in topics.read_presence(presence):
             if is_alive == (parts in present):
@@ -620,6 +628,7 @@ def run_router(
             change = "is here" if is_alive else "has left"
             say(f"session {parts.session}: {parts.member} {change}")
             empty_since_ns = None if present else clock.monotonic_ns()
+
         now_ns = clock.monotonic_ns()
         if empty_since_ns is not None and now_ns - empty_since_ns >= idle_ns:
             say(f"no member for {until_idle_s:g} s")

@@ -232,10 +232,12 @@ def send_change(
             f"{site} gave no answer; its records show whether it made the change"
             f"{'' if channel == topics.STOP else hint}"
         )
+
     try:
         reply = decode(payload, ChangeReply)
     except WireError as error:
         raise SessionError(f"the reply of {site} cannot be read: {error}") from None
+
     if request.order == "stop" and not reply.accepted and request.source is not UNSET:
         # A site with an older version of this program does not know the field `source`, and
         # refuses the whole request. Its arm must stop as well.
@@ -305,6 +307,7 @@ def list_past_events(
             backfill = None if reply is None else decode(reply, Backfill)
             if backfill is None or not backfill.payloads:
                 return
+
             for payload in backfill.payloads:
                 yield decode(payload, Event)
             first = backfill.first + len(backfill.payloads)

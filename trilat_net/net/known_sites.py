@@ -117,6 +117,7 @@ def make_site_known(
         pid=os.getpid(),
         machine=SystemClock().identity(),
     )
+
     has_users_settings = bool(connection.settings) and not connection.keys_of
     with suppress(OSError, RuntimeError):  # RuntimeError: the user has no home folder
         if not has_users_settings:
@@ -124,6 +125,7 @@ def make_site_known(
             descriptor = os.open(_find_folder() / f"{boot:016x}.json", _NEW_FILE, 0o600)
             with os.fdopen(descriptor, "wb") as stream:
                 stream.write(msgspec.json.encode(known))
+
     try:
         yield
     finally:

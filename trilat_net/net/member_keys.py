@@ -307,6 +307,7 @@ def _write_all_keys(
     authority_key = ec.generate_private_key(ec.SECP256R1())
     authority = _sign_authority(authority_key, ends)
     _write_folder(folder / _AUTHORITY_FOLDER, authority, authority, authority_key)
+
     for member in members:
         member_key = ec.generate_private_key(ec.SECP256R1())
         certificate = _sign_member(
@@ -491,6 +492,7 @@ def _check_permissions(path: Path, status: os.stat_result) -> None:
         raise UsageError(
             f"{path}: belongs to another user, who can change it: use keys of your own"
         )
+
     is_sticky_folder = stat.S_ISDIR(status.st_mode) and status.st_mode & stat.S_ISVTX
     others_may_write = status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
     if others_may_write and not is_sticky_folder:
@@ -523,6 +525,7 @@ def read_member_keys(folder: str | Path, *, stops: bool = False) -> MemberKeys:
             f"{folder}: has the keys of all members; name the folder of one member, as in "
             f"{folder}/m1"
         )
+
     try:
         _check_permissions(folder, folder.stat())
         members_text = _read_trusted(folder / MEMBERS)
@@ -551,6 +554,7 @@ def read_member_keys(folder: str | Path, *, stops: bool = False) -> MemberKeys:
         raise UsageError(
             f"{folder}: the authority has not signed this certificate ({error!r})"
         ) from None
+
     fault = _find_name_fault(members) or _find_key_fault(
         folder=folder,
         member=member,
@@ -588,6 +592,8 @@ def _find_key_fault(
     begins = certificate.not_valid_before_utc
     private = folder / PRIVATE_KEY
     now = datetime.datetime.now(datetime.UTC)
+
+    # Each entry: whether the fault is present, and its description for the user.
     faults = (
         (
             read_foreign_permissions(private),
@@ -611,6 +617,7 @@ def _find_key_fault(
             f"the certificate ended on {ends:{_DATE}}: {_RENEWAL}",
         ),
     )
+
     for is_present, text in faults:
         if is_present:
             return text

@@ -258,10 +258,12 @@ class _AdmissibleLines:
         lowest_ceiling = np.min(self._relaxed_ceilings - slope * self._ceiling_times_s)
         highest_floor = np.max(self._relaxed_floors - slope * self._floor_times_s)
         middle = 0.5 * (lowest_ceiling + highest_floor)
+
         # The present lies after every limit: the steepest line has the highest value there, and
         # the flattest line the lowest.
         high = np.min(self._relaxed_ceilings - self.steepest * self._ceiling_times_s)
         low = np.max(self._relaxed_floors - self.flattest * self._floor_times_s)
+
         return OffsetEstimate(
             local_ns=self._now_ns,
             offset_ns=self._base_ns + round(middle),
@@ -298,6 +300,7 @@ class _AdmissibleLines:
             (self._ceiling_times_s, self._ceilings, 1.0),
             (self._floor_times_s, self._floors, -1.0),
         )
+
         for round_index in range(_WEIGHTING_ROUNDS):
             numerator = 0.0
             denominator = prior_weight

@@ -147,6 +147,7 @@ def answer_backfill(
         request = decode(query.payload, BackfillRequest)
     except WireError:
         return 0  # sent by another program
+
     first, payloads, published = find(request)
     backfill = Backfill(
         member=member,

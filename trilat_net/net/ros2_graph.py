@@ -405,6 +405,7 @@ class Ros2Graph:
             settings=_SETTINGS,
             silent="no router of ROS answers at {}",
         )
+
         if not self.connected and self._session.info.peers_zid():
             self._session.close()
             endpoints = ", ".join(map(str, routers))
@@ -412,6 +413,7 @@ class Ros2Graph:
                 f"{endpoints} is no router, and forwards nothing: with --ros name that of ROS "
                 "(ros2 run rmw_zenoh_cpp rmw_zenohd, at port 7447), or trilat router"
             )
+
         self._node = Ros2Member(domain, str(self._session.zid()), namespace, name)
         self._distro = distro
         self._clock = clock

@@ -87,11 +87,15 @@ class SessionJoin:
         self._publisher = publisher
         self._sites = tuple(sites)
         self._late = late
+
+        # State of a request to join a running session.
         self.refusal = ""
         # The newest request of this site to join a running session: its event and its epoch.
         self._coming: tuple[Event, Epoch] | None = None
         self._admitted_by: set[str] = set()
         self._admitted_boots: dict[str, int] = {}  # boots of others that joined meanwhile
+
+        # What this member receives from the others.
         self._events = bus.inbox(topics.key(session, "*", topics.EVENT), 256)
         self.membership = Membership(
             bus=bus, clock=clock, session=session, publisher=publisher, sites=sites, late=late
@@ -99,14 +103,18 @@ class SessionJoin:
         self.pinger = Pinger(bus, clock, session)
         self._found_running_ns: int | None = None  # when a running session was found
         answer_pings(bus, clock, session, publisher.info)
+
         # Event `epoch` of the leader that this member has not agreed to yet.
         self._waiting_proposal: Event | None = None
         # Event `epoch` that this member has agreed to or, as the leader, has published. Its
         # epoch on the clock of this member, in ns.
         self._agreed_proposal: Event | None = None
         self._epoch_ns = 0
+
+        # Number of the newest proposal or request of this member.
         self._attempt = 0
         self._ready_epochs: dict[str, int] = {}  # the epoch on each ready member's clock
+
         bus.announce(liveliness_token(session, self._info.member, self._info.boot))
 
     @property
@@ -503,6 +511,7 @@ class SessionJoin:
         boots = self.membership.boots()
         self._ready_epochs = {}
         self._attempt += 1
+
         ahead_ns = EPOCH_AHEAD_NS + 2 * self.pinger.slowest_ns()
         self._epoch_ns = now_ns + ahead_ns
         self._agreed_proposal = self._publisher.publish(

@@ -210,6 +210,7 @@ class LinkTimingMonitor:
         # Newest tick that the peer has acknowledged, and arrival of that acknowledgement.
         self._acknowledged_ns = -1
         self._acknowledged_tick = -1
+
         self._epoch_ns = peer.epoch_ns
         self._index_at_peer = peer.index_at_peer
         self._shared_clock_offset_ns = peer.estimate.offset_ns if peer.is_own else None
@@ -360,11 +361,13 @@ class LinkTimingMonitor:
         round_trip_ns = self._shortest_round_trip_ns
         self._delays = []
         self._shortest_round_trip_ns = _NO_DELAY_NS
+
         median_us = -1
         longest_us = -1
         if delays:
             median_us = delays[len(delays) // 2] // 1000
             longest_us = delays[-1] // 1000
+
         return {
             "offset_us": self.offset.evaluate_ns(now_ns) // 1000,
             # A bound is rounded up: -(-a // b) is the smallest integer that is at least a / b.
@@ -644,6 +647,7 @@ def _describe_estimate(monitor: LinkTimingMonitor, k: int, local_ns: int) -> Clo
     drift_above = estimate.drift_high - estimate.drift
     drift_below = estimate.drift - estimate.drift_low
     drift_bound = max(drift_above, drift_below)
+
     offset_text = format_offset(offset_ns, offset.bound_ns)
     return {
         "kind": "clock",
@@ -664,6 +668,7 @@ def _describe_fault(monitor: LinkTimingMonitor) -> ClockNotice:
     stamps that contradicts earlier windows.
     """
     name = monitor.peer.name
+
     early_ns = monitor.worst_ns
     bound_ns = monitor.offset.bound_ns
     if early_ns:
@@ -671,6 +676,7 @@ def _describe_fault(monitor: LinkTimingMonitor) -> ClockNotice:
     else:
         bound_us = bound_ns / 1000
         fault = f"its stamps contradict those before, beyond the bound of {bound_us:.0f} us"
+
     return {
         "kind": "clock fault",
         "text": f"clock of {name}: {fault}; one of the two clocks has stepped",
@@ -769,17 +775,20 @@ class LoopStats:
         """
         peers = self._site.peers
         counts = dict(zip(peers, self._site.counts(), strict=True))
+
         age_us = {}  # age of the peer's sample that the tick used, -1 if there was none
         for peer, used, rate_hz in zip(peers, output.used, self._peer_rates_hz, strict=True):
             age_us[peer] = -1
             if used >= 0:
                 sample_ns = used * NS_PER_S // rate_hz
                 age_us[peer] = (output.t_ns - sample_ns) // 1000
+
         counts_by_field: dict[str, Any] = {}
         for field in _LINK_COUNTS:
             counts_by_field[field] = {
                 peer: getattr(count, field) for peer, count in counts.items()
             }
+
         stats = LinkStats(
             v=VERSION,
             site=self._site.name,
@@ -795,6 +804,7 @@ class LoopStats:
             overruns=self.overruns,
             **(measured or {}),
         )
+
         self._late_max_us = 0
         self._busy_max_us = 0
         return stats

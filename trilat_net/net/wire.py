@@ -210,6 +210,7 @@ def encode_sample(
     # As in `encode_state`, the terms are checked only if their sum is not finite.
     if not _isfinite(total) and not all(map(_isfinite, [*q, *qd, *tau_x, *ch])):
         raise WireError("not finite", f"{site} at tick {output.tick}")
+
     fields = {
         "v": VERSION,
         "site": site,
@@ -263,6 +264,7 @@ def split_states(block: bytes) -> Iterator[bytes]:
     """
     if len(block) > MAX_BYTES:
         raise WireError("oversized", f"{count_nouns(len(block), 'byte')}, at most {MAX_BYTES}")
+
     unpacker = msgpack.Unpacker(max_buffer_size=MAX_BYTES)
     unpacker.feed(block)
     start = 0
@@ -347,8 +349,10 @@ def make_decoder(
             message: Any = parse(payload)
         except (ValueError, RecursionError) as error:
             raise WireError("malformed", str(error)) from None
+
         if message.v not in versions:
             raise WireError("version", f"schema version {message.v}, this is {VERSION}")
+
         if get_vectors is not None:
             vectors = get_vectors(message)
             if lengths is not None and [*map(len, vectors)] != lengths:

@@ -435,6 +435,7 @@ def _parse_json5(source: str, text: str) -> object:
     nesting = accumulate(changes.get(character, 0) for character in text)
     if max(nesting, default=0) > MAX_DEPTH:
         raise UsageError(f"{source}: no JSON5: nested deeper than {MAX_DEPTH}")
+
     try:
         config = zenoh.Config.from_json5(f"{{metadata: [\n{text}\n]}}")
     except zenoh.ZError as error:
@@ -444,6 +445,7 @@ def _parse_json5(source: str, text: str) -> object:
         position = f"line {int(match[1]) - 1}, column {match[2]}: " if match else ""
         reason = expected[1] if expected else _first_line(error)
         raise UsageError(f"{source}: {position}no JSON5: {reason}") from None
+
     objects: list[object] = json.loads(config.get_json("metadata"))
     if len(objects) != 1:
         raise UsageError(

@@ -348,17 +348,21 @@ def check_zenoh_file(
     if not isinstance(stated, dict):
         raise UsageError(f"{source}: a Zenoh configuration is one object in braces")
     settings = _remove_nulls(stated)
+
     reason = refusal(settings)
     if reason:
         refused = list(_find_refused_keys(settings, refusal, ()))
         problems = [f"{'/'.join(path)}: {_suggest_key(path, why)}" for path, why in refused]
         raise UsageError(_list_problems(source, problems or [reason]))
+
     problems = list(_find_problems(settings))
     if problems:
         raise UsageError(_list_problems(source, problems))
+
     for path in (*_SET_BY_MODE, "low_pass_filter"):
         # The check has shown that the session's own value is the same.
         _drop_key(settings, path)
+
     mode = settings.pop("mode", "")
     endpoints = {
         side: settings[side].pop("endpoints")
@@ -614,6 +618,7 @@ def make_access_rules(members: Sequence[str]) -> dict[str, Any]:
             member_rules = list(_derive_rules(member, ROLES.get(member, SITE_ROLE)))
         # A role without channels of some kind gives a rule without keys.
         member_rules = [rule for rule in member_rules if rule["key_exprs"]]
+
         named_rules = [
             {"id": f"{member} {index}", "permission": "allow", **rule}
             for index, rule in enumerate(member_rules)
@@ -621,6 +626,7 @@ def make_access_rules(members: Sequence[str]) -> dict[str, Any]:
         rules += named_rules
         rule_ids = [rule["id"] for rule in named_rules]
         policies.append({"rules": rule_ids, "subjects": [member]})
+
     subjects = [
         {"id": member, "cert_common_names": [member], "link_protocols": list(PROTOCOLS)}
         for member in members
