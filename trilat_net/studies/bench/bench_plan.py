@@ -57,12 +57,21 @@ The form "three" has two masters and a slave, "two" has a master and a slave. Th
 has the same two sites, but the arms lie in a level plane, so gravity does not act on them.
 """
 _OUT = (-0.4557864690179811, 1.3957985827210313)
-"""Pose whose end effector is 0.30 m further out than at the start, at the same height."""
+"""Joint angles in rad at which the end effector is 0.30 m further out than at the start.
+
+Its height is that of the start.
+"""
 _LESS_OUT = (-0.4901506797631161, 1.484043235051833)
-"""Pose whose end effector is 0.24 m further out: 0.09 m behind the wall instead of 0.15 m."""
+"""Joint angles in rad at which the end effector is only 0.24 m further out.
+
+In contact, the pose is 0.09 m behind the wall, compared to 0.15 m for `_OUT`.
+"""
 _LEFT = (-0.4, 1.8)
+"""Joint angles in rad to which the first of two users moves."""
 _RIGHT = (-0.8, 1.8)
+"""Joint angles in rad to which the second of two users moves."""
 _HAND = {"kind": "spring", "stiffness_nm_rad": 50.0, "damping_nm_s_rad": 5.0}
+"""Scenario table of an operator that pulls an arm with a spring and a damper."""
 _WALL = {
     "kind": "wall",
     "point_m": [1.3376933693863516, 0.0],
@@ -70,7 +79,9 @@ _WALL = {
     "stiffness_n_m": 2000.0,
 }
 _CUT_S = (2.0, 5.0)
+"""Start and end of the outage in the task `outage`, in s."""
 _BURST_SAMPLES = 100.0
+"""Mean number of samples that are lost in succession."""
 _FIRST = 0.75
 """Parameter a of the dominance factors that lets the first user lead, as before a handover."""
 _SECOND = 0.25
@@ -559,6 +570,7 @@ def write_gains(tuned: Sequence[TunedGains], path: Path = GAINS_FILE) -> None:
 
 
 MAX_BENCH_SEEDS = 1000
+"""Largest number of seeds that a user may request."""
 
 
 class BenchCell(NamedTuple):
