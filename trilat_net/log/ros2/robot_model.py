@@ -80,7 +80,7 @@ def multiply_quaternions(a: Quaternion, b: Quaternion) -> Quaternion:
 
 
 def rotate_vector(rotation: Quaternion, vector: Vector) -> Vector:
-    """Rotates a vector v by a unit quaternion q. The result is q v q*, with the conjugate q*."""
+    """Rotates a vector v by a unit quaternion q to q v q*, with the conjugate q*."""
     x, y, z, w = rotation
     conjugate = (-x, -y, -z, w)
     half_product = multiply_quaternions(rotation, (*vector, 0.0))
