@@ -294,11 +294,17 @@ class LinkRow(Protocol):
     due_before: Annotated[int, Field("", "ns", "latest due time so far", "2 release")]
     memory: Annotated[float, Field("", "", "last number of the AR(1) delay", "2 release")]
     accepted: Annotated[int, Field("", "samples", "that arrived", "1 accept")]
-    late: Annotated[int, Field("", "samples", "that arrived after their due time", "1 accept")]
+    late: Annotated[
+        int, Field("", "samples", "that arrived after their tick of release", "1 accept")
+    ]
     duplicate: Annotated[int, Field("", "samples", "that had arrived before", "1 accept")]
     refused: Annotated[int, Field("", "samples", "with a stamp out of range", "1 accept")]
-    lost: Annotated[int, Field("", "samples", "lost by the link's model", "1 accept")]
-    superseded: Annotated[int, Field("", "samples", "replaced by a newer one", "1 accept")]
+    lost: Annotated[
+        int, Field("", "samples", "lost by the link's model, or far too old", "1 accept")
+    ]
+    superseded: Annotated[
+        int, Field("", "samples", "not used, as a newer one was (1, 2)", "1 accept")
+    ]
     copies: Annotated[int, Field("", "samples", "duplicated by the link's model", "2 release")]
 
 
