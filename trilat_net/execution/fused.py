@@ -72,11 +72,12 @@ def _mark_floats(dtype: np.dtype[np.generic]) -> NDArray[np.bool_]:
 class RunState:
     """All arrays that change during a run, viewed as 64-bit integers.
 
-    The views share the memory of the run, so that a change of the state changes the run.
-    Integers are used because equal integers mean equal bits.
+    A run creates one object, with which its state can be copied to another run, or mixed with
+    that of another run. The views share the memory of the run, so a change of an object changes
+    the run. Integers are used because equal integers mean equal bits.
 
     Args:
-        arrays: The arrays.
+        arrays: The arrays that contain the state. Their memory is shared, not copied.
     """
 
     def __init__(self, arrays: Sequence[NDArray[np.generic]]) -> None:
@@ -92,14 +93,15 @@ class RunState:
             self._floats.append(np.tile(_mark_floats(array.dtype), array.size))
 
     def scale_difference(self, other: "RunState", factor: float) -> None:
-        """Multiplies the difference from another state of the same scenario by a factor.
+        """Multiplies the difference between this state and another one by a factor.
 
-        The state becomes other + factor (state - other). With the factor 0, it is an exact copy
-        of the other state. Numbers that would not be finite are copied from the other state.
+        Every floating-point number x of this state becomes x_other + factor (x - x_other). With
+        the factor 0, this state becomes an exact copy of the other one. Integers, and results
+        that would not be finite, are copied from the other state.
 
         Args:
-            other: The other state.
-            factor: The factor.
+            other: State of another run of the same scenario. It does not change.
+            factor: Number by which the difference is multiplied. It has no unit.
         """
         arrays = zip(self._bits, other._bits, self._floats, strict=True)
         for bits, other_bits, is_float in arrays:
@@ -119,9 +121,13 @@ class RunState:
 def check_fusable(scenario: Scenario, plants: Collection[str] = ()) -> None:
     """Checks that the compiled loop can execute a scenario.
 
+    The loop computes the motion of all arms itself. It cannot use a real robot, and a user's
+    program may move an arm only if the caller provides that program.
+
     Args:
-        scenario: The scenario.
-        plants: Names of the sites whose external arms are moved by users' programs.
+        scenario: Description of the experiment.
+        plants: Names of the sites for which the caller provides a user's program that computes
+            the motion of the arm. By default, there are none.
 
     Raises:
         ScenarioError: Another arm is external, or the tick rates differ so much that too many
@@ -145,31 +151,41 @@ def _find_largest_ratio(scenario: Scenario) -> int:
 
 
 class HandActor(Protocol):
-    """Interface of a live operator, who moves an arm, in a compiled run."""
+    """Interface of a live operator in a compiled run.
+
+    A live operator is a person or program that moves an arm while the run is in progress. The
+    compiled loop asks for the operator's actions in advance, for as many ticks as possible, so
+    that it rarely has to leave compiled code.
+    """
 
     def compute_actions(self, k: int, end: int, arrays: SiteArrays) -> Array:
-        """Returns the operator's actions from tick `k` until the arm's state is needed again.
+        """Returns what the operator does from tick `k` on, for as many ticks as are certain.
+
+        A tick is one period of the site's control loop. The result ends before the first tick
+        whose action depends on a state of the arm that has not been computed yet.
 
         Args:
-            k: First tick.
-            end: Tick before which the actions end at the latest.
+            k: Number of the first tick.
+            end: Number of the tick before which the result ends at the latest.
             arrays: State of the site before tick `k`.
 
         Returns:
-            A row per tick, with the numbers of `HandInForce`.
+            An array with one row per tick. A row contains the numbers of `HandInForce`.
         """
 
 
 class RunTotals(NamedTuple):
-    """Figures of a whole run.
+    """Figures that summarise a whole run, returned by `FusedRun.totals`.
 
     Attributes:
-        rms_error_rad: Root mean square of the synchronisation error e, for the joint of all
-            sites with the largest value, in rad.
-        effort_nm: Root mean square over sites and joints of tau - G(q), the torque without the
-            part that compensates gravity, in N m.
-        force_peak_n: Largest force of a wall, in N. None if there is no wall.
-        walls_j: Work of the environments on the arms, in J. None if there is no environment.
+        rms_error_rad: Root mean square of the synchronisation error e over the run, in rad. e
+            is the difference between the angle of a joint and its reference. The value is that
+            of the joint of all sites for which it is largest.
+        effort_nm: Root mean square of tau - G(q) over sites and joints, in N m. tau is the
+            control torque, and G(q) is the torque that compensates gravity in the pose q.
+        force_peak_n: Largest force of a wall on an arm, in N. None if there is no wall.
+        walls_j: Work of the environments on the arms, in J. An environment is a wall or another
+            body that acts on an arm. None if there is none.
     """
 
     rms_error_rad: float
@@ -179,13 +195,17 @@ class RunTotals(NamedTuple):
 
 
 class RunInputs(NamedTuple):
-    """Inputs of a recorded run, with which the run can be repeated.
+    """Everything that a recorded run received from outside, so that it can be repeated.
+
+    `read_run_inputs` reads the inputs from a log, and `FusedRun` uses them.
 
     Attributes:
-        feed: Arrivals of samples, and actions of live operators.
-        changes: Changes during the run in the order of time, as (tick before which the site
-            applies the change, index of the site, change).
-        late_ns: Largest time from the stamp of a sample to its arrival, in ns.
+        feed: Ticks in which samples of other sites arrived, and actions of live operators.
+        changes: Changes of links or sites during the run, in the order of time. Each entry
+            contains the tick before which the site applies the change, the index of the site,
+            and the change.
+        late_ns: Largest time from the stamp of a sample to its arrival, in ns. The loop needs
+            it to decide how long samples are stored.
         longest_us: Longest delay that a change gave to a link, in us.
     """
 
@@ -196,10 +216,13 @@ class RunInputs(NamedTuple):
 
 
 def make_prompt_inputs(sites: int) -> RunInputs:
-    """Returns the inputs of a run in which samples arrive at once, and no live operator acts.
+    """Returns the inputs of an undisturbed run.
+
+    In such a run, every sample arrives as soon as it has been sent, no setting changes, and no
+    live operator acts. The delays that the scenario states for its links are still applied.
 
     Args:
-        sites: Number of sites.
+        sites: Number of sites of the scenario.
     """
     feed = ReplayedInputs(
         first=np.zeros((sites, max(sites - 1, 1), 0), np.int64),
@@ -211,12 +234,12 @@ def make_prompt_inputs(sites: int) -> RunInputs:
 
 
 class FusedRun:
-    """Run of all sites of a scenario in a compiled loop.
+    """Run of all sites of a scenario in one compiled loop.
 
-    Compiled control laws are executed in the loop. Laws in plain Python are called between the
-    stages of a tick. The loop also pauses before each tick for which an operator's program
-    needs the state of the arm, and after each tick of a site whose arm is moved by a user's
-    program.
+    A site is a process that runs one arm and its control loop. Control laws that can be
+    compiled are executed within the loop. Laws in plain Python are called between the stages of
+    a tick. The loop also pauses before each tick for which an operator's program needs the
+    state of the arm, and after each tick of a site whose arm is moved by a user's program.
 
     Args:
         scenario: The scenario.
@@ -355,12 +378,13 @@ class FusedRun:
         self._law_arrays = LawArrays(addresses, rows, sent)
 
     def step_to(self, last_ns: int) -> None:
-        """Executes the planned ticks up to a time, and applies the changes up to that time.
+        """Executes all planned ticks up to a time, and applies the changes up to that time.
 
-        Nothing happens if a site has diverged.
+        Nothing happens if a site has diverged, that is, if its arm has left its limits.
 
         Args:
-            last_ns: The time, in ns after the epoch.
+            last_ns: Time of the last tick to be executed, in ns after the epoch. The epoch is
+                the common start time of the sites.
 
         Raises:
             LawFailed: A user's control law failed.
@@ -518,9 +542,10 @@ class FusedRun:
                     last_ns = t_ns
 
     def advance_to(self, until_s: float) -> None:
-        """Continues the run to the end of a scenario with a duration of `until_s` seconds.
+        """Continues the run until it is as long as a run with a duration of `until_s` seconds.
 
-        Nothing happens if a site has diverged, or if the run is already that far.
+        Nothing happens if a site has diverged, that is, if its arm has left its limits. Nothing
+        happens either if the run is already that long.
         """
         if until_s <= self.ran_s or self.diverged_s is not None:
             return
@@ -530,10 +555,11 @@ class FusedRun:
         self.ran_s = until_s if self.diverged_s is None else self.diverged_s
 
     def plan(self, ticks: Sequence[int]) -> None:
-        """Sets the total number of ticks of each site, and allocates memory for them.
+        """Sets how many ticks each site will execute in total, and allocates memory for them.
 
         Args:
-            ticks: Number of ticks of each site.
+            ticks: Total number of ticks of each site, in the order of the scenario. Ticks that
+                have been executed already are included.
         """
         progress: Row
         for progress, count in zip(self._progress, ticks, strict=True):
@@ -566,22 +592,31 @@ class FusedRun:
 
     @property
     def has_programs(self) -> bool:
-        """True if operators or plants in the run are programs."""
+        """True if users' programs act as operators, or compute the motion of an arm.
+
+        The state of such programs is not part of the state of the run, so that the run cannot
+        be copied.
+        """
         return bool(self._hands or self._plants)
 
     def copy_state(self, other: "FusedRun") -> None:
-        """Copies the state of another run of the same scenario, with the same planned ticks."""
+        """Makes this run continue from exactly the same state as another run.
+
+        Both runs must have the same scenario and the same planned ticks. The other run does not
+        change.
+        """
         self.scale_difference(other, 0.0)
 
     def scale_difference(self, other: "FusedRun", factor: float) -> None:
-        """Multiplies the difference from another run of the same scenario by a factor.
+        """Multiplies the difference between the states of this run and another run by a factor.
 
-        The state becomes other + factor (state - other), see `RunState.scale_difference`. This
-        is not possible if operators or plants are programs, because their state is not known.
+        Every floating-point number x of the state becomes x_other + factor (x - x_other), see
+        `RunState.scale_difference`. This is not possible if operators or arms are users'
+        programs, because the state of such programs is not known.
 
         Args:
-            other: The other run, at the same time.
-            factor: The factor.
+            other: The other run. It must have the same scenario, and be at the same time.
+            factor: Number by which the difference is multiplied.
         """
         assert not self.has_programs
         self._state.scale_difference(other._state, factor)
@@ -595,34 +630,53 @@ class FusedRun:
                 law.restore(mixed.tolist())
 
     def arrays(self, i: int) -> SiteArrays:
-        """Returns the arrays of a site before its next tick.
+        """Returns the state of a site before its next tick.
 
-        The caller must not change them.
+        The arrays are those of the run itself, and not copies. The caller must not change them.
+
+        Args:
+            i: Index of the site in the order of the scenario.
         """
         if i not in self._selected:
             self._selected[i] = select_site(self._tables, i, self._layouts[i])
         return self._selected[i]
 
     def displace(self, field: str, offsets: Array) -> None:
-        """Adds offsets to a field of the state of every site.
+        """Adds offsets to one field of the state of all sites, for example to the joint angles.
+
+        Repeated runs with a small disturbance are disturbed in this way.
 
         Args:
-            field: Name of the field.
-            offsets: Offsets, with a row per site, shape (N, n).
+            field: Name of the field, for example "q" for the joint angles or "qd" for the
+                velocities.
+            offsets: Numbers to add, one row per site, shape (N, n). The unit is that of the
+                field.
         """
         self._tables.site[field][:, 0, : offsets.shape[1]] += offsets
 
     def measure_distance(self, other: "FusedRun", field: str) -> float:
-        """Returns the largest absolute difference of a field of the state from another run."""
+        """Returns how far this run is from another run, in one field of the state.
+
+        Args:
+            other: The other run of the same scenario.
+            field: Name of the field, for example "qd" for the joint velocities.
+
+        Returns:
+            The largest absolute difference over all sites and joints, in the unit of the field.
+        """
         difference = self._tables.site[field] - other._tables.site[field]
         return float(np.abs(difference).max())
 
     def run_and_sample(self, until_s: float) -> tuple[Array, Array]:
-        """Continues the run to the time `until_s`, and samples its last quarter at 100 times.
+        """Continues the run, and returns the states at 100 times of its last quarter.
+
+        Args:
+            until_s: Time at which the run ends, in s.
 
         Returns:
-            Joint angles q in rad, shape (100, N, n), and estimates theta_hat, shape (100, N,
-            P).
+            The joint angles q in rad, shape (100, N, n), and the estimated parameters
+            theta_hat, shape (100, N, P). N is the number of sites, n that of joints, and P that
+            of parameters.
         """
         q = []
         theta_hat = []
@@ -634,15 +688,21 @@ class FusedRun:
 
     @property
     def diverged_s(self) -> float | None:
-        """Time at which the first site left its limits, in s. None if no site did."""
+        """Time at which the first site diverged, in s.
+
+        A site has diverged if its arm has left its limits. None if all sites stayed within
+        them.
+        """
         ends_ns = [int(end_ns) for end_ns in self._progress["diverged_ns"] if end_ns >= 0]
         return min(ends_ns) / NS_PER_S if ends_ns else None
 
     @property
     def settled_s(self) -> float | None:
-        """Time from which |e| of all sites stays below `settled_rad`, in s.
+        """Time from which the synchronisation errors of all sites stay small, in s.
 
-        None if the limit is exceeded in the last tick.
+        The error e of a site is the difference between its joint angles and their reference. It
+        counts as small if |e| of every joint is below `settled_rad`. None if the limit is
+        exceeded in the last tick.
         """
         last_site = int(np.argmax(self._progress["unsettled_ns"]))
         progress: Row = self._progress[last_site]
@@ -654,10 +714,12 @@ class FusedRun:
 
     @property
     def buckets(self) -> tuple[Array, ...]:
-        """Largest values in every interval of 50 ms, for each site, see `run_until`.
+        """Course of the run in intervals of 50 ms, with one array for each site.
 
-        Each array has the shape (intervals, 3 n). -1 marks an interval without a record of the
-        site. The last interval may be incomplete.
+        Each array has the shape (intervals, 3 n), where n is the number of joints. A row
+        contains the largest synchronisation error |e| of each joint in rad, the largest speed
+        |qd| of each joint in rad/s, and the last angle q of each joint in rad. An interval
+        without a tick of the site contains -1. The last interval may be incomplete.
         """
         buckets = []
         for peaks, progress in zip(self._peaks, self._progress, strict=True):
@@ -668,15 +730,16 @@ class FusedRun:
 
     @property
     def maxima(self) -> tuple[Array, ...]:
-        """Largest |e| in rad and |qd| in rad/s in each interval, for each site.
+        """Largest error and largest speed in every interval of 50 ms, an array for each site.
 
-        Each array has the shape (intervals, 2).
+        Each array has the shape (intervals, 2). The columns are the largest synchronisation
+        error |e| of any joint in rad, and the largest joint speed |qd| in rad/s.
         """
         return tuple(map(max_over_joints, self.buckets))
 
     @property
     def totals(self) -> RunTotals:
-        """Errors, effort and contact over the whole run."""
+        """Errors, control effort and contact forces of the whole run so far."""
         sums = self._sums
         ticks = self._progress["tick"].astype(np.float64)
         joints = self._tables.site["joints"][:, 0]
@@ -704,17 +767,26 @@ class FusedRun:
 
     @property
     def q(self) -> Array:
-        """Joint angles after the last tick, in rad, shape (N, n)."""
+        """Joint angles of all arms after the last tick, in rad, shape (N, n).
+
+        N is the number of sites, and n is the number of joints.
+        """
         return np.array(self._tables.site["q"][:, 0])
 
     @property
     def theta_hat(self) -> Array:
-        """Estimated parameters after the last tick, shape (N, P)."""
+        """Arm parameters that the control laws estimate, after the last tick, shape (N, P).
+
+        N is the number of sites, and P is the number of parameters.
+        """
         return np.array(self._tables.site["theta_hat"][:, 0])
 
     @property
     def memories(self) -> list[Array]:
-        """Memory of each site's user law after the last tick. Empty for built-in laws."""
+        """Numbers that each user's control law remembers after the last tick.
+
+        There is one array per site. The array of a site with a built-in law is empty.
+        """
         memories = []
         for i in range(len(self._progress)):
             law = self._laws.get(i)
@@ -723,16 +795,23 @@ class FusedRun:
 
     @property
     def tau_x(self) -> list[Array]:
-        """Torque from outside in the last record of each site, in N m, shape (n,) each."""
+        """External torque of each site's last tick, in N m, one array of shape (n,) per site.
+
+        It is the torque of operators and environments, not of the motors.
+        """
         pairs = zip(self.records, self._layouts, strict=True)
         return [row[layout.columns()["tau_x"]] for row, layout in pairs]
 
     def pop_records(self) -> list[tuple[IntArray, Array]]:
-        """Returns the records of each site since the last call, as far as they are stored.
+        """Returns the records that each site has produced since the last call.
+
+        A record is the stored result of one tick. Only a limited number of recent records is
+        stored (see `keep` of the constructor); older ones are lost.
 
         Returns:
-            For each site, the nominal times in ns, shape (K,), and the records, shape (K,
-            floats), with the columns of `Layout.columns`.
+            For each site, the nominal times of the records in ns, shape (K,), and the records,
+            shape (K, floats). The columns of the records are those of `Layout.columns`. K is 0
+            if there are no new records.
         """
         records = []
         pages = self._sent.t_ns.shape[1]
@@ -748,7 +827,10 @@ class FusedRun:
 
     @property
     def records(self) -> Array:
-        """Last record of each site, with a row per site and the columns of `Layout.columns`."""
+        """Record of the last tick of each site.
+
+        The array has one row per site, and the columns of `Layout.columns`.
+        """
         return np.array([self._last_row(i) for i in range(len(self._progress))])
 
     def _last_row(self, i: int) -> Array:
@@ -760,11 +842,16 @@ class FusedRun:
 
 
 def explain_not_repeatable(log: Log, *, own_laws: bool = False) -> str:
-    """Returns the reason why a run cannot be repeated from its log alone. Empty if it can.
+    """Explains why a run cannot be repeated exactly from its log alone.
+
+    For example, the log may lack records, or a control law may be code that must not run here.
 
     Args:
-        log: The log.
-        own_laws: True if control laws of users may run.
+        log: Log of the run.
+        own_laws: True if control laws that are code of users may run.
+
+    Returns:
+        A reason for the user. Empty if the run can be repeated.
     """
     scenario = log.scenario
     if scenario.external:
@@ -782,9 +869,13 @@ def explain_not_repeatable(log: Log, *, own_laws: bool = False) -> str:
 
 
 def read_run_inputs(log: Log) -> RunInputs:
-    """Returns the inputs with which a recorded run can be repeated.
+    """Reads from a log everything that is needed to repeat its run.
 
-    The run must be repeatable, see `explain_not_repeatable`.
+    These inputs are the ticks in which samples arrived, the changes of settings, and the
+    actions of live operators. The run must be repeatable, see `explain_not_repeatable`.
+
+    Args:
+        log: Log of the run.
 
     Raises:
         LogError: The log contains a text that is not a change of the scenario.

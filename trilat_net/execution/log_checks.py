@@ -29,15 +29,16 @@ MAX_GAPS_NAMED = 60
 
 @dataclass(frozen=True, repr=False)
 class LogCheckReport(CheckReport):
-    """Findings of all checks of a log.
+    """Findings of all checks of a log, which decide whether the log can be trusted.
 
-    The report passes if the log is unchanged since it was written, enough records could be
-    judged, and every execution agrees with the log.
+    The report passes under three conditions. The log must be unchanged since it was written,
+    enough of its records must have been compared, and every repeated execution must agree with
+    the log.
 
     Attributes:
-        log: The log.
-        result: Result of executing the log again.
-        findings: One finding for each check.
+        log: The checked log.
+        result: Result of executing the sites of the log again.
+        findings: One finding for each check, in the order in which they are shown.
     """
 
     log: Log
@@ -46,12 +47,15 @@ class LogCheckReport(CheckReport):
 
     @property
     def records(self) -> int:
-        """Number of records that were executed again."""
+        """Number of records whose ticks were executed again to check them.
+
+        A record is the stored result of one tick, that is, of one period of the control loop.
+        """
         return self.result.records
 
     @property
     def identical(self) -> int:
-        """Number of executed records in which every computed field agrees with the log."""
+        """Number of records that the repeated execution confirmed in every computed field."""
         return self.result.identical
 
     def to_dict(self) -> dict[str, Any]:
@@ -98,16 +102,21 @@ def run_log_checks(
     min_coverage: float = MIN_COVERAGE,
     resume_every: int = 0,
 ) -> LogCheckReport:
-    """Executes a log again, and returns the findings of all checks.
+    """Executes the sites of a log again, and checks the log against the results.
 
     Args:
         log: The log.
-        virtual: If True, the log is also compared with virtual time.
+        virtual: If True, the log is also compared with a simulation of its scenario in virtual
+            time, as `compare_with_virtual` does.
         progress: Function that is called now and then with the amount of work done and the
-            total.
-        min_coverage: Smallest fraction of the ticks of every site that must be judged. A log
-            with a smaller fraction fails even if all judged records agree.
-        resume_every: See `verify`.
+            total. None if nobody wants to know.
+        min_coverage: Smallest fraction of the ticks of every site that must be compared. A log
+            with a smaller fraction fails even if all compared records agree.
+        resume_every: Every how many ticks a site is restored from the records, see `verify`. 0
+            means never.
+
+    Returns:
+        The findings of all checks.
 
     Raises:
         LogError: A record cannot be read.
@@ -121,14 +130,18 @@ def run_log_checks(
 def check_log_files(
     sources: Sequence[str], min_coverage: float, allowed: CodeConsents
 ) -> list[Finding]:
-    """Checks a log in a worker process, and returns the findings.
+    """Checks a log in a worker process.
 
+    The arguments can be sent to another process, so that many logs can be checked in parallel.
     A user's control law that cannot be created gives a failed finding instead of an error.
 
     Args:
-        sources: Files of the log.
-        min_coverage: Smallest fraction of the ticks of every site that must be judged.
-        allowed: Permissions for code of users in this process.
+        sources: Paths of the files that the log consists of.
+        min_coverage: Smallest fraction of the ticks of every site that must be compared.
+        allowed: Permissions to run code of users, which are added to those of this process.
+
+    Returns:
+        One finding for each check.
     """
     allowed_code.update(allowed)
     log = open_log(*sources)

@@ -57,11 +57,13 @@ from .virtual import SiteChannels, SiteEntry, render_accounts
 
 
 class LogAndRerun(NamedTuple):
-    """One figure, before and after the change of settings.
+    """One figure of a site or link, in the log and in the rerun of the log.
+
+    A rerun executes sites of a log again, usually with changed settings.
 
     Attributes:
-        before: Value in the log.
-        after: Value in the rerun.
+        before: Value of the figure in the log.
+        after: Value of the figure in the rerun.
     """
 
     before: float
@@ -69,30 +71,35 @@ class LogAndRerun(NamedTuple):
 
 
 class SiteEffect(NamedTuple):
-    """Effect of a rerun on one site. Figures are None if no record could be compared.
+    """Difference that a rerun makes to one site, compared with the log.
+
+    A rerun executes sites of a log again, usually with changed settings. The figures are taken
+    over those ticks of which both the log and the rerun have a record. They are None if there
+    is no such tick.
 
     Attributes:
         site: Name of the site.
-        executed: Number of executed ticks.
+        executed: Number of executed ticks. A tick is one period of the control loop.
         compared: Number of executed ticks for whose time the log contains a record.
         identical: Number of compared ticks in which all computed fields have the same bits as
             in the log. If settings were changed, the checksum of the arrivals is not compared.
-        stands: Number of records that were copied, because the log does not contain enough to
-            execute their ticks.
-        assumed: Number of executed ticks without a record in the log. Their arrivals were
-            assumed.
+        stands: Number of ticks whose record was copied from the log, because the log does not
+            contain enough to execute them.
+        assumed: Number of executed ticks without a record in the log. The samples that arrived
+            in these ticks were assumed.
         lacking: Number of samples that arrived, but whose content is missing from the log.
         first: First difference from the log. None if there is no difference, or if tick rates
             were changed.
-        diverged_at_s: Time at which the site left its limits, in s. None if it did not.
-        q_rms_rad: Root mean square of the change of q, for the joint with the largest value, in
-            rad.
+        diverged_at_s: Time at which the arm left its limits, in s. None if it did not.
+        q_rms_rad: Root mean square of the change of the joint angles q, for the joint with the
+            largest value, in rad.
         q_max_rad: Largest absolute change of q of any joint, in rad.
         q_max_at_s: Time of this largest change, in s.
         error_rms_rad: Root mean square of the synchronisation error e, Eq. (9), for the joint
-            with the largest value, in rad.
+            with the largest value, in rad. e is the difference between the joint angles and
+            their reference.
         error_max_rad: Largest |e| of any joint, in rad.
-        torque_max_nm: Largest absolute torque of any joint, Eq. (13), in N m.
+        torque_max_nm: Largest absolute control torque of any joint, Eq. (13), in N m.
     """
 
     site: str
@@ -113,14 +120,15 @@ class SiteEffect(NamedTuple):
 
 
 class LinkEffect(NamedTuple):
-    """Effect of a rerun on one link: the age of the sample that the receiver uses.
+    """Difference that a rerun makes to one link: how old the samples are when they are used.
 
-    Ages are taken in the ticks in which a sample is in use both in the log and in the rerun.
+    A link is the directed connection from one site to another. Ages are taken over those ticks
+    in which the receiver uses a sample both in the log and in the rerun.
 
     Attributes:
         link: Name of the link, for example "m1->s".
-        age_mean_ms: Mean age, in ms.
-        age_max_ms: Largest age, in ms.
+        age_mean_ms: Mean age in the log and in the rerun, in ms.
+        age_max_ms: Largest age in the log and in the rerun, in ms.
     """
 
     link: str
@@ -163,13 +171,16 @@ class _CommonRecords(NamedTuple):
 def compare_site_rerun(
     log: Log, request: RerunRequest, site: RerunSite, ticks: Sequence[RerunTick]
 ) -> tuple[SiteEffect, list[LinkEffect]]:
-    """Returns the effect of a rerun on a site, and on the links over which the site receives.
+    """Computes what a rerun changed at a site, and on the links over which the site receives.
 
     Args:
-        log: The log.
-        request: Sites and settings of the rerun.
+        log: The log that was executed again.
+        request: Executed sites and changed settings of the rerun.
         site: The executed site, after its last tick.
-        ticks: Ticks of this site.
+        ticks: All ticks of this site in the rerun, in the order of time.
+
+    Returns:
+        The effect on the site, and the effects on the links that end at it.
     """
     # Copied records are neither executed nor compared.
     executed = [tick for tick in ticks if not tick.kept]
@@ -282,14 +293,17 @@ def _compare_links(
 
 @dataclass(frozen=True, repr=False)
 class Rerun(Result):
-    """A log and the result of executing it again.
+    """A log and the result of executing some or all of its sites again.
+
+    The function `rerun` creates it. It can be shown, written as a log of its own, or converted
+    to plain values.
 
     Attributes:
-        before: The log.
+        before: The log that was executed again.
         request: Executed sites and changed settings.
         ticks: Every tick of every executed site, in the order of execution.
-        sites: Effect on each executed site, by name.
-        links: Effect on each link to an executed site, by the name of the link.
+        sites: Effect on each executed site, by the name of the site.
+        links: Effect on each link that ends at an executed site, by the name of the link.
     """
 
     before: Log
@@ -299,14 +313,18 @@ class Rerun(Result):
     links: dict[str, LinkEffect]
 
     def headline(self) -> str:
-        """Returns a line with the mode of the rerun, its executed sites and its changes."""
+        """Returns one line for the user with the kind of rerun, the sites and the changes."""
         changes = "; ".join(describe_rerun_changes(self.request)) or "nothing changed"
         executed = f"{self.request.mode}, {', '.join(self.request.replaced)} executed"
         return f"{self.before.source}: {executed}, {changes}"
 
     @cached_property
     def after(self) -> Log:
-        """The rerun as a log: executed sites as computed, and the other sites as recorded."""
+        """The rerun in the form of a log, so that it can be analysed like any other log.
+
+        Executed sites appear as they were computed now, and the other sites as they were
+        recorded.
+        """
         stream = io.BytesIO()
         self.write(stream)
         stream.seek(0)
@@ -373,7 +391,7 @@ class Rerun(Result):
 
     @property
     def diverged(self) -> bool:
-        """True if a site left its limits in the rerun, but not in the log."""
+        """True if the arm of a site left its limits in the rerun, but not in the log."""
         return any(
             effect.diverged_at_s is not None and self.before[name].states[-1].mode != "diverged"
             for name, effect in self.sites.items()
@@ -381,16 +399,17 @@ class Rerun(Result):
 
     @property
     def identical(self) -> bool:
-        """True if every compared record has the same bits as in the log."""
+        """True if the rerun reproduced every compared record with the same bits."""
         return all(effect.identical == effect.compared for effect in self.sites.values())
 
     @property
     def broken(self) -> bool:
-        """True if the rerun differs from the log, although it should have the same bits.
+        """True if the rerun differs from the log although it should have the same bits.
 
-        The bits should be the same if the log was made on this platform, no setting was
-        changed, and the log contains everything that its sites received. The last condition
-        fails for a log that is an open-loop rerun itself.
+        This indicates an error of the program or a damaged log. The bits should be the same
+        under three conditions: the log was made on this platform; no setting was changed; and
+        the log contains everything that its sites received. The last condition fails for a log
+        that is itself a rerun in which some sites were copied from another log.
         """
         same_platform = self.before.session.get("fingerprint") == compute_fingerprint()
         executable = set(self.request.replaced) <= set(self.before.executed_sites)
@@ -399,11 +418,15 @@ class Rerun(Result):
 
     @property
     def notes(self) -> list[str]:
-        """Sentences about the limits of the result."""
+        """Sentences that tell the user what limits the meaning of the result.
+
+        For example, records may have been copied because the log was incomplete. Empty if there
+        are no limits to mention.
+        """
         return list(_describe_limits(self))
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns the plain values of each executed site."""
+        """Returns the effect on each executed site as plain values, for tables and JSON."""
         return list(self.to_dict()["sites"].values())
 
     def to_dict(self) -> dict[str, Any]:
@@ -480,7 +503,15 @@ def _parse_epoch(log: Log) -> int:
 
 
 def collect_rerun_metadata(log: Log, request: RerunRequest) -> dict[str, str]:
-    """Returns the metadata of a rerun's log: its source log, executed sites and changes."""
+    """Returns the metadata with which the log of a rerun tells where it comes from.
+
+    Args:
+        log: The source log.
+        request: Executed sites and changed settings of the rerun.
+
+    Returns:
+        Texts by key: the source log, the executed sites and the changes.
+    """
     # A log in memory has no file.
     files = filter(Path.is_file, map(Path, log.sources))
     digests = {path: digest_file(path) for path in files}

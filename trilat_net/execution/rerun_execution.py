@@ -60,12 +60,12 @@ _TEXT_KEYS = ("name", "title", "about", "assumed", "expect")
 
 
 class ChangedValue(NamedTuple):
-    """A value of the scenario that a rerun changes.
+    """One value of the scenario that a rerun of a log changes.
 
     Attributes:
-        key: Dotted path of the value in the resolved scenario.
-        before: Value in the log.
-        after: Value in the rerun.
+        key: Dotted path of the value in the resolved scenario, for example of a gain.
+        before: Value with which the log was recorded.
+        after: Value that the rerun uses.
     """
 
     key: str
@@ -75,7 +75,9 @@ class ChangedValue(NamedTuple):
 
 @dataclass(frozen=True)
 class RerunRequest:
-    """A checked request: which sites are executed again, and with which settings.
+    """A checked request for a rerun: which sites of a log to execute again, and how.
+
+    `resolve_rerun_request` creates it.
 
     Attributes:
         original: Scenario of the log.
@@ -96,7 +98,10 @@ class RerunRequest:
 
     @property
     def mode(self) -> str:
-        """Mode of the rerun: "closed loop" if every site is executed, otherwise "open loop"."""
+        """Kind of the rerun: "closed loop" if every site is executed, otherwise "open loop".
+
+        In an open loop, the sites that are not executed keep their records and do not react.
+        """
         return "open loop" if self.recorded else "closed loop"
 
 
@@ -268,9 +273,15 @@ def _find_changes(original: Scenario, other: Scenario) -> list[ChangedValue]:
 
 
 def describe_rerun_changes(request: RerunRequest) -> list[str]:
-    """Describes the changes of a rerun, with a line for each kind of change.
+    """Describes which settings a rerun changes, in lines for the user.
 
     If several sites or links are changed in the same way, they share a line.
+
+    Args:
+        request: The checked request for the rerun.
+
+    Returns:
+        One line for each kind of change. Empty if nothing is changed.
     """
     owners: dict[tuple[str, str], list[str]] = {}
     for subject, owner, change in _describe_changes(request):
@@ -353,19 +364,22 @@ def _shorten(value: object) -> str:
 
 
 class RerunTick(NamedTuple):
-    """One tick of an executed site.
+    """One tick of a site that is executed again, with the record that it produced.
+
+    A tick is one period of the control loop, and its record is the stored result.
 
     Attributes:
         site: Name of the site.
         tick: Number of the tick.
-        t_ns: Nominal time, in ns after the epoch.
-        mode: Mode of the site.
+        t_ns: Nominal time of the tick, in ns after the epoch (the common start time).
+        mode: Operating mode in which the site executed the tick, for example running or at
+            rest.
         payload: Encoded record, as the site would publish it. If `kept`, the record of the log.
         same: True if the log contains a record of the tick, and all computed fields have the
             same bits.
         kept: True if the record was copied, because the log does not contain enough to execute
             the tick.
-        stats: Link statistics, if they are due in this tick.
+        stats: Statistics of the site's links. None if they are not due in this tick.
     """
 
     site: str
@@ -379,7 +393,7 @@ class RerunTick(NamedTuple):
 
 
 class RerunSite:
-    """Executes one site of a rerun, tick by tick.
+    """Executes one site of a log again, tick by tick.
 
     The state of the site is certain if it follows from the ticks before. It becomes uncertain
     after a gap in the log. Then records are copied until two consecutive records determine the
@@ -387,20 +401,21 @@ class RerunSite:
 
     Args:
         log: The log.
-        request: Sites and settings of the rerun.
+        request: Executed sites and changed settings of the rerun.
         name: Name of the site.
-        deliveries: Arrivals at the site.
-        samples: Samples of all sites, by site and tick. The samples of executed sites appear in
-            it while they are computed.
+        deliveries: The ticks in which samples of other sites arrive at this one.
+        samples: Samples of all sites, by site and tick. A sample is the state that a site
+            publishes in one tick. The samples of executed sites appear in it while they are
+            computed.
 
     Attributes:
         name: Name of the site.
-        k: Next tick.
+        k: Number of the next tick.
         output: Record of the last tick.
-        deliveries: Arrivals at the site.
-        first: First difference from the records of the log.
+        deliveries: The ticks in which samples of other sites arrive at this one.
+        first: First difference from the records of the log. None if there is none so far.
         lacking: Number of samples that arrived, but whose content is missing from the log.
-        diverged: True after the site has left its limits.
+        diverged: True after the arm of the site has left its limits.
     """
 
     output: TickRecord
@@ -453,7 +468,13 @@ class RerunSite:
         return self.k * NS_PER_S // self._site.rate_hz
 
     def execute_tick(self) -> RerunTick:
-        """Executes the next tick, or copies its record if it cannot be executed.
+        """Executes the next tick of the site.
+
+        If the log does not contain enough to execute the tick, its record is copied from the
+        log.
+
+        Returns:
+            The tick with its record.
 
         Raises:
             LogError: The log lists more changes than a site accepts, or contains an impossible
@@ -576,11 +597,14 @@ No sample is in transit for longer.
 
 
 class RerunExecution:
-    """Executes all sites of a rerun together.
+    """Executes all requested sites of a log again, together.
+
+    The sites exchange the samples that they compute now. Samples of the other sites are those
+    of the log.
 
     Args:
         log: The log.
-        request: Sites and settings of the rerun.
+        request: Executed sites and changed settings of the rerun.
 
     Attributes:
         sites: The executed sites, by name.
@@ -644,10 +668,10 @@ class RerunExecution:
         )
 
     def run(self, progress: Progress | None = None) -> Iterator[RerunTick]:
-        """Executes all sites, and yields every tick.
+        """Executes all requested sites, and yields every tick.
 
         The ticks are in the order of time, except that a site waits for the samples that it
-        receives. A site that leaves its limits executes no further ticks. If settings were
+        receives. A site whose arm leaves its limits executes no further ticks. If settings were
         changed, all sites end at that time.
 
         Args:
