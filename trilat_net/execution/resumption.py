@@ -39,11 +39,14 @@ ReceivedMotion = State | Arrival
 
 
 def read_output(state: State, peers: tuple[str, ...]) -> TickRecord:
-    """Converts a published record to the form in which `Site.step` returned it.
+    """Converts a record of a log to the form in which `Site.step` returned it.
+
+    A record is the stored result of one tick. The result of this function can be compared with
+    that of executing the tick again.
 
     Args:
         state: The record.
-        peers: Names of the site's peers, in the order of the scenario.
+        peers: Names of the other sites, in the order of the scenario.
     """
     mode = MODES.get(state.mode, MODES["diverged"]).mode
     # A complete memory contains more numbers than the pose with which it begins.
@@ -75,16 +78,17 @@ def read_output(state: State, peers: tuple[str, ...]) -> TickRecord:
 def make_arrival(
     peer: int, tick: int, sample: ReceivedMotion | TickRecord, latency_us: int = 0
 ) -> Arrival:
-    """Returns the arrival of a peer's sample.
+    """Returns the message with which a sample of another site arrives at a receiver.
 
-    The arrival contains the numbers that the peer's control law sends to all receivers.
-    `select_peer_channels` selects the numbers for one receiver.
+    A sample is the state that a site publishes in one tick. The message contains all numbers
+    that the control law of the sender sends, for all receivers. `select_peer_channels` selects
+    the numbers for one receiver.
 
     Args:
-        peer: Index of the sender among the receiver's peers.
-        tick: Tick of the sample.
-        sample: Record of that tick, or an earlier arrival of the sample.
-        latency_us: Time from the stamp to the arrival, in us.
+        peer: Index of the sender among the sites from which the receiver gets samples.
+        tick: Tick in which the sender published the sample.
+        sample: Record of that tick, or an earlier arrival of the same sample.
+        latency_us: Time from the stamp of the sample to its arrival, in us.
     """
     q = sample.q
     qd = sample.qd
@@ -108,11 +112,15 @@ def make_arrival(
 def select_peer_channels(
     arrivals: Sequence[Arrival], links: Sequence[LinkSetup]
 ) -> list[Arrival]:
-    """Returns arrivals with only those numbers of the sender's law that are for this site.
+    """Returns copies of arrivals that contain only what one receiver gets.
+
+    A control law may send different numbers to different receivers. Those for the other
+    receivers are removed.
 
     Args:
         arrivals: Arrivals with the numbers for all receivers.
-        links: Links of the receiver, by the index of the peer.
+        links: Links of the receiver, in the order of its peers. A peer is a site from which it
+            gets samples.
     """
     selected = []
     for arrival in arrivals:
@@ -126,14 +134,15 @@ def select_peer_channels(
 
 
 def find_recorded_hand(part: SiteLog, site: Site, k: int) -> list[float]:
-    """Returns the recorded action of a live operator that applies in tick `k`.
+    """Returns what a live operator did in one tick, according to the log.
 
-    It is the action in the newest record up to the time of the tick.
+    The newest record up to the time of the tick decides. The tick rate of the executed site may
+    differ from that in the log.
 
     Args:
         part: Records of the site in the log.
-        site: The executed site, whose tick rate may differ from that in the log.
-        k: Tick of the executed site.
+        site: The site that is executed again.
+        k: Number of the tick of the executed site.
 
     Returns:
         The action, in the form of `HandInForce`. Empty if the site has no live operator.
@@ -149,20 +158,25 @@ def find_recorded_hand(part: SiteLog, site: Site, k: int) -> list[float]:
 
 
 class RecordedInputs(Generic[Change]):
-    """Recorded inputs of one site: the samples that arrived, and the changes.
+    """Everything that one site received according to a log: samples and changes of settings.
+
+    With these inputs, the site can be executed again. A sample is the state that another site
+    (a peer) published in one tick.
 
     Args:
         part: Records of the site.
         samples: Records or arrivals of all sites, by site and tick.
         ends: Last tick of each site.
-        changes: Changes of the site, by tick.
-        links: Links of the site, by the index of the peer.
+        changes: Changes that took effect at the site, by tick.
+        links: Links over which the site receives, in the order of its peers.
 
     Attributes:
-        samples: Samples of each peer, by tick.
+        samples: Samples of each peer, by the tick in which the peer published them.
         ends: Last tick of each peer.
-        assumed: For each peer, the ticks of samples that are assumed to have arrived in a gap.
-        lacking: For each peer, the ticks of samples that arrived, but whose record is missing.
+        assumed: For each peer, the ticks of samples that are assumed to have arrived in a gap
+            of the log.
+        lacking: For each peer, the ticks of samples that arrived, but whose content is missing
+            from the log.
     """
 
     def __init__(
@@ -182,10 +196,14 @@ class RecordedInputs(Generic[Change]):
         self.lacking: list[set[int]] = [set() for _ in part.peers]
 
     def pop_changes(self, tick: int) -> list[tuple[int, Change]]:
-        """Removes and returns the changes up to a tick.
+        """Removes and returns the changes that take effect up to a tick.
+
+        Args:
+            tick: Last tick whose changes are returned.
 
         Returns:
-            Pairs of the tick of a change and the change, in the order of time.
+            Pairs of the tick of a change and the change, in the order of time. Empty if there
+            are no further changes.
         """
         popped: list[tuple[int, Change]] = []
         while self._changes and self._changes[-1][0] <= tick:
@@ -196,14 +214,17 @@ class RecordedInputs(Generic[Change]):
     def find_arrivals(
         self, entries: Sequence[ArrivalEntry]
     ) -> tuple[list[Arrival], list[ArrivalEntry]]:
-        """Looks up the samples that arrived.
+        """Looks up the content of samples that arrived in a tick.
+
+        The record of a tick lists only which samples arrived. Their content is in the records
+        of the senders.
 
         Args:
-            entries: Arrivals in the form of a record's `rx`.
+            entries: Arrived samples, in the form of the field `rx` of a record.
 
         Returns:
-            The arrivals with their samples, and the entries whose sample is missing from the
-            log.
+            The arrivals with the content of their samples, and the entries whose content is
+            missing from the log.
         """
         arrivals: list[Arrival] = []
         missing: list[ArrivalEntry] = []
@@ -218,23 +239,27 @@ class RecordedInputs(Generic[Change]):
         return select_peer_channels(arrivals, self._links), missing
 
     def add_lacking(self, entries: Sequence[ArrivalEntry]) -> None:
-        """Remembers samples that arrived, but whose record is missing.
+        """Remembers samples that arrived, but whose content is missing from the log.
+
+        A tick that uses such a sample cannot be computed with certainty.
 
         Args:
-            entries: Arrivals in the form of a record's `rx`.
+            entries: Arrived samples, in the form of the field `rx` of a record.
         """
         for peer, tick, _ in entries:
             self.lacking[peer].add(tick)
 
     def can_resume(self, row: int, *, detached: bool = False) -> bool:
-        """True if the site can be restored before the tick of a record, see `resume`.
+        """True if the log contains enough to restore the site before the tick of a record.
 
-        The records of the two ticks before must exist, and the samples in use must be known. A
-        site that rests with a reference of its own does not need the samples.
+        The records of the two ticks before must exist, and the content of the samples in use
+        must be known. A site that rests at a reference of its own does not need these samples.
+        `resume` restores the site.
 
         Args:
-            row: Row of the record.
-            detached: True if the site follows a reference of its own while it rests.
+            row: Index of the record among the records of the site.
+            detached: True if the site rests at a reference of its own, and does not follow its
+                peers.
         """
         states = self._part.states
         if row < 2:
@@ -249,12 +274,15 @@ class RecordedInputs(Generic[Change]):
         return all(used < 0 or used in samples for used, samples in pairs)
 
     def resume(self, site: Site, row: int, changes: Sequence[CoreChange] = ()) -> None:
-        """Restores the state of a site before the tick of a record, if it `can_resume`.
+        """Restores the state that a site had before the tick of a record.
+
+        The state follows from the two previous records, so `can_resume` must be true. It is
+        used after a gap of the log.
 
         Args:
-            site: The site. It is changed.
-            row: Row of the record.
-            changes: Changes of the site since its last executed tick.
+            site: The site. Its state is replaced.
+            row: Index of the record among the records of the site.
+            changes: Changes that took effect since the last executed tick of the site.
         """
         states = self._part.states
         peers = self._part.peers
@@ -300,11 +328,13 @@ class RecordedInputs(Generic[Change]):
         return select_peer_channels([arrival], self._links)[0]
 
     def is_uncertain(self, state: State, output: TickRecord) -> bool:
-        """True if the arrival of a sample in use is assumed, or its content is missing.
+        """True if a tick used a sample that is not known for certain.
+
+        The arrival of such a sample was assumed, or its content is missing from the log.
 
         Args:
-            state: Record of the site.
-            output: Result of executing the same tick.
+            state: Record of the tick in the log.
+            output: Result of executing the same tick again.
         """
         for peer, name in enumerate(self._part.peers):
             logged = state.used.get(name, -1)

@@ -45,16 +45,21 @@ WINDOWS = 16
 
 
 class Push(NamedTuple):
-    """Small displacement of the state of a twin.
+    """Small displacement of the state of a twin, which is a second execution of the same run.
+
+    The difference between the twin and the run then shows whether small disturbances grow or
+    die away.
 
     Attributes:
-        name: Description of the push, for example "1e-06 rad at m1 joint 1".
-        field: Displaced field of the state: "q" in rad, "qd" in rad/s, or "theta_hat".
-        by: Displacement of each number of each site, shape (N, n).
-        at_s: Time of the push, in s after the epoch.
-        again: If True, a twin whose difference has decayed is pushed again at the end of a
-            window. Otherwise the twin ends.
-        largest: Difference beyond which it is scaled down. Infinite if it is never scaled down.
+        name: Description for the user, for example "1e-06 rad at m1 joint 1".
+        field: Displaced part of the state: joint angles "q" in rad, joint velocities "qd" in
+            rad/s, or estimated arm parameters "theta_hat".
+        by: Displacement of every number of this part, shape (N, n), with one row per site.
+        at_s: Time of the push, in s after the epoch (the common start time).
+        again: If True, a twin whose difference has decayed to rounding errors is pushed again.
+            Otherwise the twin ends.
+        largest: Difference beyond which the twin is moved closer to the run, in the unit of the
+            field. Infinite if this is never done.
     """
 
     name: str
@@ -66,9 +71,11 @@ class Push(NamedTuple):
 
 
 class TwinPath(NamedTuple):
-    """Difference between a twin and the run, in intervals of 50 ms.
+    """Course of the difference between a twin and the run, in intervals of 50 ms.
 
-    The run has K intervals, and all sites together have J joints.
+    A twin is a second execution of the run in which the state received a small push. If the
+    difference becomes large, it is scaled down, and if it has decayed, the twin is pushed
+    again. The run has K intervals, and all sites together have J joints.
 
     Attributes:
         push: Push of the twin.
@@ -76,9 +83,10 @@ class TwinPath(NamedTuple):
         largest: Natural logarithm of the largest difference of velocity of each joint in each
             interval, in rad/s, shape (K, J). It is computed as if the difference had never been
             scaled down. -inf if the twin and the run are equal.
-        last: Difference in the last tick of each interval, in rad/s, shape (K, J). It includes
-            the scaling.
-        scale: Natural logarithm of the factor that removes the scaling from `last`, shape (K,).
+        last: Difference of velocity in the last tick of each interval, in rad/s, shape (K, J).
+            It is the actual difference, which may have been scaled down.
+        scale: Natural logarithm of the factor by which `last` must be multiplied to undo the
+            scaling, shape (K,).
         pushed: Indices of the intervals in which the twin was pushed.
         died: Index of the interval from which the difference consists only of rounding errors.
             None if there is no such interval, or if the twin was pushed again.
@@ -94,13 +102,18 @@ class TwinPath(NamedTuple):
 
 
 class Twins(NamedTuple):
-    """All twins of a run.
+    """A run, compared with its twins.
+
+    A twin is a second execution of the run in which the state received a small push. The twins
+    show whether small disturbances grow or die away. `run_twins` and `run_virtual_twins` create
+    the object.
 
     Attributes:
-        paths: Difference of each twin from the run.
+        paths: Course of the difference of each twin from the run.
         joints: Names of the joints of all sites, for example "m1 joint 1".
-        speed: Largest speed of each joint of the run in each interval, in rad/s, shape (K, J).
-        same: True if the repeated run has the same bits as the records.
+        speed: Largest speed of each joint of the run in each interval of 50 ms, in rad/s, shape
+            (K, J). The differences can be compared with it.
+        same: True if the repeated run has the same bits as the records of the log.
     """
 
     paths: Sequence[TwinPath]
@@ -110,7 +123,14 @@ class Twins(NamedTuple):
 
 
 def list_joints(scenario: Scenario) -> tuple[str, ...]:
-    """Returns the names of all joints, site by site, for example "m1 joint 1"."""
+    """Returns the names of the joints of all sites, for example "m1 joint 1".
+
+    Args:
+        scenario: Description of the experiment.
+
+    Returns:
+        The names, site by site, in the order of the scenario.
+    """
     joints = []
     for name in scenario.names:
         count = scenario.layout(name).joints
@@ -119,15 +139,19 @@ def list_joints(scenario: Scenario) -> tuple[str, ...]:
 
 
 def choose_pushes(scenario: Scenario, count: int) -> list[Push]:
-    """Returns a number of pushes of different joints and estimates.
+    """Chooses pushes that together can reveal most kinds of instability.
 
-    The order is: one push of all estimated parameters if a site learns; up to three pushes of
-    all joints in random directions, with sizes around `PUSH_RAD`; then one push of each joint.
-    The random pushes have different sizes, because growth may depend on the amplitude.
+    A push is a small displacement of the state of a twin, which is a second execution of the
+    run. Different pushes displace different joints or estimates. The order is:
+
+    - one push of all estimated parameters if the control law of a site estimates any;
+    - up to three pushes of all joints in random directions, with sizes around `PUSH_RAD`. The
+      sizes differ, because growth may depend on the amplitude;
+    - one push of each joint.
 
     Args:
-        scenario: The scenario.
-        count: Largest number of pushes.
+        scenario: Description of the experiment.
+        count: Largest number of pushes. Those at the end of the list are left out.
     """
     # The target of "m1 joint 1" is "m1.q1".
     joint_targets = [joint.replace(" joint ", ".q") for joint in list_joints(scenario)]
@@ -158,17 +182,21 @@ _TARGET = re.compile(r"(?:([a-z][a-z0-9_]*)\.)?(qd?|theta)([1-9]\d*)?")
 def parse_push(
     scenario: Scenario, target: str, size: float = PUSH_RAD, at_s: float = 0.0
 ) -> Push:
-    """Returns the push of a target such as "m1.q1", "s.qd2", "m2.theta3" or "m1.q".
+    """Converts a user's description of a push to the push.
 
-    Without a number, all joints (or estimates) of the site are pushed in a random direction.
-    Without a site, those of all sites are. The twin is pushed only once. A difference that is
-    larger than `LARGEST` from the beginning is never scaled down.
+    A push is a small displacement of the state of a twin, which is a second execution of the
+    run. Examples of descriptions are "m1.q1" (joint 1 of site m1), "s.qd2" (velocity of joint
+    2), "m2.theta3" (estimate 3) and "m1.q". Without a number, all joints or estimates of the
+    site are pushed in a random direction. Without a site, those of all sites are.
+
+    The twin is pushed only once. A push that is itself larger than `LARGEST` is never scaled
+    down.
 
     Args:
-        scenario: The scenario.
-        target: The target.
+        scenario: Description of the experiment.
+        target: The description.
         size: Size of the push, in rad, rad/s, or the unit of an estimate.
-        at_s: Time of the push, in s after the epoch.
+        at_s: Time of the push, in s after the epoch (the common start time).
 
     Raises:
         UsageError: The scenario has no such target, or the size is out of range.
@@ -249,12 +277,15 @@ def _describe_targets(scenario: Scenario, target: str) -> str:
 
 
 def run_twins(log: Log, pushes: Sequence[Push], *, own_laws: bool = False) -> Twins:
-    """Executes the run of a log again, together with a twin for every push.
+    """Repeats the run of a log, together with a twin for every push.
+
+    A twin is a further execution of the run that receives a small push. The differences between
+    the twins and the run show whether small disturbances grow or die away.
 
     Args:
-        log: The log.
-        pushes: The pushes.
-        own_laws: True if control laws of users may run.
+        log: Log of the run.
+        pushes: Small displacements of the state, one for each twin.
+        own_laws: True if control laws that are code of users may run.
 
     Raises:
         NotRepeatable: The run cannot be repeated, or the repeated run differs from the records.
@@ -274,11 +305,14 @@ def run_twins(log: Log, pushes: Sequence[Push], *, own_laws: bool = False) -> Tw
 
 
 def run_virtual_twins(scenario: Scenario, pushes: Sequence[Push], duration_s: float) -> Twins:
-    """Runs a scenario in virtual time, together with a twin for every push.
+    """Simulates a scenario in virtual time, together with a twin for every push.
+
+    A twin is a further execution of the run that receives a small push. The differences between
+    the twins and the run show whether small disturbances grow or die away.
 
     Args:
-        scenario: The scenario.
-        pushes: The pushes.
+        scenario: Description of the experiment.
+        pushes: Small displacements of the state, one for each twin.
         duration_s: Duration of the run, in s.
 
     Raises:

@@ -53,14 +53,17 @@ NumberEquality = Callable[[float, float], bool]
 
 
 class RecordDifference(NamedTuple):
-    """Field of a record that differs from the execution.
+    """Difference between a record of a log and the result of executing the same tick again.
+
+    Only the first field that differs is stated.
 
     Attributes:
-        site: Name of the site.
-        tick: Tick of the record.
-        field: Name of the field. For a vector with the index of the number, for example "q[1]".
-        logged: Value in the record.
-        computed: Value of the execution.
+        site: Name of the site whose record it is.
+        tick: Number of the tick.
+        field: Name of the field. For a vector, it includes the index of the number, for example
+            "q[1]".
+        logged: Value in the log.
+        computed: Value of the repeated execution.
     """
 
     site: str
@@ -83,17 +86,31 @@ def _format_value(value: object) -> str:
 
 
 def equal_bits(a: float, b: float) -> bool:
-    """True if two numbers have the same bits. Unlike `==`, it distinguishes -0.0 from 0.0."""
+    """True if two numbers have the same bits.
+
+    Unlike `==`, this distinguishes -0.0 from 0.0, and counts two NaNs as equal.
+    """
     return a.hex() == b.hex()
 
 
 def equal_to_tolerance(a: float, b: float) -> bool:
-    """True if two numbers agree within `TOLERANCE`, as those of two platforms should."""
+    """True if two numbers agree within `TOLERANCE`.
+
+    Two platforms may round some operations differently. Results of the same computation on both
+    should still agree to this extent.
+    """
     return abs(a - b) <= TOLERANCE * (1.0 + abs(a))
 
 
 def describe_law_failure(failure: LawFailed) -> RecordDifference:
-    """Returns the difference that a user's law fails now, but did not fail in the log."""
+    """Describes a user's control law that fails now, although it did not fail in the log.
+
+    The site of the law cannot be executed further. The failure is reported in the same form as
+    a record that differs.
+
+    Args:
+        failure: The error of the control law.
+    """
     return RecordDifference(
         site=failure.site,
         tick=failure.tick or 0,
@@ -112,15 +129,16 @@ def _pack_vectors(record: State | TickRecord) -> bytes:
 
 
 def equal_record(logged: State, computed: TickRecord, peers: tuple[str, ...]) -> bool:
-    """True if every computed field of a record has the same bits as in the execution.
+    """True if a record has the same bits as the result of executing its tick again.
 
-    Nearly all records are equal. Therefore this comparison is optimised for speed, and
-    `find_first_difference` finds the field of a record that is not equal.
+    All computed fields are compared. Nearly all records are equal, so this function is
+    optimised for speed. If it returns False, `find_first_difference` finds the field that
+    differs.
 
     Args:
         logged: Record in the log.
-        computed: Record of the execution.
-        peers: Names of the site's peers, in the order of the scenario.
+        computed: Result of executing the same tick again.
+        peers: Names of the other sites, in the order of the scenario.
     """
     return (
         _pack_vectors(logged) == _pack_vectors(computed)
@@ -140,14 +158,18 @@ def find_first_difference(
     equal: NumberEquality,
     channel: LawChannel = LawChannel(),  # noqa: B008
 ) -> RecordDifference | None:
-    """Returns the first field in which a record differs from the execution, or None.
+    """Finds the first field in which a record differs from executing its tick again.
 
     Args:
         logged: Record in the log.
-        computed: Record of the execution.
-        peers: Names of the site's peers, in the order of the scenario.
+        computed: Result of executing the same tick again.
+        peers: Names of the other sites, in the order of the scenario.
         equal: Function that decides whether two numbers count as equal.
-        channel: Layout of the vectors that the site's control law sends, with their names.
+        channel: Layout of the vectors that the site's control law sends, with their names. By
+            default, the law sends none.
+
+    Returns:
+        The difference. None if all computed fields agree.
     """
     comparisons = _compare_fields(
         logged=logged, computed=computed, peers=peers, equal=equal, channel=channel
@@ -213,7 +235,10 @@ def _compare_fields(
 
 @dataclass(slots=True)
 class VerifyResult:
-    """Result of executing a log again. Counts are numbers of records.
+    """Result of executing the sites of a log again, to check the log.
+
+    A record is the stored result of one tick. It is judged by comparing it with the result of
+    executing the tick again. A record after a gap of the log may be impossible to judge.
 
     Attributes:
         whole_run: True if whole runs were executed, and bits were compared. False if single
@@ -221,16 +246,16 @@ class VerifyResult:
         coverage: For each site, the number of judged ticks and the number of ticks of the run.
         min_coverage: Smallest fraction of the ticks of every site that must be judged.
         integrity: Whether the log is unchanged since it was written.
-        records: Records that were examined.
-        identical: Records in which every computed field agrees with the execution.
-        unjudged: Records after gaps that could not be judged.
-        differing: Records that differ from the execution.
+        records: Number of records that were examined.
+        identical: Number of records in which every computed field agrees with the execution.
+        unjudged: Number of records after gaps that could not be judged.
+        differing: Number of records that differ from the execution.
         first: Difference in the earliest tick. None if there is no difference.
-        gaps: Ranges of missing ticks, as (site, first, last).
+        gaps: Ranges of missing ticks, as (site, first tick, last tick).
         absences: Ranges of ticks that a site did not execute because it had left the session,
-            as (site, first, last).
-        withheld: Names of the sites that were not executed, because their control law may not
-            run. They are not included in the other numbers.
+            as (site, first tick, last tick).
+        withheld: Names of the sites that were not executed, because their control law is code
+            that may not run. They are not included in the other numbers.
     """
 
     whole_run: bool
@@ -248,17 +273,31 @@ class VerifyResult:
 
     @property
     def agreed(self) -> bool:
-        """True if no judged record differs, no matter how few records were judged."""
+        """True if no record differs from the repeated execution.
+
+        It is also true if only few records, or none, could be compared.
+        """
         return self.first is None
 
     @property
     def passed(self) -> bool:
-        """True if the log agrees with the execution, is unchanged, and was judged enough."""
+        """True if the log can be trusted.
+
+        No record differs from the repeated execution, the log is unchanged since it was
+        written, and enough of the ticks of every site were compared.
+        """
         enough = not self.withheld and self.coverage.share >= self.min_coverage
         return self.agreed and enough and self.integrity.passed
 
     def add(self, other: "VerifyResult") -> None:
-        """Adds the result for other sites, which were executed from another log."""
+        """Adds the counts and differences of other sites to this result.
+
+        In the log of a rerun, some sites were copied from a source log. They are executed from
+        that log, and have a result of their own.
+
+        Args:
+            other: Result for the other sites. It does not change.
+        """
         self.records += other.records
         self.identical += other.identical
         self.unjudged += other.unjudged
@@ -275,7 +314,11 @@ class VerifyResult:
             self.integrity = other.integrity
 
     def add_difference(self, difference: RecordDifference) -> None:
-        """Counts a record that differs, and keeps the difference if it is the earliest one."""
+        """Counts one more record that differs from the repeated execution.
+
+        Args:
+            difference: The difference. It is stored as `first` if it is the earliest one.
+        """
         self.differing += 1
         self._keep_first(difference)
 
@@ -290,23 +333,24 @@ PROGRESS_EVERY = 256
 
 
 class SiteVerifier:
-    """Executes one site from its records, and compares each record with the execution.
+    """Executes one site again from its records, and compares each record with the result.
 
     The state of the executed site is certain as long as it follows from the records before. It
     becomes uncertain at a gap of the log, and if the site uses a sample that the log does not
     contain. Two consecutive records make it certain again.
 
-    The arrivals during a gap are not known. Samples that no record lists may have arrived
-    there, so this is assumed. While such a sample is in use, a difference is not counted as a
-    difference, but the record as unjudged. The same holds for a sample that arrived, but whose
-    own record is missing.
+    The log does not say which samples arrived during a gap. A sample that no record lists is
+    assumed to have arrived there. While a sample with an assumed arrival is in use, a record
+    that differs does not count as different, but as impossible to judge. The same holds for a
+    sample that arrived, but whose content is missing from the log.
 
     Args:
         log: The log.
         site: Name of the site.
         by_tick: Records of all sites, by site and tick.
-        result: Receives the counts and differences.
-        resume_every: See `verify`.
+        result: Object to which the counts and differences are added.
+        resume_every: Every how many ticks the site is restored from the records, see `verify`.
+            0 means never.
     """
 
     def __init__(
@@ -729,10 +773,13 @@ def _compare_with_source(recorded: SiteLog, source: SiteLog, result: VerifyResul
 
 
 def open_rerun_source(log: Log) -> Log | None:
-    """Opens the source log of a rerun, if it is in the same folder as the rerun.
+    """Opens the log from which a rerun was made, if it is in the same folder as the rerun.
+
+    Args:
+        log: Log of the rerun. It states the hashes of the files of its source.
 
     Returns:
-        The log. None if its files are missing, or do not have the hashes that the rerun states.
+        The source log. None if its files are missing, or have other hashes.
     """
     names = log.session.get("rerun_of", "").split()
     digests = log.session.get("rerun_of_sha256", "").split()

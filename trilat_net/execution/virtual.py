@@ -59,7 +59,7 @@ from .virtual_network import Network, PromptNetwork
 
 
 class SiteEntry(NamedTuple):
-    """One message that is to be written to a log.
+    """One message of a site that is to be written to a log.
 
     Attributes:
         site: Name of the site that sends the message.
@@ -166,11 +166,11 @@ class SiteChannels:
             self.accounts[channel].mark_unpublished(*numbers)
 
     def make_end_entry(self, t_ns: int | None = None) -> SiteEntry:
-        """Returns the event of the end of the site.
+        """Returns the event that tells that a site has ended, as a message for the log.
 
         Args:
-            t_ns: Time of the event, in ns after the epoch. By default, the time of the last
-                tick.
+            t_ns: Time of the event, in ns after the epoch (the common start time). By default,
+                the time of the last tick.
         """
         end_ns = self._last_ns if t_ns is None else t_ns
         text = f"{self._site} made {count_nouns(self.ticks, 'tick')}"
@@ -198,11 +198,13 @@ class SiteChannels:
         return self.make_event_entry(event, number)
 
     def make_record_entry(self, state: State, payload: bytes) -> SiteEntry:
-        """Returns the entry of a record. A record of an older version is encoded again.
+        """Returns the record of a tick as a message for the log.
+
+        A record in the format of an older version is encoded again in the current format.
 
         Args:
-            state: The record.
-            payload: Bytes of the record.
+            state: The record: the stored result of the tick.
+            payload: The same record as it was encoded.
         """
         self._exclude_skipped_ticks(state.tick, state.cmd)
         sent_ns = state.sent_ns if state.v >= SENT_TIME_SINCE else state.t_ns
@@ -233,7 +235,11 @@ class SiteChannels:
         )
 
     def make_stats_entry(self, stats: LinkStats) -> SiteEntry:
-        """Returns the entry of link statistics."""
+        """Returns statistics of a site's links as a message for the log.
+
+        Args:
+            stats: The statistics, for example the numbers of received and lost samples.
+        """
         present = stats
         if stats.v != VERSION:
             present = msgspec.structs.replace(stats, v=VERSION)
@@ -248,11 +254,11 @@ class SiteChannels:
         )
 
     def make_event_entry(self, event: Event, number: int) -> SiteEntry:
-        """Returns the entry of an event.
+        """Returns an event that a site published earlier as a message for the log.
 
         Args:
-            event: The event.
-            number: Number of the event, if it has none.
+            event: The event, for example a change of the site's mode.
+            number: Number of the event. It is used only if the event itself has none.
         """
         numbered = event if event.n >= 0 else msgspec.structs.replace(event, n=number)
         payload = encode(msgspec.structs.replace(numbered, v=VERSION))
@@ -283,7 +289,16 @@ class SiteChannels:
 
 
 def render_accounts(sites: Iterable[SiteChannels]) -> dict[str, str]:
-    """Returns the texts of the accounts of all channels of some sites, by topic."""
+    """Returns texts that state how many messages each channel of some sites contains.
+
+    A log contains these texts, so that a reader notices missing messages.
+
+    Args:
+        sites: Channels of the sites.
+
+    Returns:
+        One text for each channel, by topic.
+    """
     return {
         f"/{site.keys[channel]}": f"{account.describe()}, overflowed 0"
         for site in sites
@@ -292,12 +307,14 @@ def render_accounts(sites: Iterable[SiteChannels]) -> dict[str, str]:
 
 
 class SiteTick(NamedTuple):
-    """One executed tick of one site.
+    """One tick of one site in virtual time, after it was executed.
+
+    A tick is one period of the site's control loop.
 
     Attributes:
-        site: The site.
-        arrivals: Samples that arrived in this tick.
-        output: Record of the tick.
+        site: The site, in the state after the tick.
+        arrivals: Samples of other sites that arrived in this tick.
+        output: Record of the tick: the stored result.
     """
 
     site: Site
@@ -319,6 +336,11 @@ Its arguments are the site and the number of the site's next tick.
 def check_virtual(scenario: Scenario) -> None:
     """Checks that a scenario can run in virtual time, before anything is written.
 
+    In virtual time, all sites are simulated in one process. There are no real robots.
+
+    Args:
+        scenario: Description of the experiment.
+
     Raises:
         ScenarioError: An arm is a real robot, a user's control law cannot be created, or the
             file of the law has another hash than the scenario states.
@@ -332,14 +354,15 @@ def check_virtual(scenario: Scenario) -> None:
 
 
 def find_skips(commands: Mapping[int, Sequence[CoreChange]]) -> dict[int, int]:
-    """Returns the ranges of ticks that a site skipped.
+    """Returns the ranges of ticks that a site skipped because its control loop was too late.
 
     Args:
         commands: Changes of the site, by tick. A change states how many ticks were skipped just
             before its tick.
 
     Returns:
-        For the first tick of each range, the first tick after the range.
+        A mapping from the first skipped tick of each range to the first tick after the range.
+        Empty if no tick was skipped.
     """
     next_ticks = {}
     for tick, changes in commands.items():
@@ -446,9 +469,14 @@ def _find_ready(
 
 
 def compute_boot(scenario: Scenario, site: str) -> int:
-    """Returns the number that stands for the start of a site in virtual time.
+    """Returns the number that identifies the start of a site in virtual time.
 
-    It is a function of the scenario, so that repeated runs write the same log.
+    In a live session, every start of a process gets a random number. In virtual time, the
+    number is a function of the scenario, so that repeated runs write the same log.
+
+    Args:
+        scenario: Description of the experiment.
+        site: Name of the site.
     """
     return compute_virtual_boot(scenario.sha256, site)
 
@@ -618,11 +646,14 @@ def record_virtual(
 
 
 class SimulatedLog(Log):
-    """Log of a run in virtual time, held in memory. `save` writes it to a file.
+    """Log of a simulated run, held in memory.
+
+    `simulate_scenario` returns it. It can be used like a log that was read from a file, and
+    `save` writes it to a file.
 
     Args:
-        write: Function that runs the scenario, and writes its log to a stream. Its arguments
-            are the stream and the rate of the additional channels for viewers, in Hz.
+        write: Function that runs the scenario and writes its log. Its arguments are the stream
+            to write to, and the rate of the additional channels for viewers in Hz.
     """
 
     def __init__(self, write: Callable[[Sink, float], object]) -> None:
@@ -656,11 +687,13 @@ def simulate_scenario(
     *,
     hands: HandTracks = {},  # noqa: B006
 ) -> SimulatedLog:
-    """Runs a scenario in virtual time, and returns its log.
+    """Simulates an experiment in virtual time, and returns the log of the run.
+
+    In virtual time, all sites run in this process, as fast as possible.
 
     Args:
-        scenario: The scenario.
-        hands: Actions of live operators, see `execute_virtual`.
+        scenario: Description of the experiment.
+        hands: Actions of live operators, see `execute_virtual`. By default, there are none.
 
     Raises:
         ScenarioError: The scenario cannot run in virtual time.

@@ -40,10 +40,11 @@ from .virtual_network import Network, RecordedNetwork, complete_deliveries, read
 
 
 class RecordComparison(NamedTuple):
-    """Agreement of the records of a log with another execution.
+    """Result of comparing the records of a log with another execution of the same ticks.
 
     Attributes:
-        records: Number of compared records.
+        records: Number of records that were compared. A record is the stored result of one
+            tick.
         identical: Number of records in which all computed fields have the same bits.
         first: Difference in the earliest tick. None if all records are identical.
     """
@@ -54,9 +55,11 @@ class RecordComparison(NamedTuple):
 
 
 class LateSample(NamedTuple):
-    """Sample of a peer that had not arrived at a site when it was due.
+    """Sample that had not arrived at its receiver when it should have come into use.
 
-    Samples that are lost according to the model of the link are not due, and do not count.
+    A sample is the state that a site publishes in one tick. It is due after the delay that the
+    scenario states for the link. Samples that are lost according to the scenario are never due,
+    and do not count.
 
     Attributes:
         site: Name of the receiver.
@@ -89,9 +92,10 @@ def compare_records(
 
     Args:
         log: The log.
-        executed: Name of the site and record of every executed tick, in any order. Ticks that
-            the log does not contain are skipped.
-        arrivals: If True, the checksums of the arrivals must be equal as well.
+        executed: Results of the other execution in any order, each with the name of the site.
+            Ticks that the log does not contain are skipped.
+        arrivals: If True, the same samples must have arrived in each tick as well. Their
+            checksums are compared.
     """
     by_tick = {name: log[name].by_tick for name in log.sites}
     records = 0
@@ -118,11 +122,19 @@ def compare_records(
 
 
 def find_absent_samples(log: Log) -> list[LateSample]:
-    """Returns every sample that had not arrived when it was due, in the order of the due ticks.
+    """Returns every sample that had not arrived at its receiver when it was due.
 
-    The records do not say whether a sample was lost, or arrived in a tick whose record is
-    missing. A sample that no record lists counts as lost if the first record from its due tick
-    on still uses an older sample.
+    A sample is due after the delay that the scenario states for its link. The records do not
+    say whether a sample was lost, or arrived in a tick whose record is missing. A sample that
+    no record lists counts as lost if the first record from its due tick on still uses an older
+    sample.
+
+    Args:
+        log: The log.
+
+    Returns:
+        The samples, in the order of the ticks in which they were due. Empty if all were in
+        time.
     """
     absent: list[LateSample] = []
     for name in log.sites:
@@ -194,14 +206,18 @@ def _uses_older(part: SiteLog, sender: str, tick: int, due_tick: int) -> bool:
 
 
 class VirtualComparison(NamedTuple):
-    """Comparison of a log with two runs of its scenario in virtual time.
+    """Comparison of the log of a live session with simulations of the same scenario.
+
+    It shows whether the network of the session influenced the result beyond the delays that the
+    scenario states.
 
     Attributes:
-        fed: Comparison with the run in which samples arrive as in the log. They must be equal.
-        plain: Comparison with the run in which samples arrive at once. They must be equal up to
-            the first late or lost sample. Without records if an arm is external, because its
-            motion is known only for the recorded run.
-        absent: Samples that arrived late or never, in the order of the due ticks.
+        fed: Comparison with the simulation in which samples arrive as in the log. All records
+            must be equal.
+        plain: Comparison with the simulation in which samples arrive at once. The records must
+            be equal up to the first late or lost sample. If an arm is external, no records are
+            compared, because its motion is known only for the recorded run.
+        absent: Samples that arrived late or never, in the order in which they were due.
     """
 
     fed: RecordComparison
@@ -210,25 +226,29 @@ class VirtualComparison(NamedTuple):
 
     @property
     def late(self) -> list[LateSample]:
-        """Samples that arrived late."""
+        """Samples that arrived, but later than the scenario states."""
         return [sample for sample in self.absent if sample.arrived_tick is not None]
 
     @property
     def lost(self) -> list[LateSample]:
-        """Samples that never arrived."""
+        """Samples that the network lost, so that they never arrived."""
         return [sample for sample in self.absent if sample.arrived_tick is None]
 
     @property
     def excused_from(self) -> int | None:
-        """First tick in which the plain run may differ. None if no sample was late or lost."""
+        """First tick from which the log may differ from a simulation with a perfect network.
+
+        It is the tick in which the first late or lost sample was due. None if there was no such
+        sample.
+        """
         return self.absent[0].due_tick if self.absent else None
 
 
 def compare_with_virtual(log: Log, progress: Progress | None = None) -> VirtualComparison:
-    """Compares a log with two runs of its scenario in virtual time.
+    """Compares a log with two simulations of its scenario in virtual time.
 
-    In the first run, samples arrive as in the log; in the second run, they arrive at once. Both
-    runs end at the last record of the log.
+    In the first simulation, samples arrive as in the log; in the second one, they arrive at
+    once. Both end at the last record of the log.
 
     Args:
         log: The log.
@@ -295,5 +315,15 @@ def _cut_to_records(log: Log) -> Scenario:
 
 
 def simulate_without_operators(log: Log) -> Log:
-    """Returns the log of a run of the same experiment in virtual time, without operators."""
+    """Simulates the experiment of a log in virtual time, but without operators.
+
+    An operator is a person or program that moves an arm. The result shows what the arms do by
+    themselves.
+
+    Args:
+        log: The log that contains the scenario.
+
+    Returns:
+        The log of the simulation.
+    """
     return virtual.simulate_scenario(_cut_to_records(log).without_hands())

@@ -30,16 +30,38 @@ from .resumption import ArrivalEntry, make_arrival
 
 
 class Network(Protocol):
-    """Interface of a network between the sites of a virtual run."""
+    """Interface of a network between the sites of a simulation in virtual time.
+
+    A network decides in which tick of the receiver a sample arrives. A sample is the state that
+    a site publishes in one tick. The simulation calls `send` after each tick of a site, and
+    `deliver` before each one.
+    """
 
     def send(self, sender: str, output: TickRecord) -> None:
-        """Accepts the record of one tick of a sender, for delivery to the other sites."""
+        """Accepts the sample of a tick, for delivery to the other sites.
+
+        Args:
+            sender: Name of the site that has executed the tick.
+            output: Record of the tick, which contains the sample.
+        """
 
     def is_ready(self, receiver: str, k: int) -> bool:
-        """True if all samples that arrive in tick `k` of a receiver have been sent."""
+        """True if a site can execute its next tick.
+
+        This requires that all samples that arrive in the tick have been sent.
+
+        Args:
+            receiver: Name of the site.
+            k: Number of its next tick.
+        """
 
     def deliver(self, receiver: str, k: int) -> list[Arrival]:
-        """Returns the samples that arrive in tick `k` of a receiver, in their order."""
+        """Returns the samples that arrive at a site in one tick, in the order of their arrival.
+
+        Args:
+            receiver: Name of the site.
+            k: Number of the tick.
+        """
 
 
 class PromptNetwork:
@@ -57,20 +79,20 @@ class PromptNetwork:
         }
 
     def send(self, sender: str, output: TickRecord) -> None:
-        """Stores the record until each other site has received it."""
+        """Stores the sample of a tick until each other site has received it."""
         for receiver, queues in self._in_transit.items():
             if receiver != sender:
                 queues[sender].append(output)
 
     def is_ready(self, receiver: str, k: int) -> bool:  # noqa: ARG002 - see `Network`
-        """Returns True.
+        """Returns True, because the samples for the next tick are always complete.
 
         The sites run in the order of time, so all earlier samples have been sent.
         """
         return True
 
     def deliver(self, receiver: str, k: int) -> list[Arrival]:
-        """Returns the stored samples that were sent before tick `k`."""
+        """Returns the samples sent before tick `k` that the site has not received yet."""
         now_ns = k * NS_PER_S // self._rates[receiver]
         arrivals = []
         for index, queue in enumerate(self._in_transit[receiver].values()):
@@ -82,13 +104,14 @@ class PromptNetwork:
 
 
 class RecordedNetwork:
-    """Network that delivers samples in the ticks that a log recorded.
+    """Network in which samples arrive in the same ticks as in a log.
 
-    Only the times come from the log. The content of a sample is that of the running sender.
+    Only the times come from the log. The content of a sample is that of the running sender,
+    which may differ from the log if settings were changed.
 
     Args:
-        schedule: Arrivals at each site, by tick.
-        peers: Names of the peers of each site, in the order of the scenario.
+        schedule: Arrivals at each site, by tick of the receiver.
+        peers: For each site, the names of the other sites in the order of the scenario.
     """
 
     def __init__(
@@ -104,11 +127,11 @@ class RecordedNetwork:
         self._checked = dict.fromkeys(schedule, (0, 0))
 
     def send(self, sender: str, output: TickRecord) -> None:
-        """Stores the record under its sender and tick."""
+        """Stores the sample of a tick under its sender and tick, until it is delivered."""
         self._sent[sender, output.tick] = output
 
     def is_ready(self, receiver: str, k: int) -> bool:
-        """True if all samples that arrive in tick `k` of a receiver have been sent.
+        """True if all samples that the log lists for tick `k` of a receiver have been sent.
 
         In a live session, a site whose loop ran late may have received samples with later times
         than that of its own tick. The senders of such samples must run first.
@@ -142,10 +165,10 @@ class RecordedNetwork:
 
 
 class Deliveries(NamedTuple):
-    """Arrivals at one site, by tick.
+    """Which samples of other sites arrived at one site, by tick of the site.
 
     Attributes:
-        entries: Arrivals of each tick, in order.
+        entries: Arrivals of each tick, in the order in which they arrived.
         unrecorded: Ticks between `first` and `last` without a record. Their arrivals are
             assumed.
         first: First tick with a record.
@@ -159,7 +182,9 @@ class Deliveries(NamedTuple):
 
 
 def read_deliveries(part: SiteLog) -> Deliveries:
-    """Returns the arrivals at a site that its records list.
+    """Reads from the records of a site which samples arrived in each tick.
+
+    Ticks without a record are left out; `complete_deliveries` fills them in.
 
     Args:
         part: Records of the site.
