@@ -133,13 +133,22 @@ class Arm(fields.Frozen, frozen=True):
     links: dict[str, LinkInertia] = msgspec.field(default_factory=dict)
 
     def planar_links(self) -> ArmLinks:
-        """Returns the lengths and masses of the planar arm."""
+        """Returns the lengths, masses and inertias of the planar arm of two links.
+
+        They are meaningless if the arm is a chain from a URDF file.
+        """
         values = {name: getattr(self, name) for name in ArmLinks._fields}
         return ArmLinks(**values)
 
 
 def start_margin(joint: ChainJoint) -> float:
-    """Returns how far beyond its stops and limits a joint may start, in rad or m."""
+    """Returns how far beyond its stops and position limits a joint may start, in rad or m.
+
+    A real arm at rest may stand slightly beyond the nominal position of a stop.
+
+    Args:
+        joint: A joint of a chain. A prismatic joint has a margin in m.
+    """
     return START_MARGIN_M if joint.prismatic else START_MARGIN_RAD
 
 
@@ -173,14 +182,22 @@ class Task(fields.Frozen, frozen=True, omit_defaults=True):
 
     @property
     def shared(self) -> int:
-        """Number of shared coordinates in task space, 0 if the sites share joint angles."""
+        """Number of coordinates that the sites share in task space.
+
+        It is 0 if the sites share joint angles.
+        """
         return {"joints": 0, "position": 3, "pose": 6}[self.space]
 
     def find_idle_key(self, written: Mapping[str, object]) -> fields.KeyProblem | None:
-        """Returns a key that the author wrote although it has no effect, or None.
+        """Returns a key that the author of a scenario wrote although it has no effect.
+
+        Such a key is refused, because its author probably expected an effect.
 
         Args:
-            written: Table as its author wrote it.
+            written: Table of the task as its author wrote it.
+
+        Returns:
+            The key and the reason. None if every written key has an effect.
         """
         if not self.shared:
             for key in written:
@@ -203,9 +220,9 @@ class Task(fields.Frozen, frozen=True, omit_defaults=True):
 
     @property
     def setup(self) -> TaskSetup | None:
-        """Task in the form that the simulation kernel uses.
+        """The task in the form in which the simulation kernel uses it.
 
-        None if the sites share joint angles.
+        None if the sites share joint angles, because the kernel needs no task then.
         """
         if not self.shared:
             return None
@@ -223,6 +240,8 @@ class Task(fields.Frozen, frozen=True, omit_defaults=True):
 
 class ArmModel(NamedTuple):
     """Parameters and geometry of an arm with n joints.
+
+    `build_arm` creates the model from the table of the arm in a scenario.
 
     Attributes:
         theta: True inertial parameters: the five of Eq. (24) for the planar arm, ten per link
@@ -249,7 +268,10 @@ class ArmModel(NamedTuple):
 
     @property
     def parameters(self) -> list[tuple[str, str]]:
-        """Name and unit of each parameter, in the order of `theta`."""
+        """Name and unit of each inertial parameter, in the order of `theta`.
+
+        Figures and messages use them as labels.
+        """
         if self.chain is None:
             return [(f"theta_{n + 1}", unit) for n, unit in enumerate(PLANAR_UNITS)]
         parameters = []
@@ -282,8 +304,10 @@ class ArmModel(NamedTuple):
     def joint_units(self, unit: str) -> list[str]:
         """Returns the unit of a quantity for each joint.
 
+        A prismatic joint has m in place of rad, and N in place of N m.
+
         Args:
-            unit: Unit of the quantity for a rotating joint.
+            unit: Unit of the quantity for a rotating joint, for example "rad/s".
         """
         if self.chain is None:
             return [unit] * self.counts.joints
@@ -295,7 +319,11 @@ class ArmModel(NamedTuple):
     def end_effector(self, q: Vector) -> list[float]:
         """Returns the position of the end effector in the pose `q`, in m.
 
-        It has two coordinates for the planar arm and three for a chain.
+        Args:
+            q: Joint angles in rad, or m for a prismatic joint, shape (n,).
+
+        Returns:
+            The coordinates: two for the planar arm, three for a chain.
         """
         if self.chain is None:
             l1, l2 = self.lengths_m
@@ -347,10 +375,10 @@ class ArmModel(NamedTuple):
         return HandReach(joints[0].origin_m, inner_m, outer_m)
 
     def find_joint_reach(self, limits: MotionLimits) -> HandReach:
-        """Returns the range of each joint that its stops and position limits permit.
+        """Returns the range of each joint that its mechanical stops and position limits permit.
 
         Args:
-            limits: Position limits of the site.
+            limits: Position limits of the site that runs the arm.
         """
         joints = self.counts.joints
         low = np.broadcast_to(np.array(limits.q_min, dtype=np.float64), joints)
@@ -367,18 +395,22 @@ class ArmModel(NamedTuple):
 
     @property
     def axes(self) -> tuple[float, ...]:
-        """For each task coordinate, 1 if the site follows it and 0 if not.
+        """For each task coordinate, 1 if the site follows its peers along it, and 0 if not.
 
-        Empty in joint space.
+        Empty if the sites share joint angles.
         """
         task = None if self.chain is None else self.chain.task
         return () if task is None else task.axes
 
     def shared_pose(self, q: Vector) -> tuple[float, ...]:
-        """Returns the coordinates that a site shares in the pose `q`.
+        """Returns the coordinates that a site publishes for its peers in the pose `q`.
 
-        These are the joint angles, or the scaled position of the end effector. If the sites
-        share poses, the orientation as a rotation vector follows.
+        These are the joint angles, or the position of the end effector multiplied by the scale
+        of the task. If the sites share poses, the orientation as a rotation vector in rad
+        follows.
+
+        Args:
+            q: Joint angles in rad, or m for a prismatic joint, shape (n,).
         """
         if self.chain is None or self.chain.task is None:
             return tuple(q)
@@ -388,7 +420,14 @@ class ArmModel(NamedTuple):
         return (*position.tolist(), *self.end_effector_orientation(q))
 
     def task_jacobian(self, q: Vector) -> Array:
-        """Returns the Jacobian of the shared task coordinates in the pose `q`, shape (m, n)."""
+        """Returns the matrix that converts joint velocities to those of the task coordinates.
+
+        Args:
+            q: Joint angles in rad, or m for a prismatic joint, shape (n,).
+
+        Returns:
+            The Jacobian, shape (m, n), where m is the number of task coordinates.
+        """
         assert self.chain is not None
         assert self.chain.task is not None
         rows = self._place_links(q)
@@ -397,9 +436,15 @@ class ArmModel(NamedTuple):
         return J[: self.counts.shared]
 
     def largest_gravity(self, g_m_s2: float) -> tuple[float, ...]:
-        """Returns upper bounds of the gravity torques of the planar arm, in N m.
+        """Returns the largest torques that gravity can exert on the joints of the planar arm.
 
-        Empty for a chain.
+        The values are upper bounds over all poses.
+
+        Args:
+            g_m_s2: Gravitational acceleration, in m/s^2.
+
+        Returns:
+            One torque per joint, in N m. Empty for a chain.
         """
         if self.chain is not None:
             return ()
@@ -407,7 +452,16 @@ class ArmModel(NamedTuple):
         return upper_nm + lower_nm, lower_nm
 
     def inertia(self, q: Array) -> Array:
-        """Returns the inertia matrix M(q) of a chain including its drives, shape (n, n)."""
+        """Returns the inertia matrix M(q) of a chain, including its drives.
+
+        Multiplied by the joint accelerations, it gives the torques that accelerate the arm.
+
+        Args:
+            q: Joint angles in rad, or m for a prismatic joint, shape (n,).
+
+        Returns:
+            The symmetric matrix, shape (n, n), in kg m^2 for rotating joints.
+        """
         rows = self._place_links(q)
         mass_matrix(rows, self.theta)
         # The kernel computes only the lower triangle of the symmetric matrix.
@@ -417,13 +471,14 @@ class ArmModel(NamedTuple):
 
 
 def build_arm(arm: Arm, task: Task, urdf_texts: Mapping[str, str], chains: bool) -> ArmModel:
-    """Returns the model of an arm.
+    """Converts the table of an arm in a scenario to a model for computation.
 
     Args:
-        arm: Table of the arm.
-        task: Task of its site.
-        urdf_texts: Texts of the URDF files, by name.
-        chains: True if all arms of the scenario are chains, including the planar arm.
+        arm: Table of the arm, with its lengths and masses or the name of its URDF file.
+        task: Coordinates that the site of the arm shares with other sites.
+        urdf_texts: Texts of the URDF files of the scenario, by name.
+        chains: True if all arms of the scenario are computed as chains of joints in space,
+            including the planar arm.
 
     Raises:
         ScenarioError: The file of the arm cannot be used, or the planar arm has a singular
@@ -671,13 +726,14 @@ def compute_rest_gains(
     *,
     known: bool,
 ) -> RestGains:
-    """Computes the gains with which an arm comes to rest by damping.
+    """Computes the gains with which an arm is brought to rest by damping.
 
-    A joint with the inertia M_ii gets the damping B = M_ii / T. Because the joints are coupled,
-    the fastest motion of the arm decays with the rate lambda / T, where lambda is the largest
-    eigenvalue of diag(M) M^-1. T is chosen so that the time constant T / lambda is at least
-    `BRAKE_TICKS` ticks. If the inertia of the arm is not known, B is the damping of the control
-    law, for joints for which it is positive.
+    M is the inertia matrix of the arm. The joint i gets the damping B = M_ii / T, where T is a
+    time constant. Because the joints are coupled, the fastest motion of the arm decays with the
+    rate lambda / T, where lambda is the largest eigenvalue of diag(M) M^-1. T is chosen so that
+    the time constant T / lambda of this motion is at least `BRAKE_TICKS` ticks. If the inertia
+    of the arm is not known, B is the damping of the control law, for joints for which it is
+    positive.
 
     Args:
         arm: Model of the arm.

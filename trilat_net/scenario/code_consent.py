@@ -52,7 +52,14 @@ ImportedCode = ImportedLaw | ProgramHand | OwnPlant
 
 
 def list_imported_code(scenarios: "Iterable[Scenario]") -> list[ImportedCode]:
-    """Returns the laws, operators and plants of scenarios that are classes of users."""
+    """Returns the users' classes that scenarios name, and that would run with them.
+
+    These are control laws, operators (programs that move an arm) and plants (programs that
+    compute the motion of an arm).
+
+    Args:
+        scenarios: Descriptions of the experiments.
+    """
     imported = []
     for scenario in scenarios:
         for site in scenario.sites.values():
@@ -68,15 +75,18 @@ def allow_own_code(
 ) -> "Scenario":
     """Allows the code that a scenario names to run, because a user of this process named it.
 
+    The program runs users' classes only with permission, since a scenario from elsewhere may
+    name harmful code.
+
     Args:
         scenario: The scenario.
-        codes: Classes that the user named, for example "package.module:Law". None: the user
+        codes: Classes that the user named, for example "package.module:Law". If None, the user
             wrote the whole scenario, so all its code may run.
         changed_from: Scenario from which the user made this one. Code that may run there may
-            run here as well, with its new arguments.
+            run here as well, with its new arguments. None if there is no such scenario.
 
     Returns:
-        The scenario.
+        The same scenario.
     """
     earlier_consents: dict[tuple[str, str], CodeConsent] = {}
     if changed_from is not None:
@@ -95,7 +105,7 @@ def allow_own_code(
 
 
 class RememberedFile(msgspec.Struct):
-    """File for which a person has stored a permission.
+    """File with a user's code for which a person has stored a permission to run.
 
     Attributes:
         file: Path of the file.
@@ -294,7 +304,14 @@ class LoggedUserLaw(NamedTuple):
 
 
 def find_user_laws(scenario: "Scenario") -> list[LoggedUserLaw]:
-    """Returns the control laws of users in a scenario, without running any of their code."""
+    """Returns the control laws in a scenario that are users' classes.
+
+    None of their code is run. Each entry tells whether the law may run, and which file would be
+    used.
+
+    Args:
+        scenario: Scenario of a log.
+    """
     sites: dict[CodeKey, tuple[str, ...]] = {}
     laws: dict[CodeKey, ImportedLaw] = {}
     for name, spec in scenario.sites.items():

@@ -124,10 +124,15 @@ def read_trace(path: Path, link: str) -> str:
 
 
 def format_trace(points: Sequence[TracePoint]) -> str:
-    """Returns a trace as a text, in the form in which a scenario contains it.
+    """Returns a delay trace as a text, in the form in which a scenario contains it.
 
-    The form is "t_us delay_us, t_us delay_us, ...", in microseconds, with "lost" in place of
-    the delay of a lost message. Times count from the first point.
+    A delay trace is a table of send times and the delay that each message had. The form of the
+    text is "t_us delay_us, t_us delay_us, ...", in microseconds, with "lost" in place of the
+    delay of a lost message. Times count from the first point.
+
+    Args:
+        points: Send time in s and delay in ms of each message. A lost message has an infinite
+            delay.
 
     Raises:
         ValueError: There are no points or too many, a number is out of range, or the times do
@@ -248,7 +253,7 @@ class MeasuredTrace(Result):
 
     @property
     def delay_ms(self) -> Array:
-        """Delays of the messages that were not lost, in order, in ms."""
+        """Delays of all messages that were not lost, in ms, in the order of sending."""
         return np.array([ms for _, ms in self.points if math.isfinite(ms)])
 
     def to_dict(self) -> dict[str, Any]:
@@ -295,7 +300,7 @@ class MeasuredTrace(Result):
         }
 
     def blocks(self) -> list[str]:
-        """Returns the lines that show the statistics to a user."""
+        """Returns the lines with which the command shows the statistics of the trace."""
         statistics = self.to_dict()
         samples = count_nouns(statistics["samples"], "sample")
         lost_percent = f"{statistics['lost_percent']:.2f} % lost"
@@ -331,9 +336,10 @@ class MeasuredTrace(Result):
         return lines
 
     def write_rows(self) -> str:
-        """Returns the trace as a CSV text with the columns `t_s,delay_ms`.
+        """Returns the trace as a text in CSV format, with the columns `t_s,delay_ms`.
 
-        A link of the model "trace" can read this text from a file.
+        If the text is saved in a file, a link of the model "trace" can use that file. The
+        method itself writes no file.
         """
         rows = ["t_s,delay_ms"]
         for t_s, ms in self.points:

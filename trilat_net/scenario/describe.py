@@ -46,11 +46,13 @@ IRREVERSIBLE_SHARES = (
 
 
 def lacks_detailed_balance(scenario: Scenario) -> bool:
-    """True if no diagonal matrix D > 0 exists for which D (I - alpha) is symmetric.
+    """True if the dominance factors of a scenario are irreversible.
 
-    alpha is the matrix of dominance factors. Without such a D, the factors are called
-    irreversible. The result is False if a control law exchanges more than positions or does not
-    compensate gravity, because the condition does not apply then.
+    The dominance factor alpha_ij is the weight with which site i follows site j. The factors
+    are reversible if there is a diagonal matrix D > 0 for which D (I - alpha) is symmetric,
+    where I is the identity matrix. Some stability conditions require this. The result is False
+    if a control law exchanges more than positions or does not compensate gravity, because the
+    condition does not apply then.
     """
     laws = [spec.control for spec in scenario.sites.values()]
     if not all(law.exchanges_positions() for law in laws):
@@ -116,9 +118,13 @@ def _list_situations(scenario: Scenario) -> Iterator[tuple[str, LawSettings, Law
 
 
 def describe_law_conditions(scenario: Scenario) -> list[str]:
-    """Returns lines that say whether the stability conditions of the control laws hold.
+    """Returns lines for the user that say whether the conditions of the stability proofs hold.
 
-    Sites with the same law and the same condition share a line.
+    Every control law is stable under conditions of its own, for example on its gains and on the
+    delays. Sites with the same law and the same condition share a line.
+
+    Args:
+        scenario: Description of the experiment.
     """
     owners: dict[tuple[str, StabilityCondition], list[str]] = {}
     for name, law, situation in _list_situations(scenario):
@@ -277,7 +283,14 @@ def _group_chains(scenario: Scenario) -> list[tuple[Arm, list[str]]]:
 
 
 def list_arm_notes(scenario: Scenario) -> list[str]:
-    """Returns sentences about differences between the arms of a run and their URDF files."""
+    """Returns sentences about details of the arms that a user may not expect.
+
+    For example, a joint of the URDF file may be held fixed, or an arm may start beyond a
+    position limit, which is moved for this run. Empty if there is nothing to say.
+
+    Args:
+        scenario: Description of the experiment.
+    """
     notes = []
     for arm, owners in _group_chains(scenario):
         subject = f"arm of {', '.join(owners)}"
@@ -438,7 +451,7 @@ _MAX_VALUE_LENGTH = 80
 
 
 class ScenarioDifference(NamedTuple):
-    """Difference between experiments.
+    """One key in which several experiments differ.
 
     Attributes:
         key: Dotted path of the key, without `sites.NAME` for a key of a site.
@@ -457,7 +470,14 @@ class ScenarioDifference(NamedTuple):
 
 
 def compare_scenarios(scenarios: Sequence[Scenario]) -> list[ScenarioDifference]:
-    """Returns the differences between experiments, in the order of their keys."""
+    """Finds the keys in which several experiments differ.
+
+    Args:
+        scenarios: The experiments.
+
+    Returns:
+        One entry for each difference, in the order of the keys. Empty if all are equal.
+    """
     differences: list[ScenarioDifference] = []
     site_lists = [", ".join(scenario.names) for scenario in scenarios]
     if len(set(site_lists)) > 1:
@@ -524,11 +544,13 @@ def _compare_links(scenarios: Sequence[Scenario]) -> list[ScenarioDifference]:
 
 
 def flatten_table(table: Mapping[str, Any], path: str = "") -> list[tuple[str, Any]]:
-    """Returns the values of a table and of all tables in it, with dotted keys.
+    """Returns the values of a table and of all tables in it, under dotted keys.
+
+    For example, {"a": {"b": 1}} gives the pair ("a.b", 1).
 
     Args:
         table: The table.
-        path: Dotted key of the table itself.
+        path: Dotted key of the table itself. Empty for the outermost table.
     """
     pairs: list[tuple[str, Any]] = []
     for key, value in table.items():
@@ -541,10 +563,10 @@ def flatten_table(table: Mapping[str, Any], path: str = "") -> list[tuple[str, A
 
 
 def describe_law(control: Mapping[str, Any]) -> str:
-    """Returns a short text about a control law and its gains.
+    """Returns the name of a control law and its gains as a short text for the user.
 
     Args:
-        control: Table of the law.
+        control: Table of the law in a scenario.
     """
     # The gains of a user's law are its settings; the hash of its file is left out.
     if "code" in control:
@@ -558,7 +580,13 @@ def describe_law(control: Mapping[str, Any]) -> str:
 
 
 def describe_value(value: Any) -> str:
-    """Returns a value as a short text. A list of equal numbers is written as one number."""
+    """Returns a value of a scenario as a short text for the user.
+
+    A list of equal numbers is written as one number.
+
+    Args:
+        value: Any value that a scenario may contain.
+    """
     if value is None or value == [] or value == ():
         return "none"
     if isinstance(value, dict):

@@ -29,14 +29,15 @@ _MAX_LIST_LENGTH = 64
 
 
 class Distribution(Frozen, frozen=True, omit_defaults=True, kw_only=True):
-    """Distribution from which a number was drawn, together with the number.
+    """Random distribution of a number in a scenario, together with the number drawn from it.
 
-    The pose of an operator may have been copied from a drawn start pose. Such a pose has
-    neither of the two distributions.
+    A scenario may state a distribution in place of a number. The start pose of an operator may
+    have been copied from a drawn start pose of the arm. It then has neither of the two
+    distributions.
 
     Attributes:
-        normal: Mean and standard deviation of a normal distribution.
-        uniform: Lower and upper end of a uniform distribution.
+        normal: Mean and standard deviation of a normal distribution. None for another one.
+        uniform: Lower and upper end of a uniform distribution. None for another one.
         value: The drawn number, or the copied pose.
     """
 
@@ -45,10 +46,14 @@ class Distribution(Frozen, frozen=True, omit_defaults=True, kw_only=True):
     value: float | Annotated[list[float], Meta(max_length=MAX_JOINTS)]
 
     def draw(self, seed: int, key: str) -> float:
-        """Returns the number that belongs to a seed and a dotted key.
+        """Draws the number that belongs to a seed and a key.
 
-        A hash of the seed and the key gives a uniform random number, which the inverse
-        distribution function converts.
+        The same seed and key always give the same number. A hash of both gives a uniform random
+        number, which the inverse distribution function converts.
+
+        Args:
+            seed: Seed of the scenario.
+            key: Dotted key of the number in the scenario.
         """
         # Few scenarios need this import, which takes some milliseconds.
         from statistics import NormalDist
@@ -65,7 +70,7 @@ class Distribution(Frozen, frozen=True, omit_defaults=True, kw_only=True):
         return float(f"{number:.9g}")
 
     def describe(self) -> str:
-        """Returns the distribution as a text."""
+        """Returns the kind of the distribution and its two numbers as a text for the user."""
         if self.normal is not None:
             mean, deviation = self.normal
             return f"normal, {mean:g} with a deviation of {deviation:g}"
@@ -76,12 +81,22 @@ class Distribution(Frozen, frozen=True, omit_defaults=True, kw_only=True):
 
 
 def dotted_key(path: str) -> str:
-    """Converts a path such as hands[0].peak_nm to the form of an override, hands.0.peak_nm."""
+    """Converts a path in an error message to a dotted key.
+
+    For example, hands[0].peak_nm becomes hands.0.peak_nm, which is the form of a key in an
+    override.
+
+    Args:
+        path: The path, with indices in brackets.
+    """
     return re.sub(r"\[(\d+)\]", r".\1", path)
 
 
 class Draws:
-    """Draws the numbers of one scenario.
+    """Draws the numbers of one scenario that are given as distributions.
+
+    It also remembers them, so that a resolved scenario can state both the numbers and their
+    distributions.
 
     Args:
         seed: Seed of the scenario. If it is not an integer, 0 is used here; it is refused later
@@ -101,11 +116,17 @@ class Draws:
         self.drawn: dict[str, Distribution] = {}
 
     def draw_numbers(self, table: TomlTable, path: str) -> TomlTable:
-        """Returns a table with numbers in place of distributions, also in its lists.
+        """Replaces all distributions in a table by drawn numbers.
+
+        Tables and lists within the table are included. The table itself does not change.
 
         Args:
-            table: The table.
-            path: Path of the table.
+            table: Table of a scenario.
+            path: Path of the table in the scenario. It decides, with the seed, which numbers
+                are drawn.
+
+        Returns:
+            A copy of the table with numbers.
         """
         return {key: self._draw_entry(value, f"{path}.{key}") for key, value in table.items()}
 

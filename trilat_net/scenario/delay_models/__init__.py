@@ -37,14 +37,18 @@ OutageTime = Annotated[float, Meta(ge=0.0, le=1e9)]
 
 
 class DelayMoments(NamedTuple):
-    """Mean and standard deviation of a delay, in ms."""
+    """Mean and standard deviation of the delay of a link, in ms."""
 
     mean_ms: float
     deviation_ms: float
 
 
 def ms_to_us(milliseconds: float) -> int:
-    """Converts a time in milliseconds to whole microseconds (L4)."""
+    """Converts a time in milliseconds to whole microseconds.
+
+    The simulation kernel uses integer times, so that results are the same on every machine
+    (L4).
+    """
     return round(milliseconds * 1_000)
 
 
@@ -106,6 +110,8 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
     def derive_keys(cls, table: TomlTable) -> TomlTable:  # noqa: ARG003 - subclasses use it
         """Returns the keys that an author may leave out because they follow from other keys.
 
+        A delay model with such keys overrides this method. By default, there are none.
+
         Args:
             table: Table of the link as its author wrote it.
         """
@@ -137,10 +143,10 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         return f"{self.__struct_config__.tag} {mean_ms:.4g} +- {deviation_ms:.3g} ms"
 
     def moments(self) -> DelayMoments:
-        """Returns the moments of the stated delay.
+        """Mean and standard deviation of the delay that the keys of the link describe.
 
-        They do not include the effects of `playout_ms`, of `order`, and of the cut at
-        `MAX_DELAY_MS`.
+        The delay of the simulation may differ: the effects of `playout_ms`, of `order`, and of
+        the cut at `MAX_DELAY_MS` are not included.
         """
         return DelayMoments(*self._moments())
 
@@ -157,7 +163,7 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
 
     @property
     def points(self) -> Points | None:
-        """Points of a recorded trace of delays. None for links of other models."""
+        """Points of a recorded course of delays. None for links of other delay models."""
         return None
 
     def to_core_model(self, from_ns: int = 0) -> LinkModel:
@@ -199,7 +205,11 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         return _LossChain(loss_good=0.0, loss_bad=self.loss_bad, enter=enter, leave=leave)
 
     def find_problem(self) -> KeyProblem | None:
-        """Returns a problem that involves several keys of the link, or None."""
+        """Returns a contradiction between several keys of the link.
+
+        Returns:
+            The key and the reason. None if the keys agree with each other.
+        """
         delay_problem = self._find_delay_problem()
         if delay_problem is not None:
             return delay_problem
@@ -245,7 +255,10 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         return None
 
     def describe(self) -> str:
-        """Returns a short text about the link, with the mean and the deviation of its delay."""
+        """Returns a short text for the user about the link.
+
+        It contains the kind of the delay, its mean and its standard deviation.
+        """
         parts = [self._describe_delay()]
         if self.loss:
             bursts = f" in bursts of {self.loss_burst:g}" if self.loss_burst else ""
@@ -280,10 +293,10 @@ class OwnDelay(LinkBase, frozen=True, kw_only=True):
 
     @property
     def points(self) -> Points:
-        """Numbers of the keys, stored where a trace has its points, with two numbers per row.
+        """Numbers of the model's keys, stored where a recorded trace would have its points.
 
-        The kernel has one array per link for such data. The floating-point numbers are stored
-        bit by bit in its integers.
+        The kernel has one integer array per link for such data, with two columns. The
+        floating-point numbers of the keys are stored in it bit by bit, two numbers per row.
         """
         numbers = list_numbers(self)
         rows = math.ceil(max(len(numbers), 1) / 2)
@@ -294,7 +307,15 @@ class OwnDelay(LinkBase, frozen=True, kw_only=True):
         return LinkModel(kind=DelayKind.CUSTOM, location=1e3 * self._reach_ms())
 
     def to_core_model(self, from_ns: int = 0) -> LinkModel:
-        """Returns the kernel's model of the link, with the address of the compiled `draw`."""
+        """Returns the link in the form in which the simulation kernel uses it.
+
+        It contains the address of the compiled `draw`, with which the kernel computes the
+        delays.
+
+        Args:
+            from_ns: Send time of the first sample to which this state of the link applies, in
+                ns after the epoch.
+        """
         model = super().to_core_model(from_ns)
         return model._replace(call=compile_to_address(self, "draw", LINK_MODEL_DTYPE))
 

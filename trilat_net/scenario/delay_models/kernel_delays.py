@@ -37,7 +37,9 @@ def _normal_probability(x: float) -> float:
 
 
 class UniformDelay(LinkBase, frozen=True, kw_only=True, tag="uniform"):
-    """Delay with a uniform distribution.
+    """Delay with a uniform distribution between two limits.
+
+    The limits are the mean minus and plus the half width.
 
     Attributes:
         delay_ms: Mean delay, in ms.
@@ -50,7 +52,13 @@ class UniformDelay(LinkBase, frozen=True, kw_only=True, tag="uniform"):
 
     @classmethod
     def derive_keys(cls, table: TomlTable) -> TomlTable:
-        """Returns the default of the half width, so that an author may state the mean alone."""
+        """Returns the default of the half width, which is half of the mean.
+
+        With it, an author may state the mean alone. Empty if the mean is not a number.
+
+        Args:
+            table: Table of the link as its author wrote it.
+        """
         delay_ms = table.get("delay_ms")
         return {"half_width_ms": 0.5 * delay_ms} if is_number(delay_ms) else {}
 
@@ -135,7 +143,10 @@ class MeanDeviationDelay(LinkBase, frozen=True, kw_only=True):
 
 
 class GammaDelay(MeanDeviationDelay, frozen=True, kw_only=True, tag="gamma"):
-    """Delay with a gamma distribution."""
+    """Delay with a gamma distribution, which is skewed towards long delays.
+
+    Its keys are the mean and the standard deviation.
+    """
 
     def _delay(self) -> LinkModel:
         """Returns the kernel's model.
@@ -148,7 +159,10 @@ class GammaDelay(MeanDeviationDelay, frozen=True, kw_only=True, tag="gamma"):
 
 
 class LogNormalDelay(MeanDeviationDelay, frozen=True, kw_only=True, tag="lognormal"):
-    """Delay with a log-normal distribution."""
+    """Delay whose logarithm has a normal distribution. Very long delays occur at times.
+
+    Its keys are the mean and the standard deviation of the delay itself.
+    """
 
     def _delay(self) -> LinkModel:
         """Returns the kernel's model.
@@ -333,7 +347,7 @@ class TraceDelay(LinkBase, frozen=True, kw_only=True, tag="trace"):
 
     @property
     def points(self) -> Points:
-        """Points of the table, in microseconds, shape (n, 2)."""
+        """Points of the table: send times and delays in microseconds, shape (n, 2)."""
         return parse_trace(self.trace)
 
     def _delay(self) -> LinkModel:

@@ -31,10 +31,13 @@ class LowOrbit(OwnDelay, frozen=True, kw_only=True, tag="low_orbit"):
     slot_s: Annotated[float, Meta(gt=0.0, le=1e4)] = 15.0
 
     def draw(self, now: Any) -> None:
-        """Computes the delay of a sample, in microseconds.
+        """Computes the delay of one sample, and stores it in `now.drawn_us`, in microseconds.
 
-        If x is uniform between 0 and 1, then -log(x) has an exponential distribution with mean
-        1.
+        It is the sum of the fixed part and two random parts. If x is uniform between 0 and 1,
+        then -log(x) has an exponential distribution with mean 1.
+
+        Args:
+            now: The sample, with its number and send time.
         """
         slot = now.stamp_ns // int(1e9 * self.slot_s)
         _, path_share = draw_pair(now, slot, 0)
