@@ -9,16 +9,16 @@ from .scenario_types import Change
 
 
 def describe_event(kind: str, text: str, command: str) -> str:
-    """Returns the sentence that describes an event to people.
+    """Returns the sentence that describes an event of a log to people.
 
-    Older versions published a change of a link or site with its JSON text in place of a
-    sentence. For such an event, the sentence is composed here, so that old and new logs read
-    alike.
+    Older versions of the program published the JSON text of a change of a link or site, in
+    place of a sentence. For such an event, the sentence is composed here, so that old and new
+    logs read alike. All other texts are returned unchanged.
 
     Args:
         kind: Kind of the event.
         text: Text of the event, as a site or a recorder published it.
-        command: JSON of the change that the event reports. Empty for other events.
+        command: JSON text of the change that the event reports. Empty for other events.
     """
     if kind == "change" and command and command in text:
         # The command of an untrusted log may lack the keys of a change: the text then stays.

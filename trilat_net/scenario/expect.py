@@ -99,7 +99,11 @@ class ExpectWindow(_JointPart, frozen=True, kw_only=True):
 
     @property
     def limits(self) -> Iterator[tuple[str, tuple[float, ...]]]:
-        """Pairs of each limited quantity and its [smallest, largest] permitted value."""
+        """Pairs of each quantity that the window limits and its permitted values.
+
+        The permitted values are the smallest and the largest one, in the unit that the name of
+        the quantity states. Empty if the window limits nothing.
+        """
         for key in _QUANTITIES:
             limits = getattr(self, key)
             if limits is not None:
@@ -112,7 +116,14 @@ _JOINT_QUANTITY = re.compile(r"(?:q|push)(\d+)_")
 
 
 def window_quantities(joints: int) -> tuple[str, ...]:
-    """Returns the quantities that a window may limit for an arm with `joints` joints."""
+    """Returns the names of the quantities that a window may limit.
+
+    A window is a part of a run for which a scenario states permitted values.
+
+    Args:
+        joints: Number of joints of the arm, which decides how many quantities such as q1_rad
+            exist.
+    """
     quantities = []
     for key in _QUANTITIES:
         number = _JOINT_QUANTITY.match(key)
@@ -184,11 +195,16 @@ def _split_joint_key(key: str) -> tuple[str, str, str]:
 def find_window_problem(
     window: ExpectWindow, joint_counts: Mapping[str, int]
 ) -> KeyProblem | None:
-    """Returns the reason why no run could satisfy a window, or None.
+    """Returns the reason why no run could satisfy a window of expectations.
+
+    For example, the smallest permitted value may be larger than the largest one.
 
     Args:
-        window: The window.
-        joint_counts: Number of joints of each site's arm.
+        window: Part of a run with the permitted values of some quantities.
+        joint_counts: Number of joints of each site's arm, by the name of the site.
+
+    Returns:
+        The key and the reason. None if the window is possible.
     """
     sites = f"its sites are {', '.join(joint_counts)}"
     if window.to_s <= window.from_s:
@@ -295,14 +311,14 @@ class Expect(
 
 
 def find_expect_problem(expect: Expect, joint_counts: Mapping[str, int]) -> KeyProblem | None:
-    """Returns the reason why no run could satisfy the expectations, or None.
+    """Returns the reason why no run could satisfy the expectations of a scenario.
 
     Args:
         expect: The expectations.
-        joint_counts: Number of joints of each site's arm.
+        joint_counts: Number of joints of each site's arm, by the name of the site.
 
     Returns:
-        The problem, with the path of its key below `expect`.
+        The reason, with the path of its key below `expect`. None if a run may satisfy them.
     """
     for name, pose in expect.end_pose_rad.items():
         key = f"end_pose_rad.{name}"

@@ -53,29 +53,38 @@ Its arguments are the tick and the call, a function without arguments.
 def call_directly(_k: int, function: Callable[[], Any]) -> Any:
     """Calls a user's code without a time limit.
 
-    This is the `Watch` for virtual time, in which no other process waits for the result.
+    In a live session, a user's code must not delay the control loop, so its calls are watched.
+    This function takes the place of such a `Watch` in virtual time, in which no other process
+    waits for the result.
 
     Args:
-        _k: Tick. It is not used.
-        function: The call.
+        _k: Number of the tick in which the call is made. It is not used.
+        function: Function without arguments that makes the call.
+
+    Returns:
+        The result of the function.
     """
     return function()
 
 
 class NamedCode(Protocol):
-    """Class of a user as a scenario names it: a control law, an operator or a plant."""
+    """Interface of an entry of a scenario that names a user's class.
+
+    The class is a control law, an operator (a program that moves an arm) or a plant (a program
+    that computes the motion of an arm).
+    """
 
     @property
     def code(self) -> str:
-        """Module and class, for example "package.module:Law"."""
+        """Module and name of the class, for example "package.module:Law"."""
 
     @property
     def source_sha256(self) -> str:
-        """SHA-256 hash of the file of the module."""
+        """SHA-256 hash of the file of the module. It shows whether the file has changed."""
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Arguments of the class, by name."""
+        """Arguments with which the class is created, by name."""
 
 
 ANY_SETTINGS = "*"
@@ -87,9 +96,10 @@ arguments itself.
 
 
 class CodeKey(NamedTuple):
-    """Identification of code: a class, the hash of its file and its arguments.
+    """Identification of a user's code: a class, the hash of its file and its arguments.
 
-    Permissions are stored under these keys.
+    A person permits code to run under this key. If the file or an argument changes, the
+    permission no longer applies.
 
     Attributes:
         code: Module and class, for example "package.module:Law".
@@ -103,7 +113,11 @@ class CodeKey(NamedTuple):
 
     @classmethod
     def of(cls, named: NamedCode) -> "CodeKey":
-        """Returns the key of a control law, an operator or a plant of a scenario."""
+        """Returns the key under which a user's class of a scenario may be permitted.
+
+        Args:
+            named: Control law, operator or plant of the scenario.
+        """
         return cls(
             named.code,
             named.source_sha256,
@@ -112,11 +126,12 @@ class CodeKey(NamedTuple):
 
 
 class CodeConsent(NamedTuple):
-    """Permission to run a file.
+    """Permission to run the code of a file.
 
     Attributes:
-        file: Path of the file. None: the file that Python's import finds for the module.
-        sha256: SHA-256 hash that the file must have.
+        file: Path of the file. If None, it is the file that Python's import finds for the
+            module.
+        sha256: SHA-256 hash that the file must have. Otherwise the permission does not apply.
     """
 
     file: Path | None
@@ -135,18 +150,26 @@ what differs if code is refused; they permit nothing.
 
 
 def find_consent(key: CodeKey) -> CodeConsent | None:
-    """Returns the permission for code with its arguments. None if the code may not run."""
+    """Looks up whether a user's code may run with its arguments.
+
+    Args:
+        key: Class, hash of its file and arguments.
+
+    Returns:
+        The permission. None if the code may not run.
+    """
     return allowed_code.get(key) or allowed_code.get(key._replace(settings=ANY_SETTINGS))
 
 
 @contextmanager
 def allowing_any_settings(allowed: CodeConsents) -> Iterator[None]:
-    """Widens permissions to all arguments of the same code, inside the `with` block.
+    """Permits code with any arguments, inside the `with` block.
 
-    A study uses it, because it varies the arguments of a class itself.
+    Normally, a permission applies only to certain arguments of a class. A parameter study
+    varies the arguments itself, so it needs a wider permission.
 
     Args:
-        allowed: Permissions to widen.
+        allowed: Permissions of the code that is studied.
     """
     widened = {key._replace(settings=ANY_SETTINGS): consent for key, consent in allowed.items()}
     added = {key: consent for key, consent in widened.items() if key not in allowed_code}
@@ -223,7 +246,7 @@ _executed: dict["CodeSource", Any] = {}
 
 
 class ImportedLaw(LawSettings, frozen=True, tag_field="law", tag="own"):
-    """Control law that is a class of a user.
+    """Control law of a scenario that is a user's class.
 
     Attributes:
         code: Module and class, for example "package.module:Law".
@@ -240,9 +263,9 @@ class ImportedLaw(LawSettings, frozen=True, tag_field="law", tag="own"):
     sends: SentVectorSpecs = field(default_factory=dict)
 
     def build_factory(self, sites: int, scheme: str) -> UserLawFactory:
-        """Returns a function that creates the law for a site.
+        """Returns a function that creates the control law for a site.
 
-        The class is imported only when this function is called.
+        The user's class is imported only when the returned function is called.
 
         Args:
             sites: Number of sites of the experiment.
@@ -272,7 +295,9 @@ class ImportedLaw(LawSettings, frozen=True, tag_field="law", tag="own"):
 
 
 class CodeSource(NamedTuple):
-    """File that defines a class of a user.
+    """Python file that defines a user's class, as it was read from disk.
+
+    Its content is stored, so that exactly the checked text is run.
 
     Attributes:
         file: Path of the file.
@@ -525,10 +550,14 @@ def name_law_class(kind: type) -> str:
 
 
 def name_law_classes(value: Any) -> Any:
-    """Converts a value for a scenario to types that TOML supports.
+    """Converts a value that a Python program passed to types that TOML supports.
 
-    A class becomes its name (`name_law_class`), and a number or an array of NumPy becomes a
-    number or a list. Tables are converted entry by entry.
+    A user's class becomes its name (see `name_law_class`), and a number or an array of NumPy
+    becomes a number or a list. Tables are converted entry by entry. Other values are returned
+    unchanged.
+
+    Args:
+        value: Value for a scenario.
     """
     if isinstance(value, type):
         return name_law_class(value)

@@ -43,5 +43,11 @@ else:
 
 
 def identify_law(law: Any) -> str:
-    """Returns the name of a law in a scenario. A user's law is named "package.module:Law"."""
+    """Returns the name with which a scenario names a control law.
+
+    The name of a user's law consists of its module and class, for example "package.module:Law".
+
+    Args:
+        law: Control law of a site.
+    """
     return law.code if isinstance(law, ImportedLaw) else str(law.tag)

@@ -30,7 +30,7 @@ TensorEntries = Annotated[tuple[fields.Real, ...], Meta(min_length=6, max_length
 
 
 class LinkInertia(fields.Frozen, frozen=True, omit_defaults=True):
-    """Mass and inertia of a link that replace the values in its file.
+    """Mass and inertia of a link of a robot that replace the values in its URDF file.
 
     Attributes:
         mass_kg: Mass, in kg. 0 removes the body of the link. By default, as in the file.
@@ -46,13 +46,17 @@ class LinkInertia(fields.Frozen, frozen=True, omit_defaults=True):
     inertia_kg_m2: TensorEntries | None = None
 
     def list_given_keys(self) -> list[str]:
-        """Returns the names of the keys that the scenario states."""
+        """Returns the names of those keys that the author of the scenario stated."""
         keys = fields.field_names(LinkInertia)
         return [key for key in keys if getattr(self, key) is not None]
 
 
 def fill_tensor(entries: Sequence[float]) -> Matrix:
-    """Returns the symmetric tensor with the entries xx, xy, yy, xz, yz, zz."""
+    """Returns the symmetric 3 x 3 inertia tensor with six given entries.
+
+    Args:
+        entries: The entries xx, xy, yy, xz, yz, zz, in this order, in kg m^2.
+    """
     xx, xy, yy, xz, yz, zz = entries
     return (xx, xy, xz), (xy, yy, yz), (xz, yz, zz)
 

@@ -33,13 +33,17 @@ Override = tuple[str, Any]
 
 
 def expand_overrides(scenario: Scenario, pairs: Sequence[Override]) -> dict[str, Any]:
-    """Returns overrides of a resolved scenario in which the keys of groups are written out.
+    """Replaces overrides that concern many sites or links by one override for each of them.
 
-    A key of a group becomes a key of each site or link that can have it.
+    For example, an override of `control` becomes one for each site whose control law has the
+    key.
 
     Args:
         scenario: The resolved scenario.
-        pairs: The overrides.
+        pairs: The overrides, as pairs of a dotted key and a value.
+
+    Returns:
+        Values by dotted key.
 
     Raises:
         ScenarioError: The group has no such key, or no site or link of the scenario can have
@@ -352,11 +356,13 @@ def _list_index(entries: list[Any], name: str, path: str) -> int:
 
 
 def parse_overrides(overrides: Mapping[str, Any] | Sequence[str]) -> list[Override]:
-    """Returns overrides as pairs of a key and a value.
+    """Converts the overrides that a user or program gave to pairs of a key and a value.
+
+    An override replaces one value of a scenario.
 
     Args:
-        overrides: Overrides by key, or texts KEY=VALUE. The value of a text is TOML or a bare
-            word.
+        overrides: Values by dotted key, or texts KEY=VALUE. The value of a text is written as
+            in TOML, or as a bare word.
 
     Raises:
         ScenarioError: A text does not have this form.
@@ -375,9 +381,13 @@ def parse_overrides(overrides: Mapping[str, Any] | Sequence[str]) -> list[Overri
 
 
 def split_assignment(text: str) -> Override | None:
-    """Splits a text KEY=VALUE into its key and its value. None if it does not have this form.
+    """Splits a text KEY=VALUE into its key and its value.
 
-    A value that is not TOML is a bare word, and is returned as a text.
+    Args:
+        text: The text. A value that is not valid TOML is a bare word, and is taken as a text.
+
+    Returns:
+        The key and the value. None if the text does not have this form.
     """
     key, equals, value = text.partition("=")
     if not equals or not key.strip():

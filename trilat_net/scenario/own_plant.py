@@ -69,10 +69,10 @@ class PlantContext(NamedTuple):
 
 
 class PlantProgram(Protocol):
-    """Interface of a user's plant.
+    """Interface of a user's plant: a program that computes the motion of an arm.
 
-    The class is called with a `PlantContext` as its first argument, and with its settings by
-    name.
+    The user's class is called with a `PlantContext` as its first argument, and with its
+    settings by name.
     """
 
     def step(self, tau: Array, h_s: float) -> Sequence[Sequence[float]]:
@@ -101,6 +101,8 @@ class PlantProgram(Protocol):
 
 class OwnPlant(Frozen, frozen=True, rename={"code": "class"}, omit_defaults=True):
     """Table of a user's plant in a scenario.
+
+    A plant is a program that computes the motion of an arm.
 
     Attributes:
         code: Class of the plant, for example "my_plant:Scene".

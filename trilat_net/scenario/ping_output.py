@@ -71,7 +71,7 @@ _SEVERAL_RUNS = "it has several runs of ping: import each by itself"
 
 
 class PingProbes(NamedTuple):
-    """Probes of one run of `ping`, in the order in which they were sent.
+    """Round trips that one run of the program `ping` measured, in the order of sending.
 
     Attributes:
         sent_s: Time at which each probe was sent, in s. The zero of the clock is arbitrary.

@@ -27,14 +27,17 @@ from ..distributions import Draws
 
 
 class HeldArm(NamedTuple):
-    """Facts about the arm on which an operator acts, to complete the operator's table.
+    """Arm on which an operator or environment acts, as far as its table depends on the arm.
+
+    For example, the target of an operator starts at the arm by default.
 
     Attributes:
-        counts: Lengths of the arm's vectors.
-        q0_rad: Start pose of the arm. It may be invalid if the table of the arm is wrong.
+        counts: Numbers of joints, task coordinates and parameters of the arm.
+        q0_rad: Start pose of the arm, in rad. It may be invalid if the table of the arm is
+            wrong.
         end_effector_m: Function that returns the position of the end effector in the start
             pose, in m.
-        draws: Draws the numbers that are given as distributions.
+        draws: Object that draws the numbers that a scenario states as distributions.
     """
 
     counts: fields.VectorCounts
@@ -44,7 +47,11 @@ class HeldArm(NamedTuple):
 
 
 class ActorBase(fields.Frozen, frozen=True, tag_field="kind"):
-    """Base of all operators and environments."""
+    """Base of all operators and environments, which exert forces on an arm.
+
+    An operator is a person or program that moves the arm. An environment is a wall or another
+    body that the arm touches.
+    """
 
     group: ClassVar[str] = "hands"
     """List of a site to which the actor belongs: "hands" or "environment"."""
@@ -57,14 +64,16 @@ class ActorBase(fields.Frozen, frozen=True, tag_field="kind"):
 
     @property
     def actor(self) -> TorqueSource:
-        """The actor in the form that the simulation kernel uses."""
+        """The operator or environment in the form in which the simulation kernel uses it."""
         return self._source()
 
     @classmethod
     def complete_table(
         cls, table: fields.TomlTable, entry: fields.TomlTable, held_arm: HeldArm, path: str
     ) -> None:
-        """Adds the keys that the author left out and whose values follow from the arm.
+        """Adds keys that the author left out, if their values follow from the arm.
+
+        By default, there are no such keys. A subclass that has some overrides this method.
 
         Args:
             table: Table of the actor. It is changed.
@@ -74,9 +83,13 @@ class ActorBase(fields.Frozen, frozen=True, tag_field="kind"):
         """
 
     def find_problem(self) -> fields.KeyProblem | None:
-        """Returns a problem that involves several keys, or None.
+        """Returns a contradiction between several keys of the table.
 
-        The keys `normal`, `start_s` and `end_s` mean the same for all kinds that have them.
+        The keys `normal`, `start_s` and `end_s` are checked here for all kinds that have them,
+        because they always mean the same.
+
+        Returns:
+            The key and the reason. None if the keys agree with each other.
         """
         normal = getattr(self, "normal", (1.0,))
         if math.hypot(*normal) < 1e-6:
@@ -91,16 +104,17 @@ class ActorBase(fields.Frozen, frozen=True, tag_field="kind"):
 
 
 class TimedActor(ActorBase, frozen=True, kw_only=True):
-    """Actor that acts from `start_s` to `end_s`."""
+    """Operator or environment that acts only from the time `start_s` to the time `end_s`."""
 
     start_s: fields.NotNegative = 0.0
     end_s: fields.Positive = fields.MAX_QUANTITY
 
 
 class SampledActor(TimedActor, frozen=True, kw_only=True):
-    """Actor whose torque may be sampled.
+    """Operator or environment whose torque may be computed only once per tick.
 
-    A sampled torque is computed once per tick and held, as a real haptic device renders a wall.
+    Between two ticks, the torque is then constant, as if a real haptic device rendered a wall.
+    Otherwise, the torque is computed in every stage of the integration.
     """
 
     sampled: bool = False

@@ -43,7 +43,13 @@ class HuntCrossley(OwnActor, frozen=True, kw_only=True, tag="hunt_crossley"):
     damping_s_m: fields.NotNegative = 0.0
 
     def act(self, now: Any) -> None:
-        """Computes the force, in N."""
+        """Computes the force of the body on the end effector in N, and stores it in `now`.
+
+        Nothing is stored while the end effector is outside of the body.
+
+        Args:
+            now: Position and speed of the end effector. Its field `effort` receives the force.
+        """
         normal_squared = 0.0
         depth = 0.0
         depth_rate = 0.0
@@ -68,7 +74,16 @@ class HuntCrossley(OwnActor, frozen=True, kw_only=True, tag="hunt_crossley"):
 
     # The force does not depend on the time.
     def effort(self, t_s: Array, position: Array, speed: Array) -> Array:  # noqa: ARG002
-        """Returns the force for many rows, in N."""
+        """Computes the force of the body on the end effector for many rows.
+
+        Args:
+            t_s: Times, in s. The force does not depend on them.
+            position: Positions of the end effector, in m, shape (..., n).
+            speed: Velocities of the end effector, in m/s, shape (..., n).
+
+        Returns:
+            Forces in N, shape (..., n). Zero outside of the body.
+        """
         normal = np.array(self.normal) / np.linalg.norm(self.normal)
         depth = (np.array(self.point_m) - position) @ normal
         contact_depth = np.where(depth.real > 0.0, depth, 0.0)

@@ -104,14 +104,17 @@ class MovingSpring(ActorBase, frozen=True, kw_only=True):
         held_arm: HeldArm,
         path: str,
     ) -> None:
-        """Adds the start of the arm as target if the author stated none."""
+        """Adds the start position of the arm as the start of the target.
+
+        Nothing is added if the author stated a start.
+        """
         end_key, start_key = fields.field_names(cls)[:2]
         start_pose = held_arm.end_effector_m() if cls.at_tip else held_arm.q0_rad
         held_arm.draws.follow_start(table, start_key, start_pose, path)
         held_arm.draws.follow_start(table, end_key, table[start_key], path)
 
     def find_problem(self) -> fields.KeyProblem | None:
-        """Returns a problem of the times, or None."""
+        """Returns a contradiction between the times of the motion, or None if there is none."""
         problem = super().find_problem()
         if problem is not None or self.move_end_s >= self.move_start_s:
             return problem
@@ -189,7 +192,7 @@ class RecordedTorque(ActorBase, frozen=True, tag="recorded"):
     points: Annotated[tuple[RecordedPoint, ...], Meta(min_length=1, max_length=1_000_000)]
 
     def find_problem(self) -> fields.KeyProblem | None:
-        """Returns a problem of the order of the points, or None."""
+        """Returns a problem if the points are not in the order of time, otherwise None."""
         if any(later[0] <= earlier[0] for earlier, later in pairwise(self.points)):
             return fields.KeyProblem("points", "must be in the order of their times")
         return None
@@ -244,7 +247,10 @@ class Multisine(TimedActor, frozen=True, tag="multisine"):
     phases_rad: Annotated[tuple[fields.Real, ...], Meta(max_length=64)] = ()
 
     def find_problem(self) -> fields.KeyProblem | None:
-        """Returns a problem of the number of phases, or of the times, or None."""
+        """Returns a problem if the phases do not match the frequencies, or a time is wrong.
+
+        None if there is no problem.
+        """
         count = len(self.frequencies_hz)
         if len(self.phases_rad) not in (0, count):
             return fields.KeyProblem(
@@ -291,10 +297,13 @@ class DeviceSettings(fields.Frozen, frozen=True, omit_defaults=True):
     jump_m_s: fields.Positive = 5.0
 
     def rows(self, axes: int) -> list[tuple[float, ...]]:
-        """Returns the directions of the arm's axes in the coordinates of the person.
+        """Returns the direction of each axis of the arm as the person sees it.
 
         Args:
-            axes: Number of axes, which decides the default.
+            axes: Number of axes of the arm: 2 in the plane, 3 in space. It decides the default.
+
+        Returns:
+            One vector per axis of the arm, in the coordinates of the person.
         """
         return [DIRECTIONS[name] for name in self.frame or FRAMES[axes]]
 
@@ -351,7 +360,7 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
     def complete_table(
         cls, table: fields.TomlTable, entry: fields.TomlTable, held_arm: HeldArm, path: str
     ) -> None:
-        """Removes the keys of the other modes, which would have no effect.
+        """Removes the keys of the other modes, because they would have no effect.
 
         Raises:
             ScenarioError: The author wrote a key of another mode, or a wrong direction of an
@@ -378,12 +387,14 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
     def make_rules(
         self, rate_hz: int, arm: ArmModel, limits: MotionLimits | None = None
     ) -> HandRules:
-        """Returns the rules that limit the targets and forces that an operator may command.
+        """Returns the rules that limit what an operator may command during a run.
+
+        They bound the speed and range of the targets, and the forces.
 
         Args:
             rate_hz: Tick rate of the site, in Hz.
-            arm: Arm of the site.
-            limits: Limits of the motion of the site. None: there are no limits.
+            arm: Model of the arm that the operator moves.
+            limits: Limits of the motion of the site. None if there are no limits.
         """
         if self.mode == "force":
             return HandRules(

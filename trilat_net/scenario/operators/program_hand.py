@@ -88,7 +88,10 @@ class ProgramHand(
     def complete_table(
         cls, table: fields.TomlTable, entry: fields.TomlTable, held_arm: HeldArm, path: str
     ) -> None:
-        """Adds the hash of the file of the class, and completes the keys of a live operator."""
+        """Adds the hash of the file of the program's class, and the keys of a live operator.
+
+        The hash identifies the version of the program with which an experiment was made.
+        """
         code = table.get("class")
         if isinstance(code, str) and "source_sha256" not in entry:
             table["source_sha256"] = read_code(code, f"{path}.class").sha256
@@ -100,6 +103,8 @@ class ProgramHand(
 
 class HandSite(NamedTuple):
     """A site whose operator is a program, with the settings of the program.
+
+    An operator is whoever moves the arm of the site.
 
     Attributes:
         scenario: The scenario.
@@ -127,11 +132,14 @@ class HandSite(NamedTuple):
 
     @property
     def source(self) -> str:
-        """Text that marks the messages of the program: its class and the scenario's hash."""
+        """Text that identifies the sender of the program's messages.
+
+        It consists of the class of the program and the hash of the scenario.
+        """
         return f"{self.program[:40]} {self.scenario.sha256[:16]}"
 
     def describe(self) -> HandContext:
-        """Returns the facts that the program receives when it is created."""
+        """Returns what the program is told about the experiment when it is created."""
         spec = self.spec
         rules = spec.make_rules(
             self.scenario.sites[self.name].rate_hz, self.scenario.arms[self.name]
@@ -149,7 +157,10 @@ class HandSite(NamedTuple):
         )
 
     def make_hand(self) -> OwnHand:
-        """Returns the schedule of the program: when it is called and its actions apply."""
+        """Returns the schedule of the program.
+
+        It decides in which ticks the program is called, and in which its actions apply.
+        """
         tick_rate_hz = self.scenario.sites[self.name].rate_hz
         arm = self.scenario.arms[self.name]
         locate: Any = list if self.spec.mode == "joint" else arm.end_effector
@@ -188,24 +199,34 @@ class HandPlayer:
         self.hand = hand_site.make_hand()
 
     def track(self, site: Site, k: int) -> list[float]:
-        """Returns the action of the program for tick `k`.
+        """Returns what the program does in tick `k`, and calls the program if this is due.
 
-        The tick must be the next one of the site. The numbers are those of `HandInForce`.
+        The method must be called once for each tick of the site, in order.
+
+        Args:
+            site: The site, before the tick.
+            k: Number of the tick.
+
+        Returns:
+            The action that applies in this tick, in the form of `HandInForce`.
         """
         step = self.hand.advance_to(k, self._prepare(k, site.arrays))
         self.news += [(k, self._describe_change(k, change)) for _, change in step.changes]
         return step.vector
 
     def compute_actions(self, k: int, end: int, arrays: SiteArrays) -> Array:
-        """Returns the actions from tick `k` on, as long as the state of the arm is not needed.
+        """Returns what the program does from tick `k` on, for as many ticks as are certain.
+
+        The result ends before the first tick in which the program must observe a state of the
+        arm that has not been computed yet.
 
         Args:
-            k: First tick.
-            end: Tick before which the result ends at the latest.
+            k: Number of the first tick.
+            end: Number of the tick before which the result ends at the latest.
             arrays: State of the site before tick `k`.
 
         Returns:
-            A row per tick.
+            An array with one row per tick.
         """
         return self.hand.advance_span(k, end, self._prepare(k, arrays))
 
@@ -221,11 +242,24 @@ class HandPlayer:
         return angles.tolist
 
     def view(self, k: int, arrays: SiteArrays) -> HandView:
-        """Returns the observation that the program receives in tick `k`."""
+        """Returns what the program observes in tick `k`, for example the states of the arms.
+
+        Args:
+            k: Number of the tick.
+            arrays: State of the site before the tick.
+        """
         return self.hand.build_view(k, arrays, self._layout)
 
     def request_action(self, k: int, arrays: SiteArrays) -> None:
-        """Calls the program in tick `k`, and schedules the action that it returns."""
+        """Calls the program in tick `k`, and schedules the action that it returns.
+
+        The program receives what it observes in this tick. Its action applies later, after the
+        delay that the scenario states.
+
+        Args:
+            k: Number of the tick.
+            arrays: State of the site before the tick.
+        """
         view = self.view(k, arrays)
         try:
             action = self._watch(k, lambda: self._program.act(view))
@@ -235,11 +269,11 @@ class HandPlayer:
             self.fail(k, f"{type(error).__name__}: {error}")
 
     def fail(self, k: int, problem: str) -> None:
-        """Makes the program let go of the arm at tick `k` for the rest of the run.
+        """Makes the program let go of the arm for the rest of the run.
 
         Args:
-            k: The tick.
-            problem: Reason of the failure.
+            k: Number of the tick in which it lets go.
+            problem: Reason of the failure, as a text for the user.
         """
         self.failure = f"{self._site}: its hand {self._code} failed at tick {k}: {problem}"
         self.news.append((k, f"{self.failure}; it lets go and is not asked again"))
@@ -252,7 +286,15 @@ class HandPlayer:
 
 
 def find_own_hand(scenario: "Scenario", site: str) -> HandSite | None:
-    """Returns the site with its program, or None if no operator of the site is a program."""
+    """Finds the program that operates the arm of a site.
+
+    Args:
+        scenario: Description of the experiment.
+        site: Name of the site.
+
+    Returns:
+        The site with its program. None if no operator of the site is a program.
+    """
     for hand in scenario.sites[site].hands:
         if isinstance(hand, ProgramHand):
             return HandSite(
@@ -266,7 +308,10 @@ def find_own_hand(scenario: "Scenario", site: str) -> HandSite | None:
 
 
 def make_hand_program(hand_site: HandSite) -> HandProgram:
-    """Creates the program of a site: an instance of the user's class.
+    """Creates the program that operates the arm of a site, an instance of the user's class.
+
+    Args:
+        hand_site: The site and the settings of the program.
 
     Raises:
         CodeWithheld: The class may not run.
