@@ -57,11 +57,11 @@ class RangeSet:
         return bisect_right(self._ranges, (number, math.inf))
 
     def insert(self, first: int, last: int) -> None:
-        """Inserts a range of numbers that the set does not contain yet.
+        """Inserts a range of consecutive numbers, none of which the set contains yet.
 
         Args:
             first: First number of the range.
-            last: Last number of the range.
+            last: Last number of the range, which belongs to it.
         """
         index = self._count_started(first)
         if index > 0:
@@ -99,10 +99,14 @@ class RangeSet:
         return True
 
     def find(self, number: int) -> tuple[int, int] | None:
-        """Returns the range (first, last) that contains a number.
+        """Returns the range of consecutive numbers in the set that contains a number.
 
-        None if there is no such range.
+        Args:
+            number: The number to look for.
 
+        Returns:
+            The first and the last number of the range. None if the set does not contain the
+            number.
         """
         index = self._count_started(number) - 1
         if index < 0 or number > self._ranges[index][1]:
@@ -166,12 +170,15 @@ class Account:
     def receive(self, number: int, arrived_ns: int | None = None) -> bool:
         """Counts a message that arrived from its sender without a request.
 
+        Missing numbers between the previous messages and this one are noted as a gap.
+
         Args:
-            number: Number of the message.
+            number: Number of the message in its channel.
             arrived_ns: Time of the arrival on a monotonic clock, in ns. None if it is unknown.
 
         Returns:
-            False if the number had been received before.
+            True if the message is new. False if a message with this number had been received
+            before.
         """
         if arrived_ns is not None:
             if self._last_arrival_ns is not None:
@@ -187,10 +194,14 @@ class Account:
         return True
 
     def refill(self, number: int) -> bool:
-        """Counts a message that the sender sent again from its memory on request.
+        """Counts a message that the sender sent again from its memory, as requested.
+
+        Args:
+            number: Number of the message in its channel.
 
         Returns:
-            False if the number had been received before.
+            True if the message is new. False if a message with this number had been received
+            before.
         """
         is_new = self._add(number)
         self.refilled += is_new
@@ -231,27 +242,36 @@ class Account:
         return lowest
 
     def mark_missing(self, first: int, last: int) -> None:
-        """States that unpublished numbers had messages after all, which are missing.
+        """Counts numbers as missing that had been counted as unpublished.
+
+        This is necessary when another site reports that messages with these numbers existed.
 
         Args:
             first: First number of the range.
-            last: Last number of the range.
+            last: Last number of the range, which belongs to it.
         """
         self._gaps.insert(first, last)
         self.unpublished -= last + 1 - first
 
     def abandon_below(self, number: int) -> None:
-        """Stops requests for the missing messages below a number, which nobody has any more.
+        """Gives up the missing messages below a number, because nobody can send them any more.
 
-        Such a message still counts as received if it arrives.
+        They are no longer requested, but still count as missing. Such a message still counts as
+        received if it arrives.
+
+        Args:
+            number: First number that is not affected.
         """
         self._abandoned_below = max(self._abandoned_below, number)
 
     def find_requestable_gap(self, number: int = 0) -> tuple[int, int] | None:
-        """Returns the first gap at or above a number that is not abandoned.
+        """Finds the first missing messages that can still be requested from the sender.
+
+        Args:
+            number: Smallest number to consider.
 
         Returns:
-            The range (first, last) of missing numbers. None if there is no such gap.
+            The first and the last number of the gap. None if no message can be requested.
         """
         return self._gaps.find_from(max(number, self._abandoned_below))
 
@@ -267,20 +287,30 @@ class Account:
 
     @property
     def gaps(self) -> list[list[int]]:
-        """Ranges [first, last] of missing numbers, at most the highest `MAX_GAPS` ranges."""
+        """Ranges of missing numbers in ascending order, as pairs [first, last].
+
+        There are at most `MAX_GAPS` pairs: those with the highest numbers.
+        """
         return [list(gap) for gap in self._gaps]
 
     @property
     def largest_gap(self) -> int:
-        """Number of messages in the largest gap."""
+        """Number of missing messages in the largest gap. It is 0 if no message is missing."""
         return max((last - first + 1 for first, last in self._gaps), default=0)
 
     def describe(self, *before: "Account") -> str:
-        """Returns the counts and the first gaps in one line, as a log stores them.
+        """Describes the account of a channel in one line, in the form that a log stores.
+
+        The line contains the numbers of expected, received and missing messages, and the first
+        ranges of missing numbers.
 
         Args:
             *before: Accounts of earlier starts of the sender, which numbered their messages
-                from 0 as well. Their counts are added. Gaps are listed for the last start only.
+                from 0 as well. Their counts are added to those of this account. Missing ranges
+                are listed for the last start only.
+
+        Returns:
+            The line, which `parse_counts` can read.
         """
         starts = (*before, self)
         counts = []
@@ -303,12 +333,15 @@ class Account:
         return text
 
     def format_gaps(self, most: int, base: int = 0) -> list[str]:
-        """Returns the first gaps as texts "first-last".
+        """Formats the first ranges of missing numbers for a message to the user.
 
         Args:
-            most: Largest number of gaps.
+            most: Largest number of ranges to return.
             base: Number that is added to all numbers, if the account does not count from the
                 first message of the session.
+
+        Returns:
+            A text "first-last" for each range. Empty if no message is missing.
         """
         gaps = islice(self._gaps, most)
         return [f"{base + first}-{base + last}" for first, last in gaps]
@@ -368,10 +401,14 @@ class StartGap:
             self.note_published(self._reported)
 
     def note_published(self, published: int) -> None:
-        """States how many messages the earlier start published at least, as others report.
+        """Takes into account how many messages the earlier start published.
 
-        If the number exceeds the received messages by more than those in transit, the messages
-        count as missing instead of unpublished.
+        Other sites report this number, because they received samples of the earlier start. If
+        it exceeds the received messages by more than those that may have been in transit, the
+        messages in between count as missing instead of unpublished.
+
+        Args:
+            published: Number of messages that the earlier start published at least.
         """
         self._reported = max(self._reported, published)
         published = min(published, self._next_first)
@@ -394,9 +431,13 @@ def describe_unknown_ends(sites: Sequence[str]) -> str:
 
 
 def parse_counts(account: str) -> dict[str, int]:
-    """Returns the numbers of "received" and "missing" messages in a line of `Account.describe`.
+    """Reads the numbers of received and missing messages from a line of `Account.describe`.
 
-    The dictionary is empty if the text is no such line.
+    Args:
+        account: The line, as a log stores it for each topic.
+
+    Returns:
+        The numbers, under the keys "received" and "missing". Empty if the text is no such line.
     """
     matches = re.findall(r"(received|missing) (\d{1,15})\b", account)
     return {name: int(digits) for name, digits in matches}
@@ -407,11 +448,13 @@ MIN_COVERAGE = 0.999
 
 
 class Coverage(NamedTuple):
-    """How much of a run was recorded or judged, for each site.
+    """States for each site which part of a run was recorded, or checked by a tool.
+
+    A site is a process that runs one arm. A tick is one period of its control loop.
 
     Attributes:
-        judged: Number of recorded or judged ticks, by site.
-        expected: Number of all ticks of the run, by site.
+        judged: Number of recorded or checked ticks, by name of the site.
+        expected: Number of all ticks that the site executed in the run, by name of the site.
     """
 
     judged: dict[str, int]
@@ -419,7 +462,10 @@ class Coverage(NamedTuple):
 
     @property
     def share(self) -> float:
-        """Smallest fraction of judged ticks of any site. It is 0 if no site has ticks."""
+        """Smallest fraction of recorded or checked ticks of any site, from 0 to 1.
+
+        It is 0 if no site has ticks.
+        """
         if not any(self.expected.values()):
             return 0.0
         return min(map(self._share, self.expected), default=0.0)
@@ -444,16 +490,24 @@ class Coverage(NamedTuple):
         return f"{site} {self.judged.get(site, 0)} of {ticks} ({percent})"
 
     def describe(self, least: float) -> str:
-        """Returns the coverage as a text. It mentions `least` if the fraction is too small.
+        """Describes in words how much of the run was recorded or checked.
 
         Args:
-            least: Smallest fraction of judged ticks that is sufficient.
+            least: Smallest fraction of ticks that is sufficient, from 0 to 1. The text mentions
+                it if the actual fraction is smaller.
+
+        Returns:
+            The text for the user.
         """
         shortage = f", less than {_format_percent(least)}" if self.share < least else ""
         return f"judged {self}{shortage}"
 
     def to_json(self) -> dict[str, list[int]]:
-        """Returns the pair [judged ticks, all ticks] of every site."""
+        """Returns the coverage in the form that is written to JSON.
+
+        Returns:
+            For each site the pair [recorded or checked ticks, all ticks].
+        """
         return {
             site: [self.judged.get(site, 0), ticks] for site, ticks in self.expected.items()
         }
@@ -520,7 +574,13 @@ class SessionAccounts:
         return "/" + topics.key(self._session, member, channel)
 
     def open_channel(self, topic: str) -> None:
-        """Creates the account of a topic, if it is a numbered channel of the session."""
+        """Creates an account for a topic before its first message, so that losses are noticed.
+
+        Nothing happens if the topic is not a numbered channel of the session.
+
+        Args:
+            topic: Topic of the channel.
+        """
         key = topics.parse_key(topic.removeprefix("/"))
         if key is None or key.session != self._session:
             return
@@ -584,9 +644,13 @@ class SessionAccounts:
         return is_new
 
     def apply_event(self, event: Event) -> None:
-        """Evaluates what an event states about the ticks that sites executed or skipped.
+        """Learns from an event how many ticks the sites executed or skipped.
 
-        Other events are ignored.
+        For example, the "end" event of a site states the number of ticks that it executed.
+        Events that state nothing about ticks are ignored.
+
+        Args:
+            event: The event.
         """
         if event.member not in self._rates_hz or event.ticks < 0:
             return
@@ -633,7 +697,9 @@ class SessionAccounts:
             gap.note_published(number - base)
 
     def mark_skipped_ticks(self, site: str, tick: int, skipped: int) -> None:
-        """Counts the messages of skipped ticks as unpublished.
+        """Counts the messages of skipped ticks as unpublished, so that they are not missing.
+
+        A site that is late skips ticks: it executes neither them nor publishes their messages.
 
         Args:
             site: Name of the site.
@@ -692,9 +758,14 @@ class SessionAccounts:
                 yield channel, gap
 
     def add_expected_ticks(self, site: str, ticks: int) -> None:
-        """States that a site executed at least `ticks` ticks.
+        """Takes into account that a site executed at least a given number of ticks.
 
-        Records and statistics of these ticks that have not been received count as missing.
+        Records and statistics of these ticks that have not been received count as missing from
+        now on.
+
+        Args:
+            site: Name of the site.
+            ticks: Number of executed ticks, counted from the start of the session.
         """
         for channel in (topics.STATE, topics.LINK):
             published = count_messages(channel, ticks, self._rates_hz[site])
@@ -709,9 +780,13 @@ class SessionAccounts:
             account.add_expected(published - base)
 
     def format_accounts(self) -> dict[str, str]:
-        """Returns the counts of each topic as a line of text, as a log stores them.
+        """Formats the numbers of received and missing messages, as they are stored in a log.
 
-        Members that are not sites are left out if nothing is expected of them.
+        Members that are not sites, such as recorders, are left out if no message is expected of
+        them.
+
+        Returns:
+            A line of text for each topic, see `Account.describe`.
         """
         texts = {}
         for topic, account in self._accounts.items():
@@ -726,15 +801,25 @@ class SessionAccounts:
         return texts
 
     def list_starts(self, topic: str) -> list[Account]:
-        """Returns the accounts of a topic.
+        """Lists the accounts of a topic, one for each start of the sender if it counts events.
 
-        For events, there is one for each start of the sender.
+        Events are numbered from 0 again whenever their sender is started. All other messages
+        continue their numbers, so that they have a single account.
 
+        Args:
+            topic: Topic of the channel.
         """
         return list(self._starts.get(topic, {}).values()) or [self._accounts[topic]]
 
     def list_gaps(self, topic: str) -> list[tuple[int, int]]:
-        """Returns the ranges (first, last) of missing numbers of a topic, over all starts."""
+        """Lists the ranges of missing numbers of a topic, over all starts of its sender.
+
+        Args:
+            topic: Topic of the channel.
+
+        Returns:
+            The first and the last number of each range. Empty if no message is missing.
+        """
         base = self._bases.get(topic, 0)
         gaps = []
         for account in self.list_starts(topic):
@@ -742,9 +827,12 @@ class SessionAccounts:
         return gaps
 
     def coverage(self) -> Coverage:
-        """Returns how many ticks of every site were recorded.
+        """Computes how many ticks of every site were executed, and how many were recorded.
 
-        If the end of a site is unknown, all ticks of the scenario are expected of the site.
+        If it is unknown when a site ended, all ticks of the scenario count as executed.
+
+        Returns:
+            Both numbers for every site.
         """
         records = {}
         ticks = {}
@@ -759,7 +847,11 @@ class SessionAccounts:
         return Coverage(records, ticks)
 
     def describe_missing(self) -> Iterator[str]:
-        """Yields a line for every site that lacks records, with its first gaps."""
+        """Describes the missing records for the user.
+
+        Yields:
+            A line for every site that lacks records, with the first ranges of missing ticks.
+        """
         for site in self._rates_hz:
             topic = self._topic(site, topics.STATE)
             account = self._accounts.get(topic)

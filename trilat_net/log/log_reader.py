@@ -135,7 +135,11 @@ class Log(Result, Mapping[str, SiteLog]):
             self.events += self._read_events(topic)
 
     def headline(self) -> str:
-        """Returns a line about the session: its driver, sites, length and records."""
+        """Summarises the session in one line for the user.
+
+        Returns:
+            A text with how the session ran, its sites, its length and its number of records.
+        """
         try:
             summary = self._describe_records()
         except LogError:
@@ -160,7 +164,10 @@ class Log(Result, Mapping[str, SiteLog]):
         return text
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the facts about the session, with the keys of `trilat sim --json`."""
+        """Returns a summary of the session as plain values, for JSON.
+
+        The keys are those of the output of `trilat sim --json`.
+        """
         return {
             "files": list(self.sources),
             "session": dict(self.session),
@@ -175,7 +182,11 @@ class Log(Result, Mapping[str, SiteLog]):
         }
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a row per site: its tick rate, record counts and last time in s."""
+        """Returns a table of the sites as plain values, with one row per site.
+
+        A row contains the tick rate of the site, the numbers of its recorded and missing
+        records, and the time of its last record in s.
+        """
         rows = []
         for name, part in self.items():
             row = {
@@ -271,9 +282,9 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @cached_property
     def diverged_s(self) -> float | None:
-        """Time at which the first site exceeded a limit, which ended the run, in s.
+        """Time at which the first arm exceeded a safety limit, which ended the run, in s.
 
-        None if no site exceeded its limits.
+        It is None if all arms stayed within their limits.
         """
         times_s = [part.diverged_s for part in self.values()]
         known_times_s = [time_s for time_s in times_s if time_s is not None]
@@ -294,11 +305,11 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @cached_property
     def complete(self) -> bool:
-        """True if the recording was finished.
+        """True if the recording was finished in order, so that the file has its end.
 
         A log of several files is complete if all of them were finished. It is also complete if
-        the last file was finished and no record is missing, because an unfinished part may have
-        been covered by another recorder.
+        the last file was finished and no record is missing, because another recorder may have
+        recorded what an unfinished part lacks.
         """
         if self._contents.complete or len(self.sources) == 1:
             return self._contents.complete
@@ -323,9 +334,10 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @property
     def part(self) -> int:
-        """Number of the file among the parts of a log.
+        """Number of this file, if the recorder split the log into several files.
 
-        It is 0 for a whole log or for several files.
+        The first part has the number 1. The number is 0 for a log in a single file, and for
+        several files that were opened together.
         """
         if len(self.sources) > 1:
             return 0
@@ -362,9 +374,13 @@ class Log(Result, Mapping[str, SiteLog]):
         return {**accounts.format_accounts(), **written}
 
     def account(self, site: str) -> str:
-        """Returns the message counts of a site's records as a line of text, see `accounts`.
+        """Returns how many records of a site were received and how many are missing.
 
-        The text is empty if the file was not finished.
+        Args:
+            site: Name of the site.
+
+        Returns:
+            The counts as a line of text, see `accounts`. Empty if the file was not finished.
         """
         return self.accounts.get(self._topic(site, topics.STATE), "")
 
@@ -460,10 +476,13 @@ class Log(Result, Mapping[str, SiteLog]):
         return absences
 
     def absent_ticks(self, site: str) -> int:
-        """Returns the number of ticks that a site did not execute.
+        """Counts the ticks that a site did not execute, although the session was running.
 
-        These are the ticks of its `absences`, and the ticks that the site skipped because it
-        was late, as its records state.
+        These are the ticks between two starts of the site (`absences`), and the ticks that the
+        site skipped because it was late, as its records state.
+
+        Args:
+            site: Name of the site.
         """
         between = sum(last - first + 1 for first, last in self.absences.get(site, ()))
         return between + self[site].skipped
@@ -493,10 +512,16 @@ class Log(Result, Mapping[str, SiteLog]):
         return last.kind in ("lost", "left")
 
     def missing(self, site: str) -> int:
-        """Returns the number of records of a site that the log lacks.
+        """Computes how many records of a site the log lacks.
 
-        The "end" event states how many ticks the site executed. Without this event, only
-        records before the last record can be known to be missing.
+        The "end" event of the site states how many ticks it executed. If this event is not in
+        the log, only records before the last record can be known to be missing.
+
+        Args:
+            site: Name of the site.
+
+        Returns:
+            The number of missing records. It is 0 if none is known to be missing.
         """
         part = self[site]
         after_last = max(0, self._stated_ticks.get(site, 0) - (part.last_tick + 1))
@@ -504,10 +529,11 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @cached_property
     def last_ticks(self) -> dict[str, int]:
-        """Last tick that each site is known to have executed. It is -1 if no tick is known.
+        """Last tick that each site is known to have executed, by name of the site.
 
-        The "end" event of a site states that tick. Without this event, the last record of the
-        site counts, or the last sample that one of its peers received, whichever is later.
+        The "end" event of a site states that tick. Without this event, it is the tick of the
+        last record of the site, or of the last sample of the site that another site received,
+        whichever is later. It is -1 if nothing is known.
         """
         stated = self._stated_ticks
         last = {}
@@ -565,10 +591,16 @@ class Log(Result, Mapping[str, SiteLog]):
         return part
 
     def changes(self, site: str) -> dict[int, list[str]]:
-        """Returns the changes of parameters that a site applied, as JSON texts by tick.
+        """Lists the changes of parameters that a site applied during the run.
 
-        The site stores its changes in its records. For a missing record, the changes are taken
-        from the site's "change" events.
+        The site stores its changes in its records. If a record is missing, its changes are
+        taken from the "change" events of the site.
+
+        Args:
+            site: Name of the site.
+
+        Returns:
+            For each tick with changes, the changes as JSON texts.
         """
         changes = self[site].changes()
         change_events = [event for event in self.events if event.kind == "change"]
@@ -581,7 +613,13 @@ class Log(Result, Mapping[str, SiteLog]):
         return dict(sorted(changes.items()))
 
     def commands(self, site: str) -> dict[int, list[CoreChange]]:
-        """Returns the changes that a site applied, by tick, as `Site.step` receives them.
+        """Lists the changes that a site applied, decoded so that the run can be executed again.
+
+        Args:
+            site: Name of the site.
+
+        Returns:
+            For each tick with changes, the changes in the form that `Site.step` receives.
 
         Raises:
             LogError: A text is not a valid change of the scenario.
@@ -596,11 +634,14 @@ class Log(Result, Mapping[str, SiteLog]):
         return commands
 
     def shown(self, site: str) -> dict[str, Ints]:
-        """Returns which samples of the peers the user of a site saw at each record.
+        """Finds out which samples of the other arms the user of a site saw at each record.
 
-        The user sees the sample that the control law uses. If the scenario has a table
-        `[sites.NAME.view]`, the picture has a separate delay, and the user sees the newest
+        The user usually sees the sample that the control law uses. If the scenario has a table
+        `[sites.NAME.view]`, the picture has a delay of its own. Then the user sees the newest
         sample that has arrived with that delay.
+
+        Args:
+            site: Name of the site.
 
         Returns:
             For each peer the ticks of the visible samples, shape (K,). They are -1 before the
@@ -614,11 +655,26 @@ class Log(Result, Mapping[str, SiteLog]):
         return ticks
 
     def link_stats(self, site: str) -> list[LinkStats]:
-        """Returns the statistics messages of a site, sorted by tick."""
+        """Decodes the statistics that a site published about its links.
+
+        Args:
+            site: Name of the site.
+
+        Returns:
+            The messages, sorted by tick. Empty if the log contains none.
+        """
         return self.timed_link_stats(site).messages
 
     def timed_link_stats(self, site: str) -> TimedMessages[LinkStats]:
-        """Returns the statistics messages of a site, with their arrival and sending times."""
+        """Decodes the statistics that a site published about its links, with their times.
+
+        Args:
+            site: Name of the site.
+
+        Returns:
+            The messages, with the time of arrival at the recorder and the time of sending of
+            each.
+        """
         topic = self._topic(site, topics.LINK)
         stats = self._decode(topic, LinkStats)
         order = sorted(range(len(stats)), key=lambda n: stats[n].tick)
@@ -626,7 +682,12 @@ class Log(Result, Mapping[str, SiteLog]):
         return TimedMessages([stats[n] for n in order], log_ns[order], publish_ns[order])
 
     def timed_events(self) -> TimedMessages[Event]:
-        """Returns the events in the order of their arrival, with arrival and sending times."""
+        """Decodes the events of all members of the session, in the order of their arrival.
+
+        Returns:
+            The events, with the time of arrival at the recorder and the time of sending of
+            each.
+        """
         events: list[Event] = []
         log_times = [np.zeros(0, np.int64)]
         publish_times = [np.zeros(0, np.int64)]
@@ -642,7 +703,11 @@ class Log(Result, Mapping[str, SiteLog]):
         return TimedMessages(ordered_events, log_ns[order], publish_ns[order])
 
     def recorder_stats(self) -> list[RecorderStats]:
-        """Returns the statistics messages of the recorder, in the order of the file."""
+        """Decodes the statistics that the recorder published about itself.
+
+        Returns:
+            The messages in the order of the file. Empty if the log contains none.
+        """
         return self._decode(self._topic(topics.RECORDER, topics.STATS), RecorderStats)
 
     def table(self, name: str, kind: str = "") -> Table:

@@ -42,9 +42,9 @@ _DEFAULTS = {"sent_ns": 0}
 
 
 def decode_ticks(payloads: Sequence[bytes]) -> Ints:
-    """Decodes the tick of every record.
+    """Decodes the tick of every record, the number of its period of the control loop.
 
-    Records of every readable version are accepted.
+    Records of every version of the format that can be read are accepted.
 
     Args:
         payloads: K encoded records.
@@ -62,15 +62,15 @@ def decode_ticks(payloads: Sequence[bytes]) -> Ints:
 
 
 def decode_ints(payloads: Sequence[bytes], *fields: str) -> Ints:
-    """Decodes integer fields of every record.
+    """Decodes some integer fields of every record, without decoding the rest of the records.
 
     Args:
         payloads: K encoded records.
-        fields: Names of F fields.
+        fields: Names of F integer fields of `State`.
 
     Returns:
-        The values, shape (K F,). The values of a record follow each other, in the order of
-        `fields`.
+        The values, shape (K F,). The F values of the first record come first, in the order of
+        `fields`, then those of the second record, and so on.
     """
     values = _decode_fields(payloads, *fields)
     if len(fields) > 1:
@@ -80,12 +80,12 @@ def decode_ints(payloads: Sequence[bytes], *fields: str) -> Ints:
 
 
 def decode_vectors(payloads: Sequence[bytes], layout: Layout, *fields: str) -> dict[str, Array]:
-    """Decodes vectors of every record.
+    """Decodes some vector fields of every record, without decoding the rest of the records.
 
     Args:
         payloads: K encoded records.
-        layout: Lengths of the vectors.
-        fields: Names of the fields.
+        layout: Lengths of the vectors in these records.
+        fields: Names of the fields, such as "q".
 
     Returns:
         For each field an array of shape (K, length of the vector). The shape is (K, 0) for a
@@ -142,13 +142,16 @@ def decode_strings(payloads: Sequence[bytes], field: str) -> NDArray[np.object_]
 def decode_per_peer(
     payloads: Sequence[bytes], field: str, peers: Sequence[str], absent: int
 ) -> dict[str, Ints]:
-    """Decodes a field that maps peers to integers, such as `used`.
+    """Decodes a field that contains an integer for each peer, such as `used`.
+
+    A peer is another site whose samples the site receives. The field of a record is a map from
+    names of peers to integers.
 
     Args:
         payloads: K encoded records.
         field: Name of the field.
         peers: Names of the peers.
-        absent: Number for a peer that the map of a record does not contain.
+        absent: Number to return for a peer that the map of a record does not contain.
 
     Returns:
         For each peer the integers of all records, shape (K,).
@@ -176,14 +179,15 @@ def decode_per_peer(
 
 
 def decode_arrivals(payloads: Sequence[bytes]) -> tuple[Ints, Ints]:
-    """Decodes the samples that arrived in each record.
+    """Decodes which samples of the peers arrived at the site in each tick.
 
     Args:
-        payloads: K encoded records.
+        payloads: K encoded records of the site.
 
     Returns:
-        The number of arrivals of each record, shape (K,), and all arrivals in order, shape (N,
-        3), with the columns of `rx`: index of the peer, tick of the sample, delay in us.
+        The number of arrivals of each record, shape (K,), and all N arrivals in order, shape
+        (N, 3). The columns are those of the field `rx` of a record: index of the peer, tick of
+        the sample, and delay in us.
     """
     counts = np.zeros(len(payloads), dtype=np.int64)
 

@@ -75,16 +75,17 @@ def freeze(value: T) -> T:
 
 
 def compute_task_errors(x: Array, x_des: Array, axes: Sequence[float]) -> Array:
-    """Computes the pose errors of an end effector in task space.
+    """Computes by how much the poses of an end effector differ from their references.
 
-    The error of a position is x - x_des. The error of an orientation is the rotation vector of
-    the shortest rotation from the reference to the orientation.
+    The error of a position is x - x_des. The error of an orientation is the rotation vector
+    (axis times angle) of the shortest rotation from the reference to the orientation.
 
     Args:
-        x: Positions, or positions and rotation vectors, shape (K, m), in m and rad.
-        x_des: Their references, shape (K, m).
-        axes: For each coordinate, 1 if the site follows its reference along that axis. For the
-            other axes it is 0, and the error is set to 0.
+        x: Positions x, y, z in m, or poses, which are positions and rotation vectors in rad,
+            shape (K, m), for K records.
+        x_des: Their references, in the same form, shape (K, m).
+        axes: For each of the m coordinates, 1 if the site follows its reference along that
+            axis. For the other axes it is 0, and the error is set to 0.
 
     Returns:
         The errors, shape (K, m), in m and rad.
@@ -134,14 +135,17 @@ def _compute_rotation_errors(rotation: Array, reference: Array) -> Array:
 
 
 class LazyRecords(Sequence[State]):
-    """Sequence of records that are decoded when they are accessed.
+    """Sequence of the records of a site, which are decoded only when they are accessed.
 
-    The records are decoded in blocks. The blocks that were accessed last are kept in memory.
+    A record is the result of one tick of the control loop. The records are decoded in blocks,
+    and the blocks that were accessed last are kept in memory. Thus a log of any length can be
+    read with little memory.
 
     Args:
         payloads: The encoded records.
-        decode_block: Function that decodes some of them.
-        heavy: True if only few records are kept decoded, see `HEAVY_BYTES`.
+        decode_block: Function that decodes several encoded records.
+        heavy: True if the decoded records are so large that only few of them are kept, see
+            `HEAVY_BYTES`.
     """
 
     def __init__(
@@ -220,13 +224,14 @@ def _estimate_bytes(state: State) -> int:
 
 
 class RecordsByTick(Mapping[int, State]):
-    """Mapping from ticks to records, which decodes a record when it is accessed.
+    """Read-only mapping from ticks to the records of a site.
 
-    If several records have the same tick, the mapping contains the last of them.
+    It is used for long logs: a record is decoded only when it is accessed. If several records
+    have the same tick, the mapping contains the last of them.
 
     Args:
-        states: The records, in the order of their ticks.
-        ticks: Their ticks, shape (K,).
+        states: The K records, in the order of their ticks.
+        ticks: The tick of each record, shape (K,).
     """
 
     def __init__(self, states: Sequence[State], ticks: Ints) -> None:
@@ -409,24 +414,31 @@ class SiteLog:
         return self._read(record_columns.decode_vectors, self.layout, *fields)
 
     def numbers(self, field: str) -> Ints:
-        """Returns an integer field of all records, shape (K,), by its name in `State`."""
+        """Returns an integer field of all records.
+
+        Args:
+            field: Name of the field in a record, see `State`.
+
+        Returns:
+            The value in each record, shape (K,), in the order of the ticks.
+        """
         return self._read(record_columns.decode_ints, field)
 
     def memory(self, first: int, count: int) -> Array:
-        """Returns a slice of the site's memory `mem` in all records.
+        """Returns a part of the internal state of the site's control law in all records.
 
-        A record contains in `mem` the state of the site and its control law that no other field
-        has, without names.
+        The field `mem` of a record contains every number that the site and its control law need
+        to continue from this tick, and that no other field contains. The numbers have no names.
 
         Args:
-            first: Index of the slice's first number in `mem`.
-            count: Length of the slice.
+            first: Index of the first wanted number in `mem`.
+            count: Number of wanted numbers.
 
         Returns:
             The numbers, shape (K, count).
 
         Raises:
-            LogError: The `mem` of a record is too short.
+            LogError: The field of a record contains too few numbers.
         """
         parts = [row[first : first + count] for row in self.mem]
         try:
@@ -439,10 +451,13 @@ class SiteLog:
             ) from None
 
     def record(self, n: int) -> State:
-        """Returns a record, decoded without the others.
+        """Decodes a single record, without decoding the others.
 
         Args:
             n: Index of the record in the order of ticks. -1 is the last record.
+
+        Returns:
+            The record.
         """
         return self._decode([self.payloads[n]])[0]
 
@@ -460,7 +475,10 @@ class SiteLog:
 
     @cached_property
     def states(self) -> Sequence[State]:
-        """The whole records, decoded and checked. A long sequence is decoded on access."""
+        """The whole records in the order of their ticks, decoded and checked.
+
+        If there are many, a record is decoded only when it is accessed.
+        """
         return decode_records(self.payloads, self._decode)
 
     @cached_property
@@ -477,9 +495,9 @@ class SiteLog:
 
     @property
     def diverged_s(self) -> float | None:
-        """Time at which the arm exceeded its limits, which ended the run, in s.
+        """Time at which the arm exceeded a safety limit, which ended the run, in s.
 
-        None if the arm did not exceed its limits.
+        It is None if the arm stayed within its limits.
         """
         if not len(self):
             return None
@@ -593,11 +611,11 @@ class SiteLog:
 
     @cached_property
     def body_poses(self) -> Array:
-        """Poses of the b bodies of the simulated environment, shape (K, b, 7).
+        """Poses of the b bodies that the simulated environment of the arm contains.
 
-        A pose is the position x, y, z in m and the orientation as a unit quaternion w, x, y, z.
-        The sign of each quaternion is chosen so that the quaternion is nearest to the previous
-        one.
+        The shape is (K, b, 7). A pose is the position x, y, z in m and the orientation as a
+        unit quaternion w, x, y, z. A quaternion and its negative are the same orientation. Its
+        sign is chosen so that the quaternion is nearest to the previous one.
         """
         poses = self.bodies.reshape(len(self), -1, POSITION + 4).copy()
         for body in range(poses.shape[1]):
@@ -619,10 +637,12 @@ class SiteLog:
 
     @cached_property
     def sent(self) -> dict[str, Array]:
-        """Numbers that the site's control law sends to its peers, shape (K, length) each.
+        """Numbers that the site's control law sends to its peers with every sample.
 
-        The key is the name of the quantity, such as "E", if all peers receive the same numbers.
-        For numbers that are meant for one peer, the key contains the peer, such as "u[m2]".
+        A key is the name of the quantity, such as "E", if all peers receive the same numbers.
+        If the numbers are meant for one peer, the key also contains the peer, such as "u[m2]".
+        The value is an array of shape (K, length of the quantity). Empty if the law sends
+        nothing.
         """
         columns: dict[str, list[int]] = {}
         for column, entry in enumerate(self.channel.entries(self.peers)):
@@ -640,9 +660,10 @@ class SiteLog:
 
     @cached_property
     def used(self) -> dict[str, Ints]:
-        """Tick of the sample of each peer that the control law uses, shape (K,).
+        """Tick of the sample of each peer that the control law uses at each record.
 
-        The value is -1 before the first sample of the peer.
+        A peer is another site whose samples this site receives. The key is its name, and the
+        value has the shape (K,). It is -1 before the first sample of the peer.
         """
         return self._read(record_columns.decode_per_peer, "used", self.peers, -1)
 
@@ -664,18 +685,25 @@ class SiteLog:
         return {tick: tick_texts for tick, tick_texts in pairs if tick_texts}
 
     def changes(self) -> dict[int, list[str]]:
-        """Returns the changes that the site applied during the run, as JSON texts by tick."""
+        """Lists the changes of parameters that the site applied during the run.
+
+        Returns:
+            For each tick with changes, the changes as JSON texts in the order of application.
+        """
         return {tick: list(texts) for tick, texts in self._changes.items()}
 
     def age_s(self, peer: str, rate_hz: int) -> Array:
-        """Returns the age of the peer's sample that the control law uses, shape (K,), in s.
+        """Computes how old the sample of a peer is that the control law uses at each record.
 
-        The age is the time of the record minus the stamp of the sample, which is the nominal
-        time of the tick in which the peer computed it. It is NaN before the first sample.
+        The age is the time of the record minus the stamp of the sample. The stamp is the
+        nominal time of the tick in which the peer computed the sample.
 
         Args:
-            peer: Name of the peer.
+            peer: Name of the peer, another site whose samples this site receives.
             rate_hz: Tick rate of the peer, in Hz.
+
+        Returns:
+            The ages, shape (K,), in s. NaN before the first sample.
         """
         used = self.used[peer]
         stamp_ns = used * NS_PER_S // rate_hz
