@@ -59,11 +59,14 @@ True once the session may begin.
 
 @dataclass
 class ExperimentSessions:
-    """The remaining steps of an experiment with people.
+    """Runs the remaining steps of an experiment with people, one after another.
+
+    The steps are consents, questionnaires and trials. Each trial runs in a session of its own.
 
     Attributes:
-        experiment: The experiment, with its plan and its journals.
-        stage: What the pages show around the sessions. It collects the participants' replies.
+        experiment: The experiment, with its plan and the journals of completed steps.
+        stage: Controls what the pages show between the sessions, and collects the participants'
+            replies.
         clock: Clock of this process.
         run_session: Function that runs the session of a trial.
         ends: Function that returns True once the experiment must end for now.

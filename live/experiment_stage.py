@@ -41,17 +41,20 @@ Json = dict[str, Any]
 
 
 class TrialWatch:
-    """Judges a trial while its session runs.
+    """Decides during a trial whether it succeeds, fails or must be repeated.
+
+    A trial is one execution of a task by the participants, in a session of its own. The pages
+    call `poll` many times a second while the session runs.
 
     Args:
-        trial: The trial.
+        trial: The trial, with its task and the names of its sites.
         clock: Clock of this process.
 
     Attributes:
         trial: The trial.
-        judge: Judges the records of the trial, one after another.
+        judge: Evaluates the records of the slave arm, one after another, and finds the outcome.
         aborted: Reason why the trial must be repeated. Empty if it need not be repeated.
-        diverged: True if an arm has diverged, which makes the trial fail.
+        diverged: True if an arm has exceeded a safety limit, which makes the trial fail.
     """
 
     def __init__(self, trial: ExperimentTrial, clock: Clock) -> None:
@@ -73,14 +76,17 @@ class TrialWatch:
         return has_outcome and self._clock.monotonic_ns() - self._ended_ns > END_DELAY_NS
 
     def poll(self, view: SessionView, absent: Collection[str]) -> list[str]:
-        """Judges the records that have arrived.
+        """Evaluates the new records of the slave arm, unless the trial must be repeated.
+
+        A trial must be repeated if an arm was stopped, or if the page of a user is gone.
 
         Args:
             view: Present state of the session.
             absent: Sites of the users whose page has been absent for too long.
 
         Returns:
-            Texts that the log should keep as marks of this moment.
+            Texts that the log should keep as marks of this moment. Empty if nothing has
+            happened, or if the trial is over.
         """
         if self.over or self.judge.outcome is not None or not view.running:
             return []
@@ -130,16 +136,16 @@ class TrialWatch:
         return moments
 
     def describe(self, t_s: float, site: str) -> Json:
-        """Describes the present target for the page that draws it.
+        """Describes the target that the participants must reach now, for a page.
 
         Args:
-            t_s: Time in the trial of the arms on the page, in s.
-            site: Name of the site of the page's user. Empty for other pages, which see the
-                middle of all users' targets.
+            t_s: Time of the pose that the page shows, counted in the trial, in s.
+            site: Name of the site of the page's user. If it is empty, the target lies in the
+                middle of the targets of all users.
 
         Returns:
             Position and width of the target, the corridor to it if there is one, and the
-            remaining time, ready for JSON.
+            remaining time, as plain values for JSON.
         """
         goal = self.judge.goal
         trial = self.trial
@@ -177,10 +183,10 @@ class StepRequest:
 
 
 class Stage:
-    """What the pages show around the sessions of an experiment.
+    """Controls what the pages show in an experiment, before, during and after its sessions.
 
-    The experiment requests steps and sets the phase. The page's server, in another thread,
-    calls `poll`, `accept` and `describe`.
+    The experiment requests steps, such as a questionnaire, and states which part of a trial
+    runs. The server of the pages, in another thread, calls `poll`, `accept` and `describe`.
 
     Args:
         plan: Plan of the experiment.
@@ -188,8 +194,9 @@ class Stage:
 
     Attributes:
         users: Names of the sites of the participants.
-        shows_ages: True if the pages show the ages of samples at first. A staircase, which asks
-            participants for differences, hides them, because they could reveal the answer.
+        shows_ages: True if the pages first show how old the poses of the other arms are. It is
+            False in a staircase, a procedure that asks participants for differences, because
+            the ages could reveal the answer.
     """
 
     def __init__(self, plan: ExperimentPlan, clock: Clock) -> None:
@@ -228,7 +235,11 @@ class Stage:
         return request
 
     def show_trial(self, watch: TrialWatch) -> None:
-        """Shows a trial whose session is about to begin."""
+        """Shows the pages that the session of a trial is about to begin.
+
+        Args:
+            watch: Object that judges the trial while its session runs.
+        """
         self._request = None
         self._watch = watch
         self._phase = "starting"
@@ -259,14 +270,18 @@ class Stage:
         self._phase = "over"
 
     def poll(self, view: SessionView, pages: Sequence[tuple[str, int]]) -> list[str]:
-        """Judges the records that have arrived, and notes which users are present.
+        """Evaluates the new records of a trial, and notes which users have an open page.
+
+        The server of the pages calls this method many times a second.
 
         Args:
             view: Present state of the session.
-            pages: Site and number of each user's page.
+            pages: For each open page of a user, the name of the user's site and the number of
+                the page.
 
         Returns:
-            Texts that the log should keep as marks of this moment.
+            Texts that the log should keep as marks of this moment. Empty if no trial is
+            running.
         """
         now_ns = self._clock.monotonic_ns()
         request = self._request
@@ -295,15 +310,15 @@ class Stage:
         return self._watch.poll(view, absent)
 
     def accept(self, site: str, page: int, message: StageMessage) -> bool:
-        """Applies a message of a page.
+        """Processes a message of a page, such as the answers to a questionnaire.
 
         Args:
             site: Name of the user's site. Empty for an experimenter.
-            page: Number of the page.
+            page: Number of the page that sent the message.
             message: The message.
 
         Returns:
-            False if the message was not requested from that page.
+            False if the message was not requested from that page. It has no effect then.
         """
         is_holder = self._holders.get(site) == page
         if isinstance(message, AbortTrial):
@@ -332,16 +347,17 @@ class Stage:
         return True
 
     def describe(self, role: str, site: str, page: int, t_s: float | None) -> Json:
-        """Describes the present step for a page.
+        """Describes for a page what it must show of the experiment now.
 
         Args:
-            role: Role of the page.
-            site: Name of the site of the page's user, or empty.
+            role: Role of the page: that of an experimenter, a user or a watcher.
+            site: Name of the site of the page's user. Empty if the page belongs to no user.
             page: Number of the page.
-            t_s: Time of the arms on the page, in s. None without arms.
+            t_s: Time of the pose that the page shows, in s. None if it shows no arms.
 
         Returns:
-            Phase, step, task, users and further fields that the role may see, ready for JSON.
+            The present phase, the requested step, the task, the users and further facts that
+            the role may see, as plain values for JSON.
         """
         step = self._step
         request = self._request

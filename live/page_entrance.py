@@ -28,10 +28,13 @@ MAX_PAGES = {"experimenter": 4, "user": 2, "watcher": 12}
 
 
 class Strangers:
-    """The connections whose role is not known yet.
+    """The open connections for which it is not known yet what they want.
+
+    Their number is limited. If there are too many, the oldest is closed, so that nobody can
+    keep others out with many silent connections.
 
     Args:
-        refused: Numbers of refusals by reason, to which closed connections are added.
+        refused: Numbers of refusals by reason. Connections that are closed here are added.
     """
 
     def __init__(self, refused: Counter[str]) -> None:
@@ -54,10 +57,12 @@ class Strangers:
 
 
 class SeatedPage(Protocol):
-    """A page that counts towards the limit of its role. `page_server.Page` is such a page.
+    """Describes the fields of an open page that are needed to limit the number of pages.
+
+    `page_server.Page` is such a page.
 
     Attributes:
-        role: Role of the page's user.
+        role: Role of the page's user: experimenter, user or watcher.
         number: Number of the page. Newer pages have larger numbers.
         takes_part: True if the page may hold arms and give orders.
     """
@@ -71,16 +76,25 @@ Page = TypeVar("Page", bound=SeatedPage)
 
 
 def is_full(pages: Iterable[SeatedPage], role: Role) -> bool:
-    """Returns True if there are as many pages of a role as allowed."""
+    """Finds out whether there are as many open pages of a role as allowed.
+
+    Args:
+        pages: The open pages of all roles.
+        role: The role whose pages are counted.
+    """
     role_pages = _list_pages_of_role(pages, role)
     return len(role_pages) >= MAX_PAGES[role.kind]
 
 
 def choose_page_to_close(pages: Iterable[Page], role: Role) -> Page | None:
-    """Chooses the page that must be closed to make room for a new page of a role.
+    """Chooses the open page that must be closed so that another page of a role can be opened.
+
+    Args:
+        pages: The open pages of all roles.
+        role: Role of the new page.
 
     Returns:
-        The page. None if there is room.
+        The page to close. None if there is room for the new page.
     """
     role_pages = _list_pages_of_role(pages, role)
     if len(role_pages) < MAX_PAGES[role.kind]:

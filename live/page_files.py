@@ -39,10 +39,11 @@ _POLICY = (
 
 
 class PageFiles:
-    """The files that one server sends.
+    """The files that one server sends: those of the page, and results of the session.
 
     Attributes:
-        results: Report and log of the ended session, by their addresses.
+        results: Paths of the report and the log after the session, by their addresses. Empty
+            while the session runs.
     """
 
     def __init__(self) -> None:
@@ -50,7 +51,13 @@ class PageFiles:
         self.results: dict[str, Path] = {}
 
     def add_results(self, paths: Iterable[Path]) -> None:
-        """Adds files of the ended session, unless they are too large."""
+        """Makes the report and the log of the ended session available for download.
+
+        Files that are too large are left out.
+
+        Args:
+            paths: The files.
+        """
         secret = secrets.token_urlsafe()
         sendable = (path for path in paths if path.stat().st_size <= MAX_FILE_BYTES)
         self.results |= {f"/{secret}/{path.name}": path for path in sendable}

@@ -19,10 +19,12 @@ from pathlib import Path
 
 
 class BrowserOpening:
-    """A file that redirects a browser to a link, until the page is open.
+    """Opens a browser at a secret link, through a temporary file that only the user can read.
+
+    The file redirects the browser to the link. It exists until the page is open.
 
     Args:
-        link: The link, with its token.
+        link: The link, which contains a secret token.
     """
 
     def __init__(self, link: str) -> None:

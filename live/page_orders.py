@@ -107,11 +107,13 @@ class ReleaseArms(PageMessage, frozen=True, kw_only=True, tag="release"):
 
 
 class SetLink(PageMessage, frozen=True, kw_only=True, tag="link"):
-    """New settings of a link, such as its delay, as `trilat set` accepts them.
+    """The delay or other settings of a link between two sites must change.
+
+    The settings are those of the command `trilat set`.
 
     Attributes:
-        link: Name of the link, such as "m1->s".
-        to: The settings by name.
+        link: Name of the directed link, such as "m1->s" from site m1 to site s.
+        to: The new values by the names of the settings.
     """
 
     link: Name
@@ -146,10 +148,10 @@ class MoveHand(PageMessage, frozen=True, kw_only=True, tag="hand"):
     """The page takes hold of an arm, moves it, or releases it.
 
     Attributes:
-        site: Name of the site of the arm.
-        grip: False to release the arm.
-        to: Target of the end effector in m, or of the joints in rad. For an arm that is pushed,
-            the force in N.
+        site: Name of the site that runs the arm.
+        grip: True to hold the arm, False to release it.
+        to: Where the arm is pulled: the position of the end effector in m, or the joint
+            positions in rad. For an arm that is pushed instead, the force in N.
     """
 
     site: Name
@@ -221,7 +223,11 @@ class _TokenBucket:
 
 
 class MessageLimits:
-    """Limits of a page's message rates, for each kind of message and for all kinds together."""
+    """Limits how many messages a page may send, for each kind of message and for all together.
+
+    A page that sends more messages than a person can cause is faulty or hostile. The messages
+    in excess are dropped.
+    """
 
     def __init__(self) -> None:
         self._buckets = {
@@ -229,11 +235,14 @@ class MessageLimits:
         }
 
     def allows(self, kind: type[PageMessage], now_ns: int) -> bool:
-        """Returns True if a message is allowed now, and then counts it.
+        """Checks whether a message of a page is within its rate, and counts it if it is.
 
         Args:
             kind: Kind of the message.
-            now_ns: Present time, in ns.
+            now_ns: Present time on the monotonic clock, in ns.
+
+        Returns:
+            False if the page has sent too many messages, so that this one must be dropped.
         """
         if kind not in _RATES:
             return True
@@ -251,7 +260,13 @@ class MessageLimits:
 
 
 def read_page_message(text: str | bytes) -> PageMessage:
-    """Decodes a message of a page.
+    """Decodes a message that a page sent, and checks the range of its numbers.
+
+    Args:
+        text: The message as JSON.
+
+    Returns:
+        The message, of the class that its field `do` names.
 
     Raises:
         WireError: The text is not a valid message, or a number is out of range.
@@ -279,7 +294,11 @@ class Role:
     site: str = ""
 
     def may(self, message: PageMessage) -> bool:
-        """Returns True if this role may send a message."""
+        """Finds out whether the user of a page with this role has the right to send a message.
+
+        Args:
+            message: The message.
+        """
         if isinstance(message, Seen | StopArms) or self.kind == "experimenter":
             return True
         if self.kind != "user":
@@ -290,7 +309,7 @@ class Role:
 
     @property
     def noun(self) -> str:
-        """The noun for the role in the sentence of an event, such as "the user of m1"."""
+        """Words for the user of the page in the text of an event, such as "the user of m1"."""
         if self.kind == "experimenter":
             return "the experimenter"
         if self.kind == "user":
@@ -299,7 +318,7 @@ class Role:
 
     @property
     def query(self) -> str:
-        """The query part of this role's link, such as "as=m1"."""
+        """Part of a link that states the role, such as "as=m1" for the user of site m1."""
         parts = ["watch"] if self.kind == "watcher" else []
         if self.site:
             parts.append(f"as={self.site}")
@@ -307,23 +326,24 @@ class Role:
 
 
 class RoleLinks:
-    """Makes the links of a page with their secret tokens, and recognises their roles.
+    """Makes the links that open a page, and finds out which role a link grants.
 
-    The token of a role is computed from a random secret, so that it need not be stored.
+    A link contains a secret token, so that only those who received it can open the page. The
+    token of a role is computed from a random secret, so that it need not be stored.
     """
 
     def __init__(self) -> None:
         self._secret = secrets.token_bytes(TOKEN_BYTES)
 
     def link(self, address: str, role: Role) -> str:
-        """Returns the link of a role.
+        """Makes the link under which the page of a role can be opened.
 
-        The token is in the fragment of the link, which a browser does not send to other
-        servers.
+        The secret token is in the fragment of the link, the part after #, which a browser does
+        not send to other servers.
 
         Args:
             address: Address of the page.
-            role: The role.
+            role: The role that the link grants.
         """
         query = f"?{role.query}" if role.query else ""
         return f"{address}{query}#token={self._make_token(role)}"
@@ -384,11 +404,12 @@ class PageHands:
         self._held_sites: set[str] = set()
 
     def move(self, order: MoveHand, *, pushes: bool) -> None:
-        """Sends the site of an arm how the page holds it.
+        """Tells a site where the page pulls its arm, or that the page releases it.
 
         Args:
             order: Message of the page.
-            pushes: True if the page applies a force instead of moving a target.
+            pushes: True if the page applies a force to the arm, False if it pulls the arm to a
+                target.
         """
         site = order.site
         if site not in self._senders:
@@ -414,12 +435,12 @@ class PageHands:
             self.move(MoveHand(site=site, grip=False), pushes=False)
 
     def holds(self, site: str, source: int) -> bool:
-        """Returns True if this page holds the arm of a site.
+        """Finds out whether this page is the one that holds the arm of a site.
 
         Args:
             site: Name of the site.
-            source: Number of the holder according to the site's record. 0 if nobody holds the
-                arm.
+            source: Number of the holder, as the newest record of the site states it. 0 if
+                nobody holds the arm.
         """
         sender = self._senders.get(site)
         return source != 0 and sender is not None and sender.boot == source
@@ -511,10 +532,12 @@ class OrderDesk:
             self._send_request(site, topics.STOP, request)
 
     def release(self, order: ReleaseArms, sites: Collection[str], source: str = "") -> None:
-        """Queues orders that let arms follow again, or end their faults.
+        """Queues orders to stopped arms to follow again, or to arms with a fault to end it.
+
+        An order to a site that does not exist is refused and counted.
 
         Args:
-            order: The order, and the sites of the arms.
+            order: The order, and the names of the sites of the arms.
             sites: Names of the sites of the session.
             source: Who sends the order, for the sites' events.
         """
@@ -542,7 +565,12 @@ class OrderDesk:
         self._open_queries[site, channel] = _OpenQuery(inbox, sent_ns, request)
 
     def mark(self, site: str, text: str) -> None:
-        """Queues a mark of this moment in a site's log."""
+        """Queues a text that a site publishes as an event, to mark this moment in the log.
+
+        Args:
+            site: Name of the site.
+            text: The text.
+        """
         self._enqueue(site, f"mark {text}", ChangeRequest(mark=text))
 
     def poll(self) -> None:

@@ -123,14 +123,14 @@ _NO_HTTP = b"HTTP/1.1 400 Bad Request\r\nContent-Length: 0\r\nConnection: close\
 
 
 class Visitor(ServerConnection):
-    """A connection to the server, which may or may not become a page.
+    """A connection to the server, before and after it becomes that of a page.
 
     Any program can connect. Data that are not a request of a browser are counted, and answered
     with the HTTP status 400.
 
     Attributes:
         refused: Numbers of refusals by reason.
-        strangers: List of the connections whose role is not known yet.
+        strangers: The connections for which it is not known yet what they want.
     """
 
     refused: Counter[str]
@@ -149,13 +149,24 @@ class Visitor(ServerConnection):
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        """Processes data, and notes that the connection has sent some."""
+        """Processes data of the browser, and notes that this connection has sent some.
+
+        Browsers open connections in advance and close some of them unused. The note
+        distinguishes these from connections whose data were not a valid request.
+
+        Args:
+            data: The received bytes.
+        """
         # Browsers open connections in advance and close some unused; those are not counted.
         self._has_received = True
         super().data_received(data)
 
     def send_data(self) -> None:
-        """Sends waiting data. A handshake that failed is counted first."""
+        """Sends the waiting data to the browser.
+
+        If the WebSocket could not be opened because of what the connection sent, this is
+        counted as a refusal before.
+        """
         problem = self.protocol.handshake_exc
         if problem is not None and self._has_received and not self._is_counted:
             self._is_counted = True
@@ -250,10 +261,12 @@ class PageOptions:
         return context
 
     def check(self) -> None:
-        """Checks that the address is free, and that it is safe or declared as `insecure`.
+        """Checks that the server can listen at the address, and that the user accepts its risk.
+
+        An address outside this machine must be encrypted, or declared as `insecure`.
 
         Raises:
-            UsageError: The address cannot be used.
+            UsageError: The address is in use, or neither encrypted nor declared as insecure.
         """
         if self.make_context() is None and self.host not in HERE and not self.insecure:
             raise UsageError(
@@ -421,7 +434,10 @@ class PageServer:
             self._ready.set()
 
     def report_refusals(self) -> None:
-        """Prints how many messages and requests were refused, by reason."""
+        """Prints for the user how many messages and requests were refused, with the reasons.
+
+        Prints nothing if there were none.
+        """
         for reason, count in sorted((+self.refused).items()):
             self._say(f"the page refused {count_nouns(count, 'message')} or requests: {reason}")
 

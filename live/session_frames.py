@@ -66,11 +66,11 @@ def _round(values: Array, digits: int = 5) -> list[Any]:
 
 
 class ArmFrames:
-    """Composes the parts of frames that describe one arm: shape, pose and forces.
+    """Composes the parts of a page's messages that describe one arm: shape, pose and forces.
 
     Args:
         scenario: Scenario of the session.
-        site: Name of the site of the arm.
+        site: Name of the site that runs the arm.
     """
 
     def __init__(self, scenario: Scenario, site: str) -> None:
@@ -85,7 +85,12 @@ class ArmFrames:
         self._rows = build_arm_rows(scenario, site)
 
     def describe(self) -> Json:
-        """Returns the constants of the arm, such as its joints, walls and limits."""
+        """Describes what does not change during the session, so that a page can draw the arm.
+
+        Returns:
+            Role, colour, joints, walls, limits and further constants of the arm, as plain
+            values for JSON.
+        """
         model = self._model
         spec = self._spec
         colours = self._scenario.assign_colours(COLOURS)
@@ -136,24 +141,40 @@ class ArmFrames:
         }
 
     def describe_pose(self, q: Array) -> Json:
-        """Returns the pose of the arm at joint positions `q`, shape (n,), in rad or m."""
+        """Computes where the joints of the arm are, for a page that draws it.
+
+        Args:
+            q: Positions of the joints, shape (n,), in rad or m.
+
+        Returns:
+            The points between the links of the arm in m, and the joint positions, as plain
+            values for JSON.
+        """
         points_m = joint_positions_m(self._model, q[np.newaxis])[0]
         return {"points": _round(points_m), "q": _round(q)}
 
     def describe_start(self) -> Json:
-        """Returns the pose of the arm before tick 0, as the scenario places it."""
+        """Computes where the joints of the arm are before the first tick of the session.
+
+        Returns:
+            The pose as `describe_pose` returns it, with the tick -1 and no bodies.
+        """
         pose = self.describe_pose(np.array(self._spec.q0_rad, dtype=np.float64))
         return {**pose, "tick": -1, "bodies": []}
 
     def describe_now(self, records: AlignedRecords) -> tuple[Json, list[float]]:
-        """Returns the present state of the arm, and the extremes since the previous frame.
+        """Describes the present state of the arm, and the peaks since the previous frame.
+
+        A frame is a message from which a page draws the session, about 30 times a second. The
+        largest values are plotted, so that peaks between two frames are visible.
 
         Args:
             records: Records since the previous frame. The last one is the present.
 
         Returns:
-            The state. The largest norm of the error, torque of a joint in N m, force of people
-            in N, and wall force in N.
+            The present state as plain values for JSON, and four largest values: norm of the
+            synchronisation error, torque of a joint in N m, force of people in N, and force of
+            the walls in N.
         """
         split = split_torque(records, self._scenario)
         hand_force = self._compute_hand_force(records, split)
@@ -257,15 +278,15 @@ class ArmFrames:
 
 
 class SessionFrames:
-    """Composes the frames of one session, at the rate of the pages.
+    """Composes the messages (frames) from which the pages draw a session, about 30 a second.
 
     Args:
         view: Present state of the session.
 
     Attributes:
-        points: Rows of the plots. `describe` names their columns.
-        energies: Rows of the energy plot: time in s, energy function V of the stability proof
-            in J, and the energy that operators and environment have supplied, in J.
+        points: Values of the plots at the times of the frames. `describe` names them.
+        energies: Points of the energy plot: time in s, the energy function V of the stability
+            proof in J, and the energy that operators and environment have supplied, in J.
     """
 
     def __init__(self, view: SessionView) -> None:
@@ -282,10 +303,11 @@ class SessionFrames:
         self._turns: defaultdict[tuple[str, str], BodyTurns] = defaultdict(BodyTurns)
 
     def describe(self) -> Json:
-        """Returns the constants of the session: its sites, links, and columns of plots.
+        """Describes what does not change during the session, for a page that draws it.
 
-        Before the session runs, it returns the members that are present and those that are
-        missing.
+        Returns:
+            The sites, the links and the names of the plotted values, as plain values for JSON.
+            Before the session runs, the members that are present and those that are missing.
         """
         view = self._view
         scenario = view.scenario
@@ -326,10 +348,13 @@ class SessionFrames:
         }
 
     def make_frame(self) -> Json | None:
-        """Returns the present state, and adds the points of the plots.
+        """Composes the frame of this moment from the records since the previous frame.
+
+        The new points are also added to the plots `points` and `energies`.
 
         Returns:
-            The frame. None until every site has a record.
+            The present state of all arms and links, as plain values for JSON. None until every
+            site has published a record.
         """
         view = self._view
         has_all_records = all(site.record is not None for site in view.sites.values())
@@ -378,10 +403,13 @@ class SessionFrames:
                 self.energies.add([t_s, V, supplied])
 
     def describe_session_as_user(self) -> Json:
-        """Returns the constants of the session for the page of a site's user.
+        """Describes what does not change during the session, for the page of a participant.
 
-        Links and dominance factors are left out, because they could reveal the condition of an
-        experiment.
+        The settings of links and the dominance factors, the weights with which the arms follow
+        each other, are left out. They could reveal the condition of an experiment.
+
+        Returns:
+            The remaining constants of `describe`.
         """
         constants = self.describe()
         if not constants["running"]:
@@ -390,12 +418,18 @@ class SessionFrames:
         return {**constants, **hidden}
 
     def describe_as(self, frame: Json, site: str, *, ages: bool) -> Json:
-        """Returns a frame for the user of a site, with the other arms as the site knows them.
+        """Changes a frame so that it shows what the user of a site sees.
+
+        The user sees the other arms with their delay, where the user's site last knew them to
+        be.
 
         Args:
             frame: Newest frame of `make_frame`.
             site: Name of the user's site.
-            ages: True to add the age of each peer's pose, in ms.
+            ages: True to add how old the pose of each other arm is, in ms.
+
+        Returns:
+            The frame for this user. The given frame is not changed.
         """
         local = frame["sites"][site]
         ticks = self._view.find_peer_ticks(site, local["tick"], local["used"])
@@ -555,7 +589,14 @@ def _describe_alarm(alarm: LifeAlarm) -> Json:
 
 
 def render_event(event: Event) -> Json:
-    """Returns an event as a line in the list of a page."""
+    """Formats an event of the session for the list of events on a page.
+
+    Args:
+        event: The event.
+
+    Returns:
+        The parts of its line, as plain values for JSON.
+    """
     t_s = None if event.t_ns < 0 else event.t_ns / NS_PER_S
     text = describe_event(event.kind, event.text, event.command)
     return {"t": t_s, "member": event.member, "kind": event.kind, "text": text}

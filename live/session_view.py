@@ -53,7 +53,10 @@ T = TypeVar("T")
 
 
 class Tail(Generic[T]):
-    """The last entries of a growing sequence, for readers that know only its beginning.
+    """The last entries of a growing list, such as the events of a session.
+
+    A reader, such as a page, remembers only how many entries it has read, and asks for the
+    entries that were added since.
 
     Args:
         most: Largest number of entries that are kept.
@@ -72,11 +75,14 @@ class Tail(Generic[T]):
         self.count += 1
 
     def since(self, count: int, most: int) -> list[T]:
-        """Returns the entries that a reader does not know yet.
+        """Lists the entries that a reader does not know yet.
 
         Args:
             count: Number of entries that had been added when the reader last asked.
             most: Largest number of entries to return. Older ones are left out.
+
+        Returns:
+            The entries, the oldest first. Empty if there are no new ones.
         """
         size = len(self._entries)
         new_count = min(self.count - count, most, size)
@@ -139,14 +145,15 @@ class SiteView:
         self.first_tick = 0
 
     def find_alarm(self, session: str, name: str) -> LifeAlarm | None:
-        """Returns the present alarm of the site, such as a stop or a fault.
+        """Finds out whether the arm of the site needs attention, because of a stop or a fault.
 
         Args:
             session: Name of the session.
             name: Name of the site.
 
         Returns:
-            The alarm. None if there is none, or if the site has ended.
+            The alarm, with its reason. None if there is none, if the site has ended, or if its
+            scenario has no alarms (`glides`).
         """
         record = self.record
         if record is None or not self.glides or self.ended:
@@ -183,7 +190,10 @@ class SiteView:
 
 
 class SessionView:
-    """What an observer knows about a session. `poll` receives the messages that have arrived.
+    """What an observer knows about a running session from the messages of its sites.
+
+    A session is a run of several sites, processes that control one arm each. The owner calls
+    `poll` regularly, which receives the messages that have arrived.
 
     Args:
         bus: Network connection that reaches the session.
@@ -192,14 +202,14 @@ class SessionView:
 
     Attributes:
         scenario: Scenario of the session. None until a member has sent it.
-        sites: The running sites by name. Empty until all of them run.
+        sites: What is known about each running site, by name. Empty until all of them run.
         members: Identities of the members (sites and recorders) that have replied.
-        links: Present settings of every link, as tables.
+        links: Present settings of every link between two sites, such as its delay, as tables.
         dominance: For each site, the weights with which it was last told to follow its peers.
         energy: The energy function V of the stability proof, computed while the session runs.
             None until all sites run.
-        events: The events, oldest first.
-        dropped: Numbers of dropped messages by reason.
+        events: The latest events of all members, oldest first.
+        dropped: Numbers of invalid or unknown messages, by the reason why they were dropped.
     """
 
     def __init__(self, bus: Bus, clock: Clock, session: str) -> None:
@@ -278,10 +288,12 @@ class SessionView:
         self.links.advance_to(max(times_ns, default=0))
 
     def advance_energy(self) -> EnergyCourse | None:
-        """Computes the energies V at the ticks that were completed since the last call.
+        """Computes the energy function V of the stability proof at the new ticks.
+
+        A tick is new if the records of all sites have arrived for it since the last call.
 
         Returns:
-            The energies over time. None if no tick was completed.
+            The energies over time, in J. None if there is no new tick.
         """
         if self.energy is None:
             return None
@@ -291,15 +303,18 @@ class SessionView:
     def find_peer_ticks(
         self, site: str, tick: int, used: Mapping[str, int]
     ) -> Mapping[str, int]:
-        """Returns the tick at which a site's user sees each peer.
+        """Finds out at which tick the user of a site sees each of the other arms.
 
-        This is the tick of the sample that the site uses. If the scenario delays the picture
-        further, it is the tick of an earlier sample.
+        This is the tick of the sample that the site uses for its control law. If the scenario
+        delays the user's picture further, it is the tick of an earlier sample.
 
         Args:
             site: Name of the user's site.
             tick: Tick of the site's record.
-            used: For each peer, the tick of the sample in use at that tick.
+            used: For each peer of the site, the tick of the sample that it uses at `tick`.
+
+        Returns:
+            The tick for each peer.
         """
         assert self.scenario is not None
         if site not in self._pictures:

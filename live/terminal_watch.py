@@ -92,7 +92,7 @@ def watch_session(
 
 
 class SessionWatch:
-    """The texts that a terminal shows about a session.
+    """Composes the texts that `trilat watch` shows in a terminal about a running session.
 
     Args:
         bus: Network connection that reaches the session.
@@ -128,7 +128,10 @@ class SessionWatch:
 
     @property
     def title(self) -> str:
-        """Name and state of the session: V, its end, or how long it has been silent."""
+        """Line above the table: name of the session, and its state.
+
+        The state is the energy V, the end of the session, or for how long it has been silent.
+        """
         view = self.view
         silence_s = view.session_silence_s
         state = f"as {self._as_site} knows it" if self._as_site else self._energy_text
@@ -142,7 +145,10 @@ class SessionWatch:
 
     @property
     def alarms(self) -> list[tuple[str, LifeAlarm]]:
-        """Names and alarms of the sites that hold, are stopped or have a fault."""
+        """Sites that need attention because they hold, are stopped or have a fault.
+
+        Each entry contains the name of the site and its alarm. Empty if there are none.
+        """
         view = self.view
         alarms = []
         for name, site in view.sites.items():
@@ -154,10 +160,13 @@ class SessionWatch:
         return alarms
 
     def rows(self) -> list[SiteRow]:
-        """Returns the row of each site.
+        """Composes the table of the sites, with one row per site.
 
-        With `as_site`, the row of another site has only the angles and the time that the user
-        of `as_site` sees.
+        If the view of a user is shown (`as_site`), the row of another site contains only the
+        angles of its arm and the time of the pose, as that user sees them.
+
+        Returns:
+            The texts of each row, by the heads of the columns. Empty until the sites run.
         """
         view = self.view
         scenario = view.scenario
