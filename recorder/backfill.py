@@ -64,13 +64,13 @@ class _OpenRequest(NamedTuple):
 
 
 class GapRepair:
-    """Requests the missing messages of one site.
+    """Requests the missing messages of one site from the site's buffer of recent messages.
 
     Args:
         bus: Network connection of the recorder.
         session: Name of the session.
-        reception: Received messages of the site, which knows the gaps.
-        dropped: Counts invalid replies by reason.
+        reception: Received messages of the site. It knows which numbers are missing.
+        dropped: Numbers of dropped messages by reason. Invalid replies are added.
         now_ns: Present time on the monotonic clock, in ns.
     """
 
@@ -108,15 +108,22 @@ class GapRepair:
         self._ended_ns: int | None = None
 
     def probe(self) -> None:
-        """Schedules requests for the newest messages of every channel."""
+        """Lets `poll` request the newest messages of every channel of the site.
+
+        This reveals losses at the end of a channel, which no later message can reveal by its
+        number.
+        """
         self._probes = set(SITE_CHANNELS)
 
     def poll(self, now_ns: int, *, alive: bool) -> Iterator[RepairedMessage]:
-        """Yields requested messages that have arrived, and requests more.
+        """Receives the replies of the site, and sends the next request if messages are missing.
 
         Args:
             now_ns: Present time on the monotonic clock, in ns.
-            alive: True if the site is present, so that it can reply.
+            alive: True if the site is present on the network, so that it can reply.
+
+        Yields:
+            The messages of the replies. Nothing if no reply has arrived.
         """
         if now_ns - self._polled_ns > SILENT_NS:
             # This process was suspended. The site is not to blame that nothing arrived.

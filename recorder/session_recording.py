@@ -55,7 +55,7 @@ LAST_NS = 6_000_000_000
 
 
 class Recording:
-    """One log while it is recorded, and the counts of its messages.
+    """One log while it is recorded: writes messages, and counts received and missing ones.
 
     `Recorder` creates this object when the session begins, and calls `write` periodically.
 
@@ -63,17 +63,18 @@ class Recording:
         writer: Writes the log.
         scenario: Scenario of the session.
         session: Name of the session.
-        epoch: Common start time of the session, and the boots of the members.
+        epoch: Common start time of the session, and the boots of its members. A boot is a
+            random number that identifies one start of a process.
         bus: Network connection of the recorder.
         publisher: Publishes the recorder's own events. It also puts them into the queue of the
             received messages, so that they are recorded.
 
     Attributes:
         session: Name of the session.
-        epoch: Common start time of the session.
+        epoch: Common start time of the session, and the boots of its members.
         publisher: Publishes the recorder's own events.
-        accounts: Counts of the messages of each channel, by key.
-        dropped: Number of messages that were not written, by reason.
+        accounts: For each channel, the counts of received and missing messages, by key.
+        dropped: Number of messages that were not written, by the reason.
     """
 
     def __init__(
@@ -167,7 +168,10 @@ class Recording:
         self._gone = set(self._sites)
 
     def write(self, queue: InboundQueue, now_ns: int) -> None:
-        """Writes the waiting messages, requests missing ones, and publishes "stored".
+        """Writes the messages that have arrived, and requests those that are missing.
+
+        If the recorder has every message of a site that has ended, it publishes the event
+        "stored", for which the site waits.
 
         Args:
             queue: Queue of the received messages.
@@ -407,11 +411,15 @@ class Recording:
             self._writer.add(key, payload, since_ns, log_time_ns, number, content)
 
     def note_presence(self, key: str, alive: bool) -> None:
-        """Notes that one start of a site appeared on the network or disappeared from it.
+        """Notes that a site appeared on the network, or disappeared from it.
+
+        The network announces each start of a site by a token, which disappears with the
+        process.
 
         Args:
-            key: Key of the start's token, which contains the site and the boot.
-            alive: True if the token appeared.
+            key: Key of the token, which contains the name of the site and the number of its
+                start.
+            alive: True if the token appeared, False if it disappeared.
         """
         parts = topics.parse_key(key)
         if parts is None or parts.member not in self._sites:
@@ -449,7 +457,14 @@ class Recording:
         return last_ns
 
     def is_over(self, now_ns: int) -> bool:
-        """Returns True if every site has all messages stored or is gone for good."""
+        """Finds out whether the recording can end, because no site can send any more messages.
+
+        Args:
+            now_ns: Present time on the monotonic clock, in ns.
+
+        Returns:
+            True if for every site, either all messages are stored or the site is gone for good.
+        """
         # Every site is examined, because `_has_left` notes the time at which a site
         # disappeared.
         left = [self._has_left(name, now_ns) for name in self._sites]
@@ -511,7 +526,7 @@ class Recording:
         self._writer.finish(self.render_accounts(queue))
 
     def render_accounts(self, queue: InboundQueue) -> dict[str, str]:
-        """Returns the counts of messages as texts, as the log stores them.
+        """Formats the numbers of received and missing messages, as they are stored in the log.
 
         Args:
             queue: Queue of the received messages, which counts those for which it had no room.
@@ -532,7 +547,12 @@ class Recording:
         return texts
 
     def render_summary(self) -> list[str]:
-        """Returns lines about the sites and the messages that were not written."""
+        """Summarises the recording for the user.
+
+        Returns:
+            A line for each site with the numbers of its records, and a line for each reason why
+            messages were not written.
+        """
         lines = [self._summarize_site(site) for site in self._sites.values()]
         if self._overflowed:
             messages = count_nouns(self._overflowed, "message")
@@ -558,7 +578,11 @@ class Recording:
         return line
 
     def describe_problem(self) -> str | None:
-        """Describes the first problem of the recording. None if every record is stored."""
+        """Describes the first problem of the recording, for the error message at its end.
+
+        Returns:
+            The site that disappeared or lacks messages, as a text. None if there is no problem.
+        """
         for name, site in self._sites.items():
             if site.final_ticks is None:
                 records = count_nouns(site.accounts[topics.STATE].received, "record")
@@ -578,13 +602,13 @@ _ALL_GAPS = 600
 
 
 class RecorderReport:
-    """Publishes the statistics of one recording once a second.
+    """Publishes statistics of a recording once a second, such as its size and its gaps.
 
     Args:
         bus: Network connection of the recorder.
         clock: Clock of the recorder.
         recording: The recording.
-        queue: Queue of the received messages. The statistics are added, so that they are
+        queue: Queue of the received messages. The statistics are added to it, so that they are
             recorded.
         size: Function that returns the size of the log in bytes.
     """
@@ -607,11 +631,17 @@ class RecorderReport:
         self._due_ns = clock.monotonic_ns() + REPORT_EVERY_NS
 
     def note_flush(self, duration_ns: int) -> None:
-        """Notes the duration of a flush in ns. The statistics state the longest one."""
+        """Notes how long it took to pass the written messages to the operating system.
+
+        The next statistics state the longest of these times.
+
+        Args:
+            duration_ns: The time, in ns.
+        """
         self._flush_max_ns = max(self._flush_max_ns, duration_ns)
 
     def poll(self) -> None:
-        """Publishes the statistics if they are due."""
+        """Publishes the statistics if a second has passed since the last ones."""
         now_ns = self._clock.monotonic_ns()
         if now_ns >= self._due_ns:
             # After a long delay, the missed statistics are not published later.
@@ -620,7 +650,7 @@ class RecorderReport:
             self.publish()
 
     def publish(self) -> None:
-        """Publishes the statistics, and adds them to the queue of the received messages."""
+        """Publishes the statistics now, and adds them to the messages that are recorded."""
         payload = encode(self._make_stats())
         self._flush_max_ns = 0
         self._queue.receive(self._key, payload)

@@ -58,10 +58,11 @@ _OTHER_KEYS = "others"
 
 
 class InboundMessage(NamedTuple):
-    """A received message.
+    """A message that has arrived over the network and waits to be written.
 
     Attributes:
-        key: Key under which the message was published.
+        key: Key under which the message was published. It names the session, the member and the
+            channel.
         payload: Bytes of the message.
         mono_ns: Time of the arrival on the monotonic clock, in ns.
     """
@@ -72,10 +73,13 @@ class InboundMessage(NamedTuple):
 
 
 class InboundQueue:
-    """Bounded queue between the threads of the network and the thread that writes the log.
+    """Bounded queue of messages from the network's threads to the thread that writes them.
+
+    If the disk is slow, messages wait here. A message for which there is no room is dropped and
+    counted.
 
     Args:
-        clock: Clock that stamps the messages.
+        clock: Clock that determines the times of arrival.
 
     Attributes:
         overflowed: Number of messages for which there was no room, by key.
@@ -237,11 +241,14 @@ class SiteReception:
         self._largest_counts[topics.EVENT] = self._event_bytes_left // _LEAST_EVENT_BYTES
 
     def read(self, channel: str, payload: bytes) -> SiteMessage:
-        """Decodes and checks a message, without counting it.
+        """Decodes a message of the site and checks its sender and number, without counting it.
 
         Args:
-            channel: Channel of the message.
+            channel: Name of the channel in which the message arrived.
             payload: Bytes of the message.
+
+        Returns:
+            The decoded message, with its number. Pass it to `accept` or `refill` to count it.
 
         Raises:
             WireError: The payload is not a valid message of this site in this channel.
@@ -306,16 +313,17 @@ class SiteReception:
     def accept_records(
         self, payloads: Iterable[bytes], received_ns: int
     ) -> Iterator[tuple[bytes, State]]:
-        """Counts the records of one block, and yields those that are new.
+        """Decodes and counts records of the site that arrived together in one block.
 
-        This is equivalent to `read` and `accept` for each record, but faster.
+        A record is the result of one tick of the control loop. The effect is that of calling
+        `read` and `accept` for each record, but this method is faster.
 
         Args:
             payloads: The encoded records.
             received_ns: Arrival of the block on the monotonic clock, in ns.
 
         Yields:
-            The encoded and the decoded record.
+            The encoded and the decoded record, for each record that was not received before.
 
         Raises:
             WireError: A payload is not a valid record of this site. The previous ones count.
@@ -412,10 +420,14 @@ class SiteReception:
             )
 
     def add_expected(self, channel: str, count: int) -> None:
-        """States that at least `count` messages of a channel exist.
+        """Takes into account how many messages of a channel the site published at least.
 
-        The number is limited by what is possible in the scenario by now, since a faulty site
-        could state any number.
+        Those that have not been received count as missing. A count that is impossible in the
+        scenario by now is reduced, since a faulty site could state any number.
+
+        Args:
+            channel: Name of the channel.
+            count: Number of messages, numbered from 0.
         """
         largest = self._largest_counts[channel]
         if channel != topics.EVENT:
@@ -424,9 +436,13 @@ class SiteReception:
         self.accounts[channel].add_expected(min(count, largest))
 
     def count_previous_start(self, ticks: int) -> None:
-        """States how many ticks the previous start executed at least, as another site reports.
+        """Takes into account how many ticks the previous start of the site executed at least.
 
         The previous start may have been killed, so that it could not state this number itself.
+        But other sites have received its samples.
+
+        Args:
+            ticks: Number of ticks that another site reports.
         """
         for channel, gap in self._start_gaps.items():
             gap.note_published(number_message(channel, ticks, self._rate_hz))
@@ -483,12 +499,20 @@ class SiteReception:
         return self.final_ticks is not None and not self.lacks_messages
 
     def give_up(self) -> None:
-        """Stops requests for all missing messages, which the site cannot send."""
+        """Gives up all messages that are missing, because the site cannot send them any more.
+
+        They still count as missing, but are no longer requested.
+        """
         for account in self.accounts.values():
             account.abandon_below(account.last + 1)
 
     def describe_missing(self) -> str:
-        """Returns the missing messages as a text. Empty if no message is missing."""
+        """Describes for the user which messages of the site are missing.
+
+        Returns:
+            The number of missing messages and their first ranges, for each channel. Empty if no
+            message is missing.
+        """
         texts = []
         for channel, account in self.accounts.items():
             if account.missing:

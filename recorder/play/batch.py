@@ -46,12 +46,15 @@ _COLUMNS = 5
 
 
 def order_for_play(times_ns: Ints, channels: Ints, numbers: Ints) -> tuple[Ints, Ints]:
-    """Computes the order in which messages are played, and their deadlines.
+    """Computes the order in which recorded messages are played, and the deadline of each.
+
+    Messages are played in the order of their times. Within a channel they are also played in
+    the order of their numbers, even if a message was recorded late.
 
     Args:
-        times_ns: Sending or arrival time of each message in the order of the file, shape (K,),
-            in ns.
-        channels: Channel of each message, shape (K,).
+        times_ns: Sending or arrival time of each of K messages in the order of the file, shape
+            (K,), in ns.
+        channels: Number of the channel of each message, shape (K,).
         numbers: Number of each message in its channel, shape (K,). Messages with equal numbers
             stay in the order of the file.
 
@@ -83,13 +86,14 @@ def _limit_by_later(values: Ints) -> Ints:
 
 @dataclass(frozen=True, slots=True)
 class MessageBatch:
-    """K messages: a table of numbers, and the bytes of the payloads.
+    """Stores K messages compactly, as a table of numbers and one buffer with all payloads.
 
-    Several batches may share the same bytes.
+    Several batches may share the same buffer.
 
     Attributes:
-        rows: For each message the time after the start of the session in ns, the channel, the
-            number in the channel, and the start and end of the payload in `data`, shape (K, 5).
+        rows: Table with a row per message, shape (K, 5). The columns are the deadline after the
+            start of the session in ns, the number of the channel, the number in the channel,
+            and the first and the end index of the payload in `data`.
         data: The payloads, possibly with other bytes between them.
     """
 
@@ -125,24 +129,39 @@ class MessageBatch:
         return self.rows[:, _END] - self.rows[:, _START]
 
     def payload(self, index: int) -> bytes:
-        """Returns the payload of the message at an index."""
+        """Returns the bytes of one message, as the site published them.
+
+        Args:
+            index: Index of the message in this batch.
+        """
         start, end = self.rows[index, _START:].tolist()
         return bytes(self.data[start:end])
 
     def messages(self) -> Iterator[PlayedMessage]:
-        """Yields the messages in order."""
+        """Yields the messages in the order of this batch, as objects."""
         view = memoryview(self.data)
         for t_ns, channel, number, start, end in self.rows.tolist():
             yield t_ns, channel, number, bytes(view[start:end])
 
     def part(self, indices: slice | Ints) -> "MessageBatch":
-        """Returns some of the messages, which share the bytes of this batch."""
+        """Selects some of the messages, without copying their payloads.
+
+        Args:
+            indices: Which messages are selected, and in which order.
+
+        Returns:
+            The messages, which share the buffer of this batch.
+        """
         return MessageBatch(self.rows[indices], self.data)
 
     def pieces(self, size: int = PIECE_BYTES) -> Iterator["MessageBatch"]:
-        """Yields the messages in pieces of about `size` bytes, without copying the payloads.
+        """Divides the messages into pieces of limited size, without copying their payloads.
 
-        A piece contains at least one message.
+        Args:
+            size: Approximate size of a piece, in bytes. A piece with one message may be larger.
+
+        Yields:
+            The pieces, in order.
         """
         payload_ends = np.cumsum(self._sizes)
         piece_numbers = payload_ends // size
@@ -153,7 +172,10 @@ class MessageBatch:
                 yield self.part(slice(start, end))
 
     def compact(self) -> "MessageBatch":
-        """Returns the messages with a copy of their payloads, without other bytes."""
+        """Copies the messages into a batch whose buffer contains only their payloads.
+
+        This frees memory if the batch is a small part of a large buffer.
+        """
         view = memoryview(self.data)
         spans = self.rows[:, _START:].tolist()
         payloads = [view[start:end] for start, end in spans]
@@ -189,14 +211,27 @@ class BatchBuilder:
         return len(self._payloads) + 8 * len(self._rows)
 
     def add(self, t_ns: int, channel: int, number: int, payload: bytes) -> None:
-        """Adds a message, see `PlayedMessage`."""
+        """Adds a message to those that will be sorted.
+
+        Args:
+            t_ns: Time of the message after the start of the session, in ns.
+            channel: Number of the channel.
+            number: Number of the message in its channel.
+            payload: Bytes of the message.
+        """
         start = len(self._payloads)
         self._payloads += payload
         end = len(self._payloads)
         self._rows.extend((t_ns, channel, number, start, end))
 
     def ordered(self) -> MessageBatch:
-        """Returns the messages in play order, without repetitions."""
+        """Sorts the messages into the order in which they are played.
+
+        A message that was added repeatedly, because two files contain it, is kept once.
+
+        Returns:
+            The messages, with their deadlines as times.
+        """
         rows = np.array(self._rows, dtype=np.int64).reshape(-1, _COLUMNS)
         repeats = self._find_repeats(rows)
         if repeats:

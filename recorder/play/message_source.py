@@ -47,11 +47,14 @@ and above other processes.
 
 
 class RoundEnd(NamedTuple):
-    """End of a round. A log that is played in a loop has several rounds.
+    """States that the messages of a round have ended, in the stream from the reader process.
+
+    A round is one pass through the log. A log that is played in a loop has several rounds.
 
     Attributes:
-        strays: Number of messages that were too far from their turn to be played in order.
-        torn: Damaged files, with the reason.
+        strays: Number of messages that could not be played in order, because their place in the
+            file was too far from their turn.
+        torn: The damaged files, with the reason.
     """
 
     strays: int
@@ -59,12 +62,12 @@ class RoundEnd(NamedTuple):
 
 
 class ReadPiece(NamedTuple):
-    """Messages that the reader process sends.
+    """Piece of a log that the reader process sends to the player.
 
     Attributes:
-        topics: Topics of all channels that were found so far. The number of a channel is its
-            index.
-        batch: The messages.
+        topics: Topics of all channels that were found so far. The index of a topic is the
+            number of its channel.
+        batch: The messages of the piece, in the order in which they are played.
     """
 
     topics: list[str]
@@ -121,9 +124,10 @@ class MessageSource:
         reader_pipe.close()
 
     def poll(self) -> MessageBatch | None:
-        """Returns the next messages.
+        """Returns the next messages to play, if any are available. It never waits.
 
-        None if no messages are available now, or the round has ended.
+        Returns:
+            The messages. None if none are available now, or if the round has ended (`ended`).
 
         Raises:
             LogError: A file can no longer be read.
@@ -253,13 +257,26 @@ class _MessageSorter:
         self._waiting.add(t_ns, channel, number, payload)
 
     def release_until(self, until_ns: int) -> tuple[MessageBatch, int]:
-        """Removes the messages up to a time, and returns them with the number of strays."""
+        """Removes the messages that are due up to a time, so that they can be played.
+
+        Args:
+            until_ns: The time, in ns after the start of the session.
+
+        Returns:
+            The messages in play order, and the number of strays: messages that came too late,
+            after one with a higher number in the same channel had been released.
+        """
         ordered = self._waiting.ordered()
         count = int(np.searchsorted(ordered.times_ns, until_ns, side="right"))
         return self._release(ordered, count)
 
     def release_half(self) -> tuple[MessageBatch, int]:
-        """Removes the first half, and returns it with the number of strays."""
+        """Removes the earlier half of the messages, because they need too much memory.
+
+        Returns:
+            The messages in play order, and the number of strays: messages that came too late,
+            after one with a higher number in the same channel had been released.
+        """
         ordered = self._waiting.ordered()
         return self._release(ordered, (len(ordered) + 1) // 2)
 

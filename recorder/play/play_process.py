@@ -62,21 +62,22 @@ class PlayOptions:
 
 
 class PlaybackSummary(NamedTuple):
-    """Result of a playback.
+    """Result of playing a log, from which the summary for the user is composed.
 
     Attributes:
         counts: Number of published messages, by the topic in the file.
-        rounds: Number of rounds that were started.
-        lateness: Lateness of the messages. None if they had no deadlines.
+        rounds: Number of passes through the log that were started.
+        lateness: How late the messages were published after their deadlines. None if they had
+            no deadlines.
         took_s: Duration of the playback, in s.
         held_s: Time for which the player waited for slow receivers, in s.
-        cut: How often a receiver accepted no message for 5 s and was disconnected.
-        strays: Number of messages that were too far from their turn in the file to be played in
-            order.
+        cut: How often a receiver was disconnected because it accepted no message for 5 s.
+        strays: Number of messages that could not be played in order, because their place in the
+            file was too far from their turn.
         recorders: Number of recorders that were present after the last message.
         stored: True if all these recorders reported that they stored everything.
-        refilled: Number of messages that were sent again to recorders.
-        torn: Damaged files, with the reason.
+        refilled: Number of messages that were sent again to recorders that missed them.
+        torn: The damaged files, with the reason.
     """
 
     counts: dict[str, int]

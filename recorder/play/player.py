@@ -37,14 +37,14 @@ FASTEST = 1e3
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """Linear function from times in the log to times on the clock.
+    """Converts times in the log to deadlines on the clock, by a linear function.
 
     Attributes:
-        origin_ns: Time on the clock at which `start_ns` of the log is due, in ns.
-        start_ns: Time at which the playback begins, in ns after the start of the recorded
-            session.
-        rate: Seconds of the log per second. With `math.inf`, all messages are due at the
-            origin.
+        origin_ns: Deadline of the time `start_ns` on the clock, in ns.
+        start_ns: Time in the log at which the playback begins, in ns after the start of the
+            recorded session.
+        rate: Speed of the playback, in seconds of the log per second. With `math.inf`, all
+            messages are due at the origin.
     """
 
     origin_ns: int
@@ -52,11 +52,25 @@ class Pace:
     rate: float = 1.0
 
     def due_ns(self, t_ns: int) -> int:
-        """Returns the deadline of a time of the log, in ns on the clock."""
+        """Computes the deadline of a message.
+
+        Args:
+            t_ns: Time of the message in the log, in ns after the start of the recorded session.
+
+        Returns:
+            The deadline on the clock, in ns.
+        """
         return self.origin_ns + round((t_ns - self.start_ns) / self.rate)
 
     def later(self, length_ns: int) -> "Pace":
-        """Returns the pace of the next round, which starts after `length_ns` of the log."""
+        """Computes the deadlines of the next round, when a log is played in a loop.
+
+        Args:
+            length_ns: Duration of the log from one round to the next, in ns.
+
+        Returns:
+            The pace of a round that begins `length_ns` of the log after this one.
+        """
         return Pace(self.due_ns(self.start_ns + length_ns), self.start_ns, self.rate)
 
 
@@ -109,9 +123,10 @@ LATENESS_LIMIT_US = 100_000
 
 
 class LatenessSummary(NamedTuple):
-    """Median, 99th percentile and maximum of the lateness, in us.
+    """States how late messages were published: median, 99th percentile and maximum, in us.
 
-    A percentile above `LATENESS_LIMIT_US` is replaced by the maximum.
+    If a percentile is above `LATENESS_LIMIT_US`, the histogram does not resolve it. Then it is
+    replaced by the maximum.
     """
 
     p50_us: int
@@ -139,7 +154,11 @@ class LatenessHistogram:
             self.max_us = late_us
 
     def summary(self) -> LatenessSummary | None:
-        """Returns median, 99th percentile and maximum. None if there is no message."""
+        """Computes the statistics of all messages that were counted.
+
+        Returns:
+            Median, 99th percentile and maximum of the lateness. None if no message was counted.
+        """
         sums = np.cumsum(self._counts)
         if not sums[-1]:
             return None
@@ -183,21 +202,23 @@ class PlayProgress(NamedTuple):
 
 
 class Player:
-    """Plays a log once, or in a loop.
+    """Publishes the messages of a log, each at its deadline, once or in a loop.
 
     Args:
-        source: Supplies the messages.
-        history: Receives the messages that will be played next.
+        source: Supplies the messages in the order in which they are played.
+        history: Stores the messages, so that recorders can request them again.
         clock: The clock.
-        publisher: Function that returns the publishing function of a channel, by its number.
-        serve: Function that does some other work.
+        publisher: Function that returns, for the number of a channel, the function that
+            publishes a message on this channel.
+        serve: Function that does some other work, such as replies. It is called between
+            messages.
         stopped: Function that returns True if the playback must end.
         low_cpu: True if the player sleeps until a deadline, instead of polling the clock.
 
     Attributes:
         counts: Number of published messages, by the number of the channel.
-        rounds: Number of rounds that were started.
-        lateness: Histogram of the lateness of the messages.
+        rounds: Number of passes through the log that were started.
+        lateness: Histogram of the time from deadline to publication of the messages.
         stalls: Number of publications that took so long that a receiver lost its connection.
         held_ns: Time that publications waited for receivers, in ns.
     """

@@ -43,15 +43,16 @@ PlayTime = Literal["publish", "log"]
 
 @dataclass(frozen=True, slots=True)
 class PlaySelection:
-    """Selection of the messages of a log that are played.
+    """States which messages of a log are played, by channel and by time.
 
     Attributes:
         channels: Filter of the channels. If it includes no channel explicitly, the channels of
             the sites are played.
-        start_ns: Time of the earliest message after the start of the session, in ns. None does
-            not limit it.
-        stop_ns: Time of the latest message, likewise.
-        time: The time at which messages are played.
+        start_ns: Earliest time of a message, in ns after the start of the session. None if
+            there is no limit.
+        stop_ns: Latest time of a message, in ns after the start of the session. None if there
+            is no limit.
+        time: Which time of a message counts, that of sending or that of arrival.
     """
 
     channels: ChannelFilter = ALL_CHANNELS
@@ -75,7 +76,11 @@ class PlaySelection:
         return is_candidate and self.channels.accepts(key)
 
     def contains(self, t_ns: int) -> bool:
-        """Returns True if messages of a time (ns after the session's start) are played."""
+        """Finds out whether messages of a time are played.
+
+        Args:
+            t_ns: Time of the messages, in ns after the start of the session.
+        """
         is_before = self.start_ns is not None and t_ns < self.start_ns
         is_after = self.stop_ns is not None and t_ns > self.stop_ns
         return not (is_before or is_after)
@@ -162,19 +167,20 @@ def _decode_header(payload: bytes) -> _PayloadHeader:
 
 @dataclass(slots=True)
 class SessionHeader:
-    """Description of the session in the files, which grows while they are read.
+    """Describes the recorded session that is played. It grows while the files are read.
 
     Attributes:
-        session: Name of the session.
-        scenario: Scenario of the session.
-        scenario_text: Text of the scenario, as stored in the file.
-        fingerprint: Fingerprint of the platform that recorded the session.
-        version: Schema version of the messages. It is 0 if it is unknown.
-        boots: Number that identifies the first start of each site, by site.
-        topics: Topics of the channels that are played. The number of a channel is its index.
-        torn: Damaged files, with the reason.
+        session: Name of the recorded session.
+        scenario: Scenario of the session, its description in a TOML file.
+        scenario_text: Text of the scenario, as stored in the log.
+        fingerprint: Text that identifies the platform on which the session was recorded.
+        version: Version of the messages' format. It is 0 if it is unknown.
+        boots: For each site, the random number that identifies its first start.
+        topics: Topics of the channels that are played. The index of a topic is the number of
+            its channel.
+        torn: The damaged files, with the reason.
         first_ns: Time of the earliest message so far, in ns after the start of the session.
-        last_ns: Time of the latest message so far, likewise.
+        last_ns: Time of the latest message so far, in ns after the start of the session.
     """
 
     session: str
@@ -225,11 +231,14 @@ class _PlayedChannel:
         self._starts: dict[int, int] = {}
 
     def find_number(self, item: McapMessage, t_ns: int) -> int:
-        """Returns the number of a message in its channel, see `PlayedMessage`.
+        """Finds the number of a message in its channel, see `PlayedMessage`.
 
         Args:
-            item: The message.
+            item: The message, as the file contains it.
             t_ns: Time of the message after the start of the session, in ns.
+
+        Returns:
+            The number. The messages of a channel are played in the order of their numbers.
         """
         if self.kind in (topics.STATE, topics.LINK):
             return number_message(self.kind, item.sequence, self.rate_hz)

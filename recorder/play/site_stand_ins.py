@@ -56,9 +56,14 @@ class _ChannelMessages(NamedTuple):
     batch: MessageBatch
 
     def list_from(self, number: int) -> list[tuple[int, int]]:
-        """Returns the numbers and indices of the messages from a number on.
+        """Lists the messages of a channel that are kept, beginning with a number.
 
-        There are at most as many messages as one reply contains, and one more.
+        Args:
+            number: Smallest number of a message in the list.
+
+        Returns:
+            The number and the index of each message, in ascending order. There are at most as
+            many as one reply contains, and one more.
         """
         start = int(np.searchsorted(self.numbers, number))
         selected = slice(start, start + BACKFILL_MESSAGES + 1)
@@ -83,7 +88,11 @@ class PlayedHistory:
         self._messages: dict[int, deque[_ChannelMessages]] = {}
 
     def add(self, batch: MessageBatch) -> None:
-        """Adds messages that will be played next, and removes the oldest messages."""
+        """Stores messages that will be played next, and removes those that are no longer kept.
+
+        Args:
+            batch: The messages, in the order in which they are played.
+        """
         for channel in np.unique(batch.channels).tolist():
             indices = np.flatnonzero(batch.channels == channel)
             numbers = batch.numbers[indices]
@@ -162,7 +171,10 @@ so that its encoding takes long.
 
 
 class SiteStandIns:
-    """The stand-ins for all sites of a session.
+    """Acts for all sites of a recorded session while its log is played.
+
+    To other programs, a log that is played thus looks like a running session: its sites
+    announce themselves, reply to queries, and send messages again that a recorder missed.
 
     Args:
         bus: Network connection of the player.
@@ -172,8 +184,8 @@ class SiteStandIns:
         history: The messages that were played.
 
     Attributes:
-        recorders: Boots of the recorders that are present, as text. A boot is a random number
-            that identifies one start of a process.
+        recorders: Identifiers of the starts of the recorders that are present, as text. Each
+            start of a process has its own random number.
         refilled: Number of messages that were sent again to recorders.
     """
 
@@ -279,7 +291,11 @@ class SiteStandIns:
         return identity
 
     def are_recorders_listening(self) -> bool:
-        """Queries the identities of recorders. Returns True if all of them have replied."""
+        """Queries the identities of all recorders that are present on the network.
+
+        Returns:
+            True if all of them have replied, so that they will receive the messages.
+        """
         self._listening |= {str(info.boot) for info in self._recorder_query.poll()}
         return not self.recorders - self._listening
 
