@@ -66,13 +66,17 @@ class MessageOrigins(NamedTuple):
 def find_origins(data: bytes, most: int = _SAMPLED_MESSAGES) -> MessageOrigins:
     """Finds out from which sessions and senders the first messages of a chunk come.
 
-    An event that announces the start of a session contains the start time. Records and
+    A damaged file may contain a chunk of another file. The start time of its session reveals
+    that. An event that announces the start of a session contains the start time. Records and
     statistics contain their sending time after the start, and are stored with the Unix time of
     sending. The difference is the start time. Sessions in virtual time start at 0.
 
     Args:
-        data: The unpacked chunk.
+        data: The unpacked chunk, a block of messages.
         most: Largest number of messages to decode.
+
+    Returns:
+        The start times and the senders. Empty if no message can be decoded.
     """
     epochs_ns: set[int] = set()
     boots: set[tuple[str, int]] = set()
@@ -102,14 +106,19 @@ def find_origins(data: bytes, most: int = _SAMPLED_MESSAGES) -> MessageOrigins:
 
 
 def has_foreign_boots(about: Mapping[str, str], boots: set[tuple[str, int]]) -> bool:
-    """Returns True if all messages come from another run than the session.
+    """Finds out whether all messages come from another run in virtual time than the session.
 
-    The scenario determines the boots in virtual time only. Otherwise, and if there are no
-    messages, the result is False.
+    A boot is a number that identifies one start of a process. In virtual time it is computed
+    from the scenario, so that it shows to which run a message belongs. In a live session it is
+    random and shows nothing.
 
     Args:
         about: Metadata of the session.
-        boots: Pairs of a sender and the number that identifies its start, from the messages.
+        boots: Pairs of a sender and its boot, from the messages.
+
+    Returns:
+        True if all messages come from another run. False in a live session, and if there are no
+        messages.
     """
     if about.get("driver") != VIRTUAL_DRIVER:
         return False
@@ -146,7 +155,7 @@ class ContentCheck:
         self._log_ns = 0
 
     def accept(self, topic: str, sequence: int, log_ns: int, payload: bytes) -> None:
-        """Accepts a message that a checksum covers. The next message must continue from there.
+        """Notes a message that a checksum covers, so that the next one can be compared with it.
 
         Args:
             topic: Topic of the channel.
@@ -158,7 +167,11 @@ class ContentCheck:
         self._log_ns = max(self._log_ns, log_ns)
 
     def owns_channel(self, topic: str) -> bool:
-        """Returns True if the topic is that of a member of the session."""
+        """Finds out whether a topic is one of a member of this session.
+
+        Args:
+            topic: Topic of a channel, such as "/trilat/paper/m1/state".
+        """
         key = topics.parse_key(topic.removeprefix("/"))
         if key is None or key.session != self._session or key.boot:
             return False
@@ -167,10 +180,14 @@ class ContentCheck:
         return key.member in self._scenario.sites and key.channel in SITE_CHANNELS
 
     def identify(self, payload: bytes) -> str:
-        """Returns the topic of a message, as its content states it.
+        """Finds out from the content of a message to which topic it belongs.
 
-        The topic is empty if the message is not from a member of the session, or cannot be
-        decoded.
+        Args:
+            payload: Bytes of the message.
+
+        Returns:
+            The topic. Empty if the message cannot be decoded, or is not from a member of the
+            session.
         """
         kinds: tuple[Any, ...] = tuple(CHANNEL_TYPES.values())
         for kind in kinds:
@@ -184,7 +201,14 @@ class ContentCheck:
         return ""
 
     def describe_channel(self, topic: str) -> dict[str, str]:
-        """Returns the metadata that `LogWriter` writes for a channel of the session."""
+        """Composes the metadata that a channel of the session has in a log.
+
+        They are the same that `LogWriter` writes, so that a lost definition of a channel can be
+        restored.
+
+        Args:
+            topic: Topic of the channel.
+        """
         member, channel = topic.split("/")[-2:]
         about = {"member": member}
         if channel == topics.STATE:
@@ -200,7 +224,10 @@ class ContentCheck:
         payload: bytes,
         span_ns: tuple[int, int],
     ) -> None:
-        """Accepts a message without a checksum, if it continues its channel.
+        """Checks by its content that a message is the next one of its channel.
+
+        This is needed for messages that no checksum covers. If the message is the next one, it
+        is noted like a message that `accept` receives.
 
         Args:
             topic: Topic of the channel.
@@ -208,7 +235,8 @@ class ContentCheck:
             log_ns: Arrival time, in Unix time, in ns.
             publish_ns: Sending time, in Unix time, in ns.
             payload: Bytes of the message.
-            span_ns: First and last arrival time of the chunk, in Unix time, in ns.
+            span_ns: First and last arrival time of the chunk that contains the message, in Unix
+                time, in ns.
 
         Raises:
             UnreadableRecord: The content does not prove that this is the channel's next

@@ -110,17 +110,23 @@ class Column(NamedTuple):
         return self.values.dtype == np.object_
 
     def numbers(self) -> NDArray[Any]:
-        """Returns the values of a column of numbers, with NaN for missing values."""
+        """Returns the values of a column of numbers as an array, shape (K,).
+
+        A row without a value contains NaN.
+        """
         if self.known is None or self.known.all():
             return self.values
         return np.where(self.known, self.values, np.nan)
 
     def rows(self, first: int, last: int) -> list[Any]:
-        """Returns the values of some rows as plain Python values, with None for missing values.
+        """Returns the values of consecutive rows as plain Python values.
 
         Args:
             first: Index of the first row.
             last: Index after the last row.
+
+        Returns:
+            The values. None for a row without a value.
         """
         values: list[Any] = self.values[first:last].tolist()
         if self.known is None:
@@ -186,12 +192,12 @@ _COMPLETE_TEXTS = {
 
 
 class FieldDoc(NamedTuple):
-    """Documentation of a field of a message.
+    """Documents one field of a message, for the head of an exported table.
 
     Attributes:
         unit: Unit of the field. Empty if it has no unit.
         text: Meaning of the field.
-        kind: Type of the field in JSON Schema.
+        kind: Type of the field in JSON Schema, such as "number".
     """
 
     unit: str
@@ -201,12 +207,15 @@ class FieldDoc(NamedTuple):
 
 @cache
 def read_field_docs(kind: type[msgspec.Struct]) -> dict[str, FieldDoc]:
-    """Returns the documentation of a message type's fields, in the order of definition.
+    """Collects the documentation of the fields of a message type.
 
     The meanings are taken from the docstring of the type, and the units from its JSON Schema.
 
     Args:
-        kind: Type of the messages.
+        kind: Type of the messages, such as `State`.
+
+    Returns:
+        The documentation by name of the field, in the order of definition.
     """
     texts = dict(_FIELD.findall(inspect.getdoc(kind) or ""))
     texts |= {name: _COMPLETE_TEXTS[name] for name in texts.keys() & _COMPLETE_TEXTS.keys()}
@@ -224,13 +233,16 @@ def read_field_docs(kind: type[msgspec.Struct]) -> dict[str, FieldDoc]:
 def to_int_array(
     values: Iterable[int], source: str, field: str, kind: Any = np.int64
 ) -> NDArray[Any]:
-    """Converts integers to an array.
+    """Converts integers of a log to an array, and refuses those that are too large for it.
 
     Args:
         values: The integers.
-        source: Name of the file for the error message.
-        field: Name of the field for the error message.
+        source: Name of the log for the error message.
+        field: Name of the field that contains the integers, for the error message.
         kind: Data type of the array.
+
+    Returns:
+        The array, shape (K,) for K integers.
 
     Raises:
         LogError: A number does not fit into the data type.

@@ -58,11 +58,12 @@ class Finding:
     wrong: int = 0
 
     def add(self, file: str, offset: int | None, text: str) -> None:
-        """Adds a problem, so that the check has not passed.
+        """Adds a problem to the check, which has therefore not passed.
 
         Args:
-            file: Name of the file.
-            offset: Offset of the problem in the file. None if it concerns the whole file.
+            file: Name of the file in which the problem was found.
+            offset: Place of the problem in the file, in bytes. None if it concerns the whole
+                file.
             text: Description of the problem.
         """
         self.passed = False
@@ -71,7 +72,13 @@ class Finding:
             self.places.append(ProblemPlace(file, offset, text))
 
     def summary(self) -> str:
-        """Returns the first problem and the number of further problems, as a text."""
+        """Summarises the problems of the check in one line.
+
+        There must be at least one problem.
+
+        Returns:
+            The first problem and the number of further problems.
+        """
         first = str(self.places[0])
         return f"{first}; and {self.wrong - 1} more" if self.wrong > 1 else first
 
@@ -89,7 +96,10 @@ class Finding:
         return self
 
     def to_row(self) -> dict[str, Any]:
-        """Returns the result as plain values for JSON, without the problems."""
+        """Returns the result of the check as plain values for JSON.
+
+        The single problems are left out. Their summary is in the text.
+        """
         return {
             "label": self.check,
             "text": self.text,
@@ -99,7 +109,10 @@ class Finding:
 
 
 class Findings(dict[str, Finding]):
-    """Findings of several checks by name. A finding is created when it is used first."""
+    """The results of several checks, by name of the check.
+
+    A result is created when it is used first.
+    """
 
     def __missing__(self, check: str) -> Finding:
         self[check] = finding = Finding(check)
@@ -132,5 +145,5 @@ class CheckReport(Result):
         return 0 if self.passed else CodeWithheld.exit_code
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a row for each check."""
+        """Returns the results of all checks as plain values for JSON, one row per check."""
         return [finding.to_row() for finding in self.findings]

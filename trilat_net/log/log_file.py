@@ -253,12 +253,26 @@ class LogFile:
         self._published = False
 
     def write(self, data: bytes, /) -> int:
-        """Stores bytes that the next `flush` will write, and returns their number."""
+        """Stores bytes in memory. The next `flush` writes them to the file.
+
+        Args:
+            data: The bytes.
+
+        Returns:
+            Their number.
+        """
         self._pending += data
         return len(data)
 
     def reserve(self, size: int) -> None:
-        """Sets the number of bytes that the end of the file will need."""
+        """Sets the number of bytes that the end of the file will need.
+
+        The next `flush` reserves disk space for them, so that the file can end properly even
+        if the disk becomes full.
+
+        Args:
+            size: The number of bytes.
+        """
         self._end_bytes = size
 
     def flush(self) -> None:
@@ -350,7 +364,7 @@ class LogFile:
         sync_folder(self.path.parent)
 
     def discard(self) -> None:
-        """Closes and removes the file."""
+        """Closes the file and removes it, because the log is not wanted."""
         with suppress(OSError):
             self.close()
         self.working.unlink(missing_ok=True)
@@ -382,10 +396,14 @@ class LogFile:
         self.end(error)
 
     def refused(self, error: OSError) -> LogRefused:
-        """Returns the error for the user after the disk refused data.
+        """Composes the error for the user after the disk refused data. The file must be closed.
 
-        The file must be closed. The text states the problem, which data are saved, and what the
-        user can do.
+        Args:
+            error: The error of the operating system.
+
+        Returns:
+            The error, whose text states the problem, which data are saved, and what the user
+            can do.
         """
         problem, advice = _ADVICE.get(
             error.errno or 0, (error.strerror or str(error), _ELSEWHERE)

@@ -114,7 +114,11 @@ class ChannelFilter:
     exclude: tuple[str, ...] = ()
 
     def accepts(self, key: str) -> bool:
-        """Returns True if the channel with a key is recorded."""
+        """Finds out whether a channel is recorded.
+
+        Args:
+            key: Key of the channel in the network, such as "trilat/paper/m1/state".
+        """
         if any(matches_key(expression, key) for expression in self.exclude):
             return False
         if not self.include:
@@ -122,7 +126,14 @@ class ChannelFilter:
         return any(matches_key(expression, key) for expression in self.include)
 
     def facts(self) -> Mapping[str, str]:
-        """Returns the filter as metadata of the session. Empty if all channels are recorded."""
+        """Returns the filter in the form that the metadata of a log contain.
+
+        `parse_filter_facts` reads it again.
+
+        Returns:
+            The key expressions, separated by spaces, under "include" and "exclude". Empty if
+            all channels are recorded.
+        """
         texts = {"include": " ".join(self.include), "exclude": " ".join(self.exclude)}
         return {name: text for name, text in texts.items() if text}
 
@@ -157,7 +168,14 @@ def parse_channel_filter(include: Collection[str], exclude: Collection[str]) -> 
 
 
 def parse_filter_facts(about: Mapping[str, str]) -> ChannelFilter:
-    """Returns the filter that the metadata of a session state, see `ChannelFilter.facts`."""
+    """Reads from the metadata of a log which channels were recorded.
+
+    Args:
+        about: Metadata of the session.
+
+    Returns:
+        The filter. It accepts all channels if the metadata state none.
+    """
     return ChannelFilter(
         include=tuple(about.get("include", "").split()),
         exclude=tuple(about.get("exclude", "").split()),
@@ -192,7 +210,12 @@ def _run_git(*arguments: str) -> str | None:
 
 @cache
 def collect_provenance() -> dict[str, str]:
-    """Returns versions, commit and platform of this program, as metadata of a log."""
+    """Collects the facts about this program that explain how a log was produced.
+
+    Returns:
+        Versions of the program and its packages, commit and platform, as metadata of a log.
+        There are no paths, times or host names, so that equal runs have equal logs.
+    """
     commit = _run_git("rev-parse", "HEAD")
     changed = _run_git("status", "--porcelain", "--untracked-files=no")
     facts = {

@@ -503,7 +503,22 @@ class LogParts:
         number: int,
         message: Decoded = None,
     ) -> None:
-        """Adds one message, in a new part if necessary, see `LogWriter.add`."""
+        """Adds one message to the log.
+
+        If the current part has reached its largest size or duration, a new part is begun
+        before.
+
+        Args:
+            key: Key of the channel.
+            payload: Bytes of the message.
+            t_ns: Sending time after the start of the session, in ns.
+            log_time_ns: Arrival time, in Unix time, in ns.
+            number: Sequence number of the message.
+            message: The decoded message, if the log contains messages for viewers.
+
+        Raises:
+            LogRefused: The disk refused these or earlier data.
+        """
         if self._storage.splits and not self._writer.ended:
             if self._part_start_ns is None:
                 self._part_start_ns = log_time_ns
@@ -514,11 +529,23 @@ class LogParts:
         self._writer.add(key, payload, t_ns, log_time_ns, number, message)
 
     def flush(self) -> None:
-        """Passes all messages so far to the operating system, see `LogWriter.flush`."""
+        """Passes all messages so far to the operating system, so that a crash cannot lose them.
+
+        Raises:
+            LogRefused: The disk refused the data.
+        """
         self._writer.flush()
 
     def finish(self, accounts: Mapping[str, str]) -> None:
-        """Completes the last part, see `LogWriter.finish`."""
+        """Completes the last part, so that the log is finished.
+
+        Args:
+            accounts: Numbers of received and missing messages as a text, by topic, and other
+                counts by name.
+
+        Raises:
+            LogRefused: The disk refused the data.
+        """
         self._writer.finish(accounts)
 
     def __enter__(self) -> "LogParts":

@@ -72,12 +72,16 @@ Only a chunk has unpacked records. They are empty if the chunk cannot be unpacke
 
 
 def shift_progress(progress: Progress | None, before: int, total: int) -> Progress | None:
-    """Returns a function that reports the progress of one file as that of several files.
+    """Makes a function that reports the progress in one file as that in several files.
 
     Args:
-        progress: Function that receives the progress of all files. None if nobody needs it.
+        progress: Function that receives the progress in all files, in bytes. None if nobody
+            needs it.
         before: Size of the files that were read before, in bytes.
         total: Size of all files, in bytes.
+
+    Returns:
+        A function that receives the progress in the present file. None if `progress` is None.
     """
     if progress is None:
         return None
@@ -85,15 +89,16 @@ def shift_progress(progress: Progress | None, before: int, total: int) -> Progre
 
 
 class ChannelInfo(NamedTuple):
-    """Description of a channel in a file.
+    """Describes a channel, a sequence of messages of one kind, as an MCAP file defines it.
 
     Attributes:
-        topic: Topic of the channel.
+        topic: Topic of the channel, such as "/trilat/paper/m1/state".
         encoding: Encoding of the messages.
-        schema: Name of the schema of the messages. Empty if the channel has no schema.
-        schema_encoding: Encoding of the schema.
-        metadata: Metadata of the channel.
-        schema_data: Content of the schema.
+        schema: Name of the schema, which describes the fields of the messages. Empty if the
+            channel has no schema.
+        schema_encoding: Language in which the schema is written.
+        metadata: Further facts about the channel, by name.
+        schema_data: Text of the schema, encoded.
     """
 
     topic: str
@@ -338,7 +343,13 @@ class McapReader:
         self._take_memory(memory, frame)
 
     def judge_digest(self) -> Integrity:
-        """Compares the file with the digests that it states, after it has been read."""
+        """Compares the file with its digests, to find out whether it was changed.
+
+        The file must have been read to its end.
+
+        Returns:
+            The result, with an explanation.
+        """
         return self._chain.judge(
             self.metadata, finished=self.complete, damaged=bool(self.damaged)
         )
@@ -437,15 +448,23 @@ class ChannelMessages:
     publish_ns: "array[int]" = field(default_factory=partial(array, "Q"))
 
     def add(self, payload: bytes, log_ns: int, publish_ns: int) -> None:
-        """Adds one message."""
+        """Adds the next message of the topic.
+
+        Args:
+            payload: The message, encoded as published.
+            log_ns: Time of arrival at the recorder, in Unix time, in ns.
+            publish_ns: Time of sending, in Unix time, in ns.
+        """
         self.payloads.append(payload)
         self.log_ns.append(log_ns)
         self.publish_ns.append(publish_ns)
 
     def times(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Returns the arrival and sending times as arrays, shape (K,) each, in Unix ns.
+        """Returns the times of all K messages as arrays.
 
-        Times of 2^63 ns and later are replaced by the latest time that the arrays can contain.
+        Returns:
+            The times of arrival and of sending, shape (K,) each, in Unix time, in ns. A time of
+            2^63 ns or later is replaced by the latest time that the arrays can contain.
         """
         return _clip_times(self.log_ns), _clip_times(self.publish_ns)
 
@@ -541,6 +560,10 @@ def read_contents(
 
 def check_log(stream: BinaryIO, name: str) -> None:
     """Reads a log once without storing its messages, to find out whether it can be opened.
+
+    Args:
+        stream: The file, opened for reading.
+        name: Name of the file for error messages.
 
     Raises:
         LogError: The file cannot be opened as a log. The text states the reason.

@@ -130,7 +130,13 @@ def parse_chunk_head(content: bytes, length: int) -> ChunkHead:
 
 
 def unpack_chunk(content: bytes) -> bytes:
-    """Unpacks the records of a chunk, and checks them against the chunk's head.
+    """Unpacks the compressed records of a chunk, and checks them against its head.
+
+    Args:
+        content: Content of the chunk: its head and the compressed records.
+
+    Returns:
+        The unpacked records.
 
     Raises:
         UnreadableRecord: The chunk cannot be unpacked, or its size or its checksum is wrong.
@@ -284,7 +290,15 @@ class RecordScanner:
         self.torn: Damage | None = None
 
     def read(self, offset: int, length: int) -> bytes:
-        """Returns bytes of the file. At the end of the file, there are fewer than `length`."""
+        """Reads bytes of the file.
+
+        Args:
+            offset: Offset of the first byte in the file.
+            length: Number of bytes to read.
+
+        Returns:
+            The bytes. They are fewer than `length` if the file ends before.
+        """
         self._stream.seek(self._base + offset)
         return self._stream.read(max(0, min(length, self.size - offset)))
 
@@ -389,11 +403,18 @@ class RecordScanner:
         return RecordFrame(offset, opcode, length)
 
     def content(self, frame: RecordFrame) -> bytes:
-        """Returns the content of a record."""
+        """Reads the content of a record, which follows its kind and its length.
+
+        Args:
+            frame: Place of the record in the file.
+        """
         return self.read(frame.offset + RECORD_HEAD_BYTES, frame.length)
 
     def head(self, frame: RecordFrame) -> ChunkHead:
-        """Returns the head of a chunk, without reading the whole chunk.
+        """Reads the head of a chunk, without reading its compressed records.
+
+        Args:
+            frame: Place of the chunk in the file.
 
         Raises:
             UnreadableRecord: The head makes no sense.
@@ -426,7 +447,12 @@ class RecordScanner:
         return None
 
     def crc(self, begin: int, end: int) -> int:
-        """Computes the CRC-32 of the file from offset `begin` to before offset `end`."""
+        """Computes the CRC-32 checksum of a part of the file.
+
+        Args:
+            begin: Offset of the first byte of the part.
+            end: Offset of the first byte after the part.
+        """
         crc = 0
         for offset in range(begin, end, _SCAN_BYTES):
             crc = zlib.crc32(self.read(offset, min(_SCAN_BYTES, end - offset)), crc)
@@ -438,7 +464,14 @@ class RecordScanner:
         return parse_record(Opcode.FOOTER, content) if self.ends else None
 
     def is_summary_intact(self, footer: records.Footer) -> bool:
-        """Returns True if the summary has the checksum that the footer states."""
+        """Checks the summary at the end of the file, which contains its index, by its checksum.
+
+        Args:
+            footer: Footer of the file, which states the checksum.
+
+        Returns:
+            True if the summary has this checksum.
+        """
         begin = footer.summary_start
         last = self.size - FOOTER_BYTES
         if not 0 <= begin <= last:
@@ -447,9 +480,13 @@ class RecordScanner:
 
 
 def has_right_crc(attachment: bytes) -> bool:
-    """Returns True if the content of an attachment agrees with the checksum at its end.
+    """Checks the content of an attachment by the checksum at its end.
 
-    A checksum of 0 means that there is no checksum.
+    Args:
+        attachment: Content of the attachment's record.
+
+    Returns:
+        True if the checksum is right, or if it is 0, which means that there is none.
     """
     crc = int.from_bytes(attachment[-4:], "little")
     return not crc or zlib.crc32(memoryview(attachment)[:-4]) == crc

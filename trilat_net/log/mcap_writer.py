@@ -66,14 +66,20 @@ class Sink(Protocol):
 
 
 def pack_text(text: str) -> bytes:
-    """Encodes a text as the format requires: its length in bytes, then its bytes in UTF-8."""
+    """Encodes a text as MCAP files require: its length in bytes, then its bytes in UTF-8."""
     # The name of a file may contain surrogates, which UTF-8 cannot encode.
     data = text.encode(errors="backslashreplace")
     return _pack_bytes(data)
 
 
 def pack_text_map(texts: Mapping[str, str]) -> bytes:
-    """Encodes a map of texts: its length in bytes, then each key and each value."""
+    """Encodes a map of texts as MCAP files require.
+
+    The length of the encoded map in bytes comes first, then each key and each value.
+
+    Args:
+        texts: The map.
+    """
     data = b"".join(pack_text(key) + pack_text(value) for key, value in texts.items())
     return _pack_bytes(data)
 
@@ -89,7 +95,12 @@ def _pack_long_bytes(data: bytes) -> bytes:
 
 
 def pack_record(opcode: int, body: bytes) -> bytes:
-    """Encodes a record: opcode, length of the content, and content."""
+    """Encodes a record of an MCAP file: its kind, the length of its content, and the content.
+
+    Args:
+        opcode: Number of the kind of record.
+        body: Content of the record.
+    """
     return RECORD_HEAD.pack(opcode, len(body)) + body
 
 
@@ -295,7 +306,8 @@ class McapWriter:
     def close_digest(self) -> dict[str, str]:
         """Closes the open chunk, and writes the digests of all contents as metadata.
 
-        Only `finish` may be called afterwards.
+        The digests are checksums that reveal later changes of the file. Only `finish` may be
+        called afterwards.
 
         Returns:
             The metadata with the digests.

@@ -167,7 +167,14 @@ def _recorder_boot(part: LogContents) -> int:
 
 
 def identify_session(part: LogContents) -> dict[str, str]:
-    """Returns the facts that identify a session. All parts of a session agree on them."""
+    """Collects the facts that identify a session, on which all parts of its log agree.
+
+    Args:
+        part: Contents of one part.
+
+    Returns:
+        The metadata of the session, without those that differ between parts.
+    """
     names = ("session", "driver", "epoch_unix_ns")
     facts = {name: part.session.get(name, "unknown") for name in names}
     facts["scenario"] = hashlib.sha256(part.scenario).hexdigest()[:16]

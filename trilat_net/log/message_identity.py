@@ -58,12 +58,15 @@ def compute_virtual_boot(scenario_sha256: str, site: str) -> int:
 
 
 def identify_message(message: AnyMessage, rate_hz: int) -> MessageIdentity:
-    """Returns the identity of a message.
+    """Finds out from a message who sent it, in which channel and with which number.
 
     Args:
-        message: The message.
-        rate_hz: Tick rate of the sender. The numbers of statistics depend on it. For other
-            messages, any number will do.
+        message: The decoded message.
+        rate_hz: Tick rate of the sender, in Hz. It is needed to number statistics, which are
+            not sent in every tick. It has no effect on other messages.
+
+    Returns:
+        The identity of the message.
     """
     match message:
         case messages.State():

@@ -70,12 +70,16 @@ def compute_quaternions(turns: Array) -> Array:
 
 
 def align_signs(quaternions: Array) -> Array:
-    """Chooses the signs of quaternions so that each one is nearest to the previous one.
+    """Chooses the signs of unit quaternions so that a time series of them does not jump.
 
-    The sign of the first quaternion stays.
+    A quaternion and its negative are the same orientation. Each quaternion gets the sign with
+    which it is nearest to the previous one. The sign of the first one stays.
 
     Args:
         quaternions: The quaternions in the order of time, shape (K, 4).
+
+    Returns:
+        The quaternions or their negatives, shape (K, 4).
     """
     dots = np.einsum("ki,ki->k", quaternions[1:], quaternions[:-1])
     changes = np.where(dots < 0.0, -1.0, 1.0)
@@ -145,13 +149,14 @@ def expand_poses(x: Array) -> Array:
 
 
 def choose_nearest_vectors(turns: Array, references: Array) -> Array:
-    """Adds whole turns to rotation vectors so that they are nearest to references.
+    """Adds whole turns to rotation vectors so that each is nearest to its reference.
 
-    The results are the same rotations. They may be longer than half a turn.
+    A rotation vector is the axis of a rotation times its angle. Whole turns do not change the
+    rotation. The results may be longer than half a turn.
 
     Args:
-        turns: Rotation vectors, shape (K, 3), in rad.
-        references: The references, shape (K, 3), in rad.
+        turns: K rotation vectors, shape (K, 3), in rad.
+        references: A reference for each of them, shape (K, 3), in rad.
 
     Returns:
         The rotation vectors, shape (K, 3), in rad.
@@ -189,12 +194,14 @@ def compute_continuous_vectors(turns: Array) -> Array:
 
 
 class QuaternionSigns:
-    """Chooses the signs of quaternions that arrive one after another.
+    """Chooses the signs of unit quaternions that arrive one after another, so that none jumps.
 
-    Each quaternion is nearest to the previous one, and the first has w >= 0.
+    A quaternion and its negative are the same orientation. Each quaternion gets the sign with
+    which it is nearest to the previous one, and the first one gets the sign with w >= 0.
 
     Args:
-        w: Index of w among the four numbers of a quaternion, since ROS 2 has w at the end.
+        w: Index of the scalar part w among the four numbers of a quaternion. It is the last one
+            in ROS 2.
     """
 
     def __init__(self, w: int = 3) -> None:
@@ -202,7 +209,14 @@ class QuaternionSigns:
         self._last: tuple[float, ...] = ()
 
     def align(self, quaternion: Sequence[float]) -> tuple[float, ...]:
-        """Returns the next quaternion, or its negative, which is the same rotation."""
+        """Chooses the sign of the next quaternion.
+
+        Args:
+            quaternion: The four numbers of the unit quaternion.
+
+        Returns:
+            The quaternion or its negative, which is the same orientation.
+        """
         dot = quaternion[self._w]
         if self._last:
             dot = sum(a * b for a, b in zip(quaternion, self._last, strict=True))

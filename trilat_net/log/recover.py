@@ -133,18 +133,21 @@ class Recovery(Result):
         }
 
     def add_loss(self, text: str, size: int = 0) -> None:
-        """Adds a loss.
+        """Notes that a part of the source file was lost.
 
         Args:
-            text: Sentence that describes the loss.
-            size: Size of the part that cannot be read, in bytes. 0 if it is another kind of
-                loss.
+            text: Sentence that describes the loss to the user.
+            size: Size of the part that cannot be read, in bytes. 0 if something else was lost.
         """
         self.lost.append(text)
         self.lost_bytes += size
 
     def facts(self) -> dict[str, str]:
-        """Returns the result as metadata for the new file."""
+        """Returns the result in the form that the metadata of the new file contain.
+
+        They state the source file, the losses and the missing records, so that a recovered log
+        can be recognised as such.
+        """
         losses = self.lost[:MAX_LISTED_LOSSES]
         unlisted = len(self.lost) - len(losses)
         if unlisted:

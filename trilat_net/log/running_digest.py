@@ -36,9 +36,12 @@ PREVIOUS_DIGEST_KEY = "previous_records"
 class DigestState(StrEnum):
     """Result of comparing a file with its digests, in order from the best to the worst.
 
-    INTACT: the file agrees with its digests. ABSENT: an old program wrote the file, without
-    digests. OPEN: the file was not finished or is damaged, so that it cannot be compared.
-    CHANGED: the file differs from its digests, or the digests were removed.
+    A digest is a checksum of the contents, which reveals changes.
+
+    - INTACT: The file agrees with its digests.
+    - ABSENT: The file has no digests, because an old program wrote it.
+    - OPEN: The file was not finished or is damaged, so that it cannot be compared.
+    - CHANGED: The file differs from its digests, or the digests were removed.
     """
 
     INTACT = "intact"
@@ -98,7 +101,12 @@ class RunningDigest:
         self._descriptions.add(hashlib.sha256(bytes([opcode]) + content).digest())
 
     def facts(self) -> dict[str, str]:
-        """Returns the digests in hexadecimal digits, as metadata for the end of the file."""
+        """Returns the digests of everything added so far, as metadata for the end of the file.
+
+        Returns:
+            The method, the number of messages, and the two digests in hexadecimal digits:
+            "records" of the messages, and "about" of what describes them.
+        """
         about = hashlib.sha256(b"".join(sorted(self._descriptions))).hexdigest()
         digests = {"records": self._records.hexdigest(), "about": about}
         return {"algorithm": ALGORITHM, "messages": str(self.messages), **digests}
@@ -106,12 +114,15 @@ class RunningDigest:
     def judge(
         self, metadata: Mapping[str, Mapping[str, str]], *, finished: bool, damaged: bool
     ) -> Integrity:
-        """Compares a file that was read with the digests that it states.
+        """Compares the digests of a file that was read with those that the file contains.
 
         Args:
-            metadata: All metadata of the file, by name.
-            finished: True if the file was finished.
+            metadata: All metadata of the file, by name. They contain its digests.
+            finished: True if the file was finished, so that it must contain digests.
             damaged: True if a part of the file cannot be read.
+
+        Returns:
+            Whether the file agrees with its digests, with an explanation.
         """
         stated = metadata.get(DIGESTS)
         recovered = metadata.get(RECOVERED, {})

@@ -86,7 +86,11 @@ class LogCheckResult(CheckReport):
         }
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a row for each check, with its problems."""
+        """Returns the results of all checks as plain values for JSON, with one row per check.
+
+        A row contains the name of the check, whether it passed, and its problems with their
+        places.
+        """
         return [
             {
                 "check": finding.check,
@@ -563,10 +567,10 @@ class SessionCheck:
             self._findings["schema"].add(self._file, None, text)
 
     def findings(self) -> Iterator[Finding]:
-        """Yields the findings after all files were read.
+        """Completes all checks after the files were read, and yields their results.
 
-        The content of a file without a session is not checked. Only its digests may show that
-        the session was removed from it.
+        If the files contain no session, the messages are not checked. Then only the digests may
+        show that the session was removed from the file.
         """
         counts = self._counts
         findings = self._findings
@@ -701,11 +705,17 @@ class SessionCheck:
 
 
 def judge_integrity(log: Log) -> Integrity:
-    """Judges whether a log was changed after it was recorded.
+    """Finds out whether a log was changed after it was recorded.
 
-    The log agrees with its digests, or not. In addition, its records are compared with the
-    message counts and the statistics of the recorder, which also reveals changes to a log that
-    was written anew with new digests.
+    The contents are compared with the digests, the checksums that the log contains. In
+    addition, the records are compared with the message counts and the statistics of the
+    recorder. This also reveals changes to a log that was written anew with new digests.
+
+    Args:
+        log: The log.
+
+    Returns:
+        The result, with an explanation.
 
     Raises:
         LogError: A message cannot be decoded.

@@ -48,10 +48,13 @@ InnerRecord = tuple[int, bytes]
 
 
 class TornChunk(NamedTuple):
-    """Chunk that reaches beyond the end of its file.
+    """A compressed block of messages (chunk) that reaches beyond the end of its file.
+
+    This happens when a recording is interrupted. The messages in the existing part can still be
+    recovered.
 
     Attributes:
-        head: Head of the chunk.
+        head: Head of the chunk, which describes the compressed records.
         packed: Compressed bytes of the chunk that exist and can be trusted.
         offset: Offset of the first compressed byte in the file.
     """

@@ -291,13 +291,14 @@ def pack_trigger_response(*, success: bool, text: str) -> bytes:
 
 
 class Diagnosis(NamedTuple):
-    """Status of one component in a message of `/diagnostics`.
+    """Status of one component, as a message of the ROS topic `/diagnostics` reports it.
 
     Attributes:
-        level: 0 for ok, 1 for a warning, 2 for an error, 3 for an outdated status.
+        level: 0 if the component is ok, 1 for a warning, 2 for an error, 3 if the status is too
+            old.
         name: Name of the component.
         text: Description of the status.
-        values: Further values, by key.
+        values: Further values as texts, by name.
     """
 
     level: int
@@ -327,15 +328,16 @@ def pack_diagnostics(stamp_ns: int, diagnoses: Sequence[Diagnosis]) -> bytes:
 
 
 class CdrReader:
-    """Decoder of the fields of a message, one after another.
+    """Decodes a ROS 2 message field by field, in the order of its definition.
 
-    All methods raise a ValueError if the message ends before the field does.
+    Every call of a method returns the next field. All methods raise a ValueError if the message
+    ends before the field does.
 
     Args:
-        payload: The message with its header.
+        payload: The message with its header of four bytes.
 
     Raises:
-        ValueError: The message is not plain, little-endian CDR.
+        ValueError: The message is not plain, little-endian CDR, the usual encoding of ROS 2.
     """
 
     def __init__(self, payload: bytes) -> None:
@@ -345,11 +347,14 @@ class CdrReader:
         self._position = 0
 
     def numbers(self, code: str, count: int = 1) -> tuple[Any, ...]:
-        """Decodes the next numbers.
+        """Decodes the next numbers of the message.
 
         Args:
-            code: Type of the numbers, as the module `struct` defines it.
-            count: How many numbers.
+            code: Type of the numbers, in the notation of the module `struct`.
+            count: How many numbers to decode.
+
+        Returns:
+            The numbers.
         """
         size = struct.calcsize(f"<{code}")
         padding = _count_padding(self._position, size) if count else 0

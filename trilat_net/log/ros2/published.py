@@ -169,7 +169,14 @@ class SiteMessages:
         return topics
 
     def stamp_ns(self, record: State) -> int:
-        """Returns the nominal time of a record, in Unix time, in ns."""
+        """Computes the time stamp of a record's messages.
+
+        Args:
+            record: The record.
+
+        Returns:
+            The nominal time of the record's tick, in Unix time, in ns.
+        """
         return max(0, self._epoch_unix_ns + record.t_ns)
 
     def pack_record(
@@ -299,7 +306,14 @@ class SiteMessages:
                 yield topic, data
 
     def pack_frames(self, record: State) -> Iterable[bytes]:
-        """Yields the messages of a record for the topic `/tf`, with the poses of all links."""
+        """Encodes the poses of all links of the arm, for viewers that draw it.
+
+        Args:
+            record: The record, which contains the joint positions.
+
+        Yields:
+            The messages for the topic `/tf`.
+        """
         stamp_ns = self.stamp_ns(record)
         transforms = self._robot.compute_transforms(record.q)
         aligned: list[tuple[Sequence[float], Sequence[float]]] = []
@@ -311,7 +325,14 @@ class SiteMessages:
             yield self._pack_shared_frame(stamp_ns, [*origin, *rotation])
 
     def pack_statistics(self, stats: LinkStats) -> Iterator[tuple[str, bytes]]:
-        """Yields the topic's name in trilat-net and the message, for statistics of links."""
+        """Encodes the statistics of a site's links.
+
+        Args:
+            stats: The statistics.
+
+        Yields:
+            The name of the topic in trilat-net, and the message.
+        """
         yield from self._channels.pack_statistics(stats)
 
 

@@ -64,10 +64,13 @@ class _JointFrame(NamedTuple):
 
 
 def multiply_quaternions(a: Quaternion, b: Quaternion) -> Quaternion:
-    """Multiplies two quaternions.
+    """Computes the product a b of two quaternions.
 
-    The product a b is the rotation b, followed by the rotation a.
+    For unit quaternions, the product is the rotation b, followed by the rotation a.
 
+    Args:
+        a: The left factor.
+        b: The right factor.
     """
     ax, ay, az, aw = a
     bx, by, bz, bw = b
@@ -80,7 +83,15 @@ def multiply_quaternions(a: Quaternion, b: Quaternion) -> Quaternion:
 
 
 def rotate_vector(rotation: Quaternion, vector: Vector) -> Vector:
-    """Rotates a vector v by a unit quaternion q to q v q*, with the conjugate q*."""
+    """Rotates a vector by a rotation that is given as a unit quaternion.
+
+    The result is q v q*, with the vector v as a quaternion without scalar part, and the
+    conjugate q* of q.
+
+    Args:
+        rotation: The unit quaternion q.
+        vector: The vector v.
+    """
     x, y, z, w = rotation
     conjugate = (-x, -y, -z, w)
     half_product = multiply_quaternions(rotation, (*vector, 0.0))
@@ -96,7 +107,11 @@ def _rotate_about(axis: Vector, angle: float) -> Quaternion:
 
 
 def compute_quaternion(rotation_vector: Vector) -> Quaternion:
-    """Returns the unit quaternion of a rotation vector in rad."""
+    """Converts a rotation vector to a unit quaternion.
+
+    Args:
+        rotation_vector: Axis of the rotation times its angle, in rad.
+    """
     angle = math.hypot(*rotation_vector)
     if not angle:
         return _rotate_about(_X_AXIS, angle)

@@ -48,12 +48,12 @@ FRAMES = "tf"
 
 
 class Ros2Channel(NamedTuple):
-    """A channel of standard ROS 2 messages.
+    """Describes a channel of standard ROS 2 messages, which general viewers can display.
 
     Attributes:
-        kind: Type of the messages.
-        about: Metadata of the channel.
-        latched: True if late subscribers receive the last message.
+        kind: ROS type of the messages.
+        about: Metadata of the channel, such as units and names of its numbers.
+        latched: True if a subscriber that joins late receives the last message.
     """
 
     kind: str
@@ -124,7 +124,7 @@ _MODE_NUMBERS: dict[Mode | str, float] = {
 
 
 def pack_event(event: Event, stamp_ns: int) -> Iterator[tuple[str, bytes]]:
-    """Encodes an event for each channel of the session.
+    """Encodes an event of a member twice: as a string, and as a line for the log of ROS.
 
     Args:
         event: The event.
@@ -278,10 +278,16 @@ class Ros2SiteChannels:
         return " or ".join(different_units)
 
     def pack_slow_arrays(self, row: Sequence[float]) -> Iterator[tuple[str, bytes]]:
-        """Yields the names and messages of a record's arrays.
+        """Encodes the quantities of a record that viewers show with fewer points.
+
+        These are the exogenous torque, the estimated parameters, the numbers that the control
+        law sends, and the mode.
 
         Args:
-            row: Numbers of the record, the slice `slow_row` of `stack_signals`.
+            row: Their values, the slice `slow_row` of the numbers from `stack_signals`.
+
+        Yields:
+            The name of each array and its message.
         """
         start = 0
         for name in self._slow_names:
@@ -291,9 +297,15 @@ class Ros2SiteChannels:
             start = end
 
     def pack_statistics(self, stats: LinkStats) -> Iterator[tuple[str, bytes]]:
-        """Yields the names and messages of the arrays of link statistics.
+        """Encodes the statistics of a site's links as arrays.
 
-        There are delays, clock offsets and timing only in a live session.
+        Delays, clock offsets and timing exist only in a live session.
+
+        Args:
+            stats: The statistics.
+
+        Yields:
+            The name of each array and its message.
         """
         peers = self._peers
         if not peers:

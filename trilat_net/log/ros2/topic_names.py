@@ -106,7 +106,13 @@ class TopicTable(NamedTuple):
 
 
 def make_session_name(text: str) -> str:
-    """Converts the name of a session to a valid name in ROS 2. Other characters become _."""
+    """Converts the name of a session to a name that ROS 2 accepts.
+
+    Characters that ROS 2 does not allow in names become _.
+
+    Args:
+        text: Name of the session.
+    """
     name = re.sub(r"[^A-Za-z0-9_]", "_", text)
     return name if name[:1].isalpha() else f"_{name}"
 

@@ -73,19 +73,37 @@ class _BucketOutput:
         self._waiting_rows: Sequence[StampedRow] = ()
 
     def add(self, rows: Sequence[StampedRow], log_ns: int) -> None:
-        """Writes the first row of a bucket, and keeps the second one."""
+        """Writes the first row of a bucket at once, and keeps the second one for later.
+
+        A bucket is an interval of time. Its two rows contain the minimum and the maximum of
+        each curve. If the second row of the previous bucket is still kept, it is written
+        before.
+
+        Args:
+            rows: The rows with their times, one or two.
+            log_ns: Arrival time to write, in Unix time, in ns.
+        """
         self.flush(log_ns)
         stamp_ns, row = rows[0]
         self._write(stamp_ns, row, log_ns)
         self._waiting_rows = rows[1:]
 
     def flush(self, log_ns: int) -> None:
-        """Writes the row that was kept, if there is one."""
+        """Writes the second row of the bucket. Nothing happens if it was written already.
+
+        Args:
+            log_ns: Arrival time to write, in Unix time, in ns.
+        """
         self.write_all(self._waiting_rows, log_ns)
         self._waiting_rows = ()
 
     def write_all(self, rows: Sequence[StampedRow], log_ns: int) -> None:
-        """Writes all rows of a bucket at once, if its records arrived late."""
+        """Writes all rows of a bucket at once, because the records of the bucket arrived late.
+
+        Args:
+            rows: The rows with their times.
+            log_ns: Arrival time to write, in Unix time, in ns.
+        """
         for stamp_ns, row in rows:
             self._write(stamp_ns, row, log_ns)
 
@@ -187,7 +205,11 @@ class _SiteBuckets:
             self._put(self._topics[name], data, stamp_ns, log_ns)
 
     def add_record(self, record: Record, log_ns: int) -> None:
-        """Adds a record to its bucket, and writes the messages that are complete now.
+        """Adds a record of the site, and writes the messages that are complete now.
+
+        Records are collected in buckets, intervals of equal length. A bucket becomes two
+        messages with the minimum and the maximum of each curve, as soon as a record after it
+        arrives.
 
         Args:
             record: The record.
@@ -216,13 +238,22 @@ class _SiteBuckets:
         self._late_records.append(record)
 
     def add_statistics(self, stats: LinkStats, log_ns: int) -> None:
-        """Writes the statistics of the links, all of them."""
+        """Writes link statistics of the site for viewers, all of them, since they are few.
+
+        Args:
+            stats: The statistics.
+            log_ns: Arrival time, in Unix time, in ns.
+        """
         stamp_ns = max(0, self._epoch_unix_ns + stats.t_ns)
         for name, data in self._site_channels.pack_statistics(stats):
             self._put(self._topics[name], data, stamp_ns, log_ns)
 
     def finish(self, log_ns: int) -> None:
-        """Writes everything that was not written yet."""
+        """Writes the messages of the records that were not written yet, at the end of the log.
+
+        Args:
+            log_ns: Arrival time to write, in Unix time, in ns.
+        """
         # Two slow buckets further on, both the fast and the slow bucket are closed.
         self._close_bucket(self._bucket + 2 * self._slow_ratio, log_ns)
         self._fast_output.flush(log_ns)
@@ -322,7 +353,10 @@ def _stamp_extremes(stamps_ns: Sequence[int], curves: Iterable[SignalRow]) -> li
 
 
 class VizChannels:
-    """Channels for viewers, which are written while the log is written.
+    """Writes messages for general viewers into a log, besides the messages of the session.
+
+    Viewers such as Foxglove cannot decode or draw all messages of a session. They get standard
+    ROS 2 messages with fewer points, which keep the minimum and maximum of each interval.
 
     Args:
         scenario: Scenario of the session.
@@ -330,11 +364,12 @@ class VizChannels:
         epoch_unix_ns: Unix time of tick 0, in ns. It is 0 in virtual time.
         views_hz: Rate of the messages with the joints, in Hz. `FULL_RATE_HZ` writes a message
             for every record.
-        put: Function that writes a message.
+        put: Function that writes a message into the log.
 
     Attributes:
         channels: All channels that may occur, by topic.
-        receivers: Functions that receive the messages of the log, by the key of the messages.
+        receivers: Functions that receive the messages of the session, by the key of the
+            messages.
     """
 
     def __init__(
@@ -392,14 +427,17 @@ class VizChannels:
 
 
 def decimate_min_max(curves: Iterable[SignalRow]) -> tuple[list[float], list[float]]:
-    """Finds the minimum and the maximum of each curve, in the order in which they occur.
+    """Reduces curves to two values each, their minimum and their maximum.
+
+    The two values keep the order in which they occur, so that a drawn curve keeps its peaks.
 
     Args:
         curves: Values of each curve in the order of time. They are finite, and there is at
             least one.
 
     Returns:
-        The earlier extreme of each curve, and the later extreme of each curve.
+        The extreme of each curve that occurs first, and the extreme of each curve that occurs
+        second.
     """
     earlier: list[float] = []
     later: list[float] = []
