@@ -108,7 +108,12 @@ _UNIT_MS = {"us": 1e-3, "ms": 1.0, "": 1.0, "s": 1e3}
 
 @dataclass(frozen=True, repr=False)
 class ArmGains(Result):
-    """The largest gains for an arm, with a margin. JSON has the same keys as this class.
+    """The largest stable gains for an arm, reduced by a safety margin.
+
+    Two or three equal arms follow one another over links with a delay. The gains grow together
+    along a ray: the stiffness is K = k m for each joint, where m is the inertia of the joint
+    and k a common parameter in 1/s^2. The edge of stability is the k above which small motions
+    grow. `tune_arm` creates this object. The keys in JSON equal the attributes.
 
     Attributes:
         arm: File name of the arm's URDF.
@@ -151,11 +156,15 @@ class ArmGains(Result):
     curve: list[tuple[float, float]]
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns one row per joint."""
+        """Returns the entries of `joints`, one row per joint, for a table or a CSV file."""
         return self.joints
 
     def blocks(self) -> Iterator[Block]:
-        """Yields the loop, a table of the joints, the edge, the runs, and the line to paste."""
+        """Yields the parts of the text that the command prints.
+
+        The parts are a description of the loop, a table of the joints and their gains, the edge
+        of stability, the simulated runs that check it, and the line to paste into a scenario.
+        """
         yield (
             f"{self.arm}: {self.sites} equal arms, {self.law}, {self.rate_hz} Hz, "
             f"{self.delay}, damping ratio {self.damping:g}, margin {self.margin:g}"
@@ -433,7 +442,14 @@ class _GainSearch:
         return float(values[-1]), vectors[:, -1] ** 2
 
     def fix_age(self, age_s: float) -> OperatingConditions:
-        """Returns the conditions of the loop with a constant age of all samples, in s."""
+        """Returns the linearised conditions of the loop with the same age for all samples.
+
+        The age of a sample is the time from its sending until its use. A constant age stands
+        for a varying delay where the analysis needs a single number.
+
+        Args:
+            age_s: The age, in s.
+        """
         ages_s: Array = np.where(self.conditions.age_s > 0.0, age_s, 0.0)
         return self.conditions._replace(age_s=ages_s, varying=False)
 

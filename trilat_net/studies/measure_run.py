@@ -86,24 +86,37 @@ class RecordBatch(NamedTuple):
     used: Ints
 
     def since(self, t_ns: int) -> "RecordBatch":
-        """Returns the records after the time `t_ns`, in ns."""
+        """Returns the records after a time.
+
+        Args:
+            t_ns: The time, in ns. A record at exactly this time is not returned.
+        """
         first = np.searchsorted(self.t_ns, t_ns, side="right")
         return self._slice(int(first), None)
 
     def between(self, from_ns: int, to_ns: int) -> "RecordBatch":
-        """Returns the records at `from_ns` or later, but before `to_ns`."""
+        """Returns the records within an interval of time.
+
+        Args:
+            from_ns: Start of the interval, in ns, which belongs to the interval.
+            to_ns: End of the interval, in ns, which does not belong to it.
+        """
         first = np.searchsorted(self.t_ns, from_ns)
         stop = np.searchsorted(self.t_ns, to_ns)
         return self._slice(int(first), int(stop))
 
     def reduce(self, into: Array = NO_BUCKETS) -> Array:
-        """Reduces the records to buckets, on which the judgement of a run's end is based.
+        """Adds these records to a compact summary, from which the end of a run is judged.
+
+        The summary divides the time of the run into intervals, called buckets, and keeps only a
+        few extreme values of each. A long run can thus be judged without keeping its records.
 
         Args:
-            into: Buckets of all earlier records, which may be changed in place.
+            into: Summary of all earlier records, which may be changed in place. By default
+                there are no earlier records.
 
         Returns:
-            The buckets including these records, see `reduce_to_buckets`.
+            The summary that includes these records, see `reduce_to_buckets`.
         """
         bucket = self.t_ns * BUCKETS_PER_S // NS_PER_S
         return reduce_to_buckets(bucket=bucket, e=self.e, qd=self.qd, q=self.q, into=into)
@@ -114,7 +127,11 @@ class RecordBatch(NamedTuple):
 
 
 def join_batches(batches: Sequence[RecordBatch]) -> RecordBatch:
-    """Returns consecutive batches of a site as a single batch."""
+    """Concatenates consecutive batches of one site to a single batch.
+
+    Args:
+        batches: Batches in the order of time, at least one.
+    """
     columns = zip(*batches, strict=True)
     return RecordBatch._make(np.concatenate(parts) for parts in columns)
 
@@ -220,10 +237,14 @@ def run_compiled_in_batches(
 
 
 def run_whole(scenario: Scenario) -> tuple[dict[str, RecordBatch], RunEnd]:
-    """Runs a scenario in the compiled loop and keeps all records.
+    """Runs a scenario in the compiled loop and keeps all records in memory.
+
+    Args:
+        scenario: The scenario.
 
     Returns:
-        The records of each site, and the judgement of the end of the run.
+        The records of each site by its name, and the judgement of the end of the run, for
+        example whether the arms came to rest.
     """
     batches: dict[str, list[RecordBatch]] = {name: [] for name in scenario.names}
     receivers = {name: batches[name].append for name in batches}
@@ -236,16 +257,20 @@ def run_whole(scenario: Scenario) -> tuple[dict[str, RecordBatch], RunEnd]:
 
 
 class Range(NamedTuple):
-    """Smallest and largest value of a quantity. Both are equal if there is a single value."""
+    """Smallest and largest value of a quantity during a window of time.
+
+    A quantity with a single value, such as a mean, has this value as both ends.
+    """
 
     least: float
     most: float
 
 
 class WindowStats:
-    """Running statistics of one site within a window of [expect].
+    """Running statistics of one site within a window of time.
 
-    A window is a period of the run for which the scenario states its own limits.
+    A scenario can state limits for parts of its run, each of which is a window in its table
+    [expect]. The statistics are updated batch by batch, so that no records need to be kept.
 
     Args:
         window: The window.
@@ -274,7 +299,13 @@ class WindowStats:
         self._hits = 0
 
     def add(self, rows: RecordBatch) -> None:
-        """Adds the next records of the site. Records outside of the window are ignored."""
+        """Updates the statistics with the next records of the site.
+
+        Records outside of the window are ignored.
+
+        Args:
+            rows: The records, which must follow those of the previous call.
+        """
         self._last_ns = int(rows.t_ns[-1])
         inside = rows.between(self._from_ns, self._to_ns)
         if not len(inside.t_ns):
@@ -366,7 +397,11 @@ _END_NS = round(END_WINDOW_S * NS_PER_S)
 
 
 class SiteStats:
-    """Running statistics of one site, which are fed with its records batch by batch.
+    """Statistics of one site over a run, which are updated batch by batch.
+
+    The metrics of the run are computed from the statistics of all sites, so that no records
+    need to be kept. Below, e is the error of the site against its reference, and |e| its
+    magnitude.
 
     Args:
         scenario: Scenario of the run.
@@ -404,7 +439,11 @@ class SiteStats:
         self._tail: list[RecordBatch] = []
 
     def add(self, rows: RecordBatch) -> None:
-        """Adds the next records of the site to all statistics."""
+        """Updates all statistics with the next records of the site.
+
+        Args:
+            rows: The records, which must follow those of the previous call.
+        """
         if not len(rows.t_ns):
             return
         error = np.abs(rows.e)
@@ -454,7 +493,10 @@ class SiteStats:
 
     @property
     def rms_error_rad(self) -> float:
-        """Root mean square of e over all records, of the worst joint, in rad."""
+        """Root mean square of the error e over all records, in rad.
+
+        It is computed for each joint, and the largest of these values is returned.
+        """
         mean_square = self._squares.max() / max(1, self.records)
         return float(np.sqrt(mean_square))
 
@@ -473,7 +515,7 @@ class SiteStats:
         return ages
 
     def end(self, end_ns: int) -> RecordBatch:
-        """Returns the records of the last second before a time.
+        """Returns the records of the last second before a time, which show how the run ended.
 
         Args:
             end_ns: The time, in ns. It must not lie before the last record.
@@ -482,7 +524,10 @@ class SiteStats:
 
     @property
     def buckets(self) -> Array:
-        """Buckets of the site's records, for `RunTrace.buckets`."""
+        """Compact summary of the site's records, from which `RunTrace` judges the end of the run.
+
+        See `RecordBatch.reduce`.
+        """
         return self._buckets[: self.last_ns // _BUCKET_NS + 1]
 
     @property
@@ -550,7 +595,7 @@ def compute_run_metrics(
     late_samples: int,
     missing: int,
 ) -> RunMetrics:
-    """Combines the statistics of the sites to the metrics of the run.
+    """Computes the metrics of a run from the statistics of its sites.
 
     Args:
         scenario: The scenario.
@@ -559,6 +604,9 @@ def compute_run_metrics(
             no site did.
         late_samples: Number of samples that arrived too late.
         missing: Number of ticks without a record.
+
+    Returns:
+        The metrics of the run. A metric that the run cannot give is None.
     """
     with_records = {name: stats for name, stats in site_stats.items() if stats.records}
     all_ran = len(with_records) == len(site_stats)
@@ -690,8 +738,12 @@ def _compute_end_spread_rad(ends: Sequence[RecordBatch]) -> float | None:
 def measure_virtual_run(scenario: Scenario) -> RunMetrics:
     """Runs a scenario in virtual time and returns the metrics of the run.
 
-    The records are not kept, unless the scenario limits a metric of `docs/metrics.md`, which
-    needs the whole log.
+    The records are discarded as soon as their statistics are known, so that long runs need
+    little memory. Only if the scenario limits a metric of `docs/metrics.md`, which is computed
+    from a complete log, all records are kept.
+
+    Args:
+        scenario: The scenario.
     """
     if scenario.expect.metrics:
         return measure_log(simulate_scenario(scenario))
@@ -713,11 +765,12 @@ def measure_virtual_run(scenario: Scenario) -> RunMetrics:
 
 
 def measure_log(log: Log, expect: Expect | None = None) -> RunMetrics:
-    """Returns the metrics of a recorded run.
+    """Computes the metrics of a recorded run from its log.
 
     Args:
         log: Log of the run.
-        expect: Expectations that replace those of the log's scenario.
+        expect: Expectations (limits of the metrics) that replace those of the log's scenario.
+            None uses those of the scenario.
 
     Raises:
         LogError: A record cannot be read.
@@ -760,7 +813,9 @@ def measure_log(log: Log, expect: Expect | None = None) -> RunMetrics:
 
 
 class ExpectationResult(msgspec.Struct, frozen=True):
-    """Outcome of one expectation of one run.
+    """Result of comparing one metric of a run with the limit that the scenario states for it.
+
+    Such a limit is called an expectation and has a key in the scenario's table [expect].
 
     Attributes:
         key: Key of [expect], or the name of a requirement that every run must meet.

@@ -52,7 +52,10 @@ def _round_parameter(value: float) -> float:
 
 
 class ModelInformation(NamedTuple):
-    """Information about the model of the arms that every control law gets.
+    """Information about the model of the arms that every compared control law gets.
+
+    Some laws compensate gravity, for which they need parameters of the arm. To compare laws
+    fairly, all of them get the same parameters, which may be wrong by a chosen factor.
 
     Attributes:
         gravity: Factor by which the gravity parameters that laws get differ from the true ones.
@@ -62,18 +65,20 @@ class ModelInformation(NamedTuple):
 
     @property
     def box(self) -> float:
-        """Half width of the box of estimates, relative to the estimated parameter.
+        """Half width of the interval to which parameter estimates are limited, as a fraction.
 
-        Some adaptive laws keep their estimates within a box. The width is twice the error of
-        the gravity parameters, but the box is never narrower than `MIN_BOX`.
+        Some adaptive laws keep each estimate within an interval around the first estimate,
+        which is the box. Its half width relative to the parameter is twice the relative error
+        of the gravity parameters, but at least `MIN_BOX`.
         """
         return max(MIN_BOX, 2.0 * abs(1.0 / self.gravity - 1.0))
 
     def prior(self, scenario: Scenario, site: str) -> list[float]:
-        """Returns the first estimate of the parameters theta of an arm, shape (P,).
+        """Returns the parameter values with which an adaptive law starts, shape (P,).
 
-        The parameters of inertia are 0, and the gravity parameters are the true ones times
-        `gravity`.
+        The P parameters theta of an arm describe its inertia and its gravity. The parameters of
+        inertia are 0, since nothing is known about them. The gravity parameters are the true
+        ones times `gravity`.
 
         Args:
             scenario: The scenario.
@@ -84,13 +89,16 @@ class ModelInformation(NamedTuple):
         return [_round_parameter(value) for value in theta]
 
     def box_sides(self, scenario: Scenario, site: str) -> tuple[list[float], list[float]]:
-        """Returns the lower and upper limits of the box of estimates, shape (P,) each.
+        """Returns the limits within which an adaptive law keeps its parameter estimates.
 
         The parameters of inertia are not limited, because nothing is known about them.
 
         Args:
             scenario: The scenario.
             site: Site of the arm.
+
+        Returns:
+            Lower and upper limits of the P parameters, shape (P,) each.
         """
         is_gravity = build_arm_rows(scenario, site).gravity_parameters.tolist()
         estimate = self.prior(scenario, site)
@@ -108,7 +116,7 @@ class ModelInformation(NamedTuple):
 
     @property
     def text(self) -> str:
-        """Description of the information, as a clause of a sentence."""
+        """Description of the information for the user, as a clause of a sentence."""
         if self.gravity == 1.0:
             gravity = "the exact gravity parameters"
         else:
@@ -117,7 +125,9 @@ class ModelInformation(NamedTuple):
 
 
 def build_model_information(gravity_percent: float) -> ModelInformation:
-    """Returns the model information with wrong gravity parameters, to test robustness.
+    """Returns the information that laws get about the arms, with a chosen error of gravity.
+
+    Wrong gravity parameters test how robust a law is.
 
     Args:
         gravity_percent: Gravity parameters that laws get, in per cent of the true ones.
@@ -137,7 +147,7 @@ SiteControls = dict[str, dict[str, Any]]
 
 
 class TunedGain(NamedTuple):
-    """A gain of a control law that is searched in a range.
+    """A gain of a control law, with the range in which its best value is searched.
 
     Attributes:
         name: Name of the gain.
@@ -173,10 +183,10 @@ class SearchSpace(NamedTuple):
     def controls(
         self, scenario: Scenario, knowledge: ModelInformation, gains: GainValues
     ) -> SiteControls:
-        """Returns the table [control] of every site for a choice of gains.
+        """Returns the control settings of every site for chosen values of the gains.
 
-        For chains of joints, a gain that produces a torque becomes a list with one value per
-        joint.
+        The settings are the table [control] of a scenario. For chains of joints, a gain that
+        produces a torque becomes a list with one value per joint, see `weigh_joints`.
 
         Args:
             scenario: The scenario.

@@ -136,9 +136,10 @@ def tabulate_search(plan: TuningPlan) -> TextTable:
 def tabulate_front(
     tuned: TuningResult, search: CandidateSearch, most: int = MAX_BUDGET
 ) -> TextTable:
-    """Returns a table of a law's front, in the order of rising effort.
+    """Returns a table of the candidates on a law's Pareto front, in the order of rising effort.
 
-    A * marks the points that are on the common front of all laws.
+    A candidate is on the front if no other candidate has both a smaller error and a smaller
+    effort. A * marks the candidates that are also on the common front of all laws.
 
     Args:
         tuned: The comparison.
@@ -245,9 +246,10 @@ def describe_procedure(plan: TuningPlan) -> list[str]:
 
 
 def list_class_meanings() -> list[str]:
-    """Returns the classes with their meanings, one line each.
+    """Returns the meaning of each class of candidates, as one line per class.
 
-    A run belongs to the first class that applies.
+    The classes state how a run ended, such as stable or diverged. A run belongs to the first
+    class that applies.
     """
     return [f"{outcome.word}: {text}" for outcome, text in CLASS_MEANINGS.items()]
 
@@ -405,7 +407,15 @@ def _draw_paper_gains(axes: Axes, tuned: TuningResult) -> list[Line2D]:
 
 
 def write_tuning(tuned: TuningResult, folder: Path) -> list[Path]:
-    """Writes the files of a comparison into an existing folder, and returns their paths."""
+    """Writes the page, the tables and the figure of a comparison into an existing folder.
+
+    Args:
+        tuned: The comparison.
+        folder: The folder.
+
+    Returns:
+        The paths of the files.
+    """
     json_path = folder / "front.json"
     page_path = folder / "front.md"
     picture_paths = [folder / "front.png", folder / "front.pdf"]
