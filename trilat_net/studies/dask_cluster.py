@@ -56,7 +56,11 @@ arithmetic, Python and packages.
 
 @cache
 def describe_worker() -> WorkerIdentity:
-    """Returns the properties of this process on which its results depend."""
+    """Describes this process by everything on which its numerical results depend.
+
+    A worker of a cluster may run items of a study only if its description equals that of the
+    process that started the study, as otherwise results could differ.
+    """
     root = Path(__file__).resolve().parents[1]
     digest = hashlib.sha256()
     for file in sorted(root.rglob("*.py")):
@@ -73,7 +77,7 @@ def describe_worker() -> WorkerIdentity:
 
 
 class WorkerRequirements(NamedTuple):
-    """Requirements that every worker must meet.
+    """What a worker of a cluster must have, so that it computes the same results as this process.
 
     Attributes:
         identity: Properties that the worker must have.
@@ -88,10 +92,11 @@ class WorkerRequirements(NamedTuple):
 def explain_unfit_worker(
     required: WorkerRequirements, identity: WorkerIdentity, lacks: Sequence[str]
 ) -> str:
-    """Returns the reason why a worker must not run items.
+    """Explains why a worker may not run items of a study.
 
-    Commits need not be the same, since one commit can differ from another in documentation
-    only. They are named as a hint if the source files differ.
+    A worker must have the same program, arithmetic and files of control laws as the process
+    that started the study. Commits need not be the same, since one commit can differ from
+    another in documentation only. They are named as a hint if the source files differ.
 
     Args:
         required: Requirements.
@@ -142,7 +147,10 @@ def find_missing_laws(laws: Sequence[tuple[str, str]]) -> list[str]:
 
 
 def check_this_worker(required: WorkerRequirements) -> None:
-    """Checks that this process, a worker, meets the requirements.
+    """Checks that this process, a worker of a cluster, computes the same results as the study.
+
+    Args:
+        required: What a worker must have.
 
     Raises:
         UsageError: It does not. The message names the worker and the differences.
@@ -174,9 +182,10 @@ def _make_probe() -> Callable[
 
 
 class DaskCluster:
-    """Connection to a Dask scheduler, a context manager that closes it.
+    """Connection to the scheduler of a Dask cluster, whose workers run the items of a study.
 
-    Items that have not finished when the connection is closed are cancelled.
+    It is a context manager that closes the connection. Items that have not finished by then are
+    cancelled.
 
     Args:
         address: Address of the scheduler, such as "tcp://HOST:PORT".
@@ -263,7 +272,10 @@ class DaskCluster:
         return required
 
     def check_alive(self) -> None:
-        """Checks that the cluster can still run items. Call this regularly while waiting.
+        """Checks that the cluster can still run items.
+
+        A study calls this regularly while it waits for results, so that it ends with an error
+        instead of waiting forever.
 
         Raises:
             RunFailed: The scheduler is gone, or had no worker for `NO_WORKER_S`.
@@ -281,10 +293,17 @@ class DaskCluster:
             )
 
     def is_worker_loss(self, error: BaseException) -> bool:
-        """Returns True if an error means that the workers of an item died.
+        """Distinguishes the death of a worker process from an error in its item.
 
-        Returns False for an error of the user, such as a worker that does not meet the
-        requirements.
+        After the death of a worker its items may be tried again on another one. After an error
+        of the item, such as a worker that does not meet the requirements, this would be
+        useless.
+
+        Args:
+            error: Error with which an item ended.
+
+        Returns:
+            True if the workers of the item died.
 
         Raises:
             RunFailed: The scheduler is gone, or a worker cannot receive items.

@@ -62,11 +62,11 @@ _MAX_NAME = 200
 
 
 def ignore_progress(_done: int, _total: int) -> None:
-    """Does nothing, as the progress function of a caller that shows no progress."""
+    """Ignores a report of progress. Callers without a progress display use this function."""
 
 
 class _BatchResult(NamedTuple):
-    """Result of a batch, which a worker sends back.
+    """Results of a batch of items, which a worker process sends back to the study.
 
     Attributes:
         results: Results of the items, up to the first error.
@@ -85,7 +85,10 @@ def run_batch(
     required: WorkerRequirements | None,
     allowed: CodeConsents,
 ) -> _BatchResult:
-    """Runs a function on the items of a batch. A worker executes this.
+    """Runs a function on each item of a batch, stopping at the first error.
+
+    A worker process executes this. Several items are sent together because sending each one
+    alone would take longer than running short items.
 
     Args:
         function: The function.
@@ -93,6 +96,9 @@ def run_batch(
         required: Requirements on the worker, such as the version of the program. None if there
             are no requirements.
         allowed: Imported control laws that the user allowed to run.
+
+    Returns:
+        The results up to the first error, the time that they took, and the error.
 
     Raises:
         UsageError: This worker does not meet the requirements.
@@ -114,7 +120,9 @@ def run_batch(
 
 
 class _Batch(NamedTuple):
-    """A batch that was sent to a worker and has not ended yet.
+    """A group of items that a worker process is working on.
+
+    If the worker dies, the items are known from here and return to the queue.
 
     Attributes:
         numbers: Numbers of the items.
@@ -128,10 +136,10 @@ class _Batch(NamedTuple):
 
 
 class _Feed(Generic[T]):
-    """Queue of the items, which combines them to batches.
+    """Queue of the items that wait for a worker. It groups them into batches.
 
-    The size of the batches follows from the measured duration of the items. Items whose worker
-    died come back to this queue.
+    The size of a batch follows from the measured duration of the items, so that a batch takes
+    about `batch_s`. Items whose worker died come back to this queue.
 
     Args:
         items: The items.
@@ -154,7 +162,7 @@ class _Feed(Generic[T]):
         self._wall_s = 0.0
 
     def add_timing(self, runs: int, wall_s: float) -> None:
-        """Adds finished items to the mean duration per item, which determines the batch size.
+        """Updates the mean duration of an item, from which the size of later batches follows.
 
         Args:
             runs: Number of finished items.
@@ -217,7 +225,10 @@ class _Feed(Generic[T]):
 
 
 class WorkerPool:
-    """The workers of a study. `open_worker_pool` creates this object.
+    """The workers of a study: processes of this machine, or those of a cluster.
+
+    A study is a large number of independent runs, called items. `open_worker_pool` creates this
+    object, and the study passes its items to `map` or `iterate_results`.
 
     Args:
         executor: Executor that runs the batches. None if the items run in this process.
@@ -305,12 +316,15 @@ class WorkerPool:
         items: Sequence[T],
         progress: Progress = ignore_progress,
     ) -> list[R]:
-        """Returns the results of a function in the order of the items.
+        """Runs a function on each item with all workers, and collects the results.
 
         Args:
             function: Function at module level, so that another process can import it.
             items: The items.
             progress: Function that is called whenever an item has ended.
+
+        Returns:
+            The results in the order of the items. Empty if there are no items.
 
         Raises:
             RunFailed: An item killed its workers, or no workers are left.
@@ -422,7 +436,10 @@ def open_worker_pool(
     laws: Sequence[Any] = (),
     hint: str = "",
 ) -> Iterator[WorkerPool]:
-    """Opens the workers of a study. On exit, the processes that were started end.
+    """Provides the workers of a study, for use in a `with` statement.
+
+    The processes that were started end when the statement is left. Processes of a cluster keep
+    running.
 
     Args:
         jobs: Number of processes of this machine. None uses all cores, and 1 runs the items in
@@ -467,7 +484,14 @@ def open_worker_pool(
 
 
 def check_workers(jobs: int | None, on: Workers) -> None:
-    """Refuses the option --jobs together with --on, which it does not affect.
+    """Checks that the user did not choose a number of processes for a cluster.
+
+    The option --jobs sets the number of processes of this machine, and has no effect if --on
+    selects a cluster.
+
+    Args:
+        jobs: Value of --jobs. None if it was not given.
+        on: Value of --on. None if it was not given.
 
     Raises:
         UsageError: Both options are given.
@@ -482,6 +506,10 @@ def count_workers(jobs: int | None, on: Workers = None) -> int:
     """Returns the number of items that will run at the same time.
 
     For a cluster, this connects to its scheduler and checks its workers.
+
+    Args:
+        jobs: Number of processes of this machine. None stands for all cores.
+        on: Workers to use instead of processes of this machine.
 
     Raises:
         UsageError: The cluster cannot be reached, or a worker does not meet the requirements.

@@ -524,7 +524,7 @@ class SiteStats:
 
     @property
     def buckets(self) -> Array:
-        """Compact summary of the site's records, from which `RunTrace` judges the end of the run.
+        """Compact summary of the site's records, from which the end of the run is judged.
 
         See `RecordBatch.reduce`.
         """

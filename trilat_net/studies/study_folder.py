@@ -39,7 +39,14 @@ def format_command(*arguments: str) -> str:
 
 
 def set_options(overrides: Iterable[str]) -> list[str]:
-    """Returns the arguments --set KEY=VALUE of a command, for overrides KEY=VALUE."""
+    """Returns the command line options that apply overrides of a scenario.
+
+    Args:
+        overrides: Texts KEY=VALUE, as in "link.delay_ms=100".
+
+    Returns:
+        The arguments "--set" and KEY=VALUE, in turn.
+    """
     arguments = []
     for text in overrides:
         arguments += ["--set", text]
@@ -50,6 +57,9 @@ def format_toml_value(value: Any) -> str:
     """Returns a value as TOML on one line, for commands and overrides.
 
     A number is written as short as possible, if it still parses back to the same number.
+
+    Args:
+        value: A number, text, list or table.
 
     Raises:
         ScenarioError: TOML cannot express the value.
@@ -111,15 +121,18 @@ def encode_csv(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = ()) -
 
 
 class JournalEntry(Protocol):
-    """Interface of a finished run: a structure of plain values, identified by cell and seed."""
+    """Interface of the entries of a `RunJournal`, each of which is the result of a finished run.
+
+    An entry is a structure of plain values. The cell and the seed together identify its run.
+    """
 
     @property
     def cell(self) -> Hashable:
-        """Part of the study to which the run belongs, such as the number of a grid point."""
+        """Part of the study to which the run belongs, such as the number of a point of its grid."""
 
     @property
     def seed(self) -> int:
-        """Seed of the random numbers of the run."""
+        """Seed of the random numbers of the run, which distinguishes the runs of a cell."""
 
 
 P = TypeVar("P")
@@ -128,7 +141,10 @@ E = TypeVar("E", bound=JournalEntry)
 
 
 class RunJournal(Generic[E]):
-    """Journal of the finished runs of a study, a context manager that closes the file.
+    """File to which a study appends the result of each run as soon as it has finished.
+
+    If the study is interrupted, it continues from this file without repeating finished runs.
+    The object is a context manager that closes the file.
 
     Args:
         path: Path of the file. Existing lines are read.
@@ -165,7 +181,12 @@ class RunJournal(Generic[E]):
         self._file.close()
 
     def add(self, entry: E) -> None:
-        """Writes a finished run to the file at once, unless the journal has it already.
+        """Appends the result of a run to the file at once, so that an interruption cannot lose it.
+
+        A run that the journal contains already is ignored.
+
+        Args:
+            entry: Result of the run.
 
         Raises:
             LogRefused: The disk is full.
@@ -222,7 +243,10 @@ class RunJournal(Generic[E]):
 
 
 class StudyFolder(NamedTuple, Generic[P, E]):
-    """Folder of a study.
+    """Folder with the plan, the journal and the results of a study.
+
+    A study is a set of simulated runs, such as a sweep over a parameter. It can be interrupted,
+    and continued from its folder.
 
     Attributes:
         path: Path of the folder.
@@ -239,6 +263,11 @@ class StudyFolder(NamedTuple, Generic[P, E]):
     journal: Callable[[], RunJournal[E]]
 
     def read_done(self) -> list[tuple[Any, int]]:
-        """Returns the cell and the seed of each finished run."""
+        """Reads from the journal which runs of the study have finished.
+
+        Returns:
+            The cell (the part of the study) and the seed of each finished run. Empty if no run
+            has finished.
+        """
         with self.journal() as journal:
             return list(journal.done)

@@ -107,12 +107,16 @@ def check_comparable(scenario: Scenario) -> None:
 
 
 def build_twin(scenario: Scenario) -> Scenario | None:
-    """Returns the scenario without walls, and without operators that have no target pose.
+    """Derives the scenario that shows at which pose the arms would come to rest undisturbed.
 
-    The pose at the end of the twin's run depends only on the dominance factors and the targets.
+    Walls, and operators who push without a target pose, keep the arms away from that pose. The
+    derived scenario, the twin of the candidate, lacks them. The pose at the end of its run
+    depends only on the dominance factors (the weights with which the arms follow one another)
+    and on the targets.
 
     Returns:
-        The twin. None if the scenario has no such walls and operators.
+        The twin. None if the scenario has no such walls and operators, so that no twin is
+        needed.
     """
     sites = {}
     for name, spec in scenario.sites.items():
@@ -125,7 +129,10 @@ def build_twin(scenario: Scenario) -> Scenario | None:
 
 
 def compute_consensus_pose(scenario: Scenario, t_s: Array) -> Array:
-    """Computes q*, the pose at which weightless arms would agree (see the head of this module).
+    """Computes q*, the pose at which weightless arms would agree.
+
+    The head of this module derives it from the springs of the operators and the dominance
+    factors.
 
     Args:
         scenario: The scenario.
@@ -159,7 +166,9 @@ def compute_consensus_pose(scenario: Scenario, t_s: Array) -> Array:
 
 
 class _SpringHistory(NamedTuple):
-    """An operator that pulls like a spring towards a target pose, at given times.
+    """Pull of an operator towards a target pose, as by a spring, sampled at K times.
+
+    The consensus pose q* is computed from the springs of all operators.
 
     Attributes:
         site: Site of the operator.
@@ -204,9 +213,10 @@ TOGETHER_RAD = 0.02
 
 
 class CandidateClass(StrEnum):
-    """Class of a candidate, from the worst to the best. The values are the texts in JSON.
+    """How well the arms behaved in the runs of a candidate, from the worst to the best class.
 
-    A run belongs to the first class that applies, see `CLASS_MEANINGS`.
+    A candidate is a control law with one choice of gains. The values are the texts in JSON. If
+    several classes apply to a run, the first one counts, see `CLASS_MEANINGS`.
     """
 
     DIVERGED = "diverged"
@@ -218,7 +228,7 @@ class CandidateClass(StrEnum):
 
     @property
     def word(self) -> str:
-        """Word for people, the same as in the stability certificate where possible."""
+        """Name of the class for people, the same as in the stability certificate where possible."""
         if self is CandidateClass.OSCILLATED:
             return Stability.NOT_STABLE.value
         if self is CandidateClass.SETTLED:
@@ -243,7 +253,10 @@ CLASS_MEANINGS = {
 def classify_candidate(
     ends: Sequence[RunEnd], fall_rad: float, apart_rad: float
 ) -> CandidateClass:
-    """Returns the class of a candidate.
+    """Determines the class of a candidate from the end of its runs.
+
+    The twin is a second run without walls and without operators that have no target pose. It
+    shows whether the arms agree on the pose q* that the operators ask for.
 
     Args:
         ends: Judgements of the candidate's run and of its twin's run. Without a twin, the same
@@ -252,6 +265,9 @@ def classify_candidate(
             joints, in rad, see `_predict_fall_rad`.
         apart_rad: Largest distance of a joint from the mean of the sites in the last second, in
             rad.
+
+    Returns:
+        The class. The worst class that applies to one of the runs.
     """
     stabilities = {end.stability for end in ends}
     if any(end.behaviour is EndBehaviour.DIVERGED for end in ends):
@@ -384,12 +400,13 @@ _AVERAGED = ("error_rad", "spread_rad", "pose_rad", "effort_nm", "settled_s", "s
 
 
 def average_scores(scores: Sequence[CandidateScore]) -> CandidateScore:
-    """Averages the scores of a candidate over its seeds.
+    """Combines the scores of a candidate over runs that differ only in their random numbers.
 
-    The class is the worst of all runs. A number that is missing for one of the seeds is None.
+    The class is the worst of all runs, and each number is the mean over the runs. A number that
+    is missing for one of the runs is None.
 
     Args:
-        scores: Score for each seed.
+        scores: Score of each run, at least one.
     """
     if len(scores) == 1:
         return scores[0]
@@ -453,7 +470,9 @@ def measure_candidate(text: str, twin_text: str | None) -> CandidateScore:
 
 
 class _RunMeasures(NamedTuple):
-    """Quantities that are measured in one run.
+    """Quantities that are measured in one run of a candidate or of its twin.
+
+    `CandidateScore` is computed from them.
 
     Attributes:
         end: Judgement of the end of the run.
@@ -605,7 +624,7 @@ class TuningScenario(NamedTuple):
 
     @property
     def source(self) -> str:
-        """Name of the scenario in a command."""
+        """Name or path of the scenario, as it is given to a command of `trilat`."""
         return self.experiment.label
 
     def with_controls(self, controls: SiteControls) -> "TuningScenario":
@@ -648,13 +667,16 @@ class TuningScenario(NamedTuple):
 
     @property
     def texts(self) -> tuple[str, str | None]:
-        """Canonical texts of the scenario and of its twin. None replaces a missing twin."""
+        """Canonical texts of the scenario and of its twin, from which workers restore both.
+
+        The second text is None if the scenario has no twin, see `build_twin`.
+        """
         twin = build_twin(self.scenario)
         return self.scenario.text, None if twin is None else twin.text
 
     @property
     def command(self) -> str:
-        """The command that simulates the scenario and records a log."""
+        """The command with which a user can simulate the scenario and record a log."""
         return format_command("sim", self.source, *set_options(self.overrides))
 
 
@@ -674,7 +696,7 @@ class CandidateItem(NamedTuple):
 
 
 def build_candidate_item(seeds: Sequence[TuningScenario]) -> CandidateItem:
-    """Returns the work that measures a candidate.
+    """Packs the runs of a candidate into an item that can be sent to a worker process.
 
     Args:
         seeds: Scenario of the candidate with each seed.
@@ -684,7 +706,13 @@ def build_candidate_item(seeds: Sequence[TuningScenario]) -> CandidateItem:
 
 
 def measure_candidate_task(task: CandidateItem) -> CandidateScore:
-    """Runs a candidate with all of its seeds, in any process, and returns its score."""
+    """Runs a candidate with all of its seeds, and returns its average score.
+
+    The function needs nothing but its argument, so that any worker process can call it.
+
+    Args:
+        task: The runs of the candidate.
+    """
     scores = [measure_candidate(text, twin_text) for text, twin_text in task.runs]
     return average_scores(scores)
 

@@ -68,22 +68,28 @@ ObjectivePoint = tuple[float, float]
 
 
 class Objective(StrEnum):
-    """Objective that is minimised besides the effort."""
+    """Quantity that the search minimises together with the effort of the controllers.
+
+    Both conflict in general: a smaller error needs larger torques.
+    """
 
     ERROR = "error"
     SETTLING = "settling"
 
     @property
     def unit(self) -> str:
-        """Unit of the objective."""
+        """Unit of the quantity, for tables and axes."""
         return "rad" if self is Objective.ERROR else "s"
 
     def point(self, score: CandidateScore) -> ObjectivePoint | None:
-        """Returns the objective and the effort of a candidate.
+        """Returns the point of a candidate in the plane of objective and effort.
+
+        Args:
+            score: Score of the candidate.
 
         Returns:
-            The pair. None if the candidate may not be part of a front, because it is not stable
-            or does not end at the common pose.
+            The objective and the effort. None if the candidate may not be part of a Pareto
+            front, because it is not stable or does not end at the common pose.
         """
         value = score.error_rad if self is Objective.ERROR else score.settled_s
         if score.outcome is not CandidateClass.SETTLED:
@@ -96,7 +102,8 @@ class Objective(StrEnum):
 def find_pareto_front(points: Sequence[ObjectivePoint | None]) -> list[int]:
     """Returns the indices of the points of the Pareto front, in the order of rising effort.
 
-    A point is part of the front if no other point is at least as good in both objectives.
+    The front contains the best compromises between both objectives: a point is part of it if no
+    other point is at least as good in both objectives.
 
     Args:
         points: The points. None stands for a run that does not compete.
@@ -191,12 +198,18 @@ class CandidateSearch:
 
     @property
     def points(self) -> list[ObjectivePoint | None]:
-        """Objective and effort of each candidate. None if it may not be part of a front."""
+        """Objective and effort of each candidate that has run, in order.
+
+        None stands for a candidate that may not be part of a front, see `Objective.point`.
+        """
         return [self._objective.point(score) for score in self.scores]
 
     @property
     def front(self) -> list[int]:
-        """Indices of the candidates on the law's Pareto front, by rising effort."""
+        """Indices of the candidates on the law's Pareto front, in the order of rising effort.
+
+        They are the best compromises between the objective and the effort.
+        """
         return find_pareto_front(self.points)
 
     @property
@@ -212,12 +225,16 @@ class CandidateSearch:
 
     @property
     def outcomes(self) -> dict[CandidateClass, int]:
-        """Number of candidates of each class."""
+        """Number of candidates that have run, by their class."""
         counts = Counter(score.outcome for score in self.scores)
         return {outcome: counts[outcome] for outcome in CandidateClass}
 
     def propose_candidates(self, round_number: int) -> list[CandidateGains]:
-        """Returns the candidates of a round. The earlier rounds must have been recorded.
+        """Returns the gains that are to be tried in a round.
+
+        The first round spreads its candidates evenly over the ranges of the gains by a Latin
+        hypercube. The later rounds refine the best candidates so far, so that the scores of all
+        earlier rounds must have been recorded.
 
         Args:
             round_number: 0 for the Latin hypercube, and 1 to 4 for the refinement rounds.
@@ -332,7 +349,9 @@ _PROBE_S = 2.0
 
 
 class PaperGainsResult(NamedTuple):
-    """Measured result of the gains that the paper prints.
+    """Result of running the comparison's scenario with the gains that the paper prints.
+
+    It shows what tuning improves over the published gains.
 
     Attributes:
         name: Name of the variant, such as "as printed".
@@ -369,7 +388,11 @@ class TuningPlan(NamedTuple):
 
     @property
     def runs(self) -> int:
-        """Number of all runs, including those of the printed gains and of the twins."""
+        """Number of all simulated runs of the comparison.
+
+        It includes the runs with the gains that the paper prints, and the twins that measure
+        the final pose of each candidate.
+        """
         paper_candidates = len(self.build_paper_scenarios(self.base))
         candidates = len(self.spaces) * self.budget + paper_candidates
         seeds = 1 + len(self.others)
@@ -515,13 +538,13 @@ class TuningResult(Result):
     printed: list[PaperGainsResult]
 
     def blocks(self) -> Iterator[Any]:
-        """Yields the result as text for the terminal."""
+        """Yields the parts of the text that `trilat compare --tune` prints, see `compose_tuning`."""
         from .tuning_report import compose_tuning
 
         return compose_tuning(self)
 
     def headline(self) -> str:
-        """Returns a sentence with the number of points of each law's front."""
+        """Returns a sentence that states how many points the Pareto front of each law has."""
         fronts = ", ".join(f"{search.space.law} {len(search.front)}" for search in self.found)
         return f"{self.plan.base.scenario.name}: points on the front: {fronts}"
 
@@ -605,7 +628,10 @@ class TuningResult(Result):
         }
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns one row per candidate of each law, as plain values."""
+        """Returns a table of all candidates that were tried, one row per candidate of each law.
+
+        A row contains plain values, ready for CSV.
+        """
         rows = []
         for law, facts in self.to_dict()["laws"].items():
             for candidate in facts["candidates"]:
@@ -614,7 +640,7 @@ class TuningResult(Result):
         return rows
 
     def candidate(self, search: CandidateSearch, index: int) -> TuningScenario:
-        """Returns the scenario of a candidate.
+        """Returns the scenario of a candidate, with which its run can be repeated.
 
         Args:
             search: Search of the candidate's law.
@@ -624,10 +650,16 @@ class TuningResult(Result):
         return plan.base.with_gains(search.space, plan.knowledge, search.tried[index])
 
     def list_edge_gains(self, search: CandidateSearch) -> list[str]:
-        """Lists the gains of a law's best candidate that lie at an end of their range.
+        """Lists the gains whose best value lies at an end of the range in which it was searched.
 
-        The best value of such a gain may lie outside of the range, so that the range should be
-        widened. The best candidate is that with the least objective.
+        Such a range should be widened, because a better value may lie outside of it. The best
+        candidate of the law is the one with the least objective.
+
+        Args:
+            search: Search of the law.
+
+        Returns:
+            A text for each such gain. Empty if there are none.
         """
         if not search.front:
             return []
@@ -640,7 +672,14 @@ class TuningResult(Result):
         return names
 
     def list_overall_front(self, search: CandidateSearch) -> list[int]:
-        """Returns the indices of a law's candidates on the common Pareto front of all laws."""
+        """Lists the candidates of a law that no candidate of any law beats in both objectives.
+
+        Args:
+            search: Search of the law.
+
+        Returns:
+            Indices of the candidates in this search. Empty if other laws are better everywhere.
+        """
         points = []
         owners = []
         for other in self.found:

@@ -136,7 +136,7 @@ def tabulate_search(plan: TuningPlan) -> TextTable:
 def tabulate_front(
     tuned: TuningResult, search: CandidateSearch, most: int = MAX_BUDGET
 ) -> TextTable:
-    """Returns a table of the candidates on a law's Pareto front, in the order of rising effort.
+    """Returns a table of the candidates on a law's Pareto front, by rising effort.
 
     A candidate is on the front if no other candidate has both a smaller error and a smaller
     effort. A * marks the candidates that are also on the common front of all laws.
@@ -407,7 +407,10 @@ def _draw_paper_gains(axes: Axes, tuned: TuningResult) -> list[Line2D]:
 
 
 def write_tuning(tuned: TuningResult, folder: Path) -> list[Path]:
-    """Writes the page, the tables and the figure of a comparison into an existing folder.
+    """Writes the results of a comparison into an existing folder.
+
+    The files are the results as JSON, a page in Markdown, and the figure of the fronts as PNG
+    and PDF.
 
     Args:
         tuned: The comparison.
