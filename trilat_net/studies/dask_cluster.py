@@ -77,7 +77,7 @@ def describe_worker() -> WorkerIdentity:
 
 
 class WorkerRequirements(NamedTuple):
-    """What a worker of a cluster must have, so that it computes the same results as this process.
+    """What a worker of a cluster must have to compute the same results as this process.
 
     Attributes:
         identity: Properties that the worker must have.

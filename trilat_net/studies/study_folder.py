@@ -121,14 +121,14 @@ def encode_csv(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = ()) -
 
 
 class JournalEntry(Protocol):
-    """Interface of the entries of a `RunJournal`, each of which is the result of a finished run.
+    """Interface of an entry of a `RunJournal`: the result of a finished run.
 
     An entry is a structure of plain values. The cell and the seed together identify its run.
     """
 
     @property
     def cell(self) -> Hashable:
-        """Part of the study to which the run belongs, such as the number of a point of its grid."""
+        """Part of the study to which the run belongs, such as the number of a grid point."""
 
     @property
     def seed(self) -> int:
@@ -181,9 +181,10 @@ class RunJournal(Generic[E]):
         self._file.close()
 
     def add(self, entry: E) -> None:
-        """Appends the result of a run to the file at once, so that an interruption cannot lose it.
+        """Appends the result of a run to the file at once.
 
-        A run that the journal contains already is ignored.
+        Thus an interruption of the study cannot lose the run. A run that the journal contains
+        already is ignored.
 
         Args:
             entry: Result of the run.

@@ -23,10 +23,10 @@ FAIR_COMPARISON = "laws at their best gains compare fairly by: trilat compare --
 
 
 def describe_fixed_gains(plan: SweepPlan) -> list[str]:
-    """Returns the gains that a sweep did not vary, such as "p_d of s: K 10, gravity 1".
+    """Lists the gains that a sweep did not vary, on which its results depend, too.
 
-    Sites with the same law and the same gains share a text. A text that applies to all sites
-    names no site.
+    An entry is a text such as "p_d of s: K 10, gravity 1". Sites with the same law and the same
+    gains share a text. A text that applies to all sites names no site.
 
     Args:
         plan: The sweep.

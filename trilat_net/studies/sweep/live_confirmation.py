@@ -50,7 +50,9 @@ GridIndex = tuple[Any, ...]
 
 
 class ConfirmedCell(NamedTuple):
-    """A cell that was run live, with the comparison of its classes.
+    """A cell of a sweep that was run again over a real network, with both results.
+
+    The comparison shows whether the results in virtual time also hold for a live session.
 
     Attributes:
         row: Run of the cell in the results of the sweep.
@@ -143,11 +145,17 @@ def _rank_along_edge(index: GridIndex) -> tuple[Any, ...]:
 
 
 def confirm_cell(row: ResultRow, run: SessionRunner) -> ConfirmedCell:
-    """Runs a cell over a network, and compares the class of the log with that of the sweep.
+    """Runs a cell of a sweep over a real network, and compares the results.
+
+    The cell is classified from the log of this live session, as the sweep classified it in
+    virtual time.
 
     Args:
         row: Run of the cell in the results of the sweep.
         run: Function that runs a scenario over a network.
+
+    Returns:
+        Both classes. The live class is None if the session failed.
     """
     virtual = CellClass(row["verdict"])
     extra_s = _EXTRA_S if row["diverged_s"] is not None else 0.0
@@ -175,7 +183,10 @@ def confirm_cell(row: ResultRow, run: SessionRunner) -> ConfirmedCell:
 def tabulate_confirmations(
     confirmations: Sequence[ConfirmedCell], axes: Sequence[str]
 ) -> TextTable:
-    """Returns a table with one row per cell: its values, both classes, numbers and the log.
+    """Returns a table of the cells that were run live, with one row per cell.
+
+    A row has the values of the cell, its classes in virtual time and live, numbers from the
+    log, and the path of the log.
 
     Args:
         confirmations: The cells.

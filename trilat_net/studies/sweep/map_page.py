@@ -601,7 +601,7 @@ _DPI = 300
 
 
 def write_map(chart: StabilityMap, folder: Path, width_in: float = COLUMN_IN) -> list[Path]:
-    """Writes the figure and the page of a map into an existing folder.
+    """Writes the figure and the Markdown page of a stability map into an existing folder.
 
     Args:
         chart: The map.
@@ -625,14 +625,17 @@ def write_map(chart: StabilityMap, folder: Path, width_in: float = COLUMN_IN) ->
 
 
 def build_map_page(chart: StabilityMap, picture: str) -> str:
-    """Returns the page of a map in Markdown.
+    """Composes the Markdown page of a stability map.
 
-    The page has the commands, the picture, the number of runs of each class, notes, and a table
-    of the edges for each panel.
+    The page has the commands that make the map, the picture, the number of runs of each class,
+    notes, and for each panel a table of the measured edges of stability.
 
     Args:
         chart: The map.
         picture: File name of the picture.
+
+    Returns:
+        The text of the page.
     """
     commands = "\n".join(chart.commands)
     parts = [f"# {chart.title}", f"```sh\n{commands}\n```", f"![map]({picture})"]
@@ -662,7 +665,11 @@ def _list_notes(chart: StabilityMap) -> list[str]:
 
 
 def tabulate_classes(plane: MapPlane) -> TextTable:
-    """Returns a table with the number of runs of each class, one row per panel."""
+    """Returns a table with the number of runs of each class, such as stable or diverged.
+
+    Args:
+        plane: The measured part of the map. Each of its panels has a row.
+    """
     rows = []
     for panel in plane.panels:
         counts = panel.counts.sum(axis=(0, 1)).tolist()
@@ -671,14 +678,15 @@ def tabulate_classes(plane: MapPlane) -> TextTable:
 
 
 def tabulate_edges(plane: MapPlane, panel: MapPanel, lines: Sequence[MapLine]) -> TextTable:
-    """Returns a table that compares the measured edges of a panel with the lines from theory.
+    """Returns a table that compares the measured edges of stability with theory.
 
-    The table has one row per edge. For each line it has the crossing that is nearest to the
-    edge, and the difference of this crossing from the middle of the edge, or "within" if the
-    crossing lies within the edge.
+    The table has one row per measured edge of the panel. For each line from theory it has the
+    crossing that is nearest to the edge, and the difference of this crossing from the middle of
+    the edge, or "within" if the crossing lies within the edge.
 
     On a map of growth exponents, the measured edges are the zeros of the exponent, and another
-    column has the nearest edge of the classes. If only one axis is drawn, the table is empty.
+    column has the nearest edge between stable and not stable runs. If only one axis is drawn,
+    the table is empty.
 
     Args:
         plane: The map.

@@ -58,13 +58,17 @@ False if it is not stable, and None if it is undecided.
 
 
 class KeyMargin(NamedTuple):
-    """The edges of stability along one key.
+    """The edges of stability along one key: where its values change to not stable or back.
+
+    `search_key_margin` creates this object from runs at selected values of the key.
 
     Attributes:
-        spans: The edges in rising order. There are several if the scan detected islands.
-        stable: If there are no edges, True if the decided values are stable and False if they
-            are not. None with edges, and if no value was decided.
-        undecided: Number of undecided values.
+        spans: The edges in rising order. There are several if stable values lie between values
+            that are not stable, or the other way round.
+        stable: If there are no edges, True if all decided values are stable, and False if all
+            are not stable. None if there are edges, or if no value was decided.
+        undecided: Number of values whose runs show neither that they are stable nor that they
+            are not.
         runs: Number of values that were run.
     """
 
@@ -82,7 +86,7 @@ def search_key_margin(
     *,
     whole: bool = False,
 ) -> KeyMargin:
-    """Searches the edges of stability between two values.
+    """Searches the edges of stability between two values of a key.
 
     Args:
         stable: Function that runs and classifies one value. Each value is run once.
@@ -90,6 +94,9 @@ def search_key_margin(
         high: Upper end of the range.
         tolerance: Largest width of an edge, as a fraction of its value.
         whole: True if only whole numbers can be run.
+
+    Returns:
+        The edges. If there are none, the result states whether all values are stable.
     """
     results: dict[float, bool | None] = {}
 
@@ -193,7 +200,9 @@ class SearchRange(NamedTuple):
 
 
 class MarginItem(NamedTuple):
-    """Work for a worker process: the search at one grid point. The object can be pickled.
+    """The search at one grid point of a sweep, as an item for a worker process.
+
+    The object can be pickled.
 
     Attributes:
         plan: The sweep.
@@ -213,7 +222,9 @@ class MarginItem(NamedTuple):
 
 
 class GridPointMargin(NamedTuple):
-    """The edges of stability at one grid point, from runs and from theory.
+    """The edges of stability at one grid point of a sweep, from runs and from theory.
+
+    An edge is a value of the searched key at which runs change between stable and not stable.
 
     Attributes:
         cell: The grid point, with its values along the axes of the sweep.
@@ -278,7 +289,7 @@ def search_margins(
     progress: Progress = ignore_progress,
     on: Workers = None,
 ) -> list[GridPointMargin]:
-    """Searches the edges at each grid point of a sweep, for each seed.
+    """Searches the edges of stability at each grid point of a sweep, for each seed.
 
     Args:
         plan: The sweep. Its last axis consists of the two ends of the range.
@@ -286,6 +297,9 @@ def search_margins(
         jobs: Number of worker processes. None uses all cores.
         progress: Function that is called with the number of finished and of all searches.
         on: Workers to use instead of processes of this computer.
+
+    Returns:
+        The edges of each grid point and seed, in the order of the grid.
 
     Raises:
         ScenarioError: The scenario is not valid at a value of the range.
@@ -305,7 +319,12 @@ def search_margins(
 
 
 def search_margin_task(task: MarginItem) -> GridPointMargin:
-    """Searches the edges at one grid point, by runs and by theory.
+    """Searches the edges of stability at one grid point, by runs and by theory.
+
+    The function needs nothing but its argument, so that any worker process can call it.
+
+    Args:
+        task: The grid point, the seed and the range.
 
     Raises:
         ScenarioError: The scenario is not valid at a value of the range.
@@ -348,7 +367,9 @@ def _find_nearest(value: float, edges: Sequence[float]) -> float | None:
 
 @dataclass(frozen=True, repr=False)
 class SweepMargins(Result):
-    """The edges of stability along one key, at each grid point of a sweep and for each seed.
+    """Result of a margin search: the edges of stability along one key.
+
+    The edges are searched at each grid point of a sweep and for each seed.
 
     Attributes:
         plan: The sweep. Its last axis consists of the two ends of the range.
@@ -417,7 +438,7 @@ class SweepMargins(Result):
         yield self.table()
 
     def headline(self) -> str:
-        """Returns a sentence with the number of edges and the range of the search."""
+        """Returns a sentence that states how many edges were found, and in which range."""
         edges = sum(len(point.margin.spans) for point in self.found)
         low = self.within.low
         high = self.within.high
@@ -488,7 +509,14 @@ class SweepMargins(Result):
         return "\n\n".join(parts) + "\n"
 
     def write(self, folder: Path) -> list[Path]:
-        """Writes margin.json and margin.md into a folder, and returns their paths."""
+        """Writes the results into an existing folder, as margin.json and margin.md.
+
+        Args:
+            folder: The folder.
+
+        Returns:
+            The paths of both files.
+        """
         json_path = folder / "margin.json"
         page_path = folder / "margin.md"
         write_whole(json_path, json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n")

@@ -88,7 +88,7 @@ class PlaneAxis(NamedTuple):
 
     @property
     def positions(self) -> Array:
-        """Positions at which the values are drawn.
+        """Positions at which the values are drawn along the axis, shape (K,) for K values.
 
         Equally spaced values are drawn at their own positions. Other values, as in 1, 10, 100,
         are drawn at equal distances, at their indices.
@@ -99,7 +99,10 @@ class PlaneAxis(NamedTuple):
 
 
 class MapPanel(NamedTuple):
-    """One panel of a map: the runs with the same setting of the axes that are not drawn.
+    """One panel of a stability map: a grid of runs over the two drawn axes.
+
+    A sweep may vary more keys than a picture has axes. All runs of a panel have the same
+    setting of these other keys.
 
     Attributes:
         title: The setting as a text, such as "p d, delay 200 ms". Empty if there are no such
@@ -132,18 +135,18 @@ class MapPanel(NamedTuple):
 
     @property
     def decided(self) -> RunCounts:
-        """Number of runs at each grid point that are stable or not stable, shape (y, x).
+        """Number of runs at each grid point that were judged stable or not stable, shape (y, x).
 
-        An undecided run shows neither, for example because it was too short.
+        The other runs are undecided, for example because they were too short.
         """
         undecided = self.counts[:, :, CELL_CLASSES.index(CellClass.UNDECIDED)]
         return self.runs - undecided
 
     @property
     def share(self) -> Array:
-        """Fraction of the decided runs that are stable, shape (y, x).
+        """Fraction of the decided runs at each grid point that are stable, shape (y, x).
 
-        NaN at grid points without decided runs.
+        It is NaN at grid points at which all runs are undecided.
         """
         stable = self.stable
         decided = self.decided
@@ -153,9 +156,10 @@ class MapPanel(NamedTuple):
 
 
 class MapPlane(NamedTuple):
-    """The measured part of a map: panels that have the same two axes.
+    """The measured part of a stability map: panels over the same two axes.
 
-    If only one swept axis is numeric, the vertical axis y has an empty key and a single value.
+    If only one swept axis has numeric values, the vertical axis y has an empty key and a single
+    value.
 
     Attributes:
         scenario: Name of the swept scenario.
@@ -171,12 +175,16 @@ class MapPlane(NamedTuple):
 
     @property
     def judged_by_twins(self) -> bool:
-        """True if the sweep measured growth exponents, by runs repeated with a small push."""
+        """True if the sweep measured growth exponents instead of judging the end of each run.
+
+        A growth exponent is the rate at which a small disturbance grows, in 1/s. It is measured
+        by twins: repeated runs with a small push.
+        """
         return any(np.isfinite(panel.exponents_per_s).any() for panel in self.panels)
 
     @property
     def seeds(self) -> int:
-        """Number of runs at the grid point with the most runs."""
+        """Largest number of runs at any grid point. The runs of a point differ in their seeds."""
         return max(int(panel.runs.max()) for panel in self.panels)
 
 
@@ -302,7 +310,7 @@ class StabilityEdge(NamedTuple):
 
     @property
     def middle(self) -> float:
-        """Centre of the interval."""
+        """Centre of the interval that contains the edge, in the unit of the parameter."""
         return 0.5 * (self.low + self.high)
 
 
@@ -345,6 +353,9 @@ _ROUNDING = 1e-6
 
 class StabilityCriterion(NamedTuple):
     """A stability condition in closed form, evaluated for one scenario.
+
+    The condition is an inequality between parameters of the scenario, such as a gain and a
+    delay, which is known from theory.
 
     Attributes:
         symbol: Equation of the limit of the condition, in TeX, for the legend of a figure.
@@ -642,7 +653,7 @@ class MapLine(NamedTuple):
 
     @property
     def crosses_map(self) -> bool:
-        """True if the line passes between grid points.
+        """True if the line passes between grid points, so that it is visible on the map.
 
         This is so if four neighbouring grid points all have a value, and only some of them are
         on the stable side of the line.
@@ -657,11 +668,14 @@ class MapLine(NamedTuple):
         return bool(crossed.any())
 
     def crossings(self, column: int, y: PlaneAxis) -> list[float]:
-        """Returns the values of y at which the line crosses a column, in rising order.
+        """Finds the values of y at which the line crosses a column of grid points.
 
         Args:
             column: Index of the column, which is the index of its value of x.
             y: Vertical axis.
+
+        Returns:
+            The values in rising order. Empty if the line does not cross the column.
         """
         values = y.values
         excess = self.excess[:, column].tolist()
@@ -682,7 +696,12 @@ _ABOUT_TWINS = (
 
 
 def trace_zero_exponent(panel: MapPanel) -> MapLine | None:
-    """Returns the measured line on which small disturbances neither grow nor die away.
+    """Finds the measured line on which small disturbances neither grow nor die away.
+
+    There the growth exponent is zero, the rate at which a small disturbance grows.
+
+    Args:
+        panel: The panel with its measured exponents.
 
     Returns:
         The line of zero growth exponents. None if it does not cross the panel.
@@ -698,10 +717,11 @@ def trace_zero_exponent(panel: MapPanel) -> MapLine | None:
 
 
 def trace_closed_form(load: PanelLoader, x: PlaneAxis, y: PlaneAxis) -> MapLine | None:
-    """Returns the line on which the closed-form criterion of a panel is marginal.
+    """Finds the line on which the stability condition of a panel is just met.
 
-    Between two grid points of a column on different sides of the line, the crossing is located
-    with Brent's method, because the criterion may be nonlinear in y.
+    The condition is one in closed form, from theory, see `evaluate_criterion`. Between two grid
+    points of a column on different sides of the line, the crossing is located with Brent's
+    method, because the condition may be nonlinear in y.
 
     Args:
         load: Function that returns the scenario of the panel at values of x and y.
@@ -709,7 +729,7 @@ def trace_closed_form(load: PanelLoader, x: PlaneAxis, y: PlaneAxis) -> MapLine 
         y: Vertical axis.
 
     Returns:
-        The line. None if no criterion applies, or if the line does not cross the panel.
+        The line. None if no condition is known for the panel, or if the line does not cross it.
     """
     first_criterion: StabilityCriterion | None = None
     columns = []
@@ -746,7 +766,9 @@ def trace_closed_form(load: PanelLoader, x: PlaneAxis, y: PlaneAxis) -> MapLine 
 def trace_linear_analysis(
     columns: Sequence[GrowthColumn], y: PlaneAxis
 ) -> tuple[MapLine | None, list[str]]:
-    """Returns the line on which the rightmost root of the linearised loop is marginal.
+    """Finds the line on which small motions of the linearised loop neither grow nor decay.
+
+    There the real part of the loop's rightmost characteristic root is zero.
 
     Args:
         columns: Linear analysis of each column of the panel, in the order of x.
@@ -823,7 +845,9 @@ def _place_zeros(
 def find_criterion_edge(
     criterion: Callable[[float], StabilityCriterion | None], low: float, high: float
 ) -> float | None:
-    """Finds the value at which a criterion is marginal, with Brent's method.
+    """Finds the value of a parameter at which a stability condition is just met.
+
+    The value is located with Brent's method.
 
     Args:
         criterion: Function that evaluates the criterion at a value. It may raise ScenarioError
@@ -886,9 +910,9 @@ def build_stability_map(
     linearly: bool = True,
     on: Workers = None,
 ) -> StabilityMap:
-    """Returns the stability map of the results of a sweep.
+    """Builds the stability map of a sweep: its measurements and the lines from theory.
 
-    Lines are drawn only if the map has two numeric axes.
+    Lines are computed only if the map has two numeric axes.
 
     Args:
         results: Results of the sweep.
@@ -897,6 +921,9 @@ def build_stability_map(
         progress: Function that is called while the linear analysis runs.
         linearly: True to add the line of the linear analysis, which takes longest.
         on: Workers that compute the linear analysis. None starts processes on this computer.
+
+    Returns:
+        The map.
 
     Raises:
         UsageError: There is nothing to draw, or there would be too many panels.
@@ -956,13 +983,17 @@ def _analyse_column(task: tuple[PanelLoader, float, PlaneAxis]) -> GrowthColumn:
 def make_panel_loader(plan: SweepPlan, panel: MapPanel, x: str, y: str) -> PanelLoader:
     """Returns a function that loads the scenario at any point of a panel.
 
-    The function can be pickled, so that other processes can call it.
+    The lines from theory need scenarios between the grid points of the sweep, too. The function
+    can be pickled, so that other processes can call it.
 
     Args:
         plan: The sweep.
         panel: The panel.
         x: Scenario key of the horizontal axis.
         y: Scenario key of the vertical axis.
+
+    Returns:
+        Function of the values of x and y that returns the scenario.
     """
     settings = dict(panel.settings)
     only_law = next(iter(plan.laws), "")

@@ -32,7 +32,10 @@ from ...scenario.validate import refuse_live_only
 
 
 class CellClass(StrEnum):
-    """Class of a cell. The values are the texts in results and on pages."""
+    """Result of a run of a sweep in one word, such as stable or undecided.
+
+    The values are the texts in tables and on pages.
+    """
 
     CONVERGED = "converged"
     BOUNDED = "bounded oscillation"
@@ -41,17 +44,20 @@ class CellClass(StrEnum):
 
     @property
     def stable(self) -> bool | None:
-        """True if the run is stable, False if it is not stable, None if it is undecided."""
+        """Whether the class means that the run is stable. None if the run is undecided."""
         if self is CellClass.UNDECIDED:
             return None
         return self is CellClass.CONVERGED
 
 
 def classify_end(end: RunEnd) -> CellClass:
-    """Returns the class of a cell, given the judgement of the end of its run.
+    """Returns the class of a run of a sweep, given the judgement of its end.
 
-    A run that is not stable counts as diverged unless it stays bounded, that is, also if it
-    drifts or grows.
+    A run that is not stable counts as diverged unless it stays bounded. Thus a run that drifts
+    or grows counts as diverged, too.
+
+    Args:
+        end: Judgement of the end of the run.
     """
     if end.stability is Stability.STABLE:
         return CellClass.CONVERGED
@@ -119,7 +125,13 @@ FLAT_LOG_CHANGE = 0.02
 
 
 def check_sweepable(scenario: Scenario) -> None:
-    """Refuses a scenario that needs a live network, or that the compiled loop cannot run.
+    """Checks that a scenario can be run in a sweep.
+
+    A sweep runs in virtual time in the compiled loop. It refuses scenarios that need a live
+    network, or that this loop cannot run.
+
+    Args:
+        scenario: The scenario.
 
     Raises:
         ScenarioError: See `refuse_live_only` and `check_fusable`.
@@ -332,10 +344,15 @@ numbers of the base, and lines that the base does not contain.
 
 
 def diff_lines(text: str, base: str) -> LineDiff:
-    """Returns the differences of a text from a base, from which `apply_diff` restores the text.
+    """Encodes a text by its differences from a similar text, to save space in a file.
 
-    The differences need not be minimal. Each line is looked up in the base: first at the
-    position after the previous line, and then at its first occurrence.
+    `apply_diff` restores the text. The differences need not be minimal. Each line is looked up
+    in the base: first at the position after the previous line, and then at its first
+    occurrence.
+
+    Args:
+        text: The text.
+        base: The similar text.
     """
     base_lines = base.split("\n")
     # In reversed order the first occurrence of a line is entered last, and so it is kept.
@@ -360,7 +377,7 @@ def diff_lines(text: str, base: str) -> LineDiff:
 
 
 def apply_diff(parts: Iterable[str | Sequence[int]], base: str) -> str:
-    """Returns the text that has these differences from a base.
+    """Restores a text from its differences from a base, as `diff_lines` encoded them.
 
     Args:
         parts: Differences, as `diff_lines` returns them.

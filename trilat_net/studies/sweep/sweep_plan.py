@@ -51,9 +51,10 @@ _VALUES_EXAMPLE = "as in KEY=0:1600:50 (from, to, step) or KEY=1,2,5"
 
 
 class _Steps:
-    """Sequence of equally spaced numbers as texts, each formatted when it is accessed.
+    """Sequence of equally spaced numbers, as texts.
 
-    A range may have so many values that a list of them would not fit into memory.
+    A text is made only when it is accessed, because a range may have so many values that a list
+    of them would not fit into memory.
 
     Args:
         first: First value.
@@ -88,7 +89,14 @@ class SweepAxis(NamedTuple):
     texts: tuple[str, ...] | _Steps
 
     def value(self, number: int) -> float | str:
-        """Returns the value with index `number`: a float if it is a number, else its text."""
+        """Returns one of the values along the axis.
+
+        Args:
+            number: Index of the value, from 0.
+
+        Returns:
+            A float if the value is a number. Otherwise its text.
+        """
         text = self.texts[number]
         value = _parse_value(text)
         return float(value) if is_number(value) else text
@@ -101,12 +109,16 @@ class SweepAxis(NamedTuple):
         return all(is_number(_parse_value(text)) for text in self.texts)
 
     def override(self, number: int) -> str:
-        """Returns the override KEY=VALUE that sets the value with index `number`."""
+        """Returns the text KEY=VALUE that sets the scenario key to one of the values.
+
+        Args:
+            number: Index of the value, from 0.
+        """
         return f"{self.key}={self.texts[number]}"
 
 
 def parse_axis(description: str) -> SweepAxis:
-    """Parses the text of an axis.
+    """Parses the text with which a user describes an axis of a sweep.
 
     Args:
         description: Either "KEY=a:b:step", a range that includes b if a whole number of steps
@@ -307,7 +319,10 @@ class SweepCell(NamedTuple):
 
 
 class SweepPlan(NamedTuple):
-    """A sweep that was checked and is ready to run.
+    """Everything that determines a sweep: scenario, axes, laws and seeds.
+
+    `plan_sweep` creates this object and checks it. A sweep runs a scenario for every
+    combination of the values of its axes, called a cell, with one or several seeds.
 
     Attributes:
         written: Scenario as its author wrote it.
@@ -335,9 +350,10 @@ class SweepPlan(NamedTuple):
 
     @property
     def default_longest_s(self) -> float:
-        """Default of `longest_s`, in s.
+        """Default of `longest_s`, the longest duration to which a run is extended, in s.
 
-        Runs that are judged by growth exponents are not extended.
+        Runs that are judged by growth exponents are not extended, so that the default is then
+        the duration of the scenario.
         """
         extension = 1.0 if self.judge == "twins" else MAX_EXTENSION
         return min(MAX_SCENARIO_S, extension * self.base.duration_s)
@@ -356,7 +372,10 @@ class SweepPlan(NamedTuple):
         return math.prod(self.shape)
 
     def cell(self, number: int) -> SweepCell:
-        """Returns the cell with a number.
+        """Returns one cell of the grid, with its values and overrides.
+
+        Args:
+            number: Number of the cell, from 0.
 
         Raises:
             UsageError: The grid has no cell with this number.
@@ -397,10 +416,10 @@ class SweepPlan(NamedTuple):
         return self.written.load([*self.overrides, *more])
 
     def facts(self) -> dict[str, Any]:
-        """Returns the plan as plain values for a JSON file, which `plan_from_json` reads.
+        """Returns the plan as plain values for a JSON file, from which it can be restored.
 
-        A judge or metrics are stored only if they differ from the default, so that the files of
-        older versions keep their content.
+        `plan_from_json` restores it. The keys for the judge and the metrics are stored only if
+        they differ from the default, so that the files of older versions keep their content.
         """
         plan: dict[str, Any] = {
             "source": self.written.label,
@@ -495,6 +514,9 @@ def plan_from_json(facts: dict[str, Any]) -> SweepPlan:
     """Restores a plan from the plain values that `SweepPlan.facts` returned.
 
     The scenario is parsed from its stored text. Files that the scenario names are read again.
+
+    Args:
+        facts: The plain values, as read from the JSON file.
 
     Raises:
         ScenarioError: The plan cannot run on this machine.

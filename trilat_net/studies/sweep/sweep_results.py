@@ -66,11 +66,17 @@ class SweepResults(Result):
     rows: Sequence[ResultRow]
 
     def blocks(self) -> Iterator[str]:
-        """Yields the lines that describe the sweep, and then the lines of its summary."""
+        """Yields the lines of the text that `trilat sweep` prints.
+
+        The first lines describe the sweep, the others summarise its results.
+        """
         yield from (*describe_sweep_plan(self.plan), *summarize_sweep(self))
 
     def to_rows(self) -> Sequence[ResultRow]:
-        """Returns one row per run, ordered by cell and then by seed."""
+        """Returns the table of all runs, one row per run, ordered by cell and then by seed.
+
+        A cell is a combination of the values of all axes.
+        """
         return self.rows
 
     def to_dict(self) -> dict[str, Any]:
@@ -79,7 +85,9 @@ class SweepResults(Result):
         return {"plan": self.plan.facts(), "runs": runs}
 
     def of_cell(self, number: int) -> list[ResultRow]:
-        """Returns the runs of a cell, one per seed.
+        """Returns the runs of one cell, one row per seed.
+
+        A cell is a combination of the values of all axes and of a control law.
 
         Args:
             number: Number of the cell.
@@ -91,16 +99,19 @@ class SweepResults(Result):
         return [row for row in self.rows if row["cell"] == number]
 
     def outcome(self, row: ResultRow) -> CellResult:
-        """Returns the result of a run as an object.
+        """Converts the row of a run in the table to an object with named fields.
 
         Fields that are missing from the row, because an older version wrote it, have the
         default values of `CellResult`.
+
+        Args:
+            row: Row of the run.
         """
         return msgspec.convert(row, CellResult)
 
 
 def build_result_rows(plan: SweepPlan, entries: Sequence[CellRun]) -> list[ResultRow]:
-    """Builds the table of finished runs.
+    """Builds the table of results from the finished runs of a sweep.
 
     Args:
         plan: The sweep.
@@ -339,24 +350,27 @@ class GridPoint(NamedTuple):
 
     @property
     def decided(self) -> int:
-        """Number of runs that are stable or not stable, without the undecided ones."""
+        """Number of runs that were judged stable or not stable. Undecided runs do not count."""
         classes = zip(self.counts, CellClass, strict=True)
         return sum(count for count, verdict in classes if verdict.stable is not None)
 
     @property
     def stable(self) -> int:
-        """Number of stable runs."""
+        """Number of runs of the cell that were judged stable."""
         classes = zip(self.counts, CellClass, strict=True)
         return sum(count for count, verdict in classes if verdict.stable)
 
     @property
     def doubtful(self) -> bool:
-        """True if the cell is stable with some seeds and not stable with others."""
+        """True if the cell is stable with some seeds and not stable with others.
+
+        Chance then decides the result, and more seeds are needed to know how often.
+        """
         return 0 < self.stable < self.decided
 
     @property
     def interval(self) -> tuple[float, float]:
-        """95 % Wilson interval of the stable share of the decided runs."""
+        """95 % confidence interval of the fraction of decided runs that are stable, by Wilson."""
         return wilson_interval(self.stable, self.decided)
 
 
@@ -369,7 +383,10 @@ def list_totals(plan: SweepPlan) -> list[str]:
 
 
 def collect_grid_points(results: SweepResults) -> list[GridPoint]:
-    """Combines the runs of each cell to a grid point.
+    """Combines the runs of each cell, which differ only in their seeds, to one grid point.
+
+    Args:
+        results: Results of the sweep.
 
     Returns:
         The grid points in the order of the cells.
@@ -401,10 +418,11 @@ def collect_grid_points(results: SweepResults) -> list[GridPoint]:
 
 
 def encode_grid_points(plan: SweepPlan, points: Sequence[GridPoint]) -> str:
-    """Returns grid points as CSV text, with one line per point.
+    """Encodes grid points as a CSV table, with one line per point.
 
     A line contains the number of the cell, its axis values and law, the number of runs of each
-    class, the stable share with its interval, and the means with their intervals.
+    class, the fraction of stable runs with its 95 % interval, and the means of the measured
+    quantities with their intervals.
 
     Args:
         plan: The sweep.
@@ -446,7 +464,11 @@ _MAX_DOUBTFUL_SHOWN = 8
 
 
 def describe_sweep_plan(plan: SweepPlan) -> list[str]:
-    """Returns lines that tell the user how many runs a sweep has, and over which values."""
+    """Returns lines that tell the user how many runs a sweep has, and over which values.
+
+    Args:
+        plan: The sweep.
+    """
     sizes = " x ".join(str(len(axis.texts)) for axis in plan.axes) or "1"
     laws = f" x laws {', '.join(plan.laws)}" if plan.laws else ""
     if len(plan.seeds) == 1:
@@ -474,8 +496,12 @@ def describe_sweep_plan(plan: SweepPlan) -> list[str]:
 def summarize_sweep(results: SweepResults) -> Iterator[str]:
     """Yields the lines of the summary that is printed after a sweep.
 
-    The lines state how many runs each class has, how many runs were extended, the ranges of
-    the measured quantities, the growth exponents, and the differences between seeds.
+    The lines state how many runs each class has, how many runs were extended, the ranges of the
+    measured quantities, the growth exponents, and the differences between seeds. Lines about
+    quantities that the sweep does not have are left out.
+
+    Args:
+        results: Results of the sweep.
     """
     rows = results.rows
     counts = Counter(row["verdict"] for row in rows)

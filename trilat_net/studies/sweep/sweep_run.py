@@ -224,7 +224,9 @@ class DurationEstimate(NamedTuple):
 
 
 class FinishedSweep(NamedTuple):
-    """A finished sweep, with the effort since it was last started or resumed.
+    """Results of a finished sweep, with the time and the number of runs that it took.
+
+    The numbers of runs and times count from the last start or resumption of the sweep.
 
     Attributes:
         results: Results of all runs of the sweep.
@@ -244,7 +246,7 @@ class FinishedSweep(NamedTuple):
 
 
 class CellItem(NamedTuple):
-    """Work for a worker process: one run of a cell. It can be sent to another process.
+    """One run of a sweep as an item for a worker process. It can be pickled.
 
     Attributes:
         plan: The sweep.
@@ -261,7 +263,15 @@ class CellItem(NamedTuple):
 
 
 def run_cell(task: CellItem) -> CellRun:
-    """Runs one cell with one seed, in any process.
+    """Executes one run of a sweep.
+
+    The function needs nothing but its argument, so that any worker process can call it.
+
+    Args:
+        task: The run.
+
+    Returns:
+        The finished run with its result, ready for the journal of the sweep.
 
     Raises:
         ScenarioError: The scenario is not valid or cannot run. The message names the cell.
@@ -375,6 +385,9 @@ def format_wall_time(seconds: float) -> str:
     """Returns a duration as a text with a readable unit, as in "2.5 h".
 
     A larger unit is used from one and a half units on, and days from two days on.
+
+    Args:
+        seconds: The duration, in s.
     """
     units = (("days", 86_400.0, 172_800.0), ("h", 3600.0, 5400.0), ("min", 60.0, 90.0))
     for unit, unit_s, smallest_s in units:
@@ -480,7 +493,11 @@ def _run_cells(
 
 
 def describe_sweep_speed(speed: FinishedSweep) -> str:
-    """Returns a sentence on the speed of a sweep in relation to real time."""
+    """Returns a sentence on how fast the runs were computed in relation to real time.
+
+    Args:
+        speed: The finished sweep.
+    """
     processes = count_nouns(speed.jobs, "process")
     wall_time = format_wall_time(speed.wall_s)
     ratio = speed.simulated_s / (speed.wall_s * speed.jobs) if speed.wall_s else math.nan

@@ -228,7 +228,7 @@ class CandidateClass(StrEnum):
 
     @property
     def word(self) -> str:
-        """Name of the class for people, the same as in the stability certificate where possible."""
+        """Name of the class for people, as in the stability certificate where possible."""
         if self is CandidateClass.OSCILLATED:
             return Stability.NOT_STABLE.value
         if self is CandidateClass.SETTLED:

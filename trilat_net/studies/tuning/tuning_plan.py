@@ -538,7 +538,10 @@ class TuningResult(Result):
     printed: list[PaperGainsResult]
 
     def blocks(self) -> Iterator[Any]:
-        """Yields the parts of the text that `trilat compare --tune` prints, see `compose_tuning`."""
+        """Yields the parts of the text that `trilat compare --tune` prints.
+
+        See `compose_tuning`.
+        """
         from .tuning_report import compose_tuning
 
         return compose_tuning(self)
@@ -650,7 +653,7 @@ class TuningResult(Result):
         return plan.base.with_gains(search.space, plan.knowledge, search.tried[index])
 
     def list_edge_gains(self, search: CandidateSearch) -> list[str]:
-        """Lists the gains whose best value lies at an end of the range in which it was searched.
+        """Lists the gains whose best value lies at an end of the searched range.
 
         Such a range should be widened, because a better value may lie outside of it. The best
         candidate of the law is the one with the least objective.
