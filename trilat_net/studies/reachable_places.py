@@ -33,7 +33,7 @@ _LARGEST_STEP_RAD = 0.5
 
 
 def can_reach(arm: ArmModel, start_rad: Sequence[float] | Array, position_m: Array) -> bool:
-    """Returns whether the end effector of an arm can reach a position.
+    """Tells whether the end effector of an arm can reach a position.
 
     Args:
         arm: Model of the arm.

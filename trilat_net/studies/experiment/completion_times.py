@@ -36,6 +36,9 @@ SUCCESS = "succeeded"
 class CompletionTime(NamedTuple):
     """Completion time of the trials under one condition.
 
+    Some trials may end without success at a time limit. Their completion time is not known,
+    only that it is longer (it is censored), so that medians are used instead of means.
+
     Attributes:
         condition: Name of the condition.
         trials: Number of trials that count.
@@ -91,7 +94,7 @@ def is_completed(row: Row) -> bool:
 
 
 def find_median(times_s: Sequence[float]) -> float:
-    """Returns the median of times, in s.
+    """Computes the median of completion times, in s.
 
     Args:
         times_s: Times, in s. They are infinite for trials that were not completed.
@@ -196,14 +199,18 @@ def find_median_interval(times_s: Sequence[float]) -> tuple[float, float | None]
 def compare_times(
     rows: Sequence[Row], *, unit: str = "participant"
 ) -> list[CompletionComparison]:
-    """Compares the completion times of each pair of conditions, in the order of the rows.
+    """Compares the completion times of each pair of conditions, within participants or pairs.
 
-    Each unit counts for the condition under which its median is longer. A median that was not
-    reached is longer than any that was reached. Two medians that were not reached are a tie.
+    Each unit (a participant or a pair) counts for the condition under which its median is
+    longer. A median that was not reached is longer than any that was reached. Two medians that
+    were not reached are a tie.
 
     Args:
         rows: Trials, as for `find_unit_medians`.
         unit: "participant" or "pair".
+
+    Returns:
+        A comparison for each pair of conditions, in the order of the rows.
     """
     medians = find_unit_medians(rows, unit)
     comparisons = []
@@ -279,5 +286,9 @@ def _replace_infinity(time_s: float) -> float | None:
 def to_table(
     results: Sequence[CompletionTime] | Sequence[CompletionComparison],
 ) -> list[dict[str, Any]]:
-    """Returns a row for each condition or comparison."""
+    """Converts results to a table of plain values, one row per condition or comparison.
+
+    Args:
+        results: Completion times of conditions, or their comparisons.
+    """
     return [result._asdict() for result in results]

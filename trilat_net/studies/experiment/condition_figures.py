@@ -47,7 +47,7 @@ _LIMIT: Look = {"color": style.FAINT, "linewidth": 1.0, "linestyle": "--"}
 
 
 def draw_conditions(rows: Sequence[Row], measure: str, *, unit: str = "participant") -> Figure:
-    """Draws a measure by condition.
+    """Draws one measure of an experiment under each of its conditions.
 
     The figure shows the mean of each participant or pair, and the mean over them with its 95 %
     interval.
@@ -73,7 +73,7 @@ def draw_conditions(rows: Sequence[Row], measure: str, *, unit: str = "participa
 
 
 def draw_times(rows: Sequence[Row], limit_s: float, *, unit: str = "participant") -> Figure:
-    """Draws completion times by condition, for trials with a time limit.
+    """Draws the completion times under each condition, for trials with a time limit.
 
     The points are the medians of each participant or pair. An open marker on the line of the
     limit stands for a median beyond the limit.
@@ -182,7 +182,7 @@ def draw_learning(
     unit: str = "participant",
     limit_s: float | None = None,
 ) -> Figure:
-    """Draws a measure over the trials of a block, with a line per condition.
+    """Draws how a measure changes from trial to trial of a block, with a line per condition.
 
     Args:
         rows: A row per trial, as for `statistics`, with the number of each `trial` in its

@@ -80,7 +80,7 @@ NOT_REACHED = "not reached"
 
 
 class MissingAnswers(NamedTuple):
-    """Number of items of a questionnaire without an answer under one condition.
+    """How many answers are missing in the questionnaires under one condition.
 
     Attributes:
         questionnaire: Name of the questionnaire.
@@ -271,7 +271,13 @@ class ExperimentAnalysis(Result):
             )
 
     def of(self, measure: str) -> Sequence[Row]:
-        """Returns the rows that have a measure: of trials, of units, or of questionnaires."""
+        """Returns the rows of the table that contains a measure.
+
+        This is the table of trials, of units (participants or pairs), or of questionnaires.
+
+        Args:
+            measure: Name of the measure.
+        """
         rows_by_kind = {
             "throughput": self.throughput_rows,
             "gain": self.gain_rows,
@@ -545,8 +551,9 @@ class ExperimentAnalysis(Result):
         return "\n\n".join(parts) + "\n"
 
     def fit_models(self) -> Iterator[MixedModel]:
-        """Yields mixed models of the forces of users within pairs.
+        """Fits mixed models of the forces of users within pairs, one after the other.
 
+        A mixed model accounts for the fact that users of the same pair are not independent.
         There are models only if the package statsmodels is installed.
         """
         pairs = {row[self.unit] for row in self.rows}
@@ -571,7 +578,7 @@ class ExperimentAnalysis(Result):
         return rows
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a row for each comparison."""
+        """Returns the comparisons as a table, one row per measure and pair of conditions."""
         return [test._asdict() for test in chain.from_iterable(self.comparisons.values())]
 
     def to_dict(self) -> dict[str, Any]:
@@ -762,7 +769,9 @@ def analyse_experiment(
 
 
 class PowerOfExperiment(Result):
-    """Number of participants that an effect needs.
+    """Number of participants that an experiment needs to detect an effect of a given size.
+
+    The power is the probability that the test finds an effect that exists.
 
     Args:
         d_z: Size of the effect.
@@ -811,7 +820,11 @@ class PowerOfExperiment(Result):
         }
 
     def blocks(self) -> Iterator[Block]:
-        """Yields the text: participants for each power, and the power as planned."""
+        """Yields the parts of the text that `trilat experiment power` prints.
+
+        A table has the number of participants for each power. With a planned number of
+        participants, a second part has the power that it gives.
+        """
         yield (
             "paired comparison of two conditions, two-sided, alpha 0.05, "
             f"effect d_z {self.d_z:g}"

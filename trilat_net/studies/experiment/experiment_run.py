@@ -44,7 +44,10 @@ LOGS = "logs"
 
 
 class Note(msgspec.Struct, frozen=True):
-    """An event with people that is not a finished trial. Notes have a journal of their own.
+    """Event of an experiment with people, other than a finished trial.
+
+    Such events are consents, answers to a questionnaire, and aborted trials. They are stored in
+    a journal of their own.
 
     Attributes:
         cell: Unique key of the event: a step and a participant, or an aborted trial.
@@ -68,7 +71,7 @@ class Note(msgspec.Struct, frozen=True):
 
 
 class ExperimentStatus(NamedTuple):
-    """The progress of an experiment.
+    """How many trials of an experiment are done, and which one is next.
 
     Attributes:
         done: Number of trials in the journal.
@@ -82,7 +85,9 @@ class ExperimentStatus(NamedTuple):
 
 
 class Experiment(Result):
-    """An experiment in its folder.
+    """An experiment in its folder, which contains its plan, journals, logs and tables.
+
+    `begin_experiment` and `open_experiment` create this object.
 
     Args:
         folder: The folder.
@@ -101,7 +106,10 @@ class Experiment(Result):
         self._remedy = build_resume_hint("experiment", "run", str(folder))
 
     def open_trials(self, *, people: bool | None = None) -> RunJournal[TrialEntry]:
-        """Opens the journal of trials, to read it or to continue the experiment.
+        """Opens the journal with the results of the finished trials.
+
+        People and synthetic participants (models of people) must not be mixed in one
+        experiment, so that a caller who continues it states which it uses.
 
         Args:
             people: True if people continue the experiment, False if synthetic participants do.
@@ -125,23 +133,26 @@ class Experiment(Result):
         )
 
     def open_notes(self) -> RunJournal[Note]:
-        """Opens the journal of consents, answers and aborted trials."""
+        """Opens the journal of consents, answers to questionnaires and aborted trials."""
         return RunJournal(self.folder / NOTES_FILE, self.plan.digest, Note, self._remedy)
 
     def read_entries(self) -> dict[int, TrialEntry]:
-        """Returns the results of the finished trials, by number."""
+        """Returns the results of the finished trials, by the number of the trial in the plan."""
         with self.open_trials() as journal:
             return {entry.cell: entry for entry in journal.done.values()}
 
     def read_notes(self) -> list[Note]:
-        """Returns the notes in the order in which they were made."""
+        """Returns the consents, answers and aborted trials, in the order in which they occurred."""
         if not (self.folder / NOTES_FILE).exists():
             return []
         with self.open_notes() as journal:
             return list(journal.done.values())
 
     def list_choices(self) -> Choices:
-        """Returns the choices that participants have made in the pairs of a staircase."""
+        """Returns which trial participants chose in each pair of a staircase.
+
+        A staircase presents pairs of trials, and asks in which one the difference was larger.
+        """
         if self.plan.protocol.staircase is None:
             return {}
         choices: dict[int, float] = {}
@@ -180,7 +191,7 @@ class Experiment(Result):
                 notes.add(note)
 
     def status(self) -> ExperimentStatus:
-        """Returns the progress of the experiment."""
+        """Returns how many trials are done, and which trial is next."""
         done = self.read_entries()
         remaining = [trial for trial in self.plan.trials if trial.number not in done]
         next_trial = remaining[0] if remaining else None
@@ -214,7 +225,10 @@ class Experiment(Result):
         return self
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a row for each finished trial, in the order of the plan."""
+        """Returns the table of finished trials, one row per trial, in the order of the plan.
+
+        A row contains the participants, the condition and the measures of the trial.
+        """
         done = self.read_entries()
         choices = self.list_choices()
         rows = []
@@ -276,9 +290,9 @@ class Experiment(Result):
         return rows
 
     def list_scores(self) -> list[dict[str, Any]]:
-        """Returns a row for each completed questionnaire, with the score under the form's name.
+        """Returns the scores of the completed questionnaires, one row per questionnaire.
 
-        The score is None if an answer is missing.
+        The score is under the name of the questionnaire. It is None if an answer is missing.
         """
         forms = {form.name: find_form(form) for form in self.plan.protocol.questionnaires}
         rows: list[dict[str, Any]] = []
@@ -307,10 +321,11 @@ class Experiment(Result):
             yield row, note
 
     def write_tables(self) -> Path:
-        """Writes trials.csv, with a row for each trial and the digest of its log.
+        """Writes the results as CSV tables into the folder of the experiment.
 
-        For an experiment with people, the method also writes questionnaires.csv, and events.csv
-        with the consents and the aborted trials.
+        The file trials.csv has a row for each trial, with the digest of its log. An experiment
+        with people also has the files questionnaires.csv, and events.csv with the consents and
+        the aborted trials.
 
         Returns:
             The path of trials.csv.
@@ -351,10 +366,10 @@ class Experiment(Result):
         }
 
     def blocks(self) -> Iterator[Block]:
-        """Yields the text of the progress, with a row for each condition.
+        """Yields the parts of the text about the progress, among them a table of the conditions.
 
-        The completion time is a median, in which a trial that was not completed counts as
-        longer than any other.
+        The table states the median completion time of each condition, in which a trial that was
+        not completed counts as longer than any other.
         """
         status = self.status()
         rows = [row for row in self.to_rows() if not (row["practice"] or row["catch"])]
@@ -513,7 +528,14 @@ def run_experiment(
 
 
 def list_log_problems(experiment: Experiment) -> Iterator[str]:
-    """Yields a sentence for each finished trial whose log is missing or was changed."""
+    """Finds finished trials whose log is missing or was changed since the trial.
+
+    Args:
+        experiment: The experiment.
+
+    Yields:
+        A sentence for each such trial.
+    """
     done = experiment.read_entries()
     for planned in experiment.plan.trials:
         entry = done.get(planned.number)

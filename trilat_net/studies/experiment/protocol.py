@@ -54,12 +54,15 @@ Feedback = Literal[
 
 
 class CatchTrials(Frozen, frozen=True):
-    """Trials of another condition within a block, which keep participants from anticipating.
+    """Trials of an unexpected condition that are mixed into a block of another condition.
+
+    They keep participants from anticipating what the next trial is like. They do not count in
+    the analysis.
 
     Attributes:
-        condition: Condition of the catch trials.
-        share: Share of the counted trials of a block that are catch trials. Their number is
-            rounded. Blocks of the condition itself have no catch trials.
+        condition: Condition of the catch trials. Blocks of this condition have no catch trials.
+        share: Number of catch trials in a block, as a fraction of the counted trials of the
+            block. The number is rounded.
     """
 
     condition: Name
@@ -87,7 +90,7 @@ class Training(Frozen, frozen=True):
     rest_s: Annotated[float, Meta(ge=0.0, le=1e6)] = 600.0
 
     def describe(self) -> str:
-        """Returns a sentence about the training for the methods section of a paper."""
+        """Describes the training in a sentence for the methods section of a paper."""
         courses: list[str] = []
         for condition, (first, last) in self.lead.items():
             courses.append(f"{first:g} to {last:g} ({condition})")
@@ -161,12 +164,16 @@ class Protocol(Frozen, frozen=True):
     ) -> list[tuple[str, float | None]]:
         """Lists the phase and the lead of each trial of a block, without practice trials.
 
-        The lead is the first user's part of the authority that two users have over the slave.
-        None keeps the scenario's dominance factors.
+        A phase is a part of a training or a staircase, see `PlannedTrial`. The lead is the
+        first user's part of the authority that two users have over the slave.
 
         Args:
             condition: Condition of the block.
             random: Generator that draws the order within the pairs of a staircase.
+
+        Returns:
+            Pairs of the phase, which is empty outside of a training or staircase, and the lead.
+            A lead of None keeps the scenario's dominance factors.
         """
         phases: list[tuple[str, float | None]] = []
         if self.staircase is not None:
@@ -187,7 +194,7 @@ class Protocol(Frozen, frozen=True):
 
     @property
     def forms(self) -> list[Questionnaire]:
-        """The forms that people fill in: questionnaires, and the choices of a staircase."""
+        """Forms that participants fill in: the questionnaires, and the choices of a staircase."""
         forms = list(self.questionnaires)
         if self.staircase:
             forms.append(self.staircase.form)
@@ -195,7 +202,7 @@ class Protocol(Frozen, frozen=True):
 
     @property
     def groups(self) -> list[tuple[str, ...]]:
-        """Pseudonyms of the participants who take part together, alone or in pairs."""
+        """Participants who take part together, as tuples of one or two pseudonyms."""
         participants = self.participants
         if isinstance(participants, int):
             digits = len(str(participants))
@@ -208,7 +215,7 @@ class Protocol(Frozen, frozen=True):
 
 
 class PlannedTrial(NamedTuple):
-    """A trial of the plan.
+    """One trial of an experiment, with its participants, condition and place in the order.
 
     Attributes:
         number: Number of the trial in the experiment, from 1.
@@ -256,7 +263,7 @@ Choices = Mapping[int, float]
 
 
 class Step(NamedTuple):
-    """A step of an experiment: a consent, a trial or a questionnaire.
+    """One thing that participants have to do: give consent, do a trial or answer a questionnaire.
 
     Attributes:
         kind: "consent", "trial" or "questionnaire".
@@ -271,7 +278,7 @@ class Step(NamedTuple):
 
     @property
     def key(self) -> str:
-        """Identifier of the step in notes and messages."""
+        """Identifier of the step, with which notes and messages refer to it."""
         key = f"{self.kind} {self.planned.number}"
         if self.form is not None:
             return f"{key} {self.form.name}"
@@ -280,7 +287,9 @@ class Step(NamedTuple):
 
 @dataclass(frozen=True, repr=False)
 class ExperimentPlan(Result):
-    """A protocol, the scenario of each condition, and all trials in their order.
+    """An experiment that is ready to run: its protocol and all trials in their order.
+
+    `plan_experiment` creates this object from a protocol.
 
     Attributes:
         protocol: The protocol.
@@ -309,7 +318,10 @@ class ExperimentPlan(Result):
         }
 
     def list_steps(self) -> Iterator[Step]:
-        """Yields the steps of the experiment in their order."""
+        """Yields everything that participants have to do, in the order of the experiment.
+
+        These are the consents, the trials, and the questionnaires after blocks or at the end.
+        """
         protocol = self.protocol
         last_trial = self.trials[-1].trial
         for planned in self.trials:
@@ -349,15 +361,18 @@ class ExperimentPlan(Result):
         return judgements
 
     def find_pair(self, planned: PlannedTrial, choices: Choices) -> tuple[float, bool | None]:
-        """Returns the difference within a trial's pair, and whether the choice was right.
+        """Returns what is known about the pair of trials to which a trial of a staircase belongs.
+
+        A staircase presents pairs of trials that differ in one key, and the participant chooses
+        the trial in which the value was larger.
 
         Args:
             planned: A trial of the pair.
             choices: Choices of the participants.
 
         Returns:
-            The difference in the unit of the staircase's key. True if the choice was right,
-            False if it was wrong, None before the choice.
+            The difference between both trials, in the unit of the staircase's key; and True if
+            the participant's choice was right, False if it was wrong, None before the choice.
         """
         staircase = self.protocol.staircase
         assert staircase is not None
@@ -368,7 +383,15 @@ class ExperimentPlan(Result):
         return difference, is_right
 
     def find_scenario(self, planned: PlannedTrial, choices: Choices) -> Scenario:
-        """Returns the scenario of a trial. A staircase adapts it to the earlier choices."""
+        """Returns the scenario of a trial.
+
+        It is the scenario of the trial's condition. In a staircase, a key of it is adapted to
+        the earlier choices of the participant.
+
+        Args:
+            planned: The trial.
+            choices: Choices that participants have made so far.
+        """
         scenario = self.scenarios[planned.condition]
         staircase = self.protocol.staircase
         if staircase is None or planned.practice:
@@ -379,7 +402,11 @@ class ExperimentPlan(Result):
         return load_scenario(scenario, {staircase.key: staircase.standard + difference})
 
     def rest_before_s(self, planned: PlannedTrial) -> float:
-        """Returns the shortest rest before a trial, in s."""
+        """Returns how long participants must at least rest before a trial, in s.
+
+        Args:
+            planned: The trial.
+        """
         training = self.protocol.training
         previous = self.trials[max(planned.number - 2, 0)]
         starts_retention = planned.phase == "retention" and previous.phase != "retention"
@@ -389,7 +416,11 @@ class ExperimentPlan(Result):
         return self.protocol.rest_s if starts_later_block else 0.0
 
     def list_orders(self) -> dict[str, list[str]]:
-        """Returns the order of conditions of each group, by the name of the group."""
+        """Returns the order in which each group of participants gets the conditions.
+
+        Returns:
+            Names of the conditions in order, by the name of the group.
+        """
         orders: dict[str, list[str]] = {}
         for trial in self.trials:
             if trial.catch:
@@ -400,7 +431,7 @@ class ExperimentPlan(Result):
         return orders
 
     def blocks(self) -> Iterator[Block]:
-        """Yields the text of the plan."""
+        """Yields the parts of the text that `trilat experiment check` prints."""
         protocol = self.protocol
         facts = self.to_dict()
         units = "pairs" if len(protocol.users) > 1 else "participants"
@@ -422,7 +453,10 @@ class ExperimentPlan(Result):
 
 
 def read_protocol(file: str | Path) -> Protocol:
-    """Reads a protocol from a TOML file.
+    """Reads the protocol of an experiment from a TOML file, without planning its trials.
+
+    Args:
+        file: Path of the file.
 
     Raises:
         UsageError: The file cannot be read, or a key or value in it is not valid.
@@ -637,9 +671,9 @@ def _check_scenario(scenario: Scenario, protocol: Protocol) -> Scenario:
 def limit_forces(
     scenario: Scenario, protocol: Protocol, group: Sequence[str]
 ) -> dict[str, Any]:
-    """Returns the specifications of sites whose participants need a lower force limit.
+    """Returns sites with lower force limits, for participants who must not push hard.
 
-    The limits are those of `force_limit_n` for the participants of a group.
+    The protocol states these participants and their limits under `force_limit_n`.
 
     Args:
         scenario: Scenario of the condition.
@@ -647,7 +681,8 @@ def limit_forces(
         group: Pseudonyms of the participants.
 
     Returns:
-        The changed specifications by site.
+        The specifications of the sites whose limits change, by the name of the site. Empty if
+        no participant of the group needs a lower limit.
 
     Raises:
         ScenarioError: The scenario has no force limit for this site, or has a lower limit

@@ -68,10 +68,13 @@ class Questionnaire(Frozen, frozen=True):
         return self.name == CHOICE
 
     def read(self, values: Sequence[float | None]) -> dict[str, float | None]:
-        """Checks the answers that a page sent, and returns them by item.
+        """Checks the answers that a page sent, and assigns them to the items.
 
         Args:
             values: Answers in the order of the items. None for a missing answer.
+
+        Returns:
+            The answers by the names of the items. None for a missing answer.
 
         Raises:
             UsageError: There are more or fewer values than items, a value is not on the scale,
@@ -92,8 +95,12 @@ class Questionnaire(Frozen, frozen=True):
     def score(self, answers: Answers) -> float | None:
         """Computes the score of a completed questionnaire.
 
+        Args:
+            answers: The answers by item.
+
         Returns:
-            Raw NASA-TLX, the score of SUS, or the mean of the answers. None if an answer is
+            The raw NASA Task Load Index for `tlx`, the score of the System Usability Scale for
+            `sus`, and the mean of the answers for any other questionnaire. None if an answer is
             missing.
         """
         complete = {item: value for item, value in answers.items() if value is not None}
@@ -115,7 +122,12 @@ def _read_shipped() -> dict[str, Any]:
 
 
 def find_form(questionnaire: Questionnaire) -> Questionnaire:
-    """Returns a questionnaire with its items, which those that are shipped need not state.
+    """Returns a questionnaire with its items filled in.
+
+    A protocol names a shipped questionnaire without stating its items.
+
+    Args:
+        questionnaire: The questionnaire as the protocol states it.
 
     Raises:
         UsageError: The questionnaire has no items and no shipped one has its name, or its scale

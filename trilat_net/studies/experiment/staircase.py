@@ -60,7 +60,10 @@ class Staircase(Frozen, frozen=True):
 
     @property
     def form(self) -> Questionnaire:
-        """The questionnaire after each pair. The answer is 1 or 2."""
+        """Questionnaire that participants answer after each pair of trials.
+
+        The answer is 1 or 2, the trial of the pair in which the value seemed larger.
+        """
         return Questionnaire(
             name=CHOICE,
             title="Which one?",
@@ -92,10 +95,16 @@ class Staircase(Frozen, frozen=True):
         return directions
 
     def list_differences(self, right: Sequence[bool]) -> list[float]:
-        """Returns the difference of each pair, and of the next pair.
+        """Lists the differences between the two trials of each pair, including the next pair.
+
+        The difference decreases after `down` right answers in a row, and increases after a
+        wrong answer.
 
         Args:
             right: For each earlier answer, True if it was right.
+
+        Returns:
+            The differences in the key's unit, one more than answers.
         """
         differences = [self.start]
         for direction in self._list_directions(right):
@@ -152,7 +161,7 @@ class Staircase(Frozen, frozen=True):
         return comparison if difference + error > 0.0 else standard
 
     def describe(self) -> str:
-        """Returns the procedure as a sentence for the methods section of a paper."""
+        """Describes the procedure in a sentence for the methods section of a paper."""
         right_percent = 100.0 * 0.5 ** (1.0 / self.down)
         return (
             f"{self.key} was adapted in a two-interval forced choice against "

@@ -42,7 +42,7 @@ _ROUNDING = 1e-12
 
 
 def import_scipy_stats() -> Any:
-    """Returns the module `scipy.stats`."""
+    """Imports and returns the module `scipy.stats`, which only the statistics need."""
     # The import takes half a second, and most commands do not need it.
     from scipy import stats
 
@@ -55,7 +55,10 @@ def import_scipy_stats() -> Any:
 def average_trials(
     rows: Sequence[Row], measure: str, unit: str = "participant"
 ) -> dict[str, dict[str, float]]:
-    """Returns the mean of a measure over the trials of each condition and unit.
+    """Averages a measure over the trials of each participant or pair under each condition.
+
+    The statistics are computed from these means, because trials of the same participant are not
+    independent.
 
     Args:
         rows: Trials.
@@ -63,7 +66,8 @@ def average_trials(
         unit: Key of the independently sampled unit: "participant" or "pair".
 
     Returns:
-        Means by condition and unit, in the order of the rows.
+        The means, by condition and then by the name of the participant or pair, in the order of
+        the rows.
 
     Raises:
         UsageError: No row has the measure, a row lacks a key, or a value is not a finite
@@ -190,13 +194,20 @@ def _summarise(condition: str, values: list[float], seed: int) -> ConditionMean:
 
 
 def bootstrap_interval(values: Sequence[float], seed: int = 0) -> tuple[float, float] | None:
-    """Returns the 95 % interval of a mean by the BCa bootstrap.
+    """Computes the 95 % confidence interval of a mean by the BCa bootstrap.
 
-    Returns:
-        Lower and upper end. None for fewer than two values.
+    The bootstrap resamples the values with replacement, and needs no normal distribution. BCa
+    stands for its bias-corrected and accelerated form.
 
     Source: Efron, "Better bootstrap confidence intervals", J. American Statistical Association
     82 (1987).
+
+    Args:
+        values: The values, one per participant or pair.
+        seed: Seed of the resampling.
+
+    Returns:
+        Lower and upper end. None for fewer than two values.
     """
     sample = np.asarray(values, dtype=np.float64)
     if sample.size < 2:
@@ -260,16 +271,19 @@ class Comparison(NamedTuple):
 def compare_conditions(
     rows: Sequence[Row], measure: str, *, unit: str = "participant"
 ) -> list[Comparison]:
-    """Compares each pair of conditions, in the order of the rows.
-
-    Args:
-        rows: Trials, as for `average_trials`.
-        measure: Name of the measure.
-        unit: "participant" or "pair".
+    """Compares a measure between each pair of conditions, within participants or pairs.
 
     Sources: Holm, "A simple sequentially rejective multiple test procedure", Scandinavian J.
     Statistics 6 (1979); Lakens, "Calculating and reporting effect sizes to facilitate
     cumulative science", Frontiers in Psychology 4:863 (2013), for d_z and d_av.
+
+    Args:
+        rows: Trials, as for `average_trials`.
+        measure: Name of the measure.
+        unit: "participant" or "pair", which is sampled independently.
+
+    Returns:
+        A comparison for each pair of conditions, in the order of the rows.
     """
     means = average_trials(rows, measure, unit)
     comparisons: list[Comparison] = []
@@ -324,7 +338,9 @@ def _compare(
 
 
 def correct_holm(p: Sequence[float | None]) -> list[float | None]:
-    """Corrects p values for their number by Holm's method.
+    """Corrects p values for the number of tests by Holm's method.
+
+    Without a correction, the more tests are made, the more of them are significant by chance.
 
     Args:
         p: p values. None does not count as a test.
@@ -397,6 +413,10 @@ def fit_mixed_model(rows: Sequence[Row], measure: str) -> MixedModel:
     The model is for measures of single users. A measure that both users of a pair share is
     tested by `compare_conditions` with `unit="pair"`. The fit needs `pip install
     'trilat-net[stats]'`.
+
+    Args:
+        rows: Trials, as for `average_trials`, with the keys "pair" and "participant".
+        measure: Name of the measure.
 
     Raises:
         UsageError: statsmodels is not installed, a participant is in two pairs, or there are
@@ -573,7 +593,9 @@ def find_least_number(
 
 
 class SimulatedPower(NamedTuple):
-    """Share of simulated experiments in which two conditions differ significantly.
+    """Fraction of simulated experiments in which two conditions differ significantly.
+
+    It estimates the power: the probability that an experiment finds the simulated effect.
 
     Args:
         first: Name of the first condition.

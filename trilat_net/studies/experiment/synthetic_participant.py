@@ -62,7 +62,14 @@ class ParticipantModel(Frozen, frozen=True):
     spread: Share = 0.15
 
     def draw(self, seed: int) -> "ParticipantModel":
-        """Draws the parameters of one participant around the mean parameters."""
+        """Draws the parameters of one participant, who differs from the mean by chance.
+
+        Args:
+            seed: Seed of the random numbers.
+
+        Returns:
+            A model with these parameters.
+        """
         random = np.random.default_rng(seed)
         factors = np.exp(self.spread * random.standard_normal(5)).tolist()
         reaction, fitts_a, fitts_b, noise, crossover = factors
@@ -77,10 +84,10 @@ class ParticipantModel(Frozen, frozen=True):
 
 
 class SyntheticParticipant:
-    """A synthetic participant at one master in one trial.
+    """A model of a person at one master arm in one trial, for experiments without people.
 
-    It has the interface of a hand program, as users may write one: the site calls `act` at a
-    fixed rate.
+    It has the interface of an operator program, as users may write one: the site of the arm
+    calls `act` at a fixed rate, and moves the arm towards the returned position.
 
     Args:
         facts: Description of the participant's site.
@@ -122,10 +129,13 @@ class SyntheticParticipant:
         self._moved_s = 0.0
 
     def act(self, now: HandView) -> Array:
-        """Returns the target position of the hand, in m.
+        """Decides where the participant moves the arm now.
 
         Args:
-            now: What the participant sees at its site.
+            now: What the participant sees and feels at its site.
+
+        Returns:
+            The target position of the hand, shape (2,) or (3,), in m.
         """
         slave = now.peers[self._slave_index]
         slave_m = self._see_slave(now, slave)

@@ -28,7 +28,9 @@ Seconds = Annotated[float, Meta(gt=0.0, le=600.0)]
 
 
 class TrialTask(Frozen, frozen=True, tag_field="kind"):
-    """A task, as a protocol defines it. `make_goal` returns the goal of a trial.
+    """A task for the participants, as a protocol defines it: reach, press or follow.
+
+    It is the same for all trials. `make_goal` derives the goal of a single trial.
 
     Attributes:
         description: The task in a phrase, for texts and plans.
@@ -43,7 +45,11 @@ class TrialTask(Frozen, frozen=True, tag_field="kind"):
     needs_wall: ClassVar[bool] = False
 
     def render_instructions(self, slave: str) -> str:
-        """Returns the instructions for participants, with the slave's name and numbers."""
+        """Returns the text that tells participants what to do.
+
+        Args:
+            slave: Name of the slave in the text.
+        """
         return self.instructions.format(slave=slave, task=self)
 
     @property
@@ -53,12 +59,12 @@ class TrialTask(Frozen, frozen=True, tag_field="kind"):
 
     @property
     def has_limit(self) -> bool:
-        """True if a trial fails after `longest_s`. Otherwise every trial lasts that long."""
+        """True if a trial fails when `longest_s` is over. Otherwise every trial lasts that long."""
         return True
 
     @property
     def needs_pair(self) -> bool:
-        """True if the task needs two users."""
+        """True if the task is for two users together."""
         return False
 
     def make_goal(self, start_m: Array, number: int, seed: int) -> "TrialGoal":
@@ -130,7 +136,9 @@ class TrialGoal:
         return self._judge(t_s, position_m, force_n)
 
     def has_authority(self, t_s: float, user: int) -> bool:
-        """Returns True if a user has any authority over the slave.
+        """Tells whether the slave follows a user at all at some time of the trial.
+
+        With a handover, the authority over the slave moves from the first user to the second.
 
         Args:
             t_s: Time since the start of the session, in s.
@@ -147,7 +155,9 @@ class TrialGoal:
         return abs(self.lead - 1) > 0.05
 
     def find_corridor(self, t_s: float) -> tuple[Array, float] | None:  # noqa: ARG002 - there is none
-        """Returns the corridor to the target, which nobody may leave.
+        """Returns the corridor from the start to the target, which the end effector may not leave.
+
+        Its other end is the target.
 
         Args:
             t_s: Time since the start of the session, in s.
@@ -185,7 +195,7 @@ class TrialGoal:
 
 
 class Outcome(NamedTuple):
-    """The outcome of a trial.
+    """How a trial ended: with success or not, and when.
 
     Attributes:
         succeeded: True if the task was done.
@@ -230,7 +240,7 @@ class ReachTrial(TrialTask, frozen=True, tag="reach"):
 
     @property
     def needs_pair(self) -> bool:
-        """True if one user hands the slave over to the other."""
+        """True if the task has a handover, in which one user hands the slave over to the other."""
         return self.handover_s is not None
 
     def render_instructions(self, slave: str) -> str:
@@ -245,7 +255,10 @@ class ReachTrial(TrialTask, frozen=True, tag="reach"):
 
     @property
     def longest_s(self) -> float:
-        """The time-out, in s. With a handover it begins again at the second target."""
+        """Longest duration of a trial after its target appears, in s.
+
+        It is the time-out. With a handover, the time-out begins again at the second target.
+        """
         if self.handover_s is None:
             return self.timeout_s
         second_appears_s = self.handover_s + self.ramp_s
@@ -271,7 +284,10 @@ class ReachTrial(TrialTask, frozen=True, tag="reach"):
 
 
 class _DwellGoal(TrialGoal):
-    """A goal that is reached by meeting a condition for some time, see `_is_inside`."""
+    """A goal that is reached once a condition has been met for some time without a break.
+
+    Subclasses define the condition by `_is_inside`.
+    """
 
     def __init__(self, task: "ReachTrial | ContactTrial", start_m: Array) -> None:
         super().__init__(start_m, task.width_m)
@@ -298,9 +314,10 @@ class _DwellGoal(TrialGoal):
 
 
 class _ReachGoal(_DwellGoal):
-    """A target of the ring, and after a handover the next target.
+    """Goal of a trial of `ReachTrial`: to bring the end effector to a target and stay there.
 
-    Without a handover, `_handover_s` and `_second_appears_s` are -1.
+    With a handover, there is a second target for the user who receives the slave. Without one,
+    `_handover_s` and `_second_appears_s` are -1.
     """
 
     def __init__(self, task: ReachTrial, start_m: Array, targets_m: Sequence[Array]) -> None:
@@ -333,7 +350,12 @@ class _ReachGoal(_DwellGoal):
         return {"error_handover_mm": 1e3 * float(errors_m.max())}
 
     def find_corridor(self, t_s: float) -> tuple[Array, float] | None:
-        """Returns the corridor from the target's appearance on, if the task has one."""
+        """Returns the corridor to the target, once the target has appeared.
+
+        Returns:
+            The start of the corridor and its width, both in m. None before the target appears,
+            and for a task without a corridor.
+        """
         if self._corridor_m is None or t_s < self.appears_s:
             return None
         start_m, _ = self._find_segment(t_s - self.appears_s)
@@ -403,12 +425,12 @@ class ContactTrial(TrialTask, frozen=True, tag="contact"):
         return self.timeout_s
 
     def make_goal(self, start_m: Array, number: int, seed: int) -> TrialGoal:  # noqa: ARG002 - there is one wall
-        """Returns the goal of a trial: the position of the wall, and the force."""
+        """Returns the goal of a trial: where the wall is, and with which force to press it."""
         return _ContactGoal(self, start_m)
 
 
 class _ContactGoal(_DwellGoal):
-    """A target at a wall, and a force with which to press it."""
+    """Goal of a trial of `ContactTrial`: to press a wall with a force for some time."""
 
     def __init__(self, task: ContactTrial, start_m: Array) -> None:
         super().__init__(task, start_m)
@@ -477,7 +499,7 @@ class TrackTrial(TrialTask, frozen=True, tag="track"):
 
     @property
     def needs_pair(self) -> bool:
-        """True if the users see different targets."""
+        """True if two users see different targets, and must agree on a position."""
         return self.apart_m > 0.0
 
     @property
@@ -493,7 +515,7 @@ class TrackTrial(TrialTask, frozen=True, tag="track"):
 
 
 class _TrackGoal(TrialGoal):
-    """A target that moves along a path until the time of the trial is over."""
+    """Goal of a trial of `TrackTrial`: to follow a moving target until the time is over."""
 
     is_moving = True
 
@@ -508,10 +530,13 @@ class _TrackGoal(TrialGoal):
         position_m: Array,
         force_n: Array,  # noqa: ARG002
     ) -> dict[str, float]:
-        """Returns whose target the slave followed, as a number between the two users.
+        """Computes whose target the slave followed, if the two users see different targets.
 
-        The number is 1 for the first user's target, 0 for the second user's, and 0.5 for the
-        middle. Empty if both users have the same target.
+        The measure is 1 for the first user's target, 0 for the second user's, and 0.5 for the
+        middle between them.
+
+        Returns:
+            The measure by its name. Empty if both users have the same target.
         """
         task = self._task
         if not task.needs_pair:
@@ -546,7 +571,7 @@ AnyTask = ReachTrial | ContactTrial | TrackTrial
 
 
 def place_slave(arm: Any, shared: Sequence[float]) -> Array:
-    """Returns the position of an end effector, in m, from the state that its site sends.
+    """Computes the position of an end effector from the state that its site sends, in m.
 
     Args:
         arm: Arm of the site.

@@ -54,7 +54,7 @@ REST_S = 0.1
 
 
 class TrialEntry(msgspec.Struct, frozen=True):
-    """Result of a finished trial, as the journal stores it.
+    """Result of a finished trial, as the journal of the experiment stores it.
 
     Attributes:
         cell: Number of the trial.
@@ -74,7 +74,9 @@ class TrialEntry(msgspec.Struct, frozen=True):
 
 
 class TrialJudge:
-    """Judges a trial by the records of the slave, one after the other.
+    """Decides during a trial whether it has ended, from the records of the slave arm.
+
+    The records are passed on one after the other, as they arrive.
 
     Args:
         trial: The trial.
@@ -90,7 +92,7 @@ class TrialJudge:
         self.outcome: Outcome | None = None
 
     def accept(self, t_s: float, q: Sequence[float], tau_x: Sequence[float]) -> Outcome | None:
-        """Judges a record of the slave.
+        """Takes the next record of the slave into account.
 
         Args:
             t_s: Time since the start of the session, in s.
@@ -109,7 +111,9 @@ class TrialJudge:
 
 
 class _MotionSamples(NamedTuple):
-    """Samples of the motion of the slave's end effector.
+    """Motion of the slave's end effector in a trial, from which its measures are computed.
+
+    There are K samples at a constant rate.
 
     Attributes:
         indices: Indices of the records, shape (K,).
@@ -127,7 +131,7 @@ class _MotionSamples(NamedTuple):
 
 
 class ExperimentTrial:
-    """A trial of the plan with people.
+    """One trial with people: its scenario, its goal, and the result from its log.
 
     Args:
         protocol: Protocol of the experiment.
@@ -215,7 +219,12 @@ class ExperimentTrial:
         return replace(scenario, dominance=dominance, timeline=timeline)
 
     def find_force_n(self, q: Sequence[float], tau_x: Sequence[float]) -> float:
-        """Returns the magnitude of the external force on the slave's end effector, in N."""
+        """Computes the magnitude of the external force on the slave's end effector, in N.
+
+        Args:
+            q: Joint positions, in rad or m.
+            tau_x: External torques, in N m or N.
+        """
         forces_n = self._find_forces_n(np.array([q]), np.array([tau_x]))
         return float(forces_n[0])
 
@@ -231,7 +240,7 @@ class ExperimentTrial:
         return self._rows.place_end_effector(q, speed)
 
     def make_goal(self) -> TrialGoal:
-        """Returns the goal of the trial."""
+        """Creates the goal of the trial, which states its target and decides when it ends."""
         planned = self.planned
         goal = self.protocol.task.make_goal(self._start_m, planned.target, planned.seed)
         goal.appears_s = self.appears_s
@@ -241,7 +250,16 @@ class ExperimentTrial:
         return goal
 
     def settle(self, path: Path) -> TrialEntry:
-        """Executes the log of the trial again, and returns the trial's result.
+        """Verifies the log of the trial, and computes the trial's result from it.
+
+        The run is executed again from the log. The result counts only if the records are the
+        same.
+
+        Args:
+            path: Path of the log.
+
+        Returns:
+            The result, as the journal stores it.
 
         Raises:
             LogError: The records are not those of a run, or they end before the trial does.
@@ -380,7 +398,10 @@ class ExperimentTrial:
 
 
 class SyntheticTrial(ExperimentTrial):
-    """A trial of synthetic participants, which are models of people."""
+    """A trial in which models of people (synthetic participants) move the master arms.
+
+    It runs in virtual time, without a network.
+    """
 
     people = False
 
@@ -415,7 +436,7 @@ class SyntheticTrial(ExperimentTrial):
         return self.protocol.model.draw(participant_seed)
 
     def find_end_s(self) -> float:
-        """Runs the trial, compiled, until it ends.
+        """Finds out how long the trial lasts, by a fast run without a log.
 
         Returns:
             The end of the trial, in s since the start of the session.
@@ -445,7 +466,11 @@ class SyntheticTrial(ExperimentTrial):
         return self.longest_s
 
     def write(self, path: Path) -> TrialEntry:
-        """Runs the trial into its log, and returns its result."""
+        """Runs the trial, writes its log, and returns its result.
+
+        Args:
+            path: Path of the log.
+        """
         duration_s = self.find_end_s() + REST_S
         scenario = replace(self.scenario, duration_s=duration_s)
         players = self._make_players(scenario)

@@ -135,7 +135,7 @@ class MapPanel(NamedTuple):
 
     @property
     def decided(self) -> RunCounts:
-        """Number of runs at each grid point that were judged stable or not stable, shape (y, x).
+        """Number of runs at each grid point that are stable or not stable, shape (y, x).
 
         The other runs are undecided, for example because they were too short.
         """
@@ -184,7 +184,7 @@ class MapPlane(NamedTuple):
 
     @property
     def seeds(self) -> int:
-        """Largest number of runs at any grid point. The runs of a point differ in their seeds."""
+        """Largest number of runs at any grid point. Runs of a point differ in their seeds."""
         return max(int(panel.runs.max()) for panel in self.panels)
 
 

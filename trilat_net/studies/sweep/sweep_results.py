@@ -370,7 +370,10 @@ class GridPoint(NamedTuple):
 
     @property
     def interval(self) -> tuple[float, float]:
-        """95 % confidence interval of the fraction of decided runs that are stable, by Wilson."""
+        """95 % confidence interval of the fraction of decided runs that are stable.
+
+        It is computed by Wilson's method.
+        """
         return wilson_interval(self.stable, self.decided)
 
 
