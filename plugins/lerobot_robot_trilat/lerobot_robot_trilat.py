@@ -31,7 +31,9 @@ The values are the method of `tn.hand`, and the suffix of the keys of a command.
 @RobotConfig.register_subclass("trilat")
 @dataclass(kw_only=True)
 class TrilatRobotConfig(RobotConfig):
-    """The session, and the site (arm with its control loop) that the policy drives.
+    """Settings of a `TrilatRobot`: the session, and the site that the policy drives.
+
+    A site is an arm with its control loop.
 
     Attributes:
         session: Name of the session.
@@ -55,9 +57,10 @@ class TrilatRobotConfig(RobotConfig):
 
 
 class TrilatRobot(Robot):
-    """The slave and one master of a session. A policy observes both, and drives the master.
+    """Robot for LeRobot: the slave arm and one master arm of a session of trilat-net.
 
-    LeRobot creates the object from a `TrilatRobotConfig`, and calls its methods in a loop.
+    A policy observes both arms and drives the master, which the slave follows. LeRobot creates
+    the object from a `TrilatRobotConfig`, and calls its methods in a loop.
 
     Args:
         config: The session and the sites.
@@ -127,6 +130,9 @@ class TrilatRobot(Robot):
     def connect(self, calibrate: bool = True) -> None:  # noqa: ARG002 - there is nothing to calibrate
         """Joins the session, and waits for the first state of both sites.
 
+        Args:
+            calibrate: Not used, because there is nothing to calibrate.
+
         Raises:
             DeviceAlreadyConnectedError: The robot is connected already.
             DeviceNotConnectedError: A site does not publish its state in time.
@@ -170,7 +176,11 @@ class TrilatRobot(Robot):
             self._records[record.site] = record
 
     def get_observation(self) -> dict[str, float]:
-        """Returns the newest states, with the keys of `observation_features`."""
+        """Returns the newest states of the slave and of the driven master.
+
+        Returns:
+            Numbers with the keys of `observation_features`.
+        """
         hand = self._require_hand()
         self._receive_newest()
         values: list[float] = []
@@ -183,7 +193,9 @@ class TrilatRobot(Robot):
         return dict(zip(self.observation_features, values, strict=True))
 
     def send_action(self, action: dict[str, Any]) -> dict[str, float]:
-        """Commands the operator. The site enforces the limits of force and speed.
+        """Commands the operator that moves the master arm, as the policy decided.
+
+        The site enforces the limits of force and speed.
 
         Args:
             action: A command, with the keys of `action_features`.

@@ -35,7 +35,10 @@ The values are the method of `tn.hand`, and the suffix of the keys of a command.
 @TeleoperatorConfig.register_subclass("trilat")
 @dataclass(kw_only=True)
 class TrilatTeleoperatorConfig(TeleoperatorConfig):
-    """The session, and the sites (arms with their control loops) of the person and the policy.
+    """Settings of a `TrilatTeleoperator`: the session, and the sites of person and policy.
+
+    A site is an arm with its control loop. The person and the policy each hold a master arm,
+    and the slave arm follows both.
 
     Attributes:
         session: Name of the session.
@@ -61,7 +64,7 @@ class TrilatTeleoperatorConfig(TeleoperatorConfig):
 
 
 class TrilatTeleoperator(Teleoperator):
-    """The master of a session that a person moves.
+    """Teleoperator for LeRobot: the master arm that a person moves in a session of trilat-net.
 
     LeRobot creates the object from a `TrilatTeleoperatorConfig`, and calls its methods in a
     loop.
@@ -121,7 +124,12 @@ class TrilatTeleoperator(Teleoperator):
         pass
 
     def connect(self, calibrate: bool = True) -> None:  # noqa: ARG002 - there is nothing to calibrate
-        """Joins the session, without holding the arm.
+        """Joins the session, so that the positions of the person's arm can be read.
+
+        The arm is not held: only the person moves it until `enable_torque` is called.
+
+        Args:
+            calibrate: Not used, because there is nothing to calibrate.
 
         Raises:
             DeviceAlreadyConnectedError: The teleoperator is connected already.
@@ -145,7 +153,11 @@ class TrilatTeleoperator(Teleoperator):
             self._stack = stack.pop_all()
 
     def get_action(self) -> dict[str, float]:
-        """Returns the position of the arm, with the keys of `action_features`."""
+        """Returns where the person has moved the arm, as an action for the robot.
+
+        Returns:
+            The newest position, with the keys of `action_features`.
+        """
         position = self._require_hand().pose
         return dict(zip(self._position_keys, position, strict=True))
 
@@ -162,7 +174,9 @@ class TrilatTeleoperator(Teleoperator):
         return dict(zip(felt_keys, felt_forces, strict=True))
 
     def send_feedback(self, feedback: dict[str, Any]) -> None:
-        """Pulls or pushes the arm if torque is enabled.
+        """Moves the person's arm as the policy says, if torque is enabled.
+
+        The person feels this as a pull or a push.
 
         Args:
             feedback: A command, with the keys of `feedback_features`. Other keys are ignored.
@@ -176,11 +190,11 @@ class TrilatTeleoperator(Teleoperator):
             command(*goal)
 
     def enable_torque(self) -> None:
-        """Allows feedback to move the arm."""
+        """Allows `send_feedback` to move the arm."""
         self._torque_enabled = True
 
     def disable_torque(self) -> None:
-        """Releases the arm. Then only the person moves it, and feedback has no effect."""
+        """Releases the arm, so that only the person moves it and feedback has no effect."""
         self._torque_enabled = False
         self._require_hand().release()
 

@@ -64,7 +64,10 @@ searched numerically.
 
 
 class EpisodeError(UsageError, gymnasium.error.ResetNeeded):
-    """No episode is in progress: it has not begun, or it has ended."""
+    """A method of the environment was called while no episode is in progress.
+
+    The episode has not begun, or it has ended. `TeleoperationEnv.reset` begins one.
+    """
 
 
 class Scene(NamedTuple):
@@ -108,7 +111,11 @@ class Judgement(NamedTuple):
 
 
 class EpisodeTask(Protocol):
-    """Interface of the task of an episode, which a user can implement."""
+    """Interface of the task of an episode: it draws a goal and computes the rewards.
+
+    A user can implement it. The environment calls `begin` at the start of each episode, and
+    `judge` after each step.
+    """
 
     goal: Array
     """Goal that the user observes. Its shape must never change."""
@@ -124,10 +131,13 @@ class EpisodeTask(Protocol):
         """
 
     def judge(self, scene: Scene) -> float | tuple[Any, ...]:
-        """Returns the reward of a step, or a `Judgement`, which may also be a plain tuple.
+        """Computes the reward of a step, and decides whether the episode ends.
 
         Args:
             scene: State after the step.
+
+        Returns:
+            The reward as a number, or a `Judgement`, which may also be a plain tuple.
         """
 
 
@@ -209,7 +219,7 @@ class ReachTask:
 
 
 class ActedHand(HandPlayer):
-    """Operator that applies the actions of an episode to the user's arm.
+    """Simulated operator that moves the user's arm as the actions of an episode say.
 
     Args:
         hand_site: Site and settings of the operator.
@@ -223,8 +233,12 @@ class ActedHand(HandPlayer):
     def request_action(self, k: int, arrays: SiteArrays) -> None:  # noqa: ARG002 - already observed
         """Passes the action of the current step on, as the decision of the operator.
 
-        The policy has already observed the state, so that the observation of tick `k` in the
-        second argument is not needed.
+        The simulation calls this in the ticks in which an operator decides. The policy has
+        already observed the state, so that the state in the second argument is not needed.
+
+        Args:
+            k: Tick of the decision, from 0.
+            arrays: State of the site, which is not used.
         """
         action = self._actions[k // self.hand.period_ticks]
         self.hand.accept_decision(k, action.tolist())
@@ -596,7 +610,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return np.clip(values, -self._action_limit, self._action_limit)
 
     def render(self) -> Any:
-        """Draws the arms and the goal.
+        """Draws the arms and the goal as a picture of the present state.
 
         Returns:
             A picture of shape (height, width, 3). None if the environment has no render mode.

@@ -69,7 +69,10 @@ UNITS = {"M": "kg", "B": "N s/m", "K": "N/m"}
 
 
 class SineResponse(NamedTuple):
-    """Response of the hand and the arm at the frequency of one sine.
+    """Response of the hand and the arm to one of the sines that shake the arm.
+
+    To identify the hand that holds an arm, small forces of several frequencies act on the arm.
+    The run is divided into segments, whose spectra are compared.
 
     Attributes:
         hz: The frequency, in Hz.
@@ -89,10 +92,11 @@ class SineResponse(NamedTuple):
 
 @dataclass(frozen=True, repr=False)
 class HandImpedance(Result):
-    """Identified mass, damping and stiffness of a hand.
+    """Identified mass, damping and stiffness of the hand that holds an arm.
 
-    The entry in a row and a column of a matrix is the force along the axis of the row per
-    motion along the axis of the column.
+    The model of the hand is force = M acceleration + B velocity + K displacement. The entry in
+    a row and a column of a matrix is the force along the axis of the row per motion along the
+    axis of the column.
 
     Attributes:
         site: Site of the arm that the hand holds.
@@ -131,13 +135,13 @@ class HandImpedance(Result):
         }
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns one row for each frequency, as plain values."""
+        """Returns a table of the responses, one row of plain values per frequency."""
         return [response._asdict() for response in self.responses]
 
     def to_hand(self) -> dict[str, Any]:
-        """Returns the settings of the operator of a scenario that resembles the hand most.
+        """Returns settings of a simulated operator that resembles the hand most.
 
-        This operator is a spring and a damper along each axis. It has no mass.
+        This operator of a scenario is a spring and a damper along each axis. It has no mass.
         """
         return {
             "kind": "tip_spring",
@@ -146,7 +150,11 @@ class HandImpedance(Result):
         }
 
     def blocks(self) -> Iterator[Block]:
-        """Yields the matrices and intervals, the responses, and the most similar operator."""
+        """Yields the parts of the text that `trilat identify hand` prints.
+
+        They are the matrices with their intervals, the responses at the frequencies of the
+        sines, and the most similar operator of a scenario.
+        """
         segments = count_nouns(self.segments, "segment")
         yield f"hand at {self.site}: {segments} of {self.segment_s:g} s, intervals of 95 %"
         yield self._tabulate_matrices()
@@ -272,7 +280,7 @@ def _list_responses(
 
 
 class _Sines(NamedTuple):
-    """The sines that act in a scenario.
+    """Sines of force that shake the arm, so that the hand can be identified from its response.
 
     Attributes:
         hz: Frequencies of all sines in rising order, in Hz.
@@ -388,7 +396,9 @@ def _compute_coherence(phasors: Complex) -> Array:
 
 
 class _HandFit(NamedTuple):
-    """Result of the fit of mass, damping and stiffness.
+    """Mass, damping and stiffness of a hand, fitted to measured forces and motions.
+
+    There are n axes and F frequencies.
 
     Attributes:
         matrices: M, B and K, shape (3, n, n).
@@ -512,6 +522,12 @@ def _fit_impedance(force: Complex, motions: Complex, segments: NDArray[np.int64]
 
 def read_hands(files: Sequence[str | Path]) -> list[HandMatrices]:
     """Reads identified hands from JSON files, which `trilat identify hand --json` wrote.
+
+    Args:
+        files: Paths of the files.
+
+    Returns:
+        The matrices of each hand, in the order of the files.
 
     Raises:
         UsageError: A file does not contain a hand.

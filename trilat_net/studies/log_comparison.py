@@ -30,7 +30,7 @@ _MOST_REASONS = 6
 
 @dataclass(frozen=True, repr=False)
 class LogComparison(Result):
-    """Comparison of several logs.
+    """Comparison of the metrics and the scenarios of several logs, created by `compare`.
 
     Attributes:
         logs: The logs.
@@ -48,12 +48,15 @@ class LogComparison(Result):
     remarks: dict[str, list[str]]
 
     def headline(self) -> str:
-        """Returns a sentence with the names of the logs and the number of quantities."""
+        """Returns a sentence that names the compared logs and the number of quantities."""
         quantities = count_nouns(len(self.metrics.rows), "quantity")
         return f"{', '.join(self.metrics.columns)}: {quantities}"
 
     def blocks(self) -> Iterator[Block]:
-        """Yields the differences of the scenarios, the table of metrics, and the remarks."""
+        """Yields the parts of the text that `trilat compare` prints.
+
+        They are the differences of the scenarios, the table of metrics, and the remarks.
+        """
         names = {log.scenario.name for log in self.logs}
         if len(names) > 1:
             yield f"logs of different scenarios: {', '.join(sorted(names))}"
@@ -111,7 +114,10 @@ class LogComparison(Result):
         return comparison
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns one row per quantity, with the value of each log by its column name."""
+        """Returns the metrics as a table of plain values, one row per quantity.
+
+        A row has the value of each log under the name of the log's column.
+        """
         rows = []
         for row in self.metrics.rows:
             values = dict(zip(self.metrics.columns, row.values, strict=True))

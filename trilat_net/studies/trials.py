@@ -69,7 +69,9 @@ from .study_folder import format_command, format_toml_value, set_options
 
 
 class TrialResult(NamedTuple):
-    """Result of a trial.
+    """Result of running a scenario and comparing the run with its expectations.
+
+    An expectation is a limit for a metric, which the scenario states in its table [expect].
 
     Attributes:
         trial: The trial.
@@ -94,7 +96,10 @@ class TrialResult(NamedTuple):
 
     @property
     def failures(self) -> list[str]:
-        """Sentences about the unmet expectations, and about a run without a result."""
+        """Sentences about what went wrong. Empty if the run met all expectations.
+
+        A sentence states an unmet expectation, or why the run has no result.
+        """
         sentences = [f"no result: {self.error}"] if self.error else []
         sentences += [
             f"{outcome.key}: {outcome.measured}, expected {outcome.limit}"
@@ -124,7 +129,7 @@ class Trial(NamedTuple):
 
     @property
     def again(self) -> str:
-        """The command that repeats the trial."""
+        """The command that repeats the trial, for the user to copy."""
         live = ["--live"] if self.live else []
         seeds = ["--seeds", str(self.scenario.seed)]
         return format_command("test", self.source, *live, *seeds, *set_options(self.overrides))
@@ -141,6 +146,9 @@ class Trial(NamedTuple):
         Args:
             metrics: Metrics of the run.
             wall_s: Duration of the run in real time, in s.
+
+        Returns:
+            The result of the trial.
         """
         outcomes = evaluate_expectations(self.scenario.expect, metrics)
         return TrialResult(self, outcomes, metrics.simulated_s, wall_s)
@@ -261,7 +269,7 @@ def _check_expectations_reachable(scenario: Scenario, source: str) -> None:
 
 
 def list_assignments(overrides: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
-    """Yields overrides as the texts KEY=VALUE of the command line.
+    """Yields the overrides of a nested mapping as texts KEY=VALUE, as on the command line.
 
     Args:
         overrides: Values by key, also as nested tables.
@@ -325,7 +333,9 @@ TRIAL_COLUMNS = ("", "scenario", "expected", "limit", "worst", "margin", "held")
 
 
 class ExpectationRow(NamedTuple):
-    """One expectation of a scenario, combined over all runs.
+    """One expectation of a scenario, with the results of all runs of this scenario.
+
+    The runs differ in their seeds. The object is a row in the table of a `TrialReport`.
 
     Attributes:
         scenario: Name or path of the scenario, as in a command.
@@ -344,7 +354,7 @@ class ExpectationRow(NamedTuple):
     mean: MeanInterval | None = None
 
     def cells(self) -> tuple[str, ...]:
-        """Returns the texts of the row, one for each of `TRIAL_COLUMNS`."""
+        """Returns the texts of the row in the printed table, one for each of `TRIAL_COLUMNS`."""
         mark = "ok" if self.held == self.runs else "FAIL"
         worst = self.worst
         margin = format_margin(self.worst.margin)
@@ -378,7 +388,7 @@ class TrialReport(Result):
         return groups
 
     def rows(self) -> list[ExpectationRow]:
-        """Returns one row for each expectation of each scenario.
+        """Combines the results of each scenario to one row per expectation.
 
         If some runs of a scenario have no result, another row states their number.
         """
@@ -414,7 +424,10 @@ class TrialReport(Result):
         return rows
 
     def failures(self) -> list[str]:
-        """Returns lines about the failed runs, with the commands that repeat them."""
+        """Returns lines about the failed runs, with the commands that repeat them.
+
+        Empty if all runs met their expectations.
+        """
         lines = []
         for results in self.scenarios.values():
             failed = [result for result in results if not result.held]
@@ -460,7 +473,8 @@ class TrialReport(Result):
     def table(self) -> list[str]:
         """Returns the table of expectations as aligned lines, of which the first is the header.
 
-        A column with means is added if there are any.
+        The table has a row per expectation. A column with the means over the runs is added if
+        there are any.
         """
         rows = self.rows()
         cells = [row.cells() for row in rows]
@@ -471,7 +485,7 @@ class TrialReport(Result):
         return TextTable((*TRIAL_COLUMNS, "mean, 95 %"), cells, align="lllllrrr").lines()
 
     def blocks(self) -> Iterator[Block]:
-        """Yields the table, the failures and the remarks, for the terminal."""
+        """Yields the parts of the printed text: the table, the failures and the remarks."""
         header, *lines = self.table()
         yield header
         for line in lines:
@@ -501,7 +515,7 @@ class TrialReport(Result):
         return {"held": self.held, "wall_s": self.wall_s, "runs": runs}
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns one row for each expectation of each run, as plain values."""
+        """Returns a table of plain values, one row for each expectation of each run."""
         return [
             {
                 "scenario": result.trial.source,
@@ -648,12 +662,15 @@ _NOT_XML = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
 def encode_junit_xml(report: TrialReport, began_unix_ns: int, host: str) -> bytes:
-    """Returns the results as a JUnit XML document, which build servers display.
+    """Encodes the results of trials as a JUnit XML document, which build servers display.
 
     Args:
         report: The results.
         began_unix_ns: Start of the trials in Unix time, in ns.
         host: Name of this machine.
+
+    Returns:
+        The document.
     """
     root = Xml.Element(
         "testsuites", _build_count_attributes(report.results), name="trilat test"

@@ -56,7 +56,14 @@ The slave touched no wall, the arms did not come to rest, or a run diverged.
 
 
 def list_figures_with_values(results: BenchResults) -> list[str]:
-    """Returns the names of the figures for which the results have at least one number."""
+    """Lists the figures for which the results have at least one number.
+
+    Args:
+        results: The results of the suite.
+
+    Returns:
+        Names for `draw_bench`. Empty if nothing can be drawn.
+    """
     names = []
     for name in FIGURES_OF_BENCH:
         fields = _collect_fields(results, name).values()

@@ -128,7 +128,7 @@ def _build_dominance(a: float) -> dict[str, dict[str, float]]:
 
 
 class BenchTask(NamedTuple):
-    """A task of the suite: what the operators do, and what the slave touches.
+    """A task of the suite: what the operators do, and what the slave arm touches.
 
     Attributes:
         about: Description of the task for the user.
@@ -240,7 +240,9 @@ The tuning also runs it without the wall, as free motion.
 
 
 class BenchStudy(NamedTuple):
-    """A named part of the suite.
+    """A named part of the suite: a selection of tasks, laws and links.
+
+    The study runs every law in every task over every link, as far as they fit.
 
     Attributes:
         about: Purpose of the study.
@@ -294,7 +296,10 @@ ROUND_TRIPS = 40
 
 
 def build_settings(form: str, task: str, link: str, seed: int | None = None) -> dict[str, Any]:
-    """Returns the overrides that turn the scenario of a form into a run, apart from the law.
+    """Returns the overrides that turn the scenario of a form into a run of the suite.
+
+    A form is a kind of scenario, such as with two or three sites. The overrides set the task,
+    the link and the seed, but not the law.
 
     Args:
         form: A key of `BASES`.
@@ -375,7 +380,7 @@ class TunedGains(msgspec.Struct, frozen=True):
 
     @property
     def key(self) -> tuple[str, str, int]:
-        """Form, law and round trip in ms, which identify the gains in the file."""
+        """Form, law and round trip in ms, which identify the gains in the file of tuned gains."""
         return self.form, self.law, self.round_trip_ms
 
     def __str__(self) -> str:
@@ -388,7 +393,12 @@ def format_settings(settings: Settings) -> list[str]:
 
 
 def load_tuning_task(form: str, round_trip_ms: int) -> TuningScenario:
-    """Returns the experiment in which the laws of a form are tuned at a round trip in ms."""
+    """Loads the scenario in which the control laws of a form are tuned.
+
+    Args:
+        form: A key of `BASES`.
+        round_trip_ms: Round trip of the links, in ms.
+    """
     settings = build_settings(form, TUNING_TASK, f"rtt{round_trip_ms}")
     return load_tuning_scenario(BASES[form], format_settings(settings))
 
@@ -430,10 +440,16 @@ def read_gains(path: Path = GAINS_FILE) -> dict[tuple[str, str, int], TunedGains
 
 
 def find_stale(entries: Iterable[TunedGains]) -> list[str]:
-    """Lists the gains whose law or scenario has changed since they were tuned.
+    """Lists the tuned gains that are out of date.
+
+    They are those whose law or scenario has changed since they were tuned, see
+    `fingerprint_tuning`.
+
+    Args:
+        entries: The gains to check.
 
     Returns:
-        A text for each, such as "wave (three, 68 ms)".
+        A text for each, such as "wave (three, 68 ms)". Empty if all are up to date.
     """
     return [
         str(gains) for gains in entries if fingerprint_tuning(*gains.key) != gains.fingerprint
@@ -617,7 +633,11 @@ class BenchCell(NamedTuple):
         return f"{self.name} {self.inputs}"
 
     def build(self, seed: int) -> TuningScenario:
-        """Returns the experiment of the run with a seed, with the tuned gains."""
+        """Returns the scenario of one run of the cell, with the tuned gains of its law.
+
+        Args:
+            seed: Seed of the run.
+        """
         settings = build_settings(self.form, self.task, self.link, seed)
         base = load_tuning_scenario(BASES[self.form], format_settings(settings))
         return base.with_gains(SEARCH_SPACES[self.law], KNOWLEDGE, self.tuned.gains)

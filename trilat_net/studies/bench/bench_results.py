@@ -136,7 +136,8 @@ class BenchRun(msgspec.Struct, frozen=True):
     def masked(self) -> bool:
         """True if the slave should touch a wall but did not.
 
-        The numbers of such a run are those of free motion, and are not shown.
+        The numbers of such a run are those of free motion. They would look better than those of
+        a run with contact, so that they are not shown.
         """
         return self.wall_n is not None and self.wall_n < LEAST_CONTACT_N
 
@@ -160,7 +161,9 @@ _JUDGEMENTS = (Stability.STABLE, Stability.OPEN, Stability.NOT_STABLE)
 
 
 class BenchCellResult(NamedTuple):
-    """The results of a cell: one run for each of its seeds.
+    """Results of a cell of the suite: a control law in a task over a link.
+
+    A cell has one run for each of its seeds.
 
     Attributes:
         cell: The cell.
@@ -176,12 +179,16 @@ class BenchCellResult(NamedTuple):
         return self.count(Stability.STABLE)
 
     def count(self, stability: Stability) -> int:
-        """Returns the number of runs with a given judgement."""
+        """Counts the runs of the cell with a given judgement.
+
+        Args:
+            stability: The judgement, for example that a run is stable.
+        """
         return sum(run.stability is stability for run in self.runs)
 
     @property
     def judgement(self) -> Stability:
-        """The worst judgement of the runs. A cell is stable only if all its runs are."""
+        """The worst judgement of the cell's runs. Thus a cell is stable only if all runs are."""
         if self.count(Stability.NOT_STABLE):
             return Stability.NOT_STABLE
         return Stability.OPEN if self.count(Stability.OPEN) else Stability.STABLE
@@ -193,18 +200,25 @@ class BenchCellResult(NamedTuple):
 
     @property
     def is_passive(self) -> bool:
-        """True if no run returned more energy than was put in. False if a run diverged."""
+        """True if no run returned more energy to the operators than they had put in.
+
+        False if a run diverged.
+        """
         return self.energy_j is not None and self.energy_j >= PASSIVE_J
 
     @property
     def energy_j(self) -> float | None:
-        """Smallest value of `BenchRun.energy_j` of the runs, in J. None if a run diverged."""
+        """Least energy, in J, that the arms had received from outside at any time of any run.
+
+        A negative value means that a law generated energy, see `BenchRun.energy_j`. None if a
+        run diverged.
+        """
         values = [run.energy_j for run in self.runs if run.energy_j is not None]
         return min(values) if len(values) == len(self.runs) else None
 
     @property
     def interval(self) -> tuple[float, float] | None:
-        """95 % confidence interval of the share of stable runs, by Wilson's method.
+        """95 % confidence interval of the fraction of stable runs, by Wilson's method.
 
         None for fewer than `LEAST_SEEDS` runs.
         """
@@ -281,7 +295,7 @@ class BenchResults(Result):
         return {"study": self.plan.study, "gains": entries, "places": self.to_rows()}
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns the rows of the table: one row per cell."""
+        """Returns the results as a table of plain values, one row per cell of the suite."""
         return list(map(_build_row, self.places))
 
     def select(self, task: str, law: str = "", link: str = "") -> Iterator[BenchCellResult]:
@@ -298,7 +312,16 @@ class BenchResults(Result):
                 yield result
 
     def find(self, task: str, law: str, link: str) -> BenchCellResult | None:
-        """Returns the result of a cell. None if the plan does not contain the cell."""
+        """Returns the result of one cell of the suite.
+
+        Args:
+            task: Name of the task.
+            law: Name of the law.
+            link: Name of the link.
+
+        Returns:
+            The result. None if the plan does not contain the cell.
+        """
         return next(self.select(task, law, link), None)
 
 
@@ -368,14 +391,23 @@ def list_quantities(results: BenchResults) -> list[tuple[str, str]]:
 
 
 def name_law(law: str, form: str) -> str:
-    """Returns the name of a law for tables, with a note if it runs with two sites."""
+    """Returns the name of a law for tables, with a note if it runs with two sites.
+
+    Args:
+        law: Name of the law.
+        form: Form of the suite in which the law runs, a key of `BASES`.
+    """
     return law if form == "three" else f"{law} (two sites)"
 
 
 def tabulate_verdicts(results: BenchResults) -> TextTable:
-    """Returns a table of verdicts: a row per law, a column per task.
+    """Returns a table of how many links each law copes with: a row per law, a column per task.
 
-    An entry counts the links over which the law is stable, open and not stable.
+    An entry counts the links over which the law is stable, those over which this is undecided
+    (open), and those over which it is not stable.
+
+    Args:
+        results: The results.
     """
     tasks = results.plan.tasks
     rows = []
@@ -405,11 +437,15 @@ def _count_verdicts(results: BenchResults, law: str, form: str, task: str) -> st
 
 
 def tabulate_properties(results: BenchResults, task: str) -> TextTable:
-    """Returns a table of the properties of a task's runs: a row per law, a column per property.
+    """Returns a table of the properties of a task's runs: a row per law.
 
-    An entry such as 3/12 means that all runs over 3 of the 12 links have the property. Two more
-    columns have the smallest energy, and the number of links over which the slave did not touch
-    the wall.
+    There is a column per property, such as passivity. An entry such as 3/12 means that all runs
+    over 3 of the 12 links have the property. Two more columns have the smallest energy, and the
+    number of links over which the slave did not touch the wall.
+
+    Args:
+        results: The results.
+        task: A task that ran.
     """
     headers = (
         task,
@@ -580,9 +616,10 @@ def _format_ratio(numerator: float | None, denominator: float | None) -> str:
 
 
 def describe_bench(results: BenchResults) -> Iterator[str]:
-    """Yields lines that describe a suite.
+    """Yields lines that introduce the results: the study, its runs and tasks, and missing laws.
 
-    They name its study, its runs, its tasks, and the laws that did not run.
+    Args:
+        results: The results.
     """
     plan = results.plan
     cells = count_nouns(len(plan.cells), "cell")
@@ -610,10 +647,14 @@ def describe_bench(results: BenchResults) -> Iterator[str]:
 
 
 def tabulate_gains(results: BenchResults) -> TextTable:
-    """Returns a table of the gains of each law at each round trip, and their selection.
+    """Returns a table of the gains of each law at each round trip, and how they were selected.
 
     The column "stable" has the number of stable candidates and of all candidates. The column
-    "without margin" has the number of candidates with smaller errors that lacked the margin.
+    "without margin" has the number of candidates with smaller errors that were rejected,
+    because they are not stable when delays grow.
+
+    Args:
+        results: The results.
     """
     tunings = {str(gains): gains for gains in _list_used_gains(results)}
     tunings |= {str(gains): gains for gains in results.plan.without}
@@ -667,7 +708,11 @@ def build_bench_page(
 
 
 def encode_runs(results: BenchResults) -> str:
-    """Returns the runs as CSV: a row per run."""
+    """Encodes all runs as a CSV table, one line per run.
+
+    Args:
+        results: The results.
+    """
     cells = {cell.name: cell for cell in results.plan.cells}
     rows = [
         _build_cell_columns(cells[run.name]) | msgspec.to_builtins(run) for run in results.runs

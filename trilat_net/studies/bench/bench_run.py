@@ -64,7 +64,7 @@ TIME_CONSTANTS = 6.0
 
 
 class BenchRunItem(NamedTuple):
-    """A run to execute. It contains everything that a worker process needs, and can be pickled.
+    """One run of the suite as an item for a worker process. It can be pickled.
 
     Attributes:
         cell: The cell of the suite.
@@ -106,12 +106,15 @@ class _JudgedRun(NamedTuple):
 
 
 def run_bench_task(item: BenchRunItem) -> BenchRun:
-    """Executes, judges and measures a run.
+    """Simulates a run, judges whether it is stable, and measures its numbers.
 
-    It may be called in any process, and needs no state but its argument.
+    The function needs nothing but its argument, so that any worker process can call it.
 
     Args:
         item: The run to execute.
+
+    Returns:
+        The run with its judgement and numbers, ready for the journal.
     """
     cell = item.cell
     scenario = cell.build(item.seed).scenario

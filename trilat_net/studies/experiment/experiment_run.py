@@ -137,12 +137,15 @@ class Experiment(Result):
         return RunJournal(self.folder / NOTES_FILE, self.plan.digest, Note, self._remedy)
 
     def read_entries(self) -> dict[int, TrialEntry]:
-        """Returns the results of the finished trials, by the number of the trial in the plan."""
+        """Returns the results of the finished trials, by their numbers in the plan."""
         with self.open_trials() as journal:
             return {entry.cell: entry for entry in journal.done.values()}
 
     def read_notes(self) -> list[Note]:
-        """Returns the consents, answers and aborted trials, in the order in which they occurred."""
+        """Returns the consents, answers and aborted trials, in the order of their time.
+
+        Empty if nothing has been noted yet.
+        """
         if not (self.folder / NOTES_FILE).exists():
             return []
         with self.open_notes() as journal:
@@ -366,7 +369,7 @@ class Experiment(Result):
         }
 
     def blocks(self) -> Iterator[Block]:
-        """Yields the parts of the text about the progress, among them a table of the conditions.
+        """Yields the parts of the text about the progress, with a table of the conditions.
 
         The table states the median completion time of each condition, in which a trial that was
         not completed counts as longer than any other.

@@ -194,7 +194,10 @@ class Protocol(Frozen, frozen=True):
 
     @property
     def forms(self) -> list[Questionnaire]:
-        """Forms that participants fill in: the questionnaires, and the choices of a staircase."""
+        """Forms that participants fill in.
+
+        These are the questionnaires, and the choices after the pairs of a staircase.
+        """
         forms = list(self.questionnaires)
         if self.staircase:
             forms.append(self.staircase.form)
@@ -263,7 +266,9 @@ Choices = Mapping[int, float]
 
 
 class Step(NamedTuple):
-    """One thing that participants have to do: give consent, do a trial or answer a questionnaire.
+    """One thing that participants have to do in an experiment.
+
+    It is to give consent, to do a trial, or to answer a questionnaire.
 
     Attributes:
         kind: "consent", "trial" or "questionnaire".
@@ -361,7 +366,7 @@ class ExperimentPlan(Result):
         return judgements
 
     def find_pair(self, planned: PlannedTrial, choices: Choices) -> tuple[float, bool | None]:
-        """Returns what is known about the pair of trials to which a trial of a staircase belongs.
+        """Returns what is known about the pair of trials to which a trial belongs.
 
         A staircase presents pairs of trials that differ in one key, and the participant chooses
         the trial in which the value was larger.

@@ -59,7 +59,10 @@ class TrialTask(Frozen, frozen=True, tag_field="kind"):
 
     @property
     def has_limit(self) -> bool:
-        """True if a trial fails when `longest_s` is over. Otherwise every trial lasts that long."""
+        """True if a trial fails when `longest_s` is over.
+
+        Otherwise every trial lasts that long.
+        """
         return True
 
     @property
@@ -155,9 +158,9 @@ class TrialGoal:
         return abs(self.lead - 1) > 0.05
 
     def find_corridor(self, t_s: float) -> tuple[Array, float] | None:  # noqa: ARG002 - there is none
-        """Returns the corridor from the start to the target, which the end effector may not leave.
+        """Returns the corridor to the target, which the end effector may not leave.
 
-        Its other end is the target.
+        The corridor is straight, and its other end is the target.
 
         Args:
             t_s: Time since the start of the session, in s.
@@ -240,7 +243,7 @@ class ReachTrial(TrialTask, frozen=True, tag="reach"):
 
     @property
     def needs_pair(self) -> bool:
-        """True if the task has a handover, in which one user hands the slave over to the other."""
+        """True if one user hands the slave over to the other, which takes two users."""
         return self.handover_s is not None
 
     def render_instructions(self, slave: str) -> str:
