@@ -36,7 +36,9 @@ from .summary_text import format_run_lines
 
 @dataclass(frozen=True, repr=False)
 class Conclusion(CheckReport):
-    """The result of checking and reporting a finished run.
+    """Everything that a user wants to know about a finished run, with the written files.
+
+    `conclude` creates this object after a run was recorded.
 
     Attributes:
         verdict: Judgement whether the run was stable.
@@ -72,13 +74,13 @@ class Conclusion(CheckReport):
         return pages[0] if pages else self.paths[0]
 
     def headline(self) -> str:
-        """Returns the result of the checks, and the path of the page."""
+        """Returns a sentence with the result of the checks and the path of the page."""
         results = {0: "passed", CodeWithheld.exit_code: "not all was judged"}
         result = results.get(self.exit_code, "FAILED")
         return f"{result}; {self.page}"
 
     def to_rows(self) -> list[dict[str, str]]:
-        """Returns the table of sites as a list of dictionaries, one per site."""
+        """Returns the table of sites as dictionaries of texts, one per site."""
         headers = self.table.headers
         return [dict(zip(headers, row, strict=False)) for row in self.table.rows]
 
@@ -101,14 +103,21 @@ def conclude(
     min_coverage: float = MIN_COVERAGE,
     png: bool = False,
 ) -> Conclusion:
-    """Checks a log, and writes its page and its summary into a folder.
+    """Checks the log of a finished run, and writes its page and summary into a folder.
+
+    A site is a process that runs one arm. In each tick, the period of its control loop, it
+    records its state.
 
     Args:
         log: Log that was opened from files.
         folder: Existing folder.
-        progress: Function that is called with (done, total) while figures are drawn.
-        min_coverage: Smallest share of every site's ticks that must be judged.
+        progress: Function that is called with the number of drawn figures and of all figures.
+        min_coverage: Smallest fraction of every site's ticks that the stability judgement must
+            be based on.
         png: True to write the figures as PNG files too.
+
+    Returns:
+        The judgement, the checks and the written files.
 
     Raises:
         LogError: A record cannot be read.

@@ -71,7 +71,7 @@ class EpisodePicture:
         goal_m: Array | None,
         title: str,
     ) -> NDArray[np.uint8]:
-        """Draws a picture.
+        """Draws the arms, the bodies and the goal at one instant of the episode.
 
         Args:
             q_rad: Joint angles by site, in rad, shape (n,) each.
@@ -152,5 +152,13 @@ def _draw_arm(axes: Axes, points_m: Array, colour: str) -> None:
 
 
 def is_position(goal: Sequence[float] | Array, end_effector_m: Array) -> bool:
-    """Returns True if a goal has as many numbers as the position of the end effector."""
+    """Tells whether the goal of a task is a position that can be drawn.
+
+    Args:
+        goal: Numbers that describe the goal.
+        end_effector_m: Position of the end effector, in m.
+
+    Returns:
+        True if the goal has as many numbers as the position.
+    """
     return np.shape(goal) == np.shape(end_effector_m)

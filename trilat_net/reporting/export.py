@@ -37,7 +37,9 @@ Written = Callable[[int], None]
 
 
 class ExportFormat(NamedTuple):
-    """A format of exports, the constant `FORMAT` of a module in the folder `exports`.
+    """A format in which logs can be exported, such as CSV.
+
+    It is the constant `FORMAT` of a module in the folder `exports`.
 
     Attributes:
         write: Function that writes a log. Its arguments are the log (a list of logs if `many`
@@ -59,10 +61,10 @@ class ExportFormat(NamedTuple):
 
 
 class Exporter:
-    """An export of logs to a file or a folder.
+    """A prepared export of logs to a file or a folder.
 
     Creating this object checks all arguments, so that a mistake is reported before the log is
-    read.
+    read. `export` then writes the logs.
 
     Args:
         form: Name of the format.
@@ -217,7 +219,7 @@ def _describe_table(table: Table) -> JsonObject:
 
 
 def describe_folder(log: Log, folder: Path, about: str) -> None:
-    """Writes the description of an export, and the scenario, into an exported folder.
+    """Writes the files that explain an exported folder: a description and the scenario.
 
     Args:
         log: The log.

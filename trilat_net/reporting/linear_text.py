@@ -30,7 +30,15 @@ _COLOURS = {"stable": "green", "unstable": "red", "at the edge": "yellow"}
 
 
 def compose_linear(analysis: LinearAnalysis) -> Iterator[Block]:
-    """Yields equilibrium, delays, roots, verdict, margin, notes, ports and scans, in order."""
+    """Yields the text about the linear analysis of a scenario.
+
+    The analysis linearises the loop of arms, controllers and delays at an equilibrium. The text
+    contains, in order, the equilibrium, the delays, the characteristic roots, the verdict about
+    stability, the margin, notes, the ports at which operators hold the arms, and scans.
+
+    Args:
+        analysis: The analysis.
+    """
     yield from describe_equilibrium(analysis)
     yield from describe_effective_delays(analysis)
     yield ""
@@ -62,9 +70,13 @@ def _describe_scan(scan: EdgeScan, name: str) -> str:
 
 
 def describe_equilibrium(analysis: LinearAnalysis) -> Iterator[str]:
-    """Yields how the equilibrium was computed, its residual, and the pose of each site.
+    """Yields lines about the equilibrium at which the loop was linearised.
 
-    If all sites have the same joint angles, a single line has them.
+    They state how the equilibrium was computed, its residual, and the pose of each site. If all
+    sites have the same joint angles, a single line has them.
+
+    Args:
+        analysis: The analysis.
     """
     rest = analysis.rest
     yield f"rest: {rest.how}; residual {rest.residual:.1g}"
@@ -89,9 +101,12 @@ def _list_numbers(values: Array) -> str:
 
 
 def describe_effective_delays(analysis: LinearAnalysis) -> Iterator[str]:
-    """Yields the delay of the samples in use on each link, or one line if all delays are equal.
+    """Yields a line per link about the delay of the samples in use.
 
-    If the delays vary, the lines have the means.
+    If the delays vary, the lines have the means. If all delays are equal, there is one line.
+
+    Args:
+        analysis: The analysis.
     """
     names = analysis.scenario.names
     age_s = analysis.conditions.age_s
@@ -106,12 +121,18 @@ def describe_effective_delays(analysis: LinearAnalysis) -> Iterator[str]:
 
 
 def tabulate_roots(analysis: LinearAnalysis) -> TextTable:
-    """Returns a table of the rightmost roots of the loop, with the motions that they describe.
+    """Returns a table of the rightmost characteristic roots, which decide about stability.
+
+    A motion with the root s changes as exp(s t), and grows if the real part of s is positive.
+    The table describes the motion of each root.
 
     The roots are those of the continuous loop. If a root of the sampled loop, as it is computed
     tick by tick, differs, the table also has the roots of the sampled loop. If the delays
     differ from tick to tick, the table has only the roots of the sampled loop, because the
     continuous loop has only mean delays.
+
+    Args:
+        analysis: The analysis.
     """
     spanned = analysis.decisive.span_s is not None
     roots = analysis.decisive.roots if spanned else analysis.continuous.roots
@@ -140,7 +161,13 @@ def tabulate_roots(analysis: LinearAnalysis) -> TextTable:
 
 
 def describe_zero_roots(analysis: LinearAnalysis) -> str:
-    """Returns a sentence about the roots that are zero by the structure of the system."""
+    """Returns a sentence about the roots that are zero by the structure of the system.
+
+    Such roots belong to motions that neither grow nor decay, and do not count for stability.
+
+    Args:
+        analysis: The analysis.
+    """
     count = analysis.decisive.zeros
     if not count:
         return "no root at zero"
@@ -152,7 +179,13 @@ def describe_zero_roots(analysis: LinearAnalysis) -> str:
 
 
 def describe_linear_verdict(analysis: LinearAnalysis) -> str:
-    """Returns the verdict, with the growth rate and the frequency of the rightmost root."""
+    """Returns whether small motions of the loop decay, in a sentence.
+
+    The sentence states the growth rate and the frequency of the rightmost root.
+
+    Args:
+        analysis: The analysis.
+    """
     rightmost = analysis.decisive.rightmost
     drifting = analysis.decisive.drifting
     motions = "motions keep their" if drifting > 1 else "motion keeps its"
@@ -178,12 +211,15 @@ WEIGHTS_ALIKE = 1e-9
 
 
 def describe_ports(ports: PortAnalysis) -> list[str]:
-    """Returns the lines about the ports, the places at which operators hold the arms.
+    """Returns lines about the ports, the places at which operators hold the arms.
 
     The lines are about passivity (the loop cannot generate energy at the ports), absolute
     stability (the loop is stable with any passive operators) and transparency (the impedance
     that an operator feels). If the loop is unstable without operators, or with a site clamped,
     the lines end there.
+
+    Args:
+        ports: Analysis of the ports.
     """
     lines = _describe_conditions(ports)
     if ports.verdict == "unstable":

@@ -139,7 +139,7 @@ def render_report(
     certificate: str = "",
     verdict: str = "",
 ) -> str:
-    """Returns the page of a log as HTML.
+    """Composes the HTML page that reports a run.
 
     Args:
         log: Log of the run.
@@ -149,6 +149,9 @@ def render_report(
         certificate: HTML of the section about stability. Empty for no such section.
         verdict: HTML of the judgement about stability, with which the page begins. Empty for
             none.
+
+    Returns:
+        The whole page.
     """
     scenario = log.scenario
     builder = ChartBuilder(log, twin)
@@ -293,11 +296,14 @@ def _render_certificate(certificate: Certificate) -> str:
 
 
 def render_alarms(log: Log) -> str:
-    """Returns the alarms of the sites as a list in large type.
+    """Renders the alarms of a run as a list in large type, which begins the page.
 
     Faults and stops are the severe alarms. If there are any, only these are listed, because
     other alarms usually follow from them. At most `_MAX_ALARMS` alarms are listed, and the rest
     is counted.
+
+    Args:
+        log: Log of the run.
 
     Returns:
         HTML of the list. Empty if there were no alarms.

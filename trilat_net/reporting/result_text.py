@@ -44,12 +44,18 @@ A hash is kept on one line so that it can be copied.
 
 
 def escape_text(text: str) -> str:
-    """Returns a text as HTML, in which no line break can split a hash."""
+    """Converts a text to HTML, in which no line break can split a hash.
+
+    A hash is a long hexadecimal number that identifies a file. A user must be able to copy it.
+
+    Args:
+        text: Plain text.
+    """
     return HASH.sub(r'<span style="white-space:nowrap">\g<0></span>', escape(text))
 
 
 class TextTable(NamedTuple):
-    """A table of texts.
+    """A table of texts, which can be rendered for a terminal, as Markdown or as HTML.
 
     Attributes:
         headers: Header of each column. If all are empty, the table has no header line.
@@ -84,9 +90,10 @@ class TextTable(NamedTuple):
         return [letter == "r" for letter in letters]
 
     def rich(self) -> "Table":
-        """Returns the table for a Rich console, without borders.
+        """Converts the table to a table of the package Rich, which prints it on a terminal.
 
-        Cells are folded if the terminal is too narrow, except those that consist of a hash.
+        The table has no borders. Cells are folded if the terminal is too narrow, except those
+        that consist of a hash.
         """
         from rich.table import Table
 
@@ -129,7 +136,7 @@ class TextTable(NamedTuple):
         return all(len(cell) <= width for cell in self._list_cells(index))
 
     def markdown(self) -> str:
-        """Returns the table in Markdown."""
+        """Renders the table in Markdown, for a page."""
         rule = ["--:" if right else "---" for right in self.to_the_right]
         rows = [self.titles, rule]
         for row in self.rows:
@@ -142,7 +149,7 @@ class TextTable(NamedTuple):
         return "\n".join(lines)
 
     def html(self) -> str:
-        """Returns the table in HTML."""
+        """Renders the table in HTML, for a notebook or a page."""
         sides = ["right" if right else "left" for right in self.to_the_right]
 
         def render_row(cells: Sequence[str], tag: str) -> str:
@@ -159,7 +166,7 @@ class TextTable(NamedTuple):
         return f"<table>{head}<tbody>{body}</tbody></table>"
 
     def lines(self) -> list[str]:
-        """Returns the lines of the table, with columns aligned by spaces.
+        """Renders the table as plain lines, with columns aligned by spaces.
 
         The first line has the headers, unless all headers are empty.
         """
@@ -182,12 +189,20 @@ class TextTable(NamedTuple):
 
 
 def format_number(value: float | None, digits: int = 3) -> str:
-    """Returns a number as a cell of a table, or a dash for None."""
+    """Formats a number as a cell of a table.
+
+    Args:
+        value: The number, or None.
+        digits: Number of significant digits.
+
+    Returns:
+        The text. A dash for None.
+    """
     return "-" if value is None else f"{value:.{digits}g}"
 
 
 class MarkedText(NamedTuple):
-    """A line behind a mark, such as a green "ok".
+    """A line of printed text behind a mark that states a result, such as a green "ok".
 
     Attributes:
         mark: The mark in Rich's markup, as in "[green]ok[/green]". Empty for no mark.
@@ -207,7 +222,7 @@ class MarkedText(NamedTuple):
         return [f"{mark} {self.text}"]
 
     def html(self) -> str:
-        """Returns the line in HTML."""
+        """Renders the line with its mark in HTML."""
         line = sanitize(self.lines()[0], MAX_LETTERS)
         text = escape_text(line)
         return f'<div style="white-space:pre-wrap">{text or "&nbsp;"}</div>'
@@ -236,7 +251,14 @@ _COMPOSERS = {
 
 
 def compose(result: Result) -> list[MarkedText | TextTable]:
-    """Returns the blocks of a result, in order."""
+    """Collects the parts of the text that reports a result.
+
+    Args:
+        result: The result, such as that of a command.
+
+    Returns:
+        Tables, and lines with or without a mark, in the order of the text.
+    """
     compose_blocks = getattr(result, "blocks", None)
     if compose_blocks is None:
         compose_blocks = partial(_import_composer(result), result)
@@ -259,7 +281,11 @@ def _import_composer(result: Result) -> Callable[[Result], Iterable[Block]]:
 
 
 def summarize(result: Result) -> str:
-    """Returns a result as plain text."""
+    """Renders a result as plain text, for example for `print`.
+
+    Args:
+        result: The result.
+    """
     lines = []
     for block in compose(result):
         lines += [sanitize(line, MAX_LETTERS) for line in block.lines()]
@@ -267,5 +293,9 @@ def summarize(result: Result) -> str:
 
 
 def render_html(result: Result) -> str:
-    """Returns a result as HTML, with HTML tables."""
+    """Renders a result as HTML with tables, for example for a notebook.
+
+    Args:
+        result: The result.
+    """
     return "\n".join(block.html() for block in compose(result))

@@ -55,7 +55,14 @@ _MAX_FREQUENCIES = 16
 
 
 def compose_log(log: Log) -> Iterator[Block]:
-    """Yields the session of a log, a table with a row per site, and the notable facts."""
+    """Yields the text that introduces a log.
+
+    It consists of the session, a table with a row per site, and the notable facts of the run,
+    such as alarms and changes.
+
+    Args:
+        log: Log of the run.
+    """
     yield log.headline()
     keys = ("site", "rate_hz", "records", "missing", "last_s")
     rows = [[str(row[key]) for key in keys] for row in log.to_rows()]
@@ -64,9 +71,13 @@ def compose_log(log: Log) -> Iterator[Block]:
 
 
 def format_run_lines(log: Log) -> list[str]:
-    """Returns the lines about alarms, user code, links, changes, modes and clocks of a run.
+    """Returns lines about the notable facts of a run.
 
-    Lists that are long are cut, see `_limit_lines`.
+    They concern alarms, user code, links, changes, modes and clocks. Long lists are cut, see
+    `_limit_lines`.
+
+    Args:
+        log: Log of the run.
 
     Raises:
         LogError: A record names a change that does not exist in the log.
@@ -82,10 +93,16 @@ def format_run_lines(log: Log) -> list[str]:
 
 
 def format_outside_lines(log: Log) -> list[str]:
-    """Returns the messages of users' control laws and of external arms, as lines.
+    """Returns the messages that users' control laws and external arms left in a log, as lines.
 
     These texts come from other programs. Therefore they are cut to a bounded length, and
     characters that could control the terminal are replaced by spaces.
+
+    Args:
+        log: Log of the run.
+
+    Returns:
+        The lines. Empty if there are no such messages.
     """
     lines = []
     for event in log.events:
@@ -96,10 +113,17 @@ def format_outside_lines(log: Log) -> list[str]:
 
 
 def format_link_lines(log: Log) -> list[str]:
-    """Returns a line per link whose delay varies or which loses samples.
+    """Returns a line for each link whose delay varies or which loses samples.
 
-    A line has the delay that the scenario states for the link, the measured one-way delay, the
+    A link leads from one site to another, and transmits the samples of the sender's state. A
+    line has the delay that the scenario states for the link, the measured one-way delay, the
     age of the samples in use, and the losses.
+
+    Args:
+        log: Log of the run.
+
+    Returns:
+        The lines. Empty if all links have a constant delay and no losses.
     """
     lines = []
     for use in link_summary.summarise_links(log):
@@ -122,10 +146,13 @@ def format_link_lines(log: Log) -> list[str]:
 
 
 def format_change_lines(log: Log) -> list[str]:
-    """Returns a line per change during the run.
+    """Returns a line for each change that was made during the run.
 
-    A change is a command to a site, or another model of a link, or other dominance factors,
-    which are the weights with which a site follows its peers.
+    A change is a command to a site, another model of a link, or other dominance factors, which
+    are the weights with which a site follows its peers.
+
+    Args:
+        log: Log of the run.
     """
     lines = []
     for changed in list_changes(log):
@@ -136,7 +163,13 @@ def format_change_lines(log: Log) -> list[str]:
 
 
 def format_mode_lines(log: Log) -> list[str]:
-    """Returns a line per site that held, braked or returned, with the times at which it did."""
+    """Returns a line for each site that at times did not follow its peers.
+
+    Such a site held its position, braked or returned. The line states when it did.
+
+    Args:
+        log: Log of the run.
+    """
     lines = []
     for site in log.sites:
         intervals = find_mode_intervals(log[site])
@@ -153,7 +186,13 @@ def format_mode_lines(log: Log) -> list[str]:
 
 
 def format_clock_lines(log: Log) -> list[str]:
-    """Returns a line per link whose two sites have different clocks."""
+    """Returns a line for each link whose two sites have different clocks.
+
+    The line states how far the clocks differ, because measured delays depend on this.
+
+    Args:
+        log: Log of the run.
+    """
     lines = []
     for site in log.sites:
         for peer in log[site].peers:
@@ -164,11 +203,14 @@ def format_clock_lines(log: Log) -> list[str]:
 
 
 def format_stated_models(states: Sequence[StatedModel]) -> str:
-    """Returns the delay models that a scenario states for a link, in the order of their time.
+    """Describes the delay models that a scenario states for a link, in the order of time.
 
     Args:
         states: The models. If there are more than three, only the first and the last one are
             described, with the number of changes between them.
+
+    Returns:
+        The description, for a line of text.
     """
     first, *later = states
     parts = [first.link.describe()]
@@ -180,7 +222,14 @@ def format_stated_models(states: Sequence[StatedModel]) -> str:
 
 
 def format_clock(use: link_summary.ClockSummary) -> str:
-    """Returns a clock's offset, its bound, its drift and its faults as text."""
+    """Describes the difference between the clocks of two sites.
+
+    Args:
+        use: Summary of the difference over the run.
+
+    Returns:
+        The offset, its bound, its drift and faults, as text.
+    """
     known = f"known to {use.bound_us} us (p50 {use.bound_p50_us:.0f}, max {use.bound_max_us})"
     parts = [f"{use.offset_us / 1e3:+.3f} ms at the end, {known}"]
     if use.drift_ppm is not None:
@@ -248,7 +297,13 @@ def _limit_lines(lines: list[str]) -> list[str]:
 
 
 def compose_verification(report: LogCheckReport) -> Iterator[Block]:
-    """Yields a line per check of a log. If all passed, also the notable facts of the run."""
+    """Yields the result of the checks of a log: a line per check.
+
+    If all checks passed, the notable facts of the run follow.
+
+    Args:
+        report: Results of the checks.
+    """
     for finding in report.findings:
         yield MarkedText("", f"{finding.check}: {finding.text}", failed=not finding.passed)
     if report.passed:
@@ -256,7 +311,13 @@ def compose_verification(report: LogCheckReport) -> Iterator[Block]:
 
 
 def compose_log_check(report: LogCheckResult) -> Iterator[Block]:
-    """Yields a line per check of a file, and the places in the file at which a check failed."""
+    """Yields the result of the checks of a log file: a line per check.
+
+    After each failed check, lines name the places in the file at which it failed.
+
+    Args:
+        report: Results of the checks.
+    """
     for finding in report.findings:
         mark = MARKS["ok" if finding.passed else "FAIL"]
         yield MarkedText(mark, f"{finding.check:<9}  {finding.text}")
@@ -385,7 +446,13 @@ def _format_difference(before: object, after: object) -> tuple[str, str]:
 
 
 def compose_doctor(report: Result) -> Iterator[Block]:
-    """Yields a line per finding about this machine, with a mark for good, doubtful or bad."""
+    """Yields the result of examining whether this machine is fit for a session.
+
+    Each finding has a line, with a mark for good, doubtful or bad.
+
+    Args:
+        report: Result of `trilat doctor`.
+    """
     for finding in report.to_dict()["findings"]:
         yield MarkedText(MARKS[finding["state"]], f"{finding['check']:<10}  {finding['text']}")
 
@@ -434,9 +501,13 @@ _DELAY_KEYS = ("min", "p50", "p99", "max")
 
 
 def compose_topic_delays(report: Result) -> Iterator[Block]:
-    """Yields a table of the delays of a ROS topic's messages, with a row per publisher.
+    """Yields a table of the delays with which the messages of a ROS topic arrive.
 
-    The last column is a histogram of the delays, from the smallest to the largest one.
+    There is a row per publisher. The last column is a histogram of the delays, from the
+    smallest to the largest one.
+
+    Args:
+        report: Result of the measurement.
     """
     measurement = report.to_dict()
     duration = f"{measurement['lasted_s']:.3g} s"
@@ -548,11 +619,14 @@ def _judge_transport(transport: dict[str, Any], needs: dict[str, Any]) -> str:
 
 
 def compose_metrics(metrics: LogMetrics) -> Iterator[Block]:
-    """Yields the tables of a run's metrics, then the reasons why numbers are missing.
+    """Yields the tables of a run's metrics, and then the reasons why numbers are missing.
 
     There is a table per group of quantities and kind of subject: the run, a site, a link or a
-    wall. Further tables have the forces that sites at rest feel, and the stiffness and
-    impedance that operators feel.
+    wall. Further tables have the forces that operators feel at sites at rest, and the stiffness
+    and impedance that they feel.
+
+    Args:
+        metrics: Metrics of the run.
     """
     reasons: dict[str, list[str]] = {}
     tables = groupby(quantities(), key=lambda quantity: (quantity.group, quantity.of))

@@ -354,7 +354,10 @@ class ExpectationRow(NamedTuple):
     mean: MeanInterval | None = None
 
     def cells(self) -> tuple[str, ...]:
-        """Returns the texts of the row in the printed table, one for each of `TRIAL_COLUMNS`."""
+        """Returns the texts of the row in the printed table.
+
+        There is one text for each of `TRIAL_COLUMNS`.
+        """
         mark = "ok" if self.held == self.runs else "FAIL"
         worst = self.worst
         margin = format_margin(self.worst.margin)

@@ -8,5 +8,8 @@ import pkgutil
 
 
 def list_export_formats() -> list[str]:
-    """Returns the names of all formats, which are those of the modules in this folder."""
+    """Lists the names of all formats in which a log can be exported.
+
+    Each format is a module in this folder and has its name.
+    """
     return [module.name for module in pkgutil.iter_modules(__path__)]

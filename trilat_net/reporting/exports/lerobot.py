@@ -87,7 +87,9 @@ Columns = dict[str, NDArray[Any]]
 
 
 class _Frames(NamedTuple):
-    """The F frames of a log.
+    """The F frames of a data set, each of which refers to a record of every site.
+
+    The frames have a constant rate, lower than that of the log.
 
     Attributes:
         rows: For each site, the index of each frame's record in the log, shape (F,).

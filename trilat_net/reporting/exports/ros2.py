@@ -54,7 +54,7 @@ TimedMessages = tuple[int, int, list[tuple[str, bytes]]]
 def export_ros2(
     log: Log, path: Path, written: Written = lambda _: None, *, names: str = NAMINGS[0]
 ) -> None:
-    """Writes a log as a bag for `ros2 bag` and other players of bags.
+    """Writes a log as a file that `ros2 bag` and other players of ROS 2 bags can read.
 
     Topics of sites are `/<session>/<site>/joint_states` and others. Topics of the session are
     `/<session>/events`, `/<session>/log`, `/tf` and `/diagnostics`. The metadata of the
@@ -150,7 +150,7 @@ class _SiteBag:
         return [(self._find_topic(topic), data) for topic, data in messages]
 
     def iterate_records(self) -> Iterator[TimedMessages]:
-        """Yields the messages that describe the records, in the order of their arrival.
+        """Yields the ROS messages that describe the motion of the site, in the order of arrival.
 
         The first messages also contain the description of the robot.
         """
@@ -172,7 +172,7 @@ class _SiteBag:
                 self._progress((count - 1) % _RECORDS_PER_REPORT + 1)
 
     def iterate_statistics(self) -> Iterator[TimedMessages]:
-        """Yields the messages about the links to the site, in the order of their arrival."""
+        """Yields the ROS messages about the links that lead to the site, in the order of arrival."""
         timed = self._log.timed_link_stats(self._site)
         rows = zip(
             timed.log_ns.tolist(), timed.publish_ns.tolist(), timed.messages, strict=True

@@ -88,7 +88,11 @@ class ArmPose(NamedTuple):
     bodies: Sequence[Array] = ()
 
     def scale(self, factor: float) -> "ArmPose":
-        """Returns the pose with all points multiplied by a factor."""
+        """Returns the pose with all points multiplied by a factor, to convert m to picture units.
+
+        Args:
+            factor: The factor.
+        """
         return ArmPose(
             actual=factor * self.actual,
             desired=factor * self.desired,
@@ -98,7 +102,11 @@ class ArmPose(NamedTuple):
         )
 
     def list_points(self) -> Array:
-        """Returns all points of the pose, shape (K, 2), in m."""
+        """Returns all points of the pose in one array, from which a picture's bounds follow.
+
+        Returns:
+            The points, shape (K, 2), in m.
+        """
         parts = [self.actual, self.desired, self.path, self.shadow, *self.bodies]
         return np.concatenate(parts)
 
@@ -260,7 +268,12 @@ def compute_pose_box_m(poses: Sequence[ArmPose | None]) -> PictureBox:
 
 @draws("arms", "the arms at a few instants", in_report=True)
 def draw_arms(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws the poses of all arms at a few times, with a row per site and a column per time."""
+    """Draws the poses of all arms at a few times, with a row per site and a column per time.
+
+    Args:
+        log: Log of the run.
+        form: Size of the figure.
+    """
     times_s = choose_instants_s(log, _NARROW_INSTANTS if form.narrow else INSTANTS)
     poses = {site: [find_pose(log, site, t_s) for t_s in times_s] for site in log.sites}
     all_poses = [pose for row in poses.values() for pose in row]
@@ -317,14 +330,17 @@ def _draw_pose(axes: Axes, pose: ArmPose | None, colour: str) -> None:
 
 
 def render_arms_svg(log: Log, bounds_m: PictureBox, factor: float) -> str:
-    """Returns HTML with pictures of the arms: a row per site, and a column per time.
+    """Draws the poses of all arms at a few times, as pictures in HTML.
 
-    Sites without records are left out.
+    There is a row per site and a column per time. Sites without records are left out.
 
     Args:
         log: Log of the run.
         bounds_m: Left, right, bottom and top of every picture, in m.
         factor: Scale of the pictures, in units of the picture per m.
+
+    Returns:
+        HTML with the pictures.
     """
     left_m, right_m, bottom_m, top_m = bounds_m
     bounds = (factor * left_m, factor * right_m, factor * bottom_m, factor * top_m)

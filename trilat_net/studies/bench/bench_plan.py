@@ -380,7 +380,7 @@ class TunedGains(msgspec.Struct, frozen=True):
 
     @property
     def key(self) -> tuple[str, str, int]:
-        """Form, law and round trip in ms, which identify the gains in the file of tuned gains."""
+        """Form, law and round trip in ms, which identify the gains in their file."""
         return self.form, self.law, self.round_trip_ms
 
     def __str__(self) -> str:

@@ -188,7 +188,7 @@ class BenchCellResult(NamedTuple):
 
     @property
     def judgement(self) -> Stability:
-        """The worst judgement of the cell's runs. Thus a cell is stable only if all runs are."""
+        """The worst judgement of the cell's runs: a cell is stable only if all runs are."""
         if self.count(Stability.NOT_STABLE):
             return Stability.NOT_STABLE
         return Stability.OPEN if self.count(Stability.OPEN) else Stability.STABLE
@@ -616,7 +616,9 @@ def _format_ratio(numerator: float | None, denominator: float | None) -> str:
 
 
 def describe_bench(results: BenchResults) -> Iterator[str]:
-    """Yields lines that introduce the results: the study, its runs and tasks, and missing laws.
+    """Yields lines that introduce the results.
+
+    They name the study, its runs, its tasks, and the laws that did not run.
 
     Args:
         results: The results.
