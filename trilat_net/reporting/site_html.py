@@ -20,10 +20,13 @@ FIELDS = ("q", "qd", "q_des", "e", "tau", "tau_x", "theta_hat", "x", "xd", "wren
 
 
 def render_site_html(site: SiteLog) -> str:
-    """Returns a heading, and a table with a row per number of a record.
+    """Renders the records of one site as HTML, for display in a notebook.
 
-    A row has the first, last, least and greatest value over the run. Without records there is
-    only the heading.
+    A heading is followed by a table with a row per number of a record. A row has the first,
+    last, least and greatest value over the run. Without records there is only the heading.
+
+    Args:
+        site: Records of the site.
     """
     heading = f"<p>{escape(repr(site).strip('<>'))}</p>"
     if not len(site):

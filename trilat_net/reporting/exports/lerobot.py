@@ -89,7 +89,7 @@ Columns = dict[str, NDArray[Any]]
 class _Frames(NamedTuple):
     """The F frames of a data set, each of which refers to a record of every site.
 
-    The frames have a constant rate, lower than that of the log.
+    The frames are equally spaced in time, except at gaps between episodes.
 
     Attributes:
         rows: For each site, the index of each frame's record in the log, shape (F,).

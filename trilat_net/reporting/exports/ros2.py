@@ -150,9 +150,10 @@ class _SiteBag:
         return [(self._find_topic(topic), data) for topic, data in messages]
 
     def iterate_records(self) -> Iterator[TimedMessages]:
-        """Yields the ROS messages that describe the motion of the site, in the order of arrival.
+        """Yields the ROS messages that describe the motion of the site.
 
-        The first messages also contain the description of the robot.
+        The messages are in the order of their arrival. The first ones also contain the
+        description of the robot.
         """
         records = self._log[self._site]
         shares = trace_dominance(self._log, self._site, records.t_s).alpha.tolist()
@@ -172,7 +173,10 @@ class _SiteBag:
                 self._progress((count - 1) % _RECORDS_PER_REPORT + 1)
 
     def iterate_statistics(self) -> Iterator[TimedMessages]:
-        """Yields the ROS messages about the links that lead to the site, in the order of arrival."""
+        """Yields the ROS messages about the delays and losses of the links to the site.
+
+        The messages are in the order of their arrival.
+        """
         timed = self._log.timed_link_stats(self._site)
         rows = zip(
             timed.log_ns.tolist(), timed.publish_ns.tolist(), timed.messages, strict=True

@@ -71,8 +71,13 @@ class DelayDistribution(NamedTuple):
 def draw_sample_age(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the age of the sample in use on every link over time, in ms.
 
-    The figure has a row per receiver. An age that fluctuates is drawn as a band with its
-    median, because a line would fill the area between its extremes.
+    The age of a sample of a peer's state is the time from its sending until its use. The figure
+    has a row per receiver. An age that fluctuates is drawn as a band with its median, because a
+    line would fill the area between its extremes.
+
+    Args:
+        log: Log of the run.
+        form: Size of the figure.
     """
     ages_ms = _read_ages_ms(log)
     stated = {
@@ -136,7 +141,14 @@ def _add_link_panels(
 
 
 def has_varying_delay(log: Log) -> bool:
-    """Returns True if at least one link has more than one constant delay."""
+    """Tells whether the delays of a run vary, so that their distribution is of interest.
+
+    Args:
+        log: Log of the run.
+
+    Returns:
+        True if at least one link has more than one constant delay.
+    """
     return not all(map(has_one_constant_delay, _list_link_models(log).values()))
 
 
@@ -147,10 +159,15 @@ def has_varying_delay(log: Log) -> bool:
     in_report=True,
 )
 def draw_delay_distributions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws the distributions of delay and age on every link.
+    """Draws the distributions of the delay and of the age of samples on every link.
 
-    A curve at x shows the percentage of samples with a delay of at most x ms, or of ticks with
-    an age of at most x ms. The figure has a row per receiver.
+    The delay of a sample is the time until its arrival, its age the time until its use. A curve
+    at x shows the percentage of samples with a delay of at most x ms, or of ticks with an age
+    of at most x ms. The figure has a row per receiver.
+
+    Args:
+        log: Log of the run.
+        form: Size of the figure.
     """
     links = measure_delay_distributions(log)
     x_ms = choose_delay_axis_ms(links)
@@ -185,7 +202,14 @@ def _list_link_models(log: Log) -> dict[str, list[StatedModel]]:
 
 
 def measure_delay_distributions(log: Log) -> list[DelayDistribution]:
-    """Returns the delays and ages of every link, ordered by receiver and then by sender."""
+    """Collects the delays and ages of the samples on every link of a run.
+
+    Args:
+        log: Log of the run.
+
+    Returns:
+        An entry per link, ordered by receiver and then by sender.
+    """
     distributions = []
     for site in log.sites:
         for peer, arrivals in read_arrivals(log, site).items():
@@ -201,7 +225,7 @@ def measure_delay_distributions(log: Log) -> list[DelayDistribution]:
 
 
 def choose_delay_axis_ms(links: list[DelayDistribution]) -> Array:
-    """Chooses the delays at which distributions are drawn.
+    """Chooses the delays at which the curves of the distributions have points.
 
     The delays reach up to the longest delay or age. Their steps are equal, or equal on a
     logarithmic axis if only few values are long.
@@ -278,7 +302,14 @@ def needs_log_axis(ages_ms: Array) -> bool:
 
 
 def is_unsteady(ages_ms: Array) -> bool:
-    """Returns True if ages fall so often that a line would look like a filled area."""
+    """Tells whether ages fluctuate so often that a line would look like a filled area.
+
+    Args:
+        ages_ms: Ages over time, shape (K,), in ms.
+
+    Returns:
+        True if the ages fall often, which happens whenever a newer sample is used.
+    """
     falls = np.flatnonzero(np.diff(ages_ms) < -_STEP_MS)
     return len(falls) > style.SPREAD_BUCKETS
 
@@ -303,7 +334,12 @@ def _list_sender_entries(log: Log) -> list[tuple[str, dict[str, Any]]]:
 
 
 def explain_missing_loop_times(log: Log) -> str:
-    """Returns the reason why a log has no lateness and no computing times.
+    """Explains why a log has no figures of lateness and computing times of the control loop.
+
+    Only live sites measure how late a tick began and how long it took.
+
+    Args:
+        log: Log of the run.
 
     Returns:
         The reason. Empty if at least one site has such times.
@@ -314,10 +350,13 @@ def explain_missing_loop_times(log: Log) -> str:
 
 
 def choose_bin_edges_us(log: Log) -> Array:
-    """Chooses the bins of the histograms of a log's lateness and computing times.
+    """Chooses the bins of the histograms of lateness and computing times.
 
     The bins have equal widths on a logarithmic axis, from 1 us to above the longest time of the
     log.
+
+    Args:
+        log: Log of the run.
 
     Returns:
         Edges of the bins in us, shape (B + 1,).
@@ -332,11 +371,13 @@ def choose_bin_edges_us(log: Log) -> Array:
 
 
 def bin_loop_times(times_us: Ints, edges_us: Array) -> Ints:
-    """Counts times per bin. Times below 1 us count in the first bin.
+    """Counts how many times lie in each bin of a histogram.
+
+    Times below 1 us count in the first bin.
 
     Args:
-        times_us: Times, shape (K,).
-        edges_us: Edges of the bins, shape (B + 1,).
+        times_us: Times in us, shape (K,).
+        edges_us: Edges of the bins in us, shape (B + 1,).
 
     Returns:
         Number of times in each bin, shape (B,).
@@ -352,7 +393,15 @@ def bin_loop_times(times_us: Ints, edges_us: Array) -> Ints:
     in_report=True,
 )
 def draw_loop_timing(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws the histograms of each site's lateness and computing time, in us."""
+    """Draws histograms of the timing of each site's control loop, in us.
+
+    They show the lateness, by which a tick began after its planned time, and the time that its
+    computation took.
+
+    Args:
+        log: Log of the run.
+        form: Size of the figure.
+    """
     edges_us = choose_bin_edges_us(log)
     labels = ("wake-up after the deadline", "computing time of a tick")
     if form.narrow:

@@ -88,7 +88,9 @@ class ArmPose(NamedTuple):
     bodies: Sequence[Array] = ()
 
     def scale(self, factor: float) -> "ArmPose":
-        """Returns the pose with all points multiplied by a factor, to convert m to picture units.
+        """Returns the pose with all points multiplied by a factor.
+
+        This converts a pose in m to the units of a picture.
 
         Args:
             factor: The factor.

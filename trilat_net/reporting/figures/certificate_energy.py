@@ -71,11 +71,12 @@ The panel "given" also shows the kind "taken", the energy that a law dissipated.
 def draw_functional(
     log: Log, certificate: Certificate, form: FigureSize = REPORT_SIZE
 ) -> Figure:
-    """Draws V and its energy balance over time, in J.
+    """Draws the energy function V of the stability proof and its energy balance over time, in J.
 
-    The panels are, from the top: V and the contribution of each site; the parts of V;
-    dissipation and work; and the residual of the balance. Without a balance the figure shows
-    the reason.
+    V decreases if the controllers dissipate more than the operators put in. The panels are,
+    from the top: V and the contribution of each site; the parts of V; dissipation and work; and
+    the residual of the balance, the part of V that they do not explain. Without a balance the
+    figure shows the reason.
 
     Args:
         log: Log of the run.
@@ -125,11 +126,12 @@ def _draw_certificate(log: Log, form: FigureSize) -> Figure:
 def draw_observed_energy(
     log: Log, observed: ObservedEnergy, form: FigureSize = REPORT_SIZE
 ) -> Figure:
-    """Draws the energies that the control laws declare, in J over time.
+    """Draws the energies that the control laws keep account of and record, in J over time.
 
-    There is a panel for each kind that the laws declare: the energy in the lines between sites;
-    the part of it that the receivers know; stored energy; and energy that the arms gave to the
-    laws or that the laws dissipated. A line between sites has the colour of its receiver.
+    Some laws ensure stability by not returning more energy than they received. There is a panel
+    for each kind that the laws declare: the energy in the lines between sites; the part of it
+    that the receivers know; stored energy; and energy that the arms gave to the laws or that
+    the laws dissipated. A line between sites has the colour of its receiver.
 
     Args:
         log: Log of the run.

@@ -30,7 +30,7 @@ Drawing = TypeVar("Drawing", bound=Callable[..., Figure])
 
 
 class FigureEntry(NamedTuple):
-    """A registered figure.
+    """A figure that can be drawn from a log, as registered by the decorator `draws`.
 
     Attributes:
         about: Description of the contents, for lists of figures.
@@ -59,7 +59,7 @@ _PAPER_ORDER = (
 def draws(
     name: str, about: str, absent: Absent = lambda _: "", *, in_report: bool = False
 ) -> Callable[[Drawing], Drawing]:
-    """Returns a decorator that registers a function as a figure.
+    """Registers a function as a figure that can be drawn from a log. It is a decorator.
 
     The function receives a log and the size of the figure, and returns a Matplotlib figure.
 
@@ -69,6 +69,9 @@ def draws(
         absent: Function that returns the reason why the figure of a log would be empty. By
             default every log has something to draw.
         in_report: True if the report of a run contains the figure.
+
+    Returns:
+        The decorator.
 
     Raises:
         ValueError: Another figure has the same name.
@@ -87,11 +90,17 @@ def draws(
 
 
 def unless(shows: Callable[[Log], object], reason: str) -> Absent:
-    """Returns a function that explains why the figure of a log would be empty.
+    """Makes a function that explains why the figure of a log would be empty.
+
+    It is the argument `absent` of `draws`.
 
     Args:
         shows: Function that returns a true value if a log has something to draw.
         reason: Explanation for other logs.
+
+    Returns:
+        Function that returns the explanation for a log. It returns an empty text if the log has
+        something to draw.
     """
     return lambda log: "" if shows(log) else reason
 

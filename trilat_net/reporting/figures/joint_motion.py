@@ -60,7 +60,14 @@ explain_absent_operator = unless(site_signals.sites_with_operator, NO_OPERATOR)
     "operator_torques", "torque on the arms (Fig. 3)", explain_absent_operator, in_report=True
 )
 def draw_operator_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws the torques of the operators on the arms, in N m, as Fig. 3 of the paper."""
+    """Draws the torques of the operators on the arms over time, in N m, as Fig. 3 of the paper.
+
+    An operator is the person or program that moves an arm.
+
+    Args:
+        log: Log of the run.
+        form: Size of the figure.
+    """
     return _draw_joints(
         log=log,
         form=form,
@@ -115,9 +122,14 @@ def draw_operator_displacement(
 
 @draws("control_torques", "torque of the controllers")
 def draw_control_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws the torque of every site's controller, tau of Eq. (13), in N m.
+    """Draws the torques of every site's controller over time, in N m.
 
-    The torque limit of a site is drawn if the site reached it.
+    They are tau of Eq. (13) of the paper. The torque limit of a site is drawn if the site
+    reached it.
+
+    Args:
+        log: Log of the run.
+        form: Size of the figure.
     """
     limits = list[Array]()
     for site in log.sites:
@@ -220,9 +232,14 @@ def _add_joint_rows(
 
 @draws("operation", "torque on the arms above their angles", explain_absent_operator)
 def draw_operation(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws the torques of the operators on the arms, in N m, and the joint angles, in rad.
+    """Draws what the operators did and how the arms moved.
 
-    The torques are above the angles, or beside them if the arms have more than two joints.
+    The torques of the operators on the arms, in N m, are above the joint angles, in rad, or
+    beside them if the arms have more than two joints.
+
+    Args:
+        log: Log of the run.
+        form: Size of the figure.
     """
     heads = ("torque on the arm (N m)", "joint angle (rad)")
     if form.narrow:
@@ -260,7 +277,15 @@ def _choose_height_in(log: Log, two_joints_in: float) -> float:
 
 @draws("positions", "actual and desired angles (Fig. 4)", in_report=True)
 def draw_positions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws the desired and the actual joint angles, in rad, as Fig. 4 of the paper."""
+    """Draws the desired and the actual joint angles over time, as Fig. 4 of the paper.
+
+    The desired angles of a site are the average of its peers, weighted with the dominance
+    factors. The angles are in rad.
+
+    Args:
+        log: Log of the run.
+        form: Size of the figure.
+    """
     heads = [f"{site}: q (rad)" for site in log.sites]
     labels = heads if form.narrow else [f"angle of {site} (rad)" for site in log.sites]
     row_in = 0.95 if form.narrow else 1.25
@@ -290,10 +315,15 @@ def draw_positions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
 @draws("tracking_errors", "errors, and the largest one still to come (Fig. 5)", in_report=True)
 def draw_tracking_errors(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws the tracking errors e = q - q_des of every site over time, as Fig. 5 of the paper.
+    """Draws the tracking errors of every site over time, as Fig. 5 of the paper.
 
-    The panel below shows, at each time, the largest error of any joint from then on. A site has
-    settled when this line falls below the dashed limit.
+    The error is e = q - q_des, the actual minus the desired joint angles. The panel below
+    shows, at each time, the largest error of any joint from then on. A site has settled when
+    this line falls below the dashed limit.
+
+    Args:
+        log: Log of the run.
+        form: Size of the figure.
     """
     titles = style.name_shared(log)
     unit = site_signals.shared_unit(log)
@@ -334,6 +364,10 @@ def draw_settling(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the largest error of any joint of every site over time, on a logarithmic axis.
 
     A triangle marks the time at which a site settles, and the legend states this time.
+
+    Args:
+        log: Log of the run.
+        form: Size of the figure.
     """
     unit = site_signals.shared_unit(log)
     entries = []
@@ -399,6 +433,10 @@ def draw_parameter_estimates(log: Log, form: FigureSize = REPORT_SIZE) -> Figure
     Adaptive control laws estimate these parameters while the arm moves. The figure has the
     estimates of all sites, whereas Fig. 6 of the paper has those of master 1. An arm in space
     (a chain) has a row of panels per link, or two rows per link in a narrow figure.
+
+    Args:
+        log: Log of the run.
+        form: Size of the figure.
     """
     arm = log.scenario.arms[log.sites[0]]
     if arm.chain is not None:
@@ -488,9 +526,15 @@ def _draw_estimate(
 
 @draws("phase", "errors against their rates")
 def draw_phase_portrait(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws the phase portrait of the errors: e-dot = qd - qd_des over e, a panel per joint.
+    """Draws the phase portrait of the tracking errors, with a panel per joint.
 
-    A ring marks the start of a site, and a disc its end.
+    The vertical axis has the velocity error qd - qd_des, and the horizontal axis the error q -
+    q_des, where q is the angle of the joint, qd its velocity, and "des" stands for desired. A
+    ring marks the start of a site, and a disc its end.
+
+    Args:
+        log: Log of the run.
+        form: Size of the figure.
     """
     titles = style.name_shared(log)
     unit = site_signals.shared_unit(log)
@@ -536,8 +580,13 @@ def _has_only_chains(log: Log) -> bool:
 def draw_end_effector_paths(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the paths of the end effectors of arms in space in three planes, in m.
 
-    The planes are those of the frame that all sites share. In task space, the paths are scaled
-    to the task. A ring marks the start of a site, and a disc its end.
+    The planes are those of the frame that all sites share. If the sites exchange poses of their
+    end effectors (task space), the paths are scaled to the task. A ring marks the start of a
+    site, and a disc its end.
+
+    Args:
+        log: Log of the run.
+        form: Size of the figure.
     """
     mosaic = style.arrange_joints(len(_PLANES), form.narrow)
     row_in = 0.9 * form.width_in / len(mosaic[0])
@@ -599,7 +648,13 @@ def thin_path(path: Array) -> Array:
 
 
 def list_sites_with_changing_dominance(log: Log) -> list[str]:
-    """Lists the sites whose dominance factors change during the run, in scenario order."""
+    """Lists the sites whose dominance factors change during the run, in scenario order.
+
+    A dominance factor is the weight with which a site follows another one.
+
+    Args:
+        log: Log of the run.
+    """
     changed_sites = {changed.change.dominance for changed in list_changes(log)}
     return [site for site in log.sites if site in changed_sites]
 
@@ -610,10 +665,14 @@ def list_sites_with_changing_dominance(log: Log) -> list[str]:
     unless(list_sites_with_changing_dominance, "the shares of all sites are constant"),
 )
 def draw_authority(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws the dominance factors that change, and the motion of all arms in rad.
+    """Draws the dominance factors that change during the run, and the motion of all arms.
 
     The dominance factor of a peer is the weight with which a site follows this peer. The motion
-    of an arm is its displacement from the start of the run.
+    of an arm is its displacement from the start of the run, in rad.
+
+    Args:
+        log: Log of the run.
+        form: Size of the figure.
     """
     owners = list_sites_with_changing_dominance(log)
     titles = style.name_joints(log)
@@ -646,7 +705,11 @@ def draw_authority(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
 
 def list_sites_with_walls(log: Log) -> list[str]:
-    """Lists the sites whose environment has a wall, in scenario order."""
+    """Lists the sites whose arm can touch a wall, in scenario order.
+
+    Args:
+        log: Log of the run.
+    """
     return [site for site in log.sites if list_walls(log.scenario.sites[site])]
 
 
@@ -656,7 +719,15 @@ def list_sites_with_walls(log: Log) -> list[str]:
     unless(list_sites_with_walls, "no site has a wall in this run"),
 )
 def draw_contact(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws the normal force of every wall, in N, and the end effector's depth in it, in mm."""
+    """Draws the contact of the arms with walls over time.
+
+    The panels have the normal force of every wall, in N, and the depth of the end effector in
+    it, in mm.
+
+    Args:
+        log: Log of the run.
+        form: Size of the figure.
+    """
     sites = list_sites_with_walls(log)
     with style.time_figure(log, form, 2.9) as plot:
         force_panel, depth_panel = style.add_panels(plot.figure, 2, 1, sharex=True)[:, 0]

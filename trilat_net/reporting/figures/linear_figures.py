@@ -269,7 +269,14 @@ _UNSTABLE: Any = {"color": "#cc3311", "alpha": 0.08, "linewidth": 0.0, "zorder":
 
 
 def draw_root_map(analysis: LinearAnalysis) -> Figure:
-    """Draws the continuous and the sampled roots, with the unstable half-plane shaded."""
+    """Draws the characteristic roots of the linearised loop in the complex plane.
+
+    The roots of the continuous and of the sampled loop have different marks. The half-plane of
+    unstable roots, whose motions grow, is shaded.
+
+    Args:
+        analysis: The linear analysis.
+    """
     with style.styled_figure(_SIZE, _HEIGHT_IN) as figure:
         axes = figure.add_subplot()
         _plot_roots(

@@ -65,7 +65,11 @@ def figure(
 
 
 def list_drawable_figures(log: Log) -> list[str]:
-    """Lists the names of the figures for which a log has something to show."""
+    """Lists the names of the figures for which a log has something to show.
+
+    Args:
+        log: The log.
+    """
     return [name for name, entry in FIGURES.items() if not entry.absent(log)]
 
 
@@ -120,7 +124,7 @@ def write_overlay(
     formats: Sequence[str] = FIGURE_FORMATS[:2],
     force: bool = False,
 ) -> list[Path]:
-    """Writes a figure that compares several logs, as overlay.pdf and in other formats.
+    """Writes a figure that compares several runs, as overlay.pdf and in other formats.
 
     Args:
         logs: The logs, by their names in the legend.

@@ -39,7 +39,7 @@ _MAX_SPANS = 1_000
 
 
 class _Panel(NamedTuple):
-    """Quantity that one of the panels shows.
+    """Description of one of the panels of the overview: the quantity that it shows.
 
     Attributes:
         name: Name of the quantity.
@@ -92,9 +92,13 @@ _PANELS = (
 
 @draws("overview", "errors, speeds, torques and ages of a run at a glance")
 def draw_overview(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws one run in four panels, with a line per site.
+    """Draws the most important quantities of one run in four panels, with a line per site.
 
     The title has the judgement whether the run was stable, and the settling time.
+
+    Args:
+        log: Log of the run.
+        form: Size of the figure.
     """
     height_in = _NARROW_HEIGHT_IN if form.narrow else _HEIGHT_IN
     with style.time_figure(log, form, height_in) as plot:

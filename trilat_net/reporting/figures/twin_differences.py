@@ -68,7 +68,7 @@ _NOTE: dict[str, Any] = {
 
 
 class _DifferenceLine(NamedTuple):
-    """A line of the upper panel.
+    """A line of the upper panel, which shows how the difference between two runs develops.
 
     Attributes:
         label: Text of the line in the legend.
@@ -84,10 +84,12 @@ class _DifferenceLine(NamedTuple):
 
 
 def draw_twins(pushed: PushedTwins, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws the differences of velocities in rad/s above the speed of the run.
+    """Draws how small pushes grow or decay in a run, above the speed of the run.
 
-    The figure has a line per push, or a line per joint if there was a single push. Without
-    twins it shows the reason why there are none.
+    A pushed twin is the same run with a small push. The upper panel has the differences of
+    joint velocities between the twins and the run, in rad/s, with a line per push, or a line
+    per joint if there was a single push. Without twins the figure shows the reason why there
+    are none.
 
     Args:
         pushed: A run and its pushed twins.
