@@ -163,13 +163,24 @@ def build_chain(joints: Sequence[ChainJoint], width: int = 0) -> RowArray:
 
 @leaf
 def three(a: Vector) -> Three:
-    """Returns the three numbers of a row."""
+    """Returns the three numbers of an array as a tuple.
+
+    Compiled code handles a tuple without allocating memory.
+
+    Args:
+        a: A vector of length 3, for example a field of a joint's row.
+    """
     return a[0], a[1], a[2]
 
 
 @leaf
 def put_three(a: Array, values: Three) -> None:
-    """Writes three numbers into a row."""
+    """Writes a vector, given as a tuple of three numbers, into an array of length 3.
+
+    Args:
+        a: The array, which is changed.
+        values: The three numbers.
+    """
     a[0], a[1], a[2] = values
 
 
@@ -208,7 +219,12 @@ def scale(factor: float, a: Three) -> Three:
 
 @leaf
 def rotate(R: Array, a: Three) -> Three:
-    """Returns R a."""
+    """Returns the product R a, the vector `a` rotated by R.
+
+    Args:
+        R: Rotation matrix, shape (3, 3).
+        a: The vector.
+    """
     x, y, z = a
     first = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z
     second = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z
@@ -218,7 +234,12 @@ def rotate(R: Array, a: Three) -> Three:
 
 @leaf
 def rotate_back(R: Array, a: Three) -> Three:
-    """Returns R' a."""
+    """Returns the product R' a, the vector `a` rotated by the inverse of R.
+
+    Args:
+        R: Rotation matrix, shape (3, 3).
+        a: The vector.
+    """
     x, y, z = a
     first = R[0, 0] * x + R[1, 0] * y + R[2, 0] * z
     second = R[0, 1] * x + R[1, 1] * y + R[2, 1] * z
@@ -227,7 +248,14 @@ def rotate_back(R: Array, a: Three) -> Three:
 
 
 def apply(a: Matrix, b: Three) -> Three:
-    """Returns a b by sums in a fixed order."""
+    """Returns the product a b of a matrix and a vector.
+
+    The sums have a fixed order, so that the result has the same bits on every machine.
+
+    Args:
+        a: The matrix, three rows of three numbers.
+        b: The vector, three numbers.
+    """
     row_1, row_2, row_3 = a
     x, y, z = b
     first = row_1[0] * x + row_1[1] * y + row_1[2] * z
@@ -237,9 +265,10 @@ def apply(a: Matrix, b: Three) -> Three:
 
 
 def multiply(a: Matrix, b: Matrix) -> Matrix:
-    """Returns the product a b of two matrices.
+    """Returns the product a b of two matrices of three rows.
 
-    The sums have a fixed order. The sums of a library may differ in the last bit.
+    The sums have a fixed order, so that the result has the same bits on every machine. The sums
+    of a linear algebra library may differ in the last bit.
     """
     columns: Any = zip(*b, strict=True)
     product_columns = [apply(a, column) for column in columns]
@@ -249,14 +278,15 @@ def multiply(a: Matrix, b: Matrix) -> Matrix:
 
 @leaf
 def place_joints(chain: RowArray, q: Vector) -> None:
-    """Writes the rotation R and origin p of each link in the previous link's frame.
+    """Computes the rotation R and the origin p of the frame of each link.
 
-    See `build_chain` for the rotation of a joint. Most other functions of this module need
-    these results.
+    Both refer to the frame of the previous link, and are written into the rows of the joints.
+    `build_chain` gives the equation of R. Most other functions of this module use these
+    results, so this function must be called first after each change of the positions.
 
     Args:
-        chain: Rows of the joints.
-        q: Positions of the joints, shape (n,).
+        chain: Rows of the joints; written.
+        q: Positions of the joints, shape (n,), rad or m.
     """
     for i in range(chain.shape[0]):
         row: Row = chain[i]
@@ -370,16 +400,19 @@ def _pass_force(row: Row, before: Row) -> None:
 def propagate_motion(
     chain: RowArray, gravity: Vector, qd: Vector, v: Vector, a: Vector
 ) -> None:
-    """Writes the spatial velocities V and W and acceleration A of each link.
+    """Computes the velocities and the acceleration of each link, starting at the base.
 
-    `place_joints` must have been called for the same positions.
+    These are spatial vectors, which combine an angular and a linear part. The velocity V
+    results from qd, the velocity W from v, and the acceleration A from a and gravity. They are
+    written into the rows of the joints, where `inverse_dynamics` and `parameter_gradient` read
+    them. `place_joints` must have been called for the same positions.
 
     Args:
-        chain: Rows of the joints.
+        chain: Rows of the joints; written.
         gravity: Gravitational acceleration in the base's frame, m/s^2, shape (3,).
-        qd: Velocities of the joints, shape (n,).
-        v: Reference velocities, which C multiplies, shape (n,).
-        a: Reference accelerations, which M multiplies, shape (n,).
+        qd: Velocities of the joints, shape (n,), rad/s or m/s.
+        v: Reference velocities, by which the Coriolis matrix C is multiplied, shape (n,).
+        a: Reference accelerations, by which the inertia matrix M is multiplied, shape (n,).
     """
     still = (0.0, 0.0, 0.0)
     V_lin = still
@@ -431,19 +464,22 @@ def _force_cross(V: Spatial, f: Spatial) -> Spatial:
 def inverse_dynamics(
     chain: RowArray, theta: Vector, v: Vector, a: Vector, torque: Array
 ) -> None:
-    """Writes the joint torque that the reference motion requires, shape (n,).
+    """Computes the joint torque that the reference motion requires.
 
         M a + C(q, qd) v + G + armature a + friction(v)
 
-    With friction at the reference velocity, r' (friction(qd) - friction(v)) >= 0: friction can
-    only dissipate energy. `propagate_motion` must have been called for the same motion.
+    M is the inertia matrix of the links, C the Coriolis matrix, G the gravity torque and
+    `armature` the inertia of the drives. The friction is taken at the reference velocity v and
+    not at qd. With r = qd - v, then r' (friction(qd) - friction(v)) >= 0: the difference to
+    the real friction can only dissipate energy. `propagate_motion` must have been called for
+    the same motion.
 
     Args:
         chain: Rows of the joints.
-        theta: Inertial parameters, shape (10 n,).
-        v: Reference velocities, shape (n,).
-        a: Reference accelerations, shape (n,).
-        torque: Written, shape (n,), N m or N.
+        theta: Inertial parameters, ten per link, shape (10 n,).
+        v: Reference velocities, shape (n,), rad/s or m/s.
+        a: Reference accelerations, shape (n,), rad/s^2 or m/s^2.
+        torque: Written: the torque, shape (n,), N m or N.
     """
     n = chain.shape[0]
     for i in range(n):
@@ -508,13 +544,15 @@ def _add_products(factor: float, x: Spatial, y: Spatial, first: int, gradient: A
 
 @leaf
 def parameter_gradient(chain: RowArray, gradient: Array) -> None:
-    """Writes Y' r, Eq. (15), for r = qd - v.
+    """Computes Y' r, the vector that drives the estimate of the parameters, Eq. (15).
 
-    `propagate_motion` must have been called for the same motion.
+    Y is the regressor, the matrix for which Y theta is the torque of the links in
+    `inverse_dynamics`, and r = qd - v is the filtered error. `propagate_motion` must have been
+    called for the same motion.
 
     Args:
         chain: Rows of the joints.
-        gradient: Written, shape (10 n,).
+        gradient: Written: Y' r, ten numbers per link, shape (10 n,).
     """
     for i in range(chain.shape[0]):
         row: Row = chain[i]
@@ -584,14 +622,15 @@ def _add_composite(row: Row, before: Row) -> None:
 
 @leaf
 def mass_matrix(chain: RowArray, theta: Vector) -> None:
-    """Writes M(q) with the drives' inertia into the field `M` of the rows.
+    """Computes the inertia matrix M(q) of the arm, with the inertia of its drives.
 
-    Only the lower triangle is written. The method is that of composite rigid bodies
-    (Featherstone). `place_joints` must have been called for the same positions.
+    M is written into the field `M` of the rows, the lower triangle only, because M is
+    symmetric. The method is that of composite rigid bodies (Featherstone). `place_joints` must
+    have been called for the same positions.
 
     Args:
-        chain: Rows of the joints.
-        theta: Inertial parameters, shape (10 n,).
+        chain: Rows of the joints; written.
+        theta: Inertial parameters, ten per link, shape (10 n,).
     """
     n = chain.shape[0]
     for i in range(n):
@@ -693,16 +732,20 @@ def put_model(
     M: Array,
     bias: Array,
 ) -> None:
-    """Writes M and the bias torque C qd + G + friction - stops, after `place_joints`.
+    """Computes the inertia matrix and the bias torque, for a control law that needs them.
+
+    The bias torque is C qd + G + friction - stops: Coriolis torque, gravity torque and joint
+    friction, less the torque of the stops. `place_joints` must have been called for the same
+    positions.
 
     Args:
-        chain: the chain's rows.
-        theta: inertial parameters, shape (10 n,).
-        gravity: gravitational acceleration in the base's frame, m/s^2, shape (3,).
-        q: joint positions, shape (n,).
-        qd: joint velocities, shape (n,).
-        M: written, shape (n, n).
-        bias: written, shape (n,).
+        chain: Rows of the joints.
+        theta: Inertial parameters, ten per link, shape (10 n,).
+        gravity: Gravitational acceleration in the base's frame, m/s^2, shape (3,).
+        q: Joint positions, shape (n,), rad or m.
+        qd: Joint velocities, shape (n,), rad/s or m/s.
+        M: Written: the inertia matrix, shape (n, n).
+        bias: Written: the bias torque, shape (n,), N m or N.
     """
     _bias(chain=chain, theta=theta, gravity=gravity, q=q, qd=qd)
     mass_matrix(chain, theta)
@@ -723,21 +766,22 @@ def find_acceleration(
     torque: Vector,
     qdd: Array,
 ) -> None:
-    """Writes the joint accelerations qdd, Eq. (8).
+    """Computes the joint accelerations qdd that a torque causes, Eq. (8).
 
         M qdd = torque - C qd - G - friction + stops
 
-    M is factored in place as L D L', which needs no square roots. `place_joints` must have been
-    called for the same positions.
+    M is the inertia matrix, C qd the Coriolis torque, G the gravity torque and `stops` the
+    torque of the stops. M is factored in place as L D L', which needs no square roots.
+    `place_joints` must have been called for the same positions.
 
     Args:
         chain: Rows of the joints.
-        theta: Inertial parameters, shape (10 n,).
+        theta: Inertial parameters, ten per link, shape (10 n,).
         gravity: Gravitational acceleration in the base's frame, m/s^2, shape (3,).
-        q: Joint positions, shape (n,).
-        qd: Joint velocities, shape (n,).
+        q: Joint positions, shape (n,), rad or m.
+        qd: Joint velocities, shape (n,), rad/s or m/s.
         torque: The whole torque on the joints, shape (n,), N m or N.
-        qdd: Written, shape (n,).
+        qdd: Written: the accelerations, shape (n,), rad/s^2 or m/s^2.
     """
     n = chain.shape[0]
     _bias(chain=chain, theta=theta, gravity=gravity, q=q, qd=qd)
@@ -770,13 +814,16 @@ def find_acceleration(
 
 @leaf
 def place_end_effector(chain: RowArray, tip: Vector) -> Three:
-    """Writes the Jacobian and the links' orientations into the rows, in base axes.
+    """Computes the pose of the end effector, its Jacobian and the links' orientations.
+
+    All results are in the axes of the base. The Jacobian and the orientations are written into
+    the rows of the joints: the columns of the Jacobian J_lin (m/rad or 1) and J_ang (1 or 0),
+    and for each link its orientation R_base, the position p_base of its joint, and the axis
+    axis_base of its joint.
 
     Args:
-        chain: the chain's rows, after `place_joints`. Written are the columns of the Jacobian
-            J_lin, m/rad or 1, and J_ang, 1 or 0, and for each link its orientation R_base, its
-            joint's position p_base and its joint's axis axis_base.
-        tip: the end effector in the last link's frame, m, shape (3,).
+        chain: Rows of the joints, after `place_joints`; written.
+        tip: Position of the end effector in the last link's frame, m, shape (3,).
 
     Returns:
         The position of the end effector, m.

@@ -28,16 +28,21 @@ ROBUST_RESIDUE = ((5.0**0.5 - 1.0) / 2.0) ** 2.5
 def control_errors(
     q: Vector, qd: Vector, q_des: Vector, qd_des: Vector, Lambda: Vector
 ) -> tuple[Pair, Pair, Pair]:
-    """Returns the error e, its derivative ed, and the filtered error r.
+    """Computes the errors that a control law reduces, for each joint of the planar arm.
 
         e = q - q_des,  ed = qd - qd_des,  r = qd + Lambda e        Eq. (9), (18), (10)
 
+    Here q_des is the reference, the position that the arm follows, and r is the filtered error.
+
     Args:
-        q: Joint angles.
-        qd: Joint velocities.
-        q_des: Reference of the joints.
-        qd_des: Derivative of the reference.
-        Lambda: Rate at which errors decay, per joint.
+        q: Joint angles, shape (2,), rad.
+        qd: Joint velocities, shape (2,), rad/s.
+        q_des: Reference of the joints, shape (2,), rad.
+        qd_des: Derivative of the reference, shape (2,), rad/s.
+        Lambda: Rate at which errors decay, per joint, 1/s.
+
+    Returns:
+        The error e, its derivative ed, and the filtered error r.
     """
     e_1 = q[0] - q_des[0]
     e_2 = q[1] - q_des[1]
@@ -50,11 +55,12 @@ def control_errors(
 
 @leaf
 def regressor_transpose_times(Y: tuple[Five, Five], r: Vector) -> Five:
-    """Returns Y' r, which drives the estimate in Eq. (15).
+    """Returns the product Y' r, which drives the estimate of the parameters in Eq. (15).
 
     Args:
-        Y: the regressor of Eq. (12), two rows of five numbers.
-        r: shape (2,).
+        Y: Regressor of Eq. (12), two rows of five numbers: Y theta is a torque of the arm with
+            the parameters theta.
+        r: Filtered error, shape (2,), rad/s.
     """
     first, second = Y
     r_1 = r[0]
@@ -70,13 +76,15 @@ def regressor_transpose_times(Y: tuple[Five, Five], r: Vector) -> Five:
 
 @leaf
 def update_estimate(theta_hat: Vector, gain_s: float, Gamma: Vector, Yr: Vector) -> Five:
-    """Returns theta_hat - gain_s Gamma Y' r: Eq. (15) integrated over a step.
+    """Returns the estimate of the arm's parameters after a step of the adaptation, Eq. (15).
+
+        theta_hat - gain_s Gamma Y' r
 
     Args:
-        theta_hat: Estimate of the parameters, shape (5,).
+        theta_hat: Estimate of the parameters before the step, shape (5,).
         gain_s: Duration of the step, s.
-        Gamma: Adaptation gain per parameter.
-        Yr: Y' r, shape (5,).
+        Gamma: Adaptation gain per parameter, shape (5,).
+        Yr: Product Y' r of the regressor and the filtered error, shape (5,).
     """
     return (
         theta_hat[0] - gain_s * Gamma[0] * Yr[0],
@@ -103,18 +111,21 @@ def adaptive_torque(
     ed: Vector,
     limit: float,
 ) -> Pair:
-    """Returns the torque of the adaptive law, Eq. (13), within the limit.
+    """Returns the torque of the adaptive law for the planar arm, Eq. (13), within the limit.
 
         tau = Y theta_hat - Kp r - Kd ed
 
+    The first term is the torque that the arm needs according to the estimate theta_hat of its
+    parameters. The other terms damp the errors.
+
     Args:
-        Y: the regressor Y(q, qd, -Lambda e, -Lambda ed), two rows of five numbers.
-        theta_hat: the estimate, shape (5,).
-        Kp: gain of r.
-        Kd: gain of ed.
-        r: see `control_errors`.
-        ed: derivative of the error.
-        limit: the largest torque of a joint.
+        Y: Regressor Y(q, qd, -Lambda e, -Lambda ed), two rows of five numbers.
+        theta_hat: Estimate of the parameters, shape (5,).
+        Kp: Damping of the filtered error, per joint, N m s/rad.
+        Kd: Damping of the error's velocity, per joint, N m s/rad.
+        r: Filtered error, rad/s, see `control_errors`.
+        ed: Derivative of the error, rad/s.
+        limit: Largest torque of a joint, N m.
     """
     first, second = Y
     torque_1 = 0.0
@@ -129,15 +140,16 @@ def adaptive_torque(
 
 @leaf
 def robust_torque(rho: float, width: float, r: float) -> float:
-    """Returns rho r / sqrt(r^2 + width^2), a smooth form of rho sign(r).
+    """Returns rho r / sqrt(r^2 + width^2), a torque that opposes a bounded disturbance.
 
-    The law subtracts this torque. With a disturbance d of at most rho, the power
-    (d - robust torque) r is at most ROBUST_RESIDUE rho width.
+    It is a smooth form of rho sign(r), and the law subtracts it. If the disturbance d of the
+    joint has at most the magnitude rho, the power (d - robust torque) r that remains is at most
+    ROBUST_RESIDUE rho width.
 
     Args:
-        rho: Largest torque.
-        width: Value of r at which the torque is 0.71 rho.
-        r: Filtered error of a joint.
+        rho: Largest robust torque, N m.
+        width: Value of r at which the torque is 0.71 rho, rad/s.
+        r: Filtered error of a joint, rad/s.
     """
     smooth_sign = r / sqrt(r * r + width * width)
     return rho * smooth_sign
@@ -188,30 +200,33 @@ def damped_torque(
     felt: Vector,
     limit: float,
 ) -> Pair:
-    """Returns the torque of the laws of known gravity, within the limit.
+    """Returns the torque of the laws that assume known gravity, within the limit.
 
         tau = G(q) - K e - d qd - Kd ed + k_f felt
 
-    - P+d: Kd = k_f = 0. For N sites with reversible shares, one K, one d and one constant delay
-      T, the linearised loop is stable for all masses if d >= max(abs(lambda_min(alpha)),
-      0.2172) K T; for two sites if 4 d_1 d_2 > (T_1 + T_2)^2 K_1 K_2. For other shares no bound
-      of this form exists.
+    G is the gravity torque and e = q - q_des the position error. The gains select the law:
+
+    - P+d: Kd = k_f = 0. For N sites with reversible dominance factors (the weights alpha with
+      which the sites follow each other), one K, one d and one constant delay T, the linearised
+      loop is stable for all masses if d >= max(abs(lambda_min(alpha)), 0.2172) K T. Two sites
+      are stable if 4 d_1 d_2 > (T_1 + T_2)^2 K_1 K_2. For other dominance factors no bound of
+      this form exists.
     - PD+d: k_f = 0.
     - Direct force reflection: Kd = 0, with K and d at the slave, d and k_f at the master.
 
     Args:
-        theta: the parameters that the law assumes, shape (5,).
-        g: gravitational acceleration, m/s^2.
-        K: stiffness, N m/rad.
-        d: damping of the arm's own velocity.
-        Kd: damping of the error's velocity.
-        k_f: gain of the reflected force, dimensionless.
-        q: joint angles.
-        qd: joint velocities.
-        e: position error.
-        ed: its derivative.
-        felt: the torque on the peers' arms as received, weighted by dominance.
-        limit: the largest torque of a joint.
+        theta: Parameters that the law assumes for the arm, shape (5,).
+        g: Gravitational acceleration, m/s^2.
+        K: Stiffness, per joint, N m/rad.
+        d: Damping of the arm's own velocity, per joint, N m s/rad.
+        Kd: Damping of the error's velocity, per joint, N m s/rad.
+        k_f: Gain of the reflected force, per joint, dimensionless.
+        q: Joint angles, rad.
+        qd: Joint velocities, rad/s.
+        e: Position error, rad.
+        ed: Derivative of the position error, rad/s.
+        felt: Torque on the peers' arms as received, weighted by the dominance factors, N m.
+        limit: Largest torque of a joint, N m.
     """
     G_1, G_2 = gravity(theta, g, q)
     torque_1 = G_1 - K[0] * e[0]

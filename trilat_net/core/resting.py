@@ -76,14 +76,23 @@ _KNOWN = int(Law.KNOWN)
 
 @leaf
 def rests(site: SiteRow) -> bool:
-    """Returns True if the arm comes to rest or stays at rest in the present mode."""
+    """Returns True if the arm comes to rest or stays at rest in the present mode.
+
+    Only a site whose reference glides to rest (`StaleAction.GLIDE`) does so, in the modes
+    WAITING, HOLD, FAULT and STOPPED.
+    """
     still = site.mode in (_WAITING, _HOLD, _FAULT, _STOPPED)
     return bool(still and site.on_stale == _GLIDE)
 
 
 @leaf
 def find_brake_ratio(site: SiteRow) -> float:
-    """Returns the largest ratio of B |qd| to the torque limit, over the joints."""
+    """Returns how far the brake of the arm exceeds what its torque limits permit.
+
+    This is the largest ratio of B |qd| to the torque limit over the joints, where B is the
+    damping of the arm at rest and qd the joint velocity. Above 1 the damping alone needs more
+    torque than the joint has.
+    """
     ratio = 0.0
     for i in range(site.joints):
         brake = site.damping[i] * abs(site.qd[i])
@@ -93,14 +102,21 @@ def find_brake_ratio(site: SiteRow) -> float:
 
 @leaf
 def is_fast(site: SiteRow) -> bool:
-    """Returns True if a joint is so fast that B |qd| alone exceeds the limit of its torque."""
+    """Returns True if the damping B of some joint alone would exceed its torque limit.
+
+    The torque of the damping is B |qd|, where qd is the velocity of the joint.
+    """
     fast: bool = find_brake_ratio(site) > 1.0
     return fast
 
 
 @leaf
 def rests_by_law(site: SiteRow) -> bool:
-    """Returns True if the torque at rest contains that of the law, which still adapts."""
+    """Returns True if the control law goes on acting and adapting while the arm rests.
+
+    It does not if it needs live peers, learns in task space or failed before, or while the arm
+    is too fast, see `is_fast`.
+    """
     holds = site.law != _USER or site.holds != 0
     learns_in_task = site.task != 0 and site.law != _KNOWN
     failed = site.reason == _NOT_FINITE
@@ -110,15 +126,16 @@ def rests_by_law(site: SiteRow) -> bool:
 
 @leaf
 def enter_rest(t_ns: int, mode: int, reason: int, site: SiteRow) -> None:
-    """Enters a mode in which the arm comes to rest.
+    """Enters a mode in which the arm comes to rest, and starts its rest reference.
 
-    An arm that rests already keeps its reference, unless its law failed now or before.
+    The rest reference is the position that the joints follow until they stand still. An arm
+    that rests already keeps its reference, unless its control law failed now or before.
 
     Args:
         t_ns: Time, ns since the epoch, the common start of the session.
         mode: The mode to enter.
-        reason: Reason of the change of mode.
-        site: Row of the site.
+        reason: Reason of the change of mode, a `LifeReason`.
+        site: Row of the site, the state of one arm with its controller; changed.
     """
     failed = reason == _NOT_FINITE or site.reason == _NOT_FINITE
     keeps_reference = rests(site) and not failed
@@ -305,9 +322,11 @@ def add_rest_torque(k: int, t_ns: int, site: SiteRow) -> None:
 
 @leaf
 def advance_rest(site: SiteRow) -> None:
-    """Advances w to the next tick by -h k B s.
+    """Advances w, the torque that holds the arm against a constant load, to the next tick.
 
-    Anti-windup: w does not grow in a direction in which the torque is already limited.
+    The step is -h k B s, where h is the period, k and B are the rest gains, and s is the slip
+    of the joint, all defined at the top of this module. If the torque is already limited in the
+    direction of the step, w does not change (anti-windup).
     """
     for i in range(site.joints):
         step = -site.integral[i] * _find_slip(site, i) / site.rate_hz
@@ -318,12 +337,14 @@ def advance_rest(site: SiteRow) -> None:
 
 @leaf
 def limit_torque_rate(site: SiteRow) -> None:
-    """Limits the torque's rate of change; before the first tick the torque counts as zero.
+    """Limits the change of the torque from the previous tick to this tick.
 
-    Torques that brake an arm at rest may change by B |qd| more in a tick.
+    Before the first tick the torque counts as zero. While an arm comes to rest, the torque that
+    brakes a joint may change by B |qd| more in a tick, where B is the damping at rest and qd
+    the joint velocity.
 
     Args:
-        site: Row of the site, whose torque `tau` is limited.
+        site: Row of the site, whose torque `tau` is limited in place.
     """
     braking = rests(site)
     for i in range(site.joints):

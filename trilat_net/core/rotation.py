@@ -55,7 +55,8 @@ def arctan(x: float) -> float:
 def rotation_matrix(vector: Three) -> Matrix:
     """Returns the rotation matrix of a rotation vector, three rows.
 
-    The formula is that of Rodrigues, with limits for small angles.
+    A rotation vector has the direction of the axis, and its length is the angle in rad. The
+    formula is that of Rodrigues, with limits for small angles.
     """
     x, y, z = vector
     angle = math.sqrt(x * x + y * y + z * z)
@@ -113,7 +114,13 @@ def _quaternion(R: Array | Matrix) -> tuple[float, Three]:
 
 @leaf
 def rotation_vector(R: Array | Matrix) -> Three:
-    """Returns the rotation vector of a rotation matrix (rows), rad."""
+    """Returns the rotation vector of a rotation matrix, rad.
+
+    A rotation vector has the direction of the axis, and its length is the angle.
+
+    Args:
+        R: The rotation matrix, three rows.
+    """
     w, v = _quaternion(R)
     x, y, z = v
     n = math.sqrt(x * x + y * y + z * z)
@@ -127,9 +134,15 @@ def rotation_vector(R: Array | Matrix) -> Three:
 
 @leaf
 def relative_rotation(R: Array | Matrix, other: Array | Matrix) -> Three:
-    """Returns the rotation vector of R other', in base axes, rad.
+    """Returns the rotation from the orientation `other` to the orientation R, in base axes.
 
-    This is the rotation from the orientation `other` to the orientation R.
+    Args:
+        R: Rotation matrix of the one orientation, three rows.
+        other: Rotation matrix of the other orientation, three rows.
+
+    Returns:
+        The rotation vector of R other', whose direction is the axis and whose length is the
+        angle in rad.
     """
     row_1 = other[0]
     row_2 = other[1]
@@ -154,7 +167,9 @@ def _times_rows(row: Three, a: Three, b: Three, c: Three) -> Three:
 
 @leaf
 def compose_rotations(turn: Three, vector: Three) -> Three:
-    """Returns the rotation `vector` followed by the rotation `turn` in base axes, rad.
+    """Returns the rotation `vector`, followed by the rotation `turn` about base axes.
+
+    All three are rotation vectors: the direction is the axis, the length the angle in rad.
 
     Args:
         turn: Rotation vector of the second rotation.
@@ -167,24 +182,32 @@ def compose_rotations(turn: Three, vector: Three) -> Three:
 
 @leaf
 def rotate_by_vector(turn: Three, vector: Three) -> Three:
-    """Returns a vector rotated by a rotation vector."""
+    """Returns a vector after a rotation.
+
+    Args:
+        turn: Rotation vector: its direction is the axis, its length the angle in rad.
+        vector: The vector to rotate.
+    """
     x, y, z = rotation_matrix(turn)
     return _times_rows(vector, x, y, z)
 
 
 @leaf
 def length(vector: Three) -> float:
-    """Returns the length of a vector."""
+    """Returns the Euclidean length of a vector, in the unit of its numbers."""
     return math.sqrt(dot(vector, vector))
 
 
 @leaf
 def angular_velocity(turn: Three, rate: Three) -> Three:
-    """Returns the angular velocity of a changing rotation vector, rad/s.
+    """Returns the angular velocity of a body whose rotation vector changes, rad/s.
+
+    The angular velocity differs from the derivative of the rotation vector as soon as the axis
+    changes too.
 
     Args:
         turn: The rotation vector, rad.
-        rate: Its derivative, rad/s.
+        rate: The derivative of the rotation vector, rad/s.
     """
     angle = length(turn)
     a2 = angle * angle

@@ -27,13 +27,19 @@ Vector = Sequence[float] | Any
 
 @leaf
 def pair(a: Vector) -> Pair:
-    """Returns the two numbers of a row as a tuple."""
+    """Returns the two numbers of an array as a tuple.
+
+    Compiled code handles a tuple without allocating memory.
+    """
     return a[0], a[1]
 
 
 @leaf
 def five(a: Vector) -> Five:
-    """Returns the five numbers of a row as a tuple."""
+    """Returns the five numbers of an array as a tuple.
+
+    Compiled code handles a tuple without allocating memory.
+    """
     return a[0], a[1], a[2], a[3], a[4]
 
 
@@ -46,15 +52,18 @@ def put(a: Any, values: Any) -> None:
 
 @leaf
 def count_started(table: Any, first: int, count: int, now: float) -> int:
-    """Returns how many rows of a table start at a time or before.
+    """Returns how many rows of a time table start at a given time or before.
 
-    The rows are ordered by time, which is their first column. The method is bisection.
+    The rows are sorted by time, which is their first column, so that bisection finds the count.
 
     Args:
         table: The table.
-        first: Index of the first row.
-        count: Number of rows.
-        now: The time.
+        first: Index of the first row to search; the table may contain rows of other owners.
+        count: Number of rows to search.
+        now: The time, in the unit of the first column.
+
+    Returns:
+        The count, from 0 to `count`.
     """
     low = first
     high = first + count
