@@ -250,9 +250,12 @@ def _brakes(t_ns: int, site: SiteRow) -> bool:
 
 @leaf
 def put_rest_reference(site: SiteRow, q: Array, qd: Array) -> None:
-    """Writes the rest reference in shared coordinates into q and qd.
+    """Writes the rest reference in the coordinates that the sites share.
 
-    In task space that is the present pose of the end effector: the joints rest by themselves.
+    The rest reference is the position that the joints follow until they stand still. If the
+    sites share joint angles, q and qd are this reference. In task space, where they share the
+    pose of the end effector, q and qd are the present pose and its velocity, because the joints
+    come to rest by themselves.
 
     Args:
         site: Row of the site.
@@ -288,15 +291,16 @@ def _shrink(torque: float, change: float) -> float:
 
 @leaf
 def add_rest_torque(k: int, t_ns: int, site: SiteRow) -> None:
-    """Adds w - B s to the torque in `tau`, and limits the sum.
+    """Adds the torque w - B s of an arm at rest to its torque `tau`, and limits the sum.
 
-    The sum without the limit is written into `u`. At the start of a rest w is initialised with
-    the unexplained part of the last torque.
+    B s damps the slip s, the filtered deviation of a joint from the rest reference. The torque
+    w carries a constant load; at the start of a rest it is the part of the last torque that the
+    control law does not explain. The sum without the limit is written into `u`.
 
     Args:
         k: The tick.
         t_ns: Time of the tick, ns since the epoch.
-        site: Row of the site.
+        site: Row of the site; changed.
     """
     brakes = _brakes(t_ns, site)
     held_part = 0.0

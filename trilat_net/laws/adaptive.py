@@ -68,8 +68,11 @@ class Adaptive(ControlLaw):
 
             tau = Y(q, qd, -Lambda e, -Lambda ed) theta_hat - Kp r - Kd ed
 
+        Here e = q - q_des is the position error, and Lambda, Kp and Kd are the gains of the
+        law.
+
         Args:
-            Y: Regressor of Eq. (12), shape (n, P).
+            Y: Regressor of Eq. (12), shape (n, P). Multiplied by parameters, it gives a torque.
             theta_hat: Estimate of the parameters, shape (P,).
             r: Filtered error qd + Lambda e, Eq. (10), shape (n,), rad/s.
             ed: Derivative of the error, shape (n,), rad/s.
@@ -83,13 +86,16 @@ class Adaptive(ControlLaw):
         return model_torque - (Kp * r + Kd * ed)
 
     def advance_estimate(self, theta_hat: Array, Yr: Array, gain_s: float) -> Array:
-        """Returns the estimate after a step by Eq. (15), theta_hat' = -Gamma Y' r.
+        """Returns the estimate of the arm's parameters after a step, Eq. (15).
+
+        The continuous law is theta_hat' = -Gamma Y' r, where Y is the regressor, r the filtered
+        error and Gamma the adaptation gain. The step is
 
             theta_hat - gain_s Gamma Y' r
 
         Args:
             theta_hat: Estimate before the step, shape (P,).
-            Yr: Y' r, shape (P,); the trapezoid rule passes the sum of two ticks.
+            Yr: Product Y' r, shape (P,); the trapezoid rule passes the sum of two ticks.
             gain_s: Duration of the step, s; the trapezoid rule passes half of the period.
         """
         return theta_hat - gain_s * np.array(self.Gamma) * Yr
@@ -110,12 +116,17 @@ class Adaptive(ControlLaw):
         )
 
     def exchanges_positions(self) -> bool:
-        """Returns True if the law does not learn (Gamma = 0): it is a spring between poses."""
+        """Returns True if the law does not learn (Gamma = 0): it is a spring between poses.
+
+        Such a law needs reversible dominance factors, see `LawSettings.exchanges_positions`.
+        """
         return not any(self.Gamma)
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the [control] table of a site: the tuned gains and the first estimate.
+        """Returns the [control] table of a scenario for this law, after its gains were tuned.
+
+        The table contains the tuned gains and the first estimate of the arm's parameters.
 
         Args:
             gains: The tuned gains by name.

@@ -41,13 +41,15 @@ class AdaptiveBox(Adaptive):
     known_facts: ClassVar = "gravity, as its first estimate; the box is around it"
 
     def advance_estimate(self, theta_hat: Array, Yr: Array, gain_s: float) -> Array:
-        """Returns the estimate after a step by Eq. (15), projected into the box.
+        """Returns the estimate after a step of Eq. (15), limited to its bounds.
 
             min(max(theta_hat - gain_s Gamma Y' r, theta_low), theta_high)
 
+        Here Gamma is the adaptation gain, Y the regressor and r the filtered error.
+
         Args:
-            theta_hat: Estimate before the step, shape (P,).
-            Yr: Y' r, shape (P,).
+            theta_hat: Estimate of the arm's parameters before the step, shape (P,).
+            Yr: Product Y' r, shape (P,).
             gain_s: Duration of the step, s.
         """
         estimate = Adaptive.advance_estimate(self, theta_hat, Yr, gain_s)
@@ -64,7 +66,10 @@ class AdaptiveBox(Adaptive):
         return gains._replace(low=self.theta_low, high=self.theta_high)
 
     def check(self, path: str, sites: int) -> None:  # noqa: ARG002 - as the other laws
-        """Refuses an empty box, and a first estimate outside the box.
+        """Refuses settings of the law that contradict each other.
+
+        A lower bound must not exceed its upper bound, and the first estimate must lie within
+        the bounds.
 
         Args:
             path: Path of the law's table in the scenario, for errors.

@@ -172,7 +172,11 @@ class AdaptiveKinematics(ControlLaw):
     known_facts: ClassVar = "gravity, as its first estimate, and no length"
 
     def begin(self, facts: LawContext) -> None:
-        """Creates both estimates and their rates, at the first estimates."""
+        """Creates the memory of the law for a site: its two estimates and their rates.
+
+        The estimates of the lengths and of theta, the parameters of the arm's dynamics, start
+        at the first estimates of the settings.
+        """
         self.theta_hat = list(self.theta_hat0)
         self.lengths_m = list(self.lengths0_m)
         self.Yr = [0.0] * len(self.theta_hat)
@@ -261,9 +265,11 @@ class AdaptiveKinematics(ControlLaw):
             now.tau[1] += second[p] * estimate
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns the condition: constant delays, bent elbows, lengths within their bounds.
+        """Returns the stability condition of this law at a site of a scenario.
 
-        It stays undecided, because only the run shows whether the elbows stay bent.
+        The delays must be constant, the elbows must stay bent, and the true lengths must lie
+        within the law's bounds. The condition stays undecided, because only the run shows
+        whether the elbows stay bent.
 
         Args:
             situation: The site, its peers and the delays between them.

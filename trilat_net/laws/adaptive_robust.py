@@ -55,8 +55,10 @@ class AdaptiveRobust(AdaptiveBox):
 
             tau = Y theta_hat - Kp r - Kd ed - (1 - friction) f(v) - rho r / sqrt(r^2 + width^2)
 
+        The last term is the robust term, which opposes disturbances up to rho.
+
         Args:
-            Y: Regressor of Eq. (12), shape (n, P).
+            Y: Regressor of Eq. (12), shape (n, P). Multiplied by parameters, it gives a torque.
             theta_hat: Estimate of the parameters, shape (P,).
             r: Filtered error qd + Lambda e, Eq. (10), shape (n,), rad/s.
             ed: Derivative of the error, shape (n,), rad/s.
@@ -82,7 +84,11 @@ class AdaptiveRobust(AdaptiveBox):
         return box._replace(rho=self.rho_nm, width=self.width_rad_s, friction=(self.friction,))
 
     def condition(self, situation: LawSituation) -> StabilityCondition:
-        """Returns the condition: a bound on this site's part of the mean dissipated power, W.
+        """Returns the stability condition of this law at a site of a scenario.
+
+        The condition states a bound on this site's part of the mean power, in W, that the
+        energy function of the stability proof dissipates. It is weaker than convergence of the
+        errors.
 
         Args:
             situation: The site, its peers and the delays between them.

@@ -56,9 +56,13 @@ class Authority(ControlLaw):
     needs_theta: ClassVar = True
 
     def torque(self, now: LawInput) -> None:
-        """Writes the torque of each joint, and sends to the peers whether this site leads.
+        """Computes the torque of one tick, and tells the peers whether this site leads.
 
-        The springs pull only towards sites that lead.
+        The springs pull the arm only towards the sites that lead. The torque is written into
+        `now.tau`.
+
+        Args:
+            now: Inputs and outputs of the law in this tick.
         """
         now.to_all.leads[0] = 1.0 if self.leads else 0.0
         for i in range(now.joints):
@@ -73,9 +77,10 @@ class Authority(ControlLaw):
             now.tau[i] = tau
 
     def linear_gains(self, theta: Array) -> Gains | None:
-        """Returns the kernel's law of known gravity with the damping alone.
+        """Returns gains of the kernel's law of known gravity that describe the damping alone.
 
-        The springs are described by `linear_form`.
+        The kernel's law is the built-in law tau = G(q) - K e - d qd - Kd ed + k_f felt. The
+        springs of this law are described by `linear_form`.
 
         Args:
             theta: Parameters of the arm, shape (P,).
@@ -84,7 +89,7 @@ class Authority(ControlLaw):
         return Gains(Law.KNOWN, d=self.d, known=known)
 
     def linear_form(self, situation: LinearSituation) -> LinearForm | None:
-        """Returns the springs towards the users for small motions.
+        """Returns the springs towards the users for small motions, for the linear analysis.
 
         Args:
             situation: The site, its peers and their laws.
@@ -100,13 +105,16 @@ class Authority(ControlLaw):
         return form
 
     def explain_idle_shares(self, situation: LawSituation) -> str:
-        """Explains which sites a user does not feel, because these sites do not lead.
+        """Explains to the user which dominance factors of a site have no effect.
+
+        A user does not feel the sites that do not lead, whatever dominance factor (the weight
+        with which the site follows a peer) the scenario gives them.
 
         Args:
             situation: The site, and the laws of all sites.
 
         Returns:
-            The sentence. Empty for the slave, and if all sites lead.
+            A sentence. Empty for the slave, and if all sites lead.
         """
         idle = []
         for name, law in zip(situation.names, situation.laws, strict=True):
@@ -117,9 +125,11 @@ class Authority(ControlLaw):
         return f"users feel only sites that lead, not {', '.join(idle)}"
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns the stability condition: that of P+d among the users.
+        """Returns the stability condition of this law at a site of a scenario.
 
-        The slave follows the users and closes no loop, so that it is stable for every delay.
+        For a user it is the condition of P+d, a spring with damping, among the users. The slave
+        follows the users but influences nobody. It closes no loop, so that it is stable for
+        every delay.
 
         Args:
             situation: The site, its peers and the delays between them.

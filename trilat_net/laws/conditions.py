@@ -60,11 +60,16 @@ class LawSituation(NamedTuple):
 
     @property
     def longest_s(self) -> float:
-        """Longest delay of the links that a site follows, s; NaN if any of them varies."""
+        """Longest delay of the links over which a site receives the peers that it follows, s.
+
+        It is NaN if any of these delays varies.
+        """
         return float(np.max(self.delay_s[self.alpha > 0.0], initial=0.0))
 
     def restrict(self, sites: Sequence[int]) -> "LawSituation":
         """Returns the situation of the same site as if only some of the sites existed.
+
+        A law that follows only some of its peers evaluates its condition for these alone.
 
         Args:
             sites: Indices of the sites that remain, including this site.
@@ -93,11 +98,12 @@ class StabilityCondition(NamedTuple):
 
 
 def find_least_reversible(alpha: Array) -> float | None:
-    """Returns the least eigenvalue of a reversible dominance matrix.
+    """Returns the least eigenvalue of a dominance matrix, if the matrix is reversible.
 
-    A dominance matrix alpha is reversible if positive weights D_i exist with D_i alpha_ij = D_j
-    alpha_ji. Then all eigenvalues are real. The negative of the least one is a lower bound of d
-    / (K T), see `judge_position_exchange`.
+    Row i of the matrix alpha contains the weights with which site i follows the other sites.
+    The matrix is reversible if positive weights D_i exist with D_i alpha_ij = D_j alpha_ji.
+    Then all eigenvalues are real. The negative of the least one is a lower bound of d / (K T),
+    where d is the damping, K the stiffness and T the delay, see `judge_position_exchange`.
 
     Args:
         alpha: Dominance matrix, shape (N, N).
@@ -114,13 +120,15 @@ def find_least_reversible(alpha: Array) -> float | None:
 def judge_position_exchange(
     situation: LawSituation, stiffness: str, damping: str
 ) -> StabilityCondition:
-    """Returns the condition of P+d, a spring to the peers and a damper, for any masses.
+    """Returns the stability condition of P+d, a spring to the peers and a damper.
 
-    For two sites, the condition is due to Nuno, Basanez, Ortega and Spong, IJRR 28, 2009. More
-    than two sites need reversible dominance factors, and the same stiffness K, damping d and
-    delay T at all sites (docs/errata.md, 13). A torque that is held for the period h acts h / 2
-    later: d is reduced by K h / 2 and T increased by h / 2, for arms whose least inertia is
-    above d h / 2 (docs/laws.md).
+    The condition holds for arms of any mass. For two sites, it is due to Nuno, Basanez, Ortega
+    and Spong, IJRR 28, 2009. More than two sites need reversible dominance factors, see
+    `find_least_reversible`, and the same stiffness K, damping d and delay T at all sites
+    (docs/errata.md, 13).
+
+    A torque that is held for the period h acts h / 2 later. Therefore d is reduced by K h / 2
+    and T increased by h / 2, for arms whose least inertia is above d h / 2 (docs/laws.md).
 
     Args:
         situation: The situation of the site.
@@ -277,7 +285,7 @@ class LinearSituation(NamedTuple):
 
     @property
     def peers(self) -> list[int]:
-        """Indices of the other sites."""
+        """Indices of all sites but this one, in ascending order."""
         return [j for j in range(len(self.names)) if j != self.site]
 
 

@@ -108,16 +108,22 @@ class FourChannel(ControlLaw):
     needs_theta: ClassVar = True
 
     def begin(self, facts: LawContext) -> None:
-        """Creates the torque limits and the work space for the arm's equation of motion."""
+        """Creates the work space with which the law solves the arm's equation of motion.
+
+        The law needs it, and the torque limits, to predict the acceleration that it sends.
+        """
         self.needs_model = self.acceleration > 0.0
         self.limit = (np.zeros(facts.joints) + facts.tau_limit_nm).tolist()
         # The equations M qdd = torque, row by row: n entries of M and the torque.
         self.rows = [0.0] * (facts.joints * (facts.joints + 1))
 
     def torque(self, now: LawInput) -> None:
-        """Writes the torque of each joint, and sends the acceleration that it causes.
+        """Computes the torque of one tick, and sends the acceleration that it causes.
 
-        The equation is that of the class. Without the acceleration channel nothing is sent.
+        The equation is that of the class. Nothing is sent if the factor `acceleration` is zero.
+
+        Args:
+            now: Inputs and outputs of the law in this tick.
         """
         n = now.joints
         for i in range(n):
@@ -160,7 +166,10 @@ class FourChannel(ControlLaw):
         )
 
     def linear_form(self, situation: LinearSituation) -> LinearForm | None:
-        """Returns the terms in qdd_des and tau_h for small motions.
+        """Returns the terms in qdd_des and tau_h for small motions, for the linear analysis.
+
+        These are the acceleration of the peers and the torque on the arm itself, which
+        `linear_gains` does not describe.
 
         Args:
             situation: The site and its arm.
@@ -179,9 +188,10 @@ class FourChannel(ControlLaw):
         return form
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:  # noqa: ARG002
-        """Returns an unmet condition for acceleration = 1, otherwise an undecided condition.
+        """Returns the stability condition of this law, as far as it is known without the arms.
 
-        Llewellyn's condition, which `trilat ports` evaluates, decides the other cases.
+        With acceleration = 1 the condition is not met. In all other cases it is undecided here:
+        Llewellyn's condition, which the command `trilat ports` evaluates, decides them.
         """
         if self.acceleration >= 1.0:
             return StabilityCondition(False, _NEUTRAL)

@@ -58,15 +58,21 @@ class Impedance(ControlLaw):
     needs_model: ClassVar = True
 
     def begin(self, facts: LawContext) -> None:
-        """Creates the start pose, which tick 0 sets, and the acceleration of the impedance."""
+        """Creates the memory of the law: the start pose and the acceleration of the impedance.
+
+        The first tick sets the start pose.
+        """
         self.start = [0.0] * facts.joints
         self.qdd = [0.0] * facts.joints
 
     def torque(self, now: LawInput) -> None:
-        """Writes the torque of each joint; the slave also sends the torque on its arm.
+        """Computes the torque of one tick; the slave also sends the torque on its arm.
 
         The first loop computes the acceleration of the impedance, the second the torque that
         gives the arm this acceleration.
+
+        Args:
+            now: Inputs and outputs of the law in this tick.
         """
         follows = 1.0 if self.follows else 0.0
         for i in range(now.joints):
@@ -93,9 +99,10 @@ class Impedance(ControlLaw):
             now.tau[i] = tau
 
     def linear_gains(self, theta: Array) -> Gains | None:
-        """Returns the kernel's law of known gravity without gains.
+        """Returns gains of the kernel's law of known gravity that are all zero.
 
-        The impedance is described by `linear_form`.
+        The kernel's law then only compensates gravity. The impedance itself is described by
+        `linear_form`.
 
         Args:
             theta: Parameters of the arm, shape (P,).
@@ -103,7 +110,10 @@ class Impedance(ControlLaw):
         return Gains(Law.KNOWN, known=theta.tolist())
 
     def linear_form(self, situation: LinearSituation) -> LinearForm | None:
-        """Returns the impedance, scaled by M(q) M^-1, and the force that the slave sends.
+        """Returns the impedance for small motions, for the linear analysis.
+
+        The gains are scaled by M(q) M^-1, the inertia matrix of the arm times the inverse
+        inertia of the impedance. The form of the slave also contains the force that it sends.
 
         Args:
             situation: The site and its arm.
@@ -127,15 +137,20 @@ class Impedance(ControlLaw):
         return form
 
     def explain_idle_shares(self, situation: LawSituation) -> str:  # noqa: ARG002
-        """Explains that a master stays at its start pose and follows nobody.
+        """Explains to the user that the dominance factors of a master have no effect.
+
+        A master stays at its start pose and follows nobody, so that its weights do not matter.
 
         Returns:
-            The sentence. Empty for the slave.
+            A sentence. Empty for the slave.
         """
         return "" if self.follows else "follows = false stays at its start pose"
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns the condition, with the stiffest wall that the small-gain theorem allows.
+        """Returns the stability condition of the session at a site.
+
+        Its text states the stiffest wall for which the small-gain theorem proves stability, see
+        `find_stiffest_wall`.
 
         Args:
             situation: The sites and their laws.

@@ -111,28 +111,32 @@ class LawSettings(Frozen, frozen=True):
         """
 
     def find_problem(self, rates_hz: Mapping[str, int]) -> KeyProblem | None:  # noqa: ARG002
-        """Returns the setting that does not suit the tick rates of the sites, or None.
+        """Returns the setting of the law that does not suit the tick rates of the sites.
 
         Args:
             rates_hz: Tick rate of each site, by name.
+
+        Returns:
+            The key of the setting and the problem. None if all settings are suitable.
         """
         return None
 
     def gains(self, theta: Array) -> Gains:  # noqa: ARG002 - as the laws of the kernel
-        """Returns the gains with which the kernel computes the law.
+        """Returns the gains with which the simulation kernel computes the law.
 
         Args:
-            theta: Parameters of the arm, shape (P,).
+            theta: Parameters of the arm's dynamics, shape (P,).
         """
         return Gains(Law.USER)
 
     def linear_gains(self, theta: Array) -> Gains | None:
-        """Returns the gains of a kernel law that has the same small motions as this law.
+        """Returns the gains of a law of the kernel that has the same small motions as this law.
 
-        The blocks of `linear_form`, if there are any, are added to these small motions.
+        The linear analysis uses them. If `linear_form` returns blocks, they are added to these
+        small motions.
 
         Args:
-            theta: Parameters of the arm, shape (P,).
+            theta: Parameters of the arm's dynamics, shape (P,).
 
         Returns:
             The gains. None if the law cannot be linearised.
@@ -153,9 +157,9 @@ class LawSettings(Frozen, frozen=True):
         return None
 
     def explain_no_linear_form(self) -> str:
-        """Returns the reason why the law cannot be linearised, for the user.
+        """Returns a sentence for the user that says why the law cannot be linearised.
 
-        The reason is shown if `linear_gains` returns None.
+        It is shown if `linear_gains` returns None.
         """
         return ""
 
@@ -176,12 +180,18 @@ class LawSettings(Frozen, frozen=True):
         return False
 
     def resolve_shares(self, names: Sequence[str], alpha: Array) -> Any:  # noqa: ARG002
-        """Returns the law with the settings filled in that follow from the dominance matrix.
+        """Completes the settings that follow from the dominance factors of the scenario.
+
+        A dominance factor is the weight with which a site follows a peer. Most laws have no
+        such settings and are returned unchanged.
 
         Args:
             names: Names of the sites.
             alpha: Dominance matrix at the start, shape (N, N): row i contains the weights with
                 which site i follows the other sites.
+
+        Returns:
+            The law with these settings.
         """
         return self
 
@@ -271,7 +281,10 @@ class ControlLaw:
         self.begin(facts)
 
     def begin(self, facts: LawContext) -> None:
-        """Creates the attributes that `torque` uses besides the gains.
+        """Prepares a law before the first tick: creates the attributes that `torque` uses.
+
+        The gains exist already. A law that needs no other attributes does not override this
+        method.
 
         Args:
             facts: Facts about the site that are known before the run.
@@ -295,7 +308,7 @@ class ControlLaw:
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the [control] table of a site for tuned gains.
+        """Returns the [control] table of a scenario for this law, after its gains were tuned.
 
         Args:
             gains: The tuned gains by name.

@@ -19,7 +19,10 @@ from .interface import DAMPING, ERROR_DAMPING, STIFFNESS, ControlLaw, TuningSite
 
 
 class LeeSpong(ControlLaw):
-    """A spring to the peers with the damping d = K T_max + P_e, for delays up to T_max.
+    """A spring to the peers, with enough damping for all delays up to a known maximum.
+
+    The damping is d = K T_max + P_e, where K is the stiffness of the spring, T_max half of the
+    longest round trip between the sites, and P_e additional damping.
 
     Source: Lee and Spong, "Passive bilateral teleoperation with constant time delay", IEEE T-RO
     22, 2006.
@@ -42,7 +45,10 @@ class LeeSpong(ControlLaw):
 
     @property
     def damping(self) -> tuple[float, ...]:
-        """The damping d = K T_max + P_e per joint, N m s/rad."""
+        """Damping d = K T_max + P_e of the arm's velocity per joint, N m s/rad.
+
+        K is the stiffness, T_max half of the longest round trip, P_e the additional damping.
+        """
         damping = []
         for K, P_e in zip(self.K, self.P_e, strict=True):
             needed = K * 1e-3 * self.T_max_ms
@@ -67,7 +73,9 @@ class LeeSpong(ControlLaw):
         return G - spring - damper - error_damper
 
     def gains(self, theta: Array) -> Gains:
-        """Returns the gains with which the kernel computes the law as PD+d.
+        """Returns the gains with which the simulation kernel computes the law.
+
+        The kernel computes it as PD+d, tau = G - K e - d qd - Kd ed, with d from `damping`.
 
         Args:
             theta: Parameters of the arm, shape (P,).
@@ -76,7 +84,9 @@ class LeeSpong(ControlLaw):
         return Gains(Law.KNOWN, K=self.K, Kd=self.Kd, d=self.damping, known=known)
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns the stability condition of P+d on K and d.
+        """Returns the stability condition of this law at a site of a scenario.
+
+        It is the condition of P+d, a spring with damping, on the stiffness K and the damping d.
 
         Args:
             situation: The site, its peers and the delays between them.

@@ -71,7 +71,9 @@ class PF(ControlLaw):
         return Gains(Law.KNOWN, K=self.K, d=self.d, k_f=self.k_f, known=known)
 
     def check(self, path: str, sites: int) -> None:
-        """Refuses more or fewer than two sites: the contact that is felt would be ambiguous.
+        """Refuses a scenario with more or fewer than two sites.
+
+        With several peers it would be ambiguous whose contact the master feels.
 
         Args:
             path: Path of the law's table in the scenario, for errors.
@@ -89,10 +91,13 @@ class PF(ControlLaw):
             )
 
     def explain_idle_shares(self, situation: LawSituation) -> str:  # noqa: ARG002 - as the other laws
-        """Explains that a site whose gains K and k_f are both zero follows nobody.
+        """Explains to the user that the dominance factors of a site have no effect.
+
+        That is the case if the stiffness K and the force gain k_f are both zero: the site then
+        neither follows nor feels its peers.
 
         Returns:
-            The sentence. Empty if a gain is not zero.
+            A sentence. Empty if one of the gains is not zero.
         """
         if any(self.K) or any(self.k_f):
             return ""
@@ -119,7 +124,10 @@ class PF(ControlLaw):
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the [control] table of a site for tuned gains, by the role of the site.
+        """Returns the [control] table of a scenario for this law, after its gains were tuned.
+
+        The table depends on the role of the site, because only the slave has a spring and only
+        the master feels forces.
 
         Args:
             gains: The tuned gains by name.

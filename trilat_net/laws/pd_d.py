@@ -62,5 +62,8 @@ class PdD(ControlLaw):
         return Gains(Law.KNOWN, K=self.K, Kd=self.Kd, d=self.d, known=known)
 
     def exchanges_positions(self) -> bool:
-        """Returns True if gravity is compensated exactly: the law is a spring between poses."""
+        """Returns True if gravity is compensated exactly: the law is a spring between poses.
+
+        Such a law needs reversible dominance factors, see `LawSettings.exchanges_positions`.
+        """
         return self.gravity == 1.0

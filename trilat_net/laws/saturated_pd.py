@@ -51,7 +51,13 @@ class SaturatedPd(ControlLaw):
     needs_theta: ClassVar = True
 
     def torque(self, now: LawInput) -> None:
-        """Writes the torque of each joint."""
+        """Computes the torque of one tick by the equation of the class.
+
+        The torque is written into `now.tau`.
+
+        Args:
+            now: Inputs and outputs of the law in this tick.
+        """
         for i in range(now.joints):
             q = now.q[i]
             P = self.P[i]
@@ -64,7 +70,9 @@ class SaturatedPd(ControlLaw):
             now.tau[i] = tau
 
     def linear_gains(self, theta: Array) -> Gains | None:
-        """Returns the gains of the kernel's P+d, with the stiffness of small errors.
+        """Returns the gains of P+d, to which this law is equal for small errors.
+
+        The linear analysis uses them.
 
         Args:
             theta: Parameters of the arm, shape (P,).

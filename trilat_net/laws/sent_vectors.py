@@ -48,7 +48,10 @@ SentVectorSpecs = dict[str, SentVectorSpec]
 def build_channel(
     sends: Mapping[str, SentVectorSpec], layout: Layout, peers: int
 ) -> LawChannel:
-    """Returns the channel of a law at a site: its vectors with their lengths, in their order.
+    """Returns the vectors that a law sends from a site, with their lengths, in their order.
+
+    A law declares the vectors without knowing the arm. Their lengths follow from the counts of
+    joints and coordinates.
 
     Args:
         sends: Declared vectors by name.

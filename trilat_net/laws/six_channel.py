@@ -27,9 +27,11 @@ class SixChannel(FourChannel):
     sites: ClassVar = 3
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns the four-channel condition, preceded by the factor and the weights at rest.
+        """Returns the stability condition of the four-channel law for these sites.
 
-        If the dominance matrix is not that of a factor, the condition is not met.
+        Its text starts with the dominance factor a of user 1, and with the weights with which
+        the torques of the operators are in balance at rest. If the dominance matrix does not
+        follow from one factor a, the condition is not met.
 
         Args:
             situation: The sites and their dominance matrix.
@@ -49,6 +51,9 @@ class SixChannel(FourChannel):
 def complementary_shares(a: float) -> Array:
     """Returns the dominance matrix of user 1, user 2 and the slave for the factor a.
 
+    Row i contains the weights with which site i follows the other sites; the class `SixChannel`
+    lists them.
+
     Args:
         a: Weight of user 1, from 0 to 1.
 
@@ -62,12 +67,16 @@ def complementary_shares(a: float) -> Array:
 
 
 def complementary_weights(a: float) -> tuple[float, float, float]:
-    """Returns the weights beta of user 1, user 2 and the slave for the factor a.
+    """Returns the weights with which the operators' torques are in balance at rest.
 
-    At rest the weighted sum of the operators' torques is zero: sum beta_i tau_h,i = 0.
+    With the weights beta of the sites, sum beta_i tau_h,i = 0, where tau_h,i is the torque of
+    the operator at site i.
 
     Args:
         a: Weight of user 1, from 0 to 1.
+
+    Returns:
+        The weights of user 1, user 2 and the slave.
     """
     user_1 = 1.0 - (1.0 - a) ** 2
     user_2 = 1.0 - a**2

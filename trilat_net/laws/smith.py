@@ -60,12 +60,22 @@ class Smith(ControlLaw):
     needs_theta: ClassVar = True
 
     def begin(self, facts: LawContext) -> None:
-        """Creates the model's position x and velocity xd, which start at tick 0."""
+        """Creates the state of the slave's model: its position x and its velocity xd.
+
+        The model starts in tick 0.
+        """
         self.x = [0.0] * facts.joints
         self.xd = [0.0] * facts.joints
 
     def torque(self, now: LawInput) -> None:
-        """Writes the torque of each joint, sends w, and advances the model by a tick."""
+        """Computes the torque of one tick, and advances the model of the slave by this tick.
+
+        The torque is written into `now.tau`. The vector w, defined at the top of this module,
+        is sent to the peer.
+
+        Args:
+            now: Inputs and outputs of the law in this tick.
+        """
         h = now.h_s
         for i in range(now.joints):
             K = self.K[i]
@@ -94,7 +104,10 @@ class Smith(ControlLaw):
             self.xd[i] += h * acceleration
 
     def linear_gains(self, theta: Array) -> Gains | None:
-        """Returns the kernel's law of known gravity with d, and at the slave also with K.
+        """Returns the gains of the part of the law that does not depend on the model.
+
+        This is known gravity with the damping d, and at the slave also with the spring K. The
+        rest is described by `linear_form`.
 
         Args:
             theta: Parameters of the arm, shape (P,).

@@ -55,15 +55,22 @@ class Sync(ControlLaw):
     known_facts: ClassVar = "gravity, as its first estimate"
 
     def begin(self, facts: LawContext) -> None:
-        """Creates the estimate and Y' r of the tick before."""
+        """Creates the memory of the law: the estimate of the parameters and its last rate.
+
+        The rate is Y' r of the tick before, the product of the regressor and the filtered
+        error.
+        """
         self.theta_hat = list(self.theta_hat0)
         self.Yr = [0.0] * len(self.theta_hat)
         self.g_m_s2 = facts.g_m_s2
 
     def torque(self, now: LawInput) -> None:
-        """Writes the torque of each joint and the estimate.
+        """Computes the torque and the new estimate of the parameters in one tick.
 
-        The regressor Y of the planar arm is evaluated once for the torque and for the estimate.
+        The regressor Y of the planar arm is evaluated once for both.
+
+        Args:
+            now: Inputs and outputs of the law in this tick.
         """
         half_h = 0.5 * now.h_s
         Lambda_1 = self.Lambda[0]
@@ -89,7 +96,9 @@ class Sync(ControlLaw):
             now.tau[1] += second[p] * estimate
 
     def linear_gains(self, theta: Array) -> Gains | None:  # noqa: ARG002
-        """Returns the kernel's adaptive law with r = qd + Lambda q instead of qd + Lambda e.
+        """Returns gains for the linear analysis: those of the adaptive law of the kernel.
+
+        The filtered error is r = qd + Lambda q here, instead of qd + Lambda e.
 
         Args:
             theta: Parameters of the arm, which this law does not use.
@@ -104,7 +113,9 @@ class Sync(ControlLaw):
         )
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns the condition: constant delays. The text names the pose under gravity.
+        """Returns the stability condition of this law: the delays must be constant.
+
+        Its text also names the pose at which all arms end under gravity.
 
         Args:
             situation: The site, its peers and the delays between them.

@@ -67,7 +67,11 @@ class Tanks(EnergyLaw):
     """False leaves the transparency layer without a tank, for comparison."""
 
     def begin(self, facts: LawContext) -> None:
-        """Creates the sums of energy received, the gravity torque, and the rates per tick."""
+        """Creates the memory of the law at a site, and the constants that its ticks need.
+
+        These are the sums of the energy received from each peer, the gravity torque, and the
+        rates per tick.
+        """
         self.guarded = bool(self.guarded)
         self.packet = float(self.packet_1_s) / facts.rate_hz
         self.extra_step = 0.5 * self.acceleration_rad_s2 / facts.rate_hz**2
@@ -75,11 +79,15 @@ class Tanks(EnergyLaw):
         self.carried = [0.0] * facts.joints
 
     def torque(self, now: LawInput) -> None:
-        """Writes the torque of each joint, and sends an energy packet to each peer.
+        """Computes the torque of one tick, and sends an energy packet to each peer.
 
         The steps of a tick are: book the work of the previous period and the packets that have
-        arrived; send packets; compute the torque of the transparency layer; reduce it to the
-        energy in the tank, and add damping while the tank is below its level.
+        arrived; send packets; compute the torque of the transparency layer, the springs that
+        couple the sites; reduce it to the energy in the tank, and add damping while the tank is
+        below its level.
+
+        Args:
+            now: Inputs and outputs of the law in this tick.
         """
         n = now.joints
         peers = len(now.peers)
@@ -127,10 +135,10 @@ class Tanks(EnergyLaw):
             now.tau[i] = carried + affordable * now.tau[i] - damping * now.qd[i]
 
     def energies(self, seen: LawRecords) -> LawEnergies:
-        """Returns the energies by which the records of a run show that the law was passive.
+        """Returns the energies that show whether the law was passive in a run.
 
-        Energy is put into the lines by the packets sent, and taken out by the packets received.
-        The tank itself dissipates nothing.
+        A line is the connection to a peer. Energy is put into it by the packets sent, and taken
+        out by the packets received. The tank itself dissipates nothing.
 
         Args:
             seen: Records of the site in the run.
@@ -154,9 +162,10 @@ class Tanks(EnergyLaw):
         return "the energy in the tank switches its torque on and off"
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns the condition: a tank must not send more energy per tick than it contains.
+        """Returns the stability condition: no tank may send more energy per tick than it has.
 
-        If this holds, the session is passive with passive operators and environments.
+        If this holds, the session is passive, provided that operators and environments are
+        passive.
         """
         part_per_tick = self.packet_1_s / situation.rate_hz
         if part_per_tick > 1.0:

@@ -74,16 +74,17 @@ def book_leader_work(now: LawInput, j: int, i: int, torque: float, step: float) 
 
 @compiled
 def observe_leader(law: Any, now: LawInput, j: int, i: int) -> None:
-    """Updates the energy W_led that is known at the leader's end of its coupling to follower j.
+    """Updates the energy that is known at the leader's end of its coupling to a follower.
 
-    The new energy is the part of E_followed that has arrived since the previous tick, plus,
-    with energies by step, the work of the arm in the previous period.
+    This energy, W_led, may be spent by the leader's arm. It grows by the part of the follower's
+    reported sum E_followed that has arrived since the previous tick. If work is computed by
+    step, the work of the arm in the previous period is added.
 
     Args:
-        law: The law.
+        law: The law; its account W_led is changed.
         now: Inputs and outputs of the law in this tick.
-        j: The peer that follows.
-        i: The joint.
+        j: Index of the peer that follows.
+        i: Index of the joint.
     """
     index = j * now.joints + i
     sent = now.sent[j]
@@ -322,15 +323,15 @@ def find_affordable_velocity(law: Any, now: LawInput, j: int, i: int, force: flo
 def book_follower(law: Any, now: LawInput, j: int, i: int, force: float, drift: float) -> None:
     """Books the energy at the follower's end of the coupling to peer j.
 
-    With energies by step, torque and energy belong to the velocity in use. With the published
-    law (energies by velocity), both belong to the leader's velocity, and the change by the
-    controller is booked separately.
+    If work is computed by step, torque and energy belong to the velocity in use. In the
+    published law, which computes work by velocity, both belong to the leader's velocity, and
+    the change that the controller makes to it is booked separately.
 
     Args:
-        law: The law.
+        law: The law; its accounts of the coupling are changed.
         now: Inputs and outputs of the law in this tick.
-        j: The peer that is followed.
-        i: The joint.
+        j: Index of the peer that is followed.
+        i: Index of the joint.
         force: Part of the following force that belongs to the peer, N m.
         drift: The coupling's part of the energy that drift compensation takes, J. Energy that
             drift compensation returns stays at this end.
@@ -353,15 +354,16 @@ def book_follower(law: Any, now: LawInput, j: int, i: int, force: float, drift: 
 
 @compiled
 def charge_unpaid_energy(law: Any, now: LawInput, i: int, spring: float) -> None:
-    """Charges the couplings for the energy of the previous period that they have not paid.
+    """Charges the couplings for energy of the previous period that they have not paid.
 
-    This is energy that the spring and the arm received beyond the couplings' payments. Energy
-    that the damper takes in other periods repays the charge, up to its amount.
+    This is the energy that the spring and the arm received beyond what the couplings paid for
+    in advance. Energy that the damper takes in other periods repays the charge, up to its
+    amount.
 
     Args:
-        law: The law.
+        law: The law; its accounts are changed.
         now: Inputs and outputs of the law in this tick.
-        i: The joint.
+        i: Index of the joint.
         spring: Energy of the joint's spring now, J.
     """
     arm_step = now.q[i] - now.q_before[i] - law.alignment_step[i]
@@ -382,18 +384,18 @@ def charge_unpaid_energy(law: Any, now: LawInput, i: int, spring: float) -> None
 def settle_follower(
     law: Any, now: LawInput, i: int, stretch: float, drift_velocity: float, available_J: float
 ) -> None:
-    """Settles the torque and the velocities of a joint that follows, and books the energies.
+    """Finds the torque and the velocities of a joint that follows, and books the energies.
 
-    With energies by step, the torque results from velocities that pay for it. Since several
-    peers share one torque, torque and velocities depend on each other. They are computed by a
-    fixed number of sweeps (`SWEEPS`).
+    If work is computed by step, the torque must be paid for by the velocities that cause it.
+    Since several peers share one torque, torque and velocities depend on each other. They are
+    computed by a fixed number of iterations (`SWEEPS`).
 
     Args:
-        law: The law.
-        now: Inputs and outputs of the law in this tick.
-        i: The joint.
-        stretch: Elongation of the spring, rad.
-        drift_velocity: Velocity of drift compensation, rad/s.
+        law: The law; its accounts are changed.
+        now: Inputs and outputs of the law in this tick; the torque is written.
+        i: Index of the joint.
+        stretch: Elongation of the spring between the arm and its goal, rad.
+        drift_velocity: Velocity by which drifted positions are brought together, rad/s.
         available_J: Energy that remains in all couplings together, J.
     """
     n = now.joints
@@ -579,7 +581,9 @@ class Tdpa(EnergyLaw):
     def begin(self, facts: LawContext) -> None:
         """Creates the energy accounts of both ends of each coupling, and the work space.
 
-        Lists per coupling and joint are flat: joint i of peer j has the index j n + i.
+        A coupling joins a leader and a follower, and each end keeps an account of the energy
+        that it may spend. Lists per coupling and joint are flat: joint i of peer j has the
+        index j n + i, where n is the number of joints.
         """
         n = facts.joints
         couplings = n * len(facts.peers)
@@ -661,7 +665,7 @@ class Tdpa(EnergyLaw):
             now.tau[i] = self.carried[i] + (force - applied) / self.beta
 
     def energies(self, seen: LawRecords) -> LawEnergies:
-        """Returns the energies by which the records of a run show that the law was passive.
+        """Returns the energies that show whether the law was passive in a run.
 
         In each coupling both ends put energy in and take energy out. The follower's energies
         are those up to the previous period, because the work of a period is known only at its
@@ -701,10 +705,13 @@ class Tdpa(EnergyLaw):
         return "its controllers act by energies, which are of second order in the motion"
 
     def explain_idle_shares(self, situation: LawSituation) -> str:  # noqa: ARG002
-        """Explains that a site without K and B follows nobody.
+        """Explains to the user that the dominance factors of a site have no effect.
+
+        A site without the spring K and the damper B follows nobody, whatever its dominance
+        factors.
 
         Returns:
-            The sentence. Empty if the dominance factors have an effect.
+            A sentence. Empty if the dominance factors have an effect.
         """
         return "" if any(self.K) or any(self.B) else "K = 0 and B = 0 follow nobody"
 

@@ -209,15 +209,16 @@ def receive_wave(law: Any, now: LawInput, j: int, i: int, missed: float) -> floa
 
 @compiled
 def follow_wave(law: Any, now: LawInput, j: int, i: int, v: float) -> float:
-    """Moves the spring of an end by a wave, and sends the reflected wave.
+    """Moves the spring of an end by the wave that it plays, and sends the reflected wave.
 
-    The equations are those of the end with K and B at the top of this module.
+    An end is the site at one side of a line. Its equations, with the spring K and the damper B,
+    are given at the top of this module.
 
     Args:
         law: The law.
         now: Inputs and outputs of the law in this tick.
         j: Index of the peer at the other end of the line.
-        i: The joint.
+        i: Index of the joint.
         v: The wave that the end plays, sqrt(W).
 
     Returns:
@@ -392,7 +393,9 @@ class Wave(EnergyLaw):
     def begin(self, facts: LawContext) -> None:
         """Creates the state of the lines at this end, all of it at rest and without energy.
 
-        Lists per line and joint are flat: joint i of peer j has the index j n + i.
+        A line is the virtual connection to a peer along which waves travel. Lists per line and
+        joint are flat: joint i of peer j has the index j n + i, where n is the number of
+        joints.
         """
         n = facts.joints
         peers = len(facts.peers)
@@ -420,11 +423,14 @@ class Wave(EnergyLaw):
         self.damped = [0.0] * n
 
     def torque(self, now: LawInput) -> None:
-        """Writes the torque of each joint, and sends the waves.
+        """Computes the torque of one tick, and sends the waves to the peers.
 
         The steps of a tick are: book the work of the previous period; send the waves of joints
-        without a spring; play the waves that have arrived; send the waves of joints with a
-        spring, which depend on the waves that were played.
+        without a spring; play the waves that have arrived, which means to let them act on the
+        arm; send the waves of joints with a spring, which depend on the waves that were played.
+
+        Args:
+            now: Inputs and outputs of the law in this tick.
         """
         n = now.joints
         for i in range(n):
@@ -471,10 +477,11 @@ class Wave(EnergyLaw):
                 send_waves(self, now, i, work + self.spring_gain_J[i])
 
     def energies(self, seen: LawRecords) -> LawEnergies:
-        """Returns the energies by which the records of a run show that the law was passive.
+        """Returns the energies that show whether the law was passive in a run.
 
-        Energy is put into a line by its sent waves, and taken out by the waves that are played.
-        The account H contains the energy of the springs. The dampers dissipate energy for good.
+        Energy is put into a line by the waves that this site sends, and taken out by the waves
+        that it plays. The account H of the energy at this end contains the energy of the
+        springs. The dampers dissipate energy for good.
 
         Args:
             seen: Records of the site in the run.
@@ -492,13 +499,16 @@ class Wave(EnergyLaw):
         )
 
     def find_problem(self, rates_hz: Mapping[str, int]) -> KeyProblem | None:
-        """Returns the setting that prevents the use of this law, or None.
+        """Returns the setting that prevents the use of this law in a scenario.
 
         Each named line must join two sites of the scenario. All sites must have the same tick
         rate, because a wave lasts for one tick.
 
         Args:
             rates_hz: Tick rate of each site, by name.
+
+        Returns:
+            The key of the setting and the problem. None if the law can be used.
         """
         pairs = [sorted(pair) for pair in permutations(rates_hz, 2)]
         lines = () if self.lines == "shares" else self.lines
@@ -590,9 +600,10 @@ class Wave(EnergyLaw):
         return tuple(np.broadcast_to(line, len(self.b)).tolist())
 
     def linear_gains(self, theta: Array) -> Gains | None:
-        """Returns the kernel's law of known gravity without gains.
+        """Returns gains of the kernel's law of known gravity that are all zero.
 
-        The coupling itself is described by `linear_form`.
+        The kernel's law then only compensates gravity. The waves are described by
+        `linear_form`.
 
         Args:
             theta: Parameters of the arm, shape (P,).
