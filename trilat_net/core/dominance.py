@@ -33,11 +33,17 @@ ROW_SUM_TOLERANCE = 1e-9
 
 
 def find_row_problem(row: Array, site: int) -> str | None:
-    """Returns the violation of Eq. (7) by a row of the dominance matrix, or None.
+    """Returns the reason why a row of the dominance matrix is not valid, Eq. (7).
+
+    The row contains the weights with which one site follows the others. They must lie between 0
+    and 1 and sum to 1, and the site must not follow itself.
 
     Args:
         row: Dominance factors of one site, shape (N,).
         site: Index of that site.
+
+    Returns:
+        A clause for an error message. None if the row is valid.
     """
     if not np.isfinite(row).all():
         return "shares must be finite numbers"
@@ -69,25 +75,30 @@ def find_reach(alpha: Array) -> NDArray[np.bool_]:
 def is_irreducible(alpha: Array) -> bool:
     """Returns True if every site follows every other site, directly or through others.
 
+    The stability theorem needs this property of the dominance matrix.
+
     Args:
-        alpha: Dominance matrix, shape (N, N).
+        alpha: Dominance matrix, shape (N, N): row i contains the weights with which site i
+            follows the other sites.
     """
     return bool(find_reach(alpha).all())
 
 
 def find_balancing_weights(alpha: Array) -> Array | None:
-    """Returns D > 0 with D_i alpha_ij = D_j alpha_ji (detailed balance), or None.
+    """Returns weights D > 0 with D_i alpha_ij = D_j alpha_ji, if the matrix is reversible.
 
-    Shares that have such weights are reversible: their products around each circle are equal in
-    both directions (Kolmogorov), as in alpha12 alpha23 alpha31 = alpha13 alpha32 alpha21 for
-    three sites, and the eigenvalues of alpha are real. Links out of a group of sites that reach
-    each other belong to no circle and are ignored.
+    This equation is called detailed balance. It has a solution if the products of the dominance
+    factors around each circle of sites are equal in both directions (Kolmogorov), as in
+    alpha12 alpha23 alpha31 = alpha13 alpha32 alpha21 for three sites. Then the eigenvalues of
+    alpha are real. Links out of a group of sites that reach each other belong to no circle and
+    are ignored.
 
     Args:
-        alpha: the shares, shape (N, N).
+        alpha: Dominance matrix, shape (N, N): row i contains the weights with which site i
+            follows the other sites.
 
     Returns:
-        D, shape (N,), with D = 1 at the first site of each group; None if no D exists.
+        D, shape (N,), with D = 1 at the first site of each group. None if no D exists.
     """
     reach = find_reach(alpha)
     followed = reach & reach.T & (alpha > 0.0)
@@ -112,11 +123,18 @@ def find_balancing_weights(alpha: Array) -> Array | None:
 
 
 def perron_vector(alpha: Array) -> Array:
-    """Returns beta > 0 with beta' Upsilon = 0 and sum 1, shape (N,), for an irreducible alpha.
+    """Returns the weights beta of the sites in the energy function of the stability proof.
 
-    The method is the elimination of Grassmann, Taksar and Heyman (1985). It contains no
-    subtraction, so that each entry is accurate to a few units in the last place even if the
-    shares differ by many orders of magnitude.
+    They are the positive solution of beta' Upsilon = 0 with the sum 1. The method is the
+    elimination of Grassmann, Taksar and Heyman (1985). It contains no subtraction, so that each
+    entry is accurate to a few units in the last place even if the dominance factors differ by
+    many orders of magnitude.
+
+    Args:
+        alpha: Irreducible dominance matrix, shape (N, N), see `is_irreducible`.
+
+    Returns:
+        The weights, shape (N,).
 
     Raises:
         ValueError: alpha is reducible, so that the weight of some site is zero or beta is not
@@ -169,16 +187,18 @@ def _interpolate(
 
 @leaf
 def apply_ramps(t_ns: int, count: int, ramps: Array, links: RowArray) -> None:
-    """Writes alpha and its derivative at time t into each link.
+    """Computes the dominance factors and their derivatives at time t, for each link.
 
-    A ramp starts at the factors that the previous ramp has at that time, complete or not.
+    A dominance factor is the weight with which the site follows a peer. It changes by ramps,
+    linear changes over time. A ramp starts at the factors that the previous ramp has at that
+    time, complete or not.
 
     Args:
-        t_ns: the time, ns since the epoch.
-        count: the number of filled rows of `ramps`.
-        ramps: the ramps in the order of their starts, shape (R, RAMP_COLUMNS + P); row 0 holds
+        t_ns: The time, ns since the epoch, the common start of the session.
+        count: Number of filled rows of `ramps`.
+        ramps: Ramps in the order of their starts, shape (R, RAMP_COLUMNS + P); row 0 holds
             the factors at the epoch.
-        links: the rows of the links, shape (P,).
+        links: Rows of the links, shape (P,); written.
     """
     for j in range(links.shape[0]):
         link: LinkRow = links[j]
@@ -209,15 +229,18 @@ def apply_ramps(t_ns: int, count: int, ramps: Array, links: RowArray) -> None:
 
 
 def fold_ramps(t_ns: int, count: int, ramps: Array) -> int:
-    """Removes the ramps that no longer matter at time t, and returns the number of rows left.
+    """Removes the changes of the dominance factors that are over, to make room for new ones.
 
     The last ramp that has started stays, after a row 0 with the factors at its start. From time
     t on `apply_ramps` therefore writes the same bits as before.
 
     Args:
-        t_ns: the time, ns since the epoch.
-        count: the number of filled rows of `ramps`.
-        ramps: the ramps, as in `apply_ramps`; changed in place.
+        t_ns: The time t, ns since the epoch, the common start of the session.
+        count: Number of filled rows of `ramps`.
+        ramps: Ramps, as in `apply_ramps`; changed in place.
+
+    Returns:
+        The number of rows that are left.
     """
     last = int(np.searchsorted(ramps[1:count, 0], t_ns, side="right"))
     if last < 2:

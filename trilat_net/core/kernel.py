@@ -120,13 +120,13 @@ def _update_estimate(k: int, s: SiteRow, chain: RowArray | None) -> None:
 
 @leaf
 def torque_stage(site: RowArray, chain: RowArray | None) -> None:
-    """Runs stage 6, the torque, of a law that the kernel computes.
+    """Computes the torque of a control law that is built into the kernel (stage 6 of a tick).
 
     For a user's law this function does nothing: `law_stage` computes its torque.
 
     Args:
-        site: Row of the site.
-        chain: Rows of the chain, or None.
+        site: Row of the site, in which the torque is written.
+        chain: Rows of the joints of a chain, or None for the planar arm.
     """
     s: SiteRow = site[0]
     if s.law == _USER:
@@ -325,11 +325,17 @@ def _advance(
 
 @leaf
 def channel_of(channel: ChannelArrays | None, peer: int) -> ChannelArrays | None:
-    """Returns the arrays of the numbers that one peer's law sends, or None without them.
+    """Returns the arrays of the numbers that the control law of one peer sends.
+
+    The numbers accompany the motion in each sample of the peer.
 
     Args:
-        channel: Arrays of all peers, or of all sites of stacked arrays.
+        channel: Arrays of all peers, or of all sites of stacked arrays; None if the law of this
+            site reads no such numbers.
         peer: Index of the peer or the site.
+
+    Returns:
+        Views of the peer's arrays. None if `channel` is None.
     """
     if channel is None:
         return None
@@ -338,7 +344,12 @@ def channel_of(channel: ChannelArrays | None, peer: int) -> ChannelArrays | None
 
 @leaf
 def link_arrays(arrays: SiteArrays, peer: int) -> LinkArrays:
-    """Returns the arrays of the link from one peer, as views."""
+    """Returns the arrays of the link from one peer, as views of the arrays of the site.
+
+    Args:
+        arrays: Arrays of the site.
+        peer: Index of the peer.
+    """
     return LinkArrays(
         state=arrays.links[peer : peer + 1],
         models=arrays.models[peer],
@@ -351,24 +362,30 @@ def link_arrays(arrays: SiteArrays, peer: int) -> LinkArrays:
 
 @leaf
 def find_release(peer: int, tick: int, arrays: SiteArrays) -> int:
-    """Returns the tick that releases a peer's sample, or LOST, as `link.release_tick`.
+    """Returns the tick of the site in which a peer's sample comes into use.
 
     Args:
         peer: Index of the peer.
         tick: Stamp of the sample, a tick of the peer.
         arrays: Arrays of the site.
+
+    Returns:
+        The tick. LOST in the cases that `link.release_tick` names.
     """
     return release_tick(tick, arrays.site[0].rate_hz, link_arrays(arrays, peer))
 
 
 @leaf
 def accept_stage(k: int, count: int, arrays: SiteArrays, buffers: TickBuffers) -> None:
-    """Runs stage 1: files the samples that arrived in the calendars of their links.
+    """Stores the samples that arrived until they are used (stage 1 of a tick).
+
+    Each link has a calendar, a ring of pages in which samples wait until their delay has
+    passed.
 
     Args:
         k: The tick.
         count: Number of arrivals in the buffers.
-        arrays: Arrays of the site.
+        arrays: Arrays of the site; written.
         buffers: Arrivals of the tick.
     """
     rate_hz = arrays.site[0].rate_hz
@@ -397,20 +414,22 @@ def reference_stages(
     table: TorqueTable,
     chain: RowArray | None,
 ) -> None:
-    """Runs stages 3 to 5 with the samples in use, and then computes the external torque.
+    """Computes reference, errors and estimate from the samples in use (stages 3 to 5).
 
-    The arguments are fields of `SiteArrays`; the fused run has them for each site of its stack.
+    Then the external torque of operators and environments is computed. The arguments are
+    fields of `SiteArrays`; the fused run, which computes all sites in one call, has them for
+    each site of its stack.
 
     Args:
         k: The tick.
-        t_ns: Nominal time of the tick, ns since the epoch.
-        site: Row of the site.
+        t_ns: Nominal time of the tick, ns since the epoch, the common start of the session.
+        site: Row of the site; written.
         links: Rows of its links.
         ramps: Changes of the dominance factors, the weights with which the site follows its
             peers.
         actors: Rows of operators and environments.
         table: Numbers of operators and environments.
-        chain: Rows of the chain, or None.
+        chain: Rows of the joints of a chain, or None for the planar arm.
     """
     s: SiteRow = site[0]
     # 3 reference
@@ -433,13 +452,16 @@ def reference_stages(
 def sense_stages(
     k: int, t_ns: int, count: int, arrays: SiteArrays, buffers: TickBuffers
 ) -> None:
-    """Runs stages 1 to 5 of a tick with `count` arrivals, and computes the external torque.
+    """Computes the part of a tick that precedes the control law (stages 1 to 5).
+
+    The stages are: store the samples that arrived; bring samples into use; compute the
+    reference, the errors, and the estimate. Then the external torque is computed.
 
     Args:
         k: The tick.
-        t_ns: Nominal time of the tick, ns since the epoch.
+        t_ns: Nominal time of the tick, ns since the epoch, the common start of the session.
         count: Number of arrivals in the buffers.
-        arrays: Arrays of the site.
+        arrays: Arrays of the site; written.
         buffers: Arrivals of the tick.
     """
     rate_hz = arrays.site[0].rate_hz
@@ -474,18 +496,19 @@ def act_stages(
     chain: RowArray | None,
     record: Array,
 ) -> None:
-    """Runs the end of stage 6, and stages 7 and 8, after the law wrote its torque.
+    """Computes the part of a tick that follows the control law (stages 6 to 8).
 
-    Without the rule `glide` a joint beyond its limit of speed makes the site DIVERGED here.
+    A joint beyond its limit of speed gives the site the final mode DIVERGED here, unless the
+    site is under the rule `glide`, by which such a fault brings the arm to rest.
 
     Args:
         k: The tick.
-        t_ns: Nominal time of the tick, ns since the epoch.
-        site: Row of the site.
-        actors: Operators and environments.
-        table: Their tables.
-        chain: Rows of the chain, or None.
-        record: Floats of the record; written.
+        t_ns: Nominal time of the tick, ns since the epoch, the common start of the session.
+        site: Row of the site, with the torque of the law; written.
+        actors: Rows of operators and environments.
+        table: Numbers of operators and environments.
+        chain: Rows of the joints of a chain, or None for the planar arm.
+        record: Written: the floating-point numbers of the tick's record.
     """
     s: SiteRow = site[0]
     _guard_torque(k, t_ns, s, chain)
@@ -520,10 +543,12 @@ def site_tick(
     sent: Array,
     record: Array,
 ) -> None:
-    """Computes tick k of one site at t_ns, ns since the epoch, with the first `count` arrivals.
+    """Computes one whole tick of a site, for a law that is built into the kernel.
 
-    The other arguments are the fields of `SiteArrays` and `TickBuffers`. Passing the two tuples
-    from Python instead would cost more than a microsecond.
+    Tick k is at the time t_ns, ns since the epoch, the common start of the session. The other
+    arguments are the fields of `SiteArrays` and `TickBuffers`, of which the first `count` rows
+    of `arrivals` are valid. Passing the two tuples from Python
+    instead would cost more than a microsecond.
     """
     arrays = SiteArrays(
         site=site,
@@ -554,9 +579,14 @@ def site_tick(
 
 @leaf
 def resume_stages(k: int, arrays: SiteArrays) -> None:
-    """Repeats stages 4 and 8 of tick k, after its state was restored from records.
+    """Recomputes the numbers that tick k + 1 needs and that no record contains.
 
-    They compute the numbers that no record contains and that tick k+1 needs.
+    The state of the site after tick k was restored from records before. The numbers follow
+    from it by stages 4 and 8 of tick k.
+
+    Args:
+        k: The last tick that was recorded.
+        arrays: Arrays of the site, with the restored state; written.
     """
     s: SiteRow = arrays.site[0]
     t_ns = tick_ns(k, s.rate_hz)

@@ -22,10 +22,11 @@ BLEND_S = 0.1
 
 @leaf
 def limit_reference(k: int, site: SiteRow) -> None:
-    """Limits the speed of the reference.
+    """Limits the speed of the reference, the position that the arm follows.
 
-    A reference that was held back catches up later. At the first tick the reference starts from
-    the pose of the arm.
+    The reference moves from its value in the previous tick by at most the permitted step. A
+    reference that was held back catches up later. At the first tick it starts from the pose of
+    the arm.
 
     Args:
         k: The tick.
@@ -82,7 +83,10 @@ def _limit_turn(site: SiteRow) -> None:
 
 @leaf
 def is_torque_finite(site: SiteRow) -> bool:
-    """Returns True if the law's torque is finite for each joint."""
+    """Returns True if the torque that the control law wrote is finite for each joint.
+
+    NaN is found too, so that a law that wrote no torque is noticed.
+    """
     finite = True
     for i in range(site.joints):
         finite = finite and isfinite(site.tau[i])
@@ -91,11 +95,13 @@ def is_torque_finite(site: SiteRow) -> bool:
 
 @leaf
 def return_to_law(t_ns: int, site: SiteRow) -> None:
-    """Blends the torque from the last torque at rest to that of the law, within BLEND_S.
+    """Blends the torque of an arm that leaves its rest into the torque of the control law.
+
+    The torque changes linearly within BLEND_S, so that the arm does not jerk.
 
     Args:
-        t_ns: Time, ns since the epoch.
-        site: Row of the site, whose torque is changed.
+        t_ns: Time, ns since the epoch, the common start of the session.
+        site: Row of the site, whose torque `tau` is changed.
     """
     elapsed_s = (t_ns - site.return_from_ns) * 1e-9
     progress = min(elapsed_s / BLEND_S, 1.0)

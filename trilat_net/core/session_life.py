@@ -200,7 +200,15 @@ def _extrapolate_reference(site: SiteRow) -> None:
 
 @leaf
 def is_law_returning(t_ns: int, site: SiteRow) -> bool:
-    """Returns True while the torque of a site changes from that at rest to that of its law."""
+    """Returns True while the torque changes from that of an arm at rest to that of the law.
+
+    This change takes RETURN_NS, from the start of an alignment with the peers on. A site that
+    aligns without having rested, because it dropped or restored a peer, needs no change.
+
+    Args:
+        t_ns: Time, ns since the epoch, the common start of the session.
+        site: Row of the site.
+    """
     # A site that drops or restores a peer aligns without a rest before.
     rested = site.reason != _DROPPED and site.reason != _RESTORED
     elapsed_ns = t_ns - site.return_from_ns
@@ -210,15 +218,16 @@ def is_law_returning(t_ns: int, site: SiteRow) -> bool:
 
 @leaf
 def latch_mode(t_ns: int, site: SiteRow, mode: int, reason: int) -> None:
-    """Enters FAULT or STOPPED, where the arm comes to rest.
+    """Enters a mode in which the arm comes to rest, FAULT or STOPPED.
 
-    Estimates that are not finite become zero, so that the gravity torque stays finite.
+    Only an order ends these modes. Estimates of the arm's parameters that are not finite become
+    zero, so that the gravity torque, which holds the arm, stays finite.
 
     Args:
-        t_ns: Time, ns since the epoch.
-        site: Row of the site.
+        t_ns: Time, ns since the epoch, the common start of the session.
+        site: Row of the site; changed.
         mode: The mode to enter.
-        reason: Reason of the change of mode.
+        reason: Reason of the change of mode, a `LifeReason`.
     """
     for p in range(site.theta_hat.shape[0]):
         if not isfinite(site.theta_hat[p]):
@@ -326,15 +335,16 @@ def _update_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
 
 @leaf
 def update_session_life(t_ns: int, site: SiteRow, links: RowArray) -> None:
-    """Changes the mode, and turns the peers' reference into the reference of the mode.
+    """Changes the mode of a site, and computes the reference of the arm in this mode.
 
-    The peers' reference is in `q_des` and `qd_des`, where the new reference is written. The
-    reference of the previous tick is in `q_followed` and `qd_followed`.
+    This is the rule `glide`, described at the top of this module. The peers' reference is in
+    `q_des` and `qd_des`, where the new reference is written. The reference of the previous tick
+    is in `q_followed` and `qd_followed`.
 
     Args:
-        t_ns: Time, ns since the epoch.
-        site: Row of the site.
-        links: Rows of the site's links.
+        t_ns: Time, ns since the epoch, the common start of the session.
+        site: Row of the site; changed.
+        links: Rows of the site's links, one per peer.
     """
     if site.mode == _DIVERGED:
         return

@@ -37,11 +37,12 @@ def tick_ns(tick: int, rate_hz: int) -> int:
 def first_tick_at(due_ns: int, rate_hz: int) -> int:
     """Returns the first tick whose nominal time is at or after a due time.
 
-    The result is exact: floor(k 10^9 / rate) >= due if and only if k 10^9 >= due rate. The
-    division of the negative number rounds up.
+    It is the smallest k with k / rate_hz >= due_ns / 10^9. The result is exact:
+    floor(k 10^9 / rate) >= due if and only if k 10^9 >= due rate. The division of the negative
+    number rounds up.
 
     Args:
-        due_ns: The due time, ns since the epoch.
+        due_ns: The due time, ns since the epoch, the common start of the session.
         rate_hz: Tick rate, Hz.
     """
     return -(-due_ns * rate_hz // 1_000_000_000)
@@ -188,14 +189,14 @@ class CoreChange(NamedTuple):
 
 
 class PlantState(NamedTuple):
-    """A measurement of an arm outside of the program.
+    """Measured state of an arm that is outside of the program, for example of a real arm.
 
     Attributes:
-        q: joint angles, rad.
-        qd: joint velocities, rad/s.
-        tau_x: torque of operator and environment, N m, in the sign of the record; empty if the
-            arm does not measure it.
-        bodies: poses of the other bodies of the scene, as in `TickRecord.bodies`.
+        q: Joint angles, rad.
+        qd: Joint velocities, rad/s.
+        tau_x: Torque of operator and environment, N m, in the sign of the record, which is the
+            negative of the torque ON the arm. Empty if the arm does not measure it.
+        bodies: Poses of the other bodies of the scene, as in `TickRecord.bodies`.
     """
 
     q: Sequence[float]
@@ -280,10 +281,12 @@ class TickRecord(NamedTuple):
     bodies: Sequence[float] = ()
 
     def shared(self) -> tuple[Sequence[float], Sequence[float], Sequence[float]]:
-        """Returns the position, the velocity and the exogenous torque that peers receive.
+        """Returns the part of the record that peers receive: their view of this site's arm.
 
-        They are in shared coordinates: those of the end effector in task space, else the
-        joints.
+        In task space it refers to the end effector, otherwise to the joints.
+
+        Returns:
+            The position, the velocity and the exogenous torque, a number per coordinate each.
         """
         if self.x:
             return self.x, self.xd, self.wrench
@@ -291,17 +294,20 @@ class TickRecord(NamedTuple):
 
 
 class LinkCounts(NamedTuple):
-    """Counts of samples on one link since the start.
+    """Counts of the samples of one link since the start of the site.
+
+    A link is the directed connection from a peer, and a sample the state that the peer
+    published in one tick.
 
     Attributes:
-        accepted: samples that arrived.
-        late: of those, samples that arrived after they were due.
-        duplicate: of those, samples that had arrived before.
-        refused: of those, samples whose stamp was out of range.
-        lost: of those, samples that the link's model lost.
-        superseded: samples that were never used, because a newer sample was released before
+        accepted: Samples that arrived.
+        late: Of those, samples that arrived after they were due.
+        duplicate: Of those, samples that had arrived before.
+        refused: Of those, samples whose stamp was out of range.
+        lost: Of those, samples that the link's model of losses dropped.
+        superseded: Samples that were never used, because a newer sample was released before
             them or in the same tick.
-        copies: duplicates that the link's model produced.
+        copies: Duplicates that the link's model produced.
     """
 
     accepted: int
@@ -332,13 +338,22 @@ _REASONS = {
 
 
 def find_life_reason(output: TickRecord) -> LifeReason:
-    """Returns the reason in a record for the last change of mode of a site under `glide`."""
+    """Returns the reason for the last change of mode of a site, from its record.
+
+    The site must be under the rule `glide`, by which an arm comes to rest while a peer is
+    silent. Only then does a record contain the reason.
+
+    Args:
+        output: Record of the site, the result of one tick.
+    """
     shared = len(output.q_des)
     return LifeReason(int(output.mem[2 * shared + 1]))
 
 
 class LifeAlarm(NamedTuple):
-    """Alarm about the mode of a site, which nobody may overlook.
+    """Alarm that tells people why a site does not follow its peers, and what they can do.
+
+    `find_alarm` creates it. Pages and terminals show it as long as the site is in this mode.
 
     Attributes:
         word: The mode, in capitals.
@@ -386,20 +401,24 @@ def find_alarm(
     shared: int,
     lost: Sequence[str] = (),
 ) -> LifeAlarm | None:
-    """Returns the alarm that a site under the rule `glide` requires, from its record.
+    """Returns the alarm that tells people why a site does not follow its peers.
+
+    Only a site under the rule `glide` has alarms. By this rule an arm comes to rest while a
+    peer is silent, and follows again after a person's order. All facts come from the site's
+    record, the stored result of one tick.
 
     Args:
-        session: Name of the session, for the advice.
-        site: Name of the site, for the advice.
-        mode: Mode in the site's record.
-        mem: Memory in the site's record.
-        shared: Number of coordinates that sites share.
+        session: Name of the session, which the advice of the alarm quotes.
+        site: Name of the site, which the advice quotes.
+        mode: Mode of the site, as the record names it.
+        mem: Numbers that the site keeps from tick to tick, the field `mem` of the record. They
+            contain the reason for the mode.
+        shared: Number of coordinates that sites share, by which `mem` is divided.
         lost: Names of the peers without which the site goes on.
 
     Returns:
         The alarm. None if the site needs no attention, or if the record is not from a site
-            under
-        this rule.
+        under this rule.
     """
     try:
         reason = LifeReason(int(mem[2 * shared + 1]))
@@ -446,13 +465,14 @@ _ACTIVITIES = {
 def describe_mode(
     site: str, output: TickRecord, *, glides: bool = False, law_failure: Exception | None = None
 ) -> str:
-    """Returns the text of the event by which a site reports a change of its mode.
+    """Returns the sentence with which a site reports a change of its mode in the log.
 
     Args:
         site: Name of the site.
         output: Record of the first tick in the mode.
-        glides: True: the site is under the rule `glide`, and the text gives the reason.
-        law_failure: Error with which the user's law failed, or None.
+        glides: True: the site is under the rule `glide`, by which an arm comes to rest while a
+            peer is silent. The sentence then gives the reason for the mode.
+        law_failure: Error with which the user's control law failed, or None.
     """
     if glides:
         reason = find_life_reason(output)
@@ -471,11 +491,11 @@ def describe_mode(
 
 
 def describe_divergence(site: str, output: TickRecord) -> str:
-    """Returns the text of the event by which a site reports that it diverged.
+    """Returns the sentence with which a site reports in the log that its run diverged.
 
     Args:
         site: Name of the site.
-        output: Record of the tick.
+        output: Record of the tick in which the arm went beyond its limits.
     """
     speed = max(abs(v) for v in output.qd)
     t_s = output.t_ns * 1e-9
