@@ -43,37 +43,41 @@ _TICK_TOLERANCE = 1e-5
 
 
 class AlignedRecords(NamedTuple):
-    """A site's records on every tick from its first to its last: K rows, one per tick.
+    """A site's records over K successive ticks, with one row for every tick.
 
-    In task space the shared coordinates are the m coordinates of the end effector.
+    A site is a process that runs one arm. It stores one record per tick, the period of its
+    control loop. Rows of ticks without a record are interpolated, so that all arrays are
+    complete. The arm has n joints. In task space the sites share the m coordinates of their end
+    effectors instead of their joint angles.
 
     Attributes:
         site: Name of the site.
         rate_hz: Tick rate, in Hz.
-        first: Tick of row 0.
-        known: True if the tick has a record, shape (K,).
-        follows: True if the site followed its peers, shape (K,): it did not hold, brake or
-            return, and its reference was slower than its limit.
+        first: Number of the tick in row 0.
+        known: True if the tick has a record, False if the row is interpolated, shape (K,).
+        follows: True if the site followed its peers, the sites whose motion it receives, shape
+            (K,). It did not hold, brake or return, and its reference was slower than its limit.
         q: Joint angles, shape (K, n), in rad.
         qd: Joint velocities, shape (K, n), in rad/s.
-        q_des: Reference of the shared coordinates, shape (K, n) or (K, m).
-        qd_des: Derivative of the reference.
+        q_des: Reference of the shared coordinates, shape (K, n) in rad, or (K, m) in task
+            space.
+        qd_des: Time derivative of the reference, with the same shape.
         tau: Control torque, shape (K, n), in N m.
-        tau_x: External torque in the sign of Eq. (8), which is the negative of the torque on
+        tau_x: External torque with the sign of Eq. (8), the negative of the torque that acts on
             the arm, shape (K, n), in N m.
-        theta_hat: Parameter estimates, shape (K, P).
-        used: For each peer, the tick of the sample in use, shape (K,). -1 before the first
-            sample.
+        theta_hat: Estimates of the P dynamic parameters of the arm, shape (K, P).
+        used: For each peer, the number of the peer's tick whose state was in use, shape (K,).
+            It is -1 before the first state arrived.
         x: Position or pose of the end effector in task space, shape (K, m). Empty in joint
             space.
-        xd: Derivative of x.
-        wrench: Force at the end effector that corresponds to tau_x, shape (K, m). Empty in
+        xd: Time derivative of x.
+        wrench: Force at the end effector that corresponds to `tau_x`, shape (K, m). Empty in
             joint space.
-        axes: See `SiteLog`.
-        hand: Action of an operator who acts live, shape (K, h), see `HandInForce`. Empty if
-            there is none.
-        rests: True in one of the `RESTING_MODES`, and for `RESUMING_S` afterwards, shape (K,).
-            Empty if the site never rests.
+        axes: For each coordinate of the task, whether the site follows along it, see `SiteLog`.
+        hand: Recorded action of an operator who acts live, shape (K, h), see `HandInForce`.
+            Empty if there is no such operator.
+        rests: True while the site comes to rest, in one of the `RESTING_MODES`, and for
+            `RESUMING_S` afterwards, shape (K,). Empty if the site never rests.
     """
 
     site: str
@@ -98,12 +102,19 @@ class AlignedRecords(NamedTuple):
 
     @property
     def shared(self) -> Array:
-        """The coordinates that peers receive: q, or x in task space, shape (K, m)."""
+        """The coordinates that other sites receive from this site.
+
+        They are the joint angles q, shape (K, n), or in task space the pose x of the end
+        effector, shape (K, m).
+        """
         return self.x if self.x.size else self.q
 
     @property
     def shared_rate(self) -> Array:
-        """The derivative of these coordinates: qd, or xd in task space, shape (K, m)."""
+        """The time derivative of the coordinates that other sites receive from this site.
+
+        It is qd, shape (K, n), or in task space xd, shape (K, m).
+        """
         return self.xd if self.x.size else self.qd
 
     @property
@@ -133,23 +144,33 @@ class AlignedRecords(NamedTuple):
 
     @property
     def e(self) -> Array:
-        """Position error, Eq. (9), shape (K, n), in rad, or in task space (K, m)."""
+        """The synchronisation error: the shared coordinates minus their reference, Eq. (9).
+
+        Its shape is (K, n), in rad, or in task space (K, m).
+        """
         if self.x.size:
             return compute_task_errors(self.x, self.q_des, self.axes)
         return self.q - self.q_des
 
     @property
     def ed(self) -> Array:
-        """Velocity error, shape (K, n), in rad/s. In task space (K, m)."""
+        """The derivative of the synchronisation error: shared velocities minus their reference.
+
+        Its shape is (K, n), in rad/s, or in task space (K, m).
+        """
         return self.shared_rate - self.qd_des
 
     @property
     def known_periods(self) -> Bools:
-        """True if both ends of a period are recorded, shape (K - 1,)."""
+        """Marks the tick periods that have a record at both ends, shape (K - 1,)."""
         return self.known[:-1] & self.known[1:]
 
     def known_at_end(self, length_s: float) -> Bools:
-        """Returns True for the recorded rows of the last `length_s` seconds, shape (K,)."""
+        """Marks the rows of the last seconds that have a record, shape (K,).
+
+        Args:
+            length_s: Length of the interval at the end, in s.
+        """
         t_s = self.t_s
         start_s = t_s[-1] - length_s
         rows: Bools = self.known & (t_s > start_s)
@@ -157,16 +178,19 @@ class AlignedRecords(NamedTuple):
 
 
 def hold_torque(tau: Array, limit_nm: Array | float, *, digital: bool) -> Array:
-    """Returns the torque that a controller holds during every tick period.
+    """Returns the torque that acts during every tick period, computed from recorded torques.
+
+    Between two ticks the torque is constant. The scheme `digital` holds the torque tau_k of
+    tick k. The scheme `second_order` holds 1.5 tau_k - 0.5 tau_{k-1} instead, within the limit,
+    which approximates the torque in the middle of the period.
 
     Args:
         tau: Recorded torque, shape (K, n), in N m.
-        limit_nm: Limit of the torque.
-        digital: True for the scheme `digital`, which holds tau_k. False for `second_order`,
-            which extrapolates it to 1.5 tau_k - 0.5 tau_{k-1} within the limit.
+        limit_nm: Largest magnitude of the torque, in N m.
+        digital: True for the scheme `digital`, False for `second_order`.
 
     Returns:
-        Torque, shape (K, n), in N m.
+        Torque in each period, shape (K, n), in N m.
     """
     held = tau.copy()
     if not digital:
@@ -176,17 +200,18 @@ def hold_torque(tau: Array, limit_nm: Array | float, *, digital: bool) -> Array:
 
 
 def align_records(log: Log, *, common: bool = False) -> dict[str, AlignedRecords]:
-    """Returns the aligned records of all sites that have records, in scenario order.
+    """Arranges the records of all sites with one row per tick, so that they can be compared.
 
-    A record with the mode "diverged" is left out: it may contain zeros in place of numbers that
-    are not finite.
+    Sites without records are left out. So is a record with the mode "diverged", which says that
+    the arm exceeded its limits: it may contain zeros in place of numbers that are not finite.
 
     Args:
         log: The log of the run.
         common: True to end all sites where the first site ends, as sums over all sites require.
 
     Returns:
-        The records, by site. With `common` it is empty unless every site has two ticks.
+        The records by name of the site, in scenario order. With `common` the result is empty if
+        any site has fewer than two ticks.
     """
     rows_by_site: dict[str, Ints] = {}
     for site in log.sites:
@@ -338,9 +363,10 @@ class PeerMotion(NamedTuple):
 
 
 class PeerTrajectory:
-    """The motion of a site as a function of time, through its records.
+    """The motion of a site as a function of continuous time, interpolated from its records.
 
-    The motion is a polynomial between two records, and rest before the first record (L7).
+    It tells where the site was when it sent a sample, or between two ticks. The motion is a
+    polynomial between two records. Before the first record the arm rests (assumption L7).
 
     Args:
         records: Records of the site.
@@ -358,8 +384,9 @@ class PeerTrajectory:
     def evaluate(self, t_s: Array) -> PeerMotion:
         """Returns the site's motion at some times. At its ticks this equals its records.
 
-        q is the cubic Hermite polynomial through angles and velocities, and qd is linear
-        between two records. The integral of qd squared is that of the trapezoid rule.
+        Between two records, q is the cubic polynomial that has the recorded angles and
+        velocities at both ends (Hermite interpolation), and qd is linear. The integral of qd
+        squared is computed by the trapezoid rule.
 
         Args:
             t_s: Times after the start of the session, shape (K,), in s.
@@ -405,13 +432,15 @@ class PeerTrajectory:
 
 
 class DelayedPeer(NamedTuple):
-    """Motion of a peer as a site sees it through its link.
+    """Motion of a peer, both as it is and as a site receives it, with delay.
+
+    In each of its K ticks the site uses one sample, a state that the peer sent earlier.
 
     Attributes:
         now: Motion of the peer at the site's ticks, K rows.
-        delayed: Its motion at the times at which the samples in use were sent, K rows.
-        delayed_end: Its motion at the end of every period, if the sample in use grew no older
-            within the period, K - 1 rows.
+        delayed: Motion of the peer at the times at which the samples in use were sent, K rows.
+        delayed_end: Motion of the peer at the end of every tick period, delayed as if the age
+            of the sample had not changed within the period, K - 1 rows.
         stamp_s: Time at which the sample in use was sent, shape (K,), in s. NaN before the
             first sample.
     """
@@ -423,7 +452,10 @@ class DelayedPeer(NamedTuple):
 
     @property
     def known(self) -> Bools:
-        """True if the motion over the whole period follows from records, shape (K - 1,)."""
+        """Marks the periods in which the delayed motion rests on records only.
+
+        Its shape is (K - 1,).
+        """
         now = self.now.known
         delayed = self.delayed.known
         now_known = now[:-1] & now[1:]
@@ -437,11 +469,11 @@ _BEFORE_EPOCH_S = -1.0
 
 
 def view_delayed_peer(records: AlignedRecords, past: PeerTrajectory) -> DelayedPeer:
-    """Returns the motion of a peer as a site sees it through its link.
+    """Returns the motion of a peer as a site receives it, with the delay of the link.
 
     Args:
-        records: Records of the site.
-        past: Motion of the peer.
+        records: Records of the site, which name the sample in use at every tick.
+        past: Motion of the peer over time.
     """
     used = records.used[past.records.site]
     has_sample = used >= 0
@@ -478,14 +510,17 @@ def find_latest_rows(records: AlignedRecords, t_s: Array) -> tuple[Ints, Bools]:
 
 
 def find_common_rows(sites: Sequence[AlignedRecords]) -> tuple[list[Ints], Bools]:
-    """Finds the rows of every site's latest ticks at the ticks of the first site.
+    """Finds rows at which several sites can be compared at the same instant.
+
+    The instants are the ticks of the first site. For each site, the row of its latest tick at
+    that instant is returned.
 
     Args:
         sites: Records of the sites.
 
     Returns:
-        The rows by site, shape (K,) each.
-        True if the ticks of all sites are recorded, shape (K,).
+        The rows of each site, in the order of `sites`, shape (K,) each.
+        True at instants at which these ticks of all sites are recorded, shape (K,).
     """
     rows = []
     recorded_by_site = []

@@ -75,7 +75,15 @@ def multiply_columns(matrix: Numbers, vector: Numbers) -> Numbers:
 
 
 def solve_columns(A: Numbers, b: Numbers) -> Numbers:
-    """Returns the solutions of A y = b, shapes (m, m, ...) and (m, ...)."""
+    """Solves the linear systems A y = b, one for each entry of the trailing axes.
+
+    Args:
+        A: Square matrices, shape (m, m, ...).
+        b: Right-hand sides, shape (m, ...).
+
+    Returns:
+        The solutions y, shape (m, ...).
+    """
     matrices = np.moveaxis(A, (0, 1), (-2, -1))
     right_sides = np.moveaxis(b, 0, -1)[..., np.newaxis]
     solutions = np.linalg.solve(matrices, right_sides)
@@ -84,15 +92,20 @@ def solve_columns(A: Numbers, b: Numbers) -> Numbers:
 
 @dataclass(frozen=True)
 class PlacedArm:
-    """The planar arm in given poses.
+    """Dynamics of the planar arm with two joints, evaluated in given poses.
 
-    All methods are analytic in every argument, so that a complex step gives exact derivatives.
+    The methods compute inertia, gravity and the other terms of the equation of motion. The
+    trailing axes of all arrays, written as "...", stand for the poses. All methods are analytic
+    in every argument, so that a complex step (a tiny imaginary change of an argument) gives
+    exact derivatives.
+
     They follow "Adaptive Control of Dual User Teleoperation with Time Delay and Dynamic
-    Uncertainty", Eq. (1)-(5) and (24). `theory.textbook_arm.PlacedChain` has the same methods.
+    Uncertainty", Eq. (1)-(5) and (24). `theory.textbook_arm.PlacedChain` has the same methods
+    for arms with more joints.
 
     Attributes:
         g_m_s2: Gravitational acceleration, in m/s^2.
-        lengths_m: Lengths of the two links.
+        lengths_m: Lengths of the two links, in m.
         q: Joint angles, shape (2, ...), in rad.
     """
 
@@ -104,7 +117,8 @@ class PlacedArm:
         """Returns the inertia matrix M(q), shape (2, 2, ...), in kg m^2.
 
         Args:
-            theta: Parameters, shape (5, ...).
+            theta: The five dynamic parameters of the arm, which combine masses, lengths and
+                inertias as in Eq. (24), shape (5, ...).
         """
         bend = theta[1] * np.cos(self.q[1])
         M_11 = theta[0] + 2.0 * bend
@@ -114,7 +128,16 @@ class PlacedArm:
         return np.array([[M_11, M_12], [M_12, M_22]])
 
     def coriolis_matrix(self, theta: Numbers, qd: Numbers) -> Numbers:
-        """Returns C(q, qd) by Christoffel symbols, shape (2, 2, ...), in kg m^2/s."""
+        """Returns the Coriolis matrix C(q, qd), shape (2, 2, ...), in kg m^2/s.
+
+        C(q, qd) qd is the torque of the Coriolis and centrifugal forces. C is built from
+        Christoffel symbols, so that M' - 2 C is skew-symmetric with the rate M' of the inertia
+        matrix.
+
+        Args:
+            theta: Dynamic parameters of the arm, shape (5, ...).
+            qd: Joint velocities, shape (2, ...), in rad/s.
+        """
         h = -theta[1] * np.sin(self.q[1])
         qd_1, qd_2 = qd
         C_11 = h * qd_2
@@ -125,7 +148,11 @@ class PlacedArm:
         return np.array([[C_11, C_12], [C_21, C_22]])
 
     def gravity_torque(self, theta: Numbers) -> Numbers:
-        """Returns the gravity torque G(q), shape (2, ...), in N m."""
+        """Returns the torque G(q) that holds the arm against gravity, shape (2, ...), in N m.
+
+        Args:
+            theta: Dynamic parameters of the arm, shape (5, ...).
+        """
         q_1, q_2 = self.q
         G_2 = theta[4] * self.g_m_s2 * np.cos(q_1 + q_2)
         G_1 = theta[3] * self.g_m_s2 * np.cos(q_1) + G_2
@@ -138,9 +165,16 @@ class PlacedArm:
         v: Numbers,
         a: Numbers,
     ) -> Numbers:
-        """Returns M(q) a + C(q, qd) v + G(q), which is Y theta of Eq. (12), in N m.
+        """Returns the torque that a reference motion requires, shape (2, ...), in N m.
 
-        Its shape is (2, ...).
+        It is M(q) a + C(q, qd) v + G(q), which equals Y theta in Eq. (12). M is the inertia
+        matrix, C the Coriolis matrix, G the gravity torque, and Y the regressor.
+
+        Args:
+            theta: Dynamic parameters of the arm, shape (5, ...).
+            qd: Joint velocities, shape (2, ...), in rad/s.
+            v: Reference velocities of the joints, shape (2, ...), in rad/s.
+            a: Reference accelerations of the joints, shape (2, ...), in rad/s^2.
         """
         M = self.inertia_matrix(theta)
         C = self.coriolis_matrix(theta, qd)
@@ -151,7 +185,13 @@ class PlacedArm:
     def regressor_matrix(self, qd: Numbers, v: Numbers, a: Numbers) -> Numbers:
         """Returns the regressor Y(q, qd, v, a) of Eq. (12), shape (2, 5, ...).
 
-        Column p is the torque for theta = e_p, the unit vector of parameter p.
+        The torque is linear in the parameters theta: the required torque is Y theta. Therefore
+        column p of Y is the torque of an arm whose parameter p is 1 while all others are 0.
+
+        Args:
+            qd: Joint velocities, shape (2, ...), in rad/s.
+            v: Reference velocities of the joints, shape (2, ...), in rad/s.
+            a: Reference accelerations of the joints, shape (2, ...), in rad/s^2.
         """
         columns = self.q.shape[1:]
         units = np.multiply.outer(np.eye(5), np.ones(columns))
@@ -159,13 +199,24 @@ class PlacedArm:
         return np.stack(torques, axis=1)
 
     def friction_torque(self, v: Numbers) -> Numbers:
-        """Returns zeros: this arm has no friction in its joints."""
+        """Returns zeros, shape (2, ...), because this arm has no friction in its joints.
+
+        The method exists so that the arm can take the place of a chain with friction.
+
+        Args:
+            v: Joint velocities, shape (2, ...), in rad/s. They determine only the shape.
+        """
         return 0.0 * v
 
     def joint_acceleration(self, theta: Numbers, qd: Numbers, torque: Numbers) -> Numbers:
-        """Returns the solution qdd of M qdd + C qd + G = torque, Eq. (8), in rad/s^2.
+        """Returns the joint accelerations under a torque, shape (2, ...), in rad/s^2.
 
-        Its shape is (2, ...).
+        The accelerations qdd solve the equation of motion M qdd + C qd + G = torque, Eq. (8).
+
+        Args:
+            theta: Dynamic parameters of the arm, shape (5, ...).
+            qd: Joint velocities, shape (2, ...), in rad/s.
+            torque: Total torque on the joints, shape (2, ...), in N m.
         """
         at_rest = np.zeros_like(qd)
         bias_torque = self.required_torque(theta, qd, qd, at_rest)
@@ -192,13 +243,15 @@ class PlacedArm:
 
 
 class EndEffectorRows(NamedTuple):
-    """Motion of the end effector over K rows. A chain has three coordinates instead of two.
+    """Motion of an end effector over K poses.
+
+    The planar arm moves in two coordinates, and a chain in three.
 
     Attributes:
-        position: Position, shape (K, 2) or (K, 3), in m.
+        position: Position in the frame of the base, shape (K, 2) or (K, 3), in m.
         speed: Velocity, shape (K, 2) or (K, 3), in m/s.
-        J: Jacobian, shape (K, 2, n) or (K, 3, n), in m/rad, with a row per coordinate and a
-            column per joint.
+        J: Jacobian of the position, shape (K, 2, n) or (K, 3, n), in m/rad. It has a row for
+            each coordinate and a column for each of the n joints.
     """
 
     position: Array
@@ -206,15 +259,19 @@ class EndEffectorRows(NamedTuple):
     J: Array
 
     def find_force(self, torque: Array, least: float = 1e-15) -> Array:
-        """Returns the smallest force at the end effector that explains a joint torque, in N.
+        """Finds the force at the end effector that best explains a joint torque.
+
+        The force F minimises the difference between the torque and J'F, where J is the
+        Jacobian. Among several such forces, the smallest is returned.
 
         Args:
             torque: Joint torque, shape (K, n), in N m.
-            least: Directions in which the end effector moves by less than this share of the
-                largest motion are treated as directions in which it cannot move.
+            least: Threshold for singular poses, relative to the largest singular value of J.
+                The end effector counts as immobile along directions with smaller singular
+                values.
 
         Returns:
-            Force, shape (K, 2) or (K, 3).
+            Force, shape (K, 2) or (K, 3), in N.
         """
         J_transposed = self.J.transpose(0, 2, 1)
         inverse = np.linalg.pinv(J_transposed, rcond=least)
@@ -223,12 +280,15 @@ class EndEffectorRows(NamedTuple):
 
 
 class PlanarArmRows(NamedTuple):
-    """The planar arm with two joints, for many poses. `ChainArmRows` has the same methods.
+    """The planar arm with two joints, for computations over K poses at once.
+
+    In contrast to `PlacedArm`, every array has a row for each pose. `ChainArmRows` has the same
+    methods for arms with more joints.
 
     Attributes:
-        theta: True parameters, Eq. (24), shape (5,).
+        theta: True dynamic parameters of the arm, Eq. (24), shape (5,).
         g: Gravitational acceleration, in m/s^2.
-        lengths_m: Lengths of the two links.
+        lengths_m: Lengths of the two links, in m.
     """
 
     theta: Array
@@ -237,24 +297,46 @@ class PlanarArmRows(NamedTuple):
 
     @property
     def task(self) -> None:
-        """None: the planar arm follows joint by joint."""
+        """The task that the end effector follows, which does not exist for this arm.
+
+        It is always None: the planar arm follows other arms joint by joint.
+        """
         return
 
     @property
     def gravity_parameters(self) -> NDArray[np.bool_]:
-        """True for the parameters of the gravity torque, theta_4 and theta_5, shape (5,)."""
+        """Marks the parameters on which the gravity torque depends, shape (5,).
+
+        The entries are True for theta_4 and theta_5, the products of masses and lever arms.
+        """
         return np.arange(5) >= 3
 
     def place(self, q: Array) -> PlacedArm:
-        """Returns the arm in the poses of all rows. The rows become columns."""
+        """Returns the arm in all K poses, for computations with one column per pose.
+
+        Args:
+            q: Joint angles, shape (K, 2), in rad.
+        """
         return PlacedArm(self.g, self.lengths_m, q.T)
 
     def weightless(self) -> "PlanarArmRows":
-        """Returns the same arm without gravity, whose torque is linear in v and a."""
+        """Returns the same arm without gravity.
+
+        The torque of such an arm is linear in the reference velocity v and acceleration a, so
+        that the effects of parts of a motion can be computed separately and added.
+        """
         return self._replace(g=0.0)
 
     def multiply_inertia(self, q: Array, x: Array) -> Array:
-        """Returns M(q) x, shape (K, 2)."""
+        """Returns the product M(q) x of the inertia matrix and a vector, in each of K poses.
+
+        Args:
+            q: Joint angles, shape (K, 2), in rad.
+            x: The vectors, such as velocities or accelerations, shape (K, 2).
+
+        Returns:
+            The products, shape (K, 2).
+        """
         M = self.place(q).inertia_matrix(self.theta)
         product = multiply_columns(M, x.T)
         return product.T
@@ -267,14 +349,19 @@ class PlanarArmRows(NamedTuple):
         v: Array,
         a: Array,
     ) -> Array:
-        """Returns the torque Y(q, qd, v, a) theta_hat, shape (K, 2), in N m.
+        """Returns the torque with which a law compensates the dynamics that it estimates.
+
+        It is Y(q, qd, v, a) theta_hat, with the regressor Y of Eq. (12).
 
         Args:
-            theta_hat: Parameter estimates, shape (K, 5).
+            theta_hat: Estimates of the arm's dynamic parameters, shape (K, 5).
             q: Joint angles, shape (K, 2), in rad.
             qd: Joint velocities, shape (K, 2), in rad/s.
             v: Reference velocities, shape (K, 2), in rad/s.
             a: Reference accelerations, shape (K, 2), in rad/s^2.
+
+        Returns:
+            Torque, shape (K, 2), in N m.
         """
         arm = self.place(q)
         torque = arm.required_torque(theta_hat.T, qd.T, v.T, a.T)
@@ -288,18 +375,48 @@ class PlanarArmRows(NamedTuple):
         a: Array,
         r: Array,
     ) -> Array:
-        """Returns Y'r of r = qd - v, with the regressor Y, shape (K, 5)."""
+        """Returns Y'r, the direction in which the adaptive law changes the parameter estimates.
+
+        Y' is the transposed regressor of Eq. (12), and r = qd - v the filtered error.
+
+        Args:
+            q: Joint angles, shape (K, 2), in rad.
+            qd: Joint velocities, shape (K, 2), in rad/s.
+            v: Reference velocities, shape (K, 2), in rad/s.
+            a: Reference accelerations, shape (K, 2), in rad/s^2.
+            r: Filtered errors, shape (K, 2), in rad/s.
+
+        Returns:
+            Gradient, shape (K, 5).
+        """
         arm = self.place(q)
         Y = arm.regressor_matrix(qd.T, v.T, a.T)
         gradient: Array = np.einsum("ijk,ki->kj", Y, r)
         return gradient
 
     def gravity_torque(self, q: Array) -> Array:
-        """Returns the gravity torque G(q), shape (K, 2), in N m."""
+        """Returns the torque G(q) that holds the arm against gravity, in N m.
+
+        Args:
+            q: Joint angles, shape (K, 2), in rad.
+
+        Returns:
+            Torque, shape (K, 2).
+        """
         return self.place(q).gravity_torque(self.theta).T
 
     def potential_energy(self, q: Array) -> Array:
-        """Returns g (theta_4 sin q_1 + theta_5 sin(q_1 + q_2)), shape (K,), in J."""
+        """Returns the potential energy of the arm in each of K poses, in J.
+
+        It is g (theta_4 sin q_1 + theta_5 sin(q_1 + q_2)), with the gravitational acceleration
+        g and the parameters theta_4 and theta_5. It is zero when the arm is level.
+
+        Args:
+            q: Joint angles, shape (K, 2), in rad.
+
+        Returns:
+            Energy, shape (K,).
+        """
         q_1, q_2 = q.T
         inner = self.theta[3] * np.sin(q_1)
         outer = self.theta[4] * np.sin(q_1 + q_2)
@@ -315,7 +432,12 @@ class PlanarArmRows(NamedTuple):
         return np.zeros_like(q)
 
     def place_end_effector(self, q: Array, qd: Array) -> EndEffectorRows:
-        """Returns the motion of the end effector in the plane."""
+        """Returns position, velocity and Jacobian of the end effector in each of K poses.
+
+        Args:
+            q: Joint angles, shape (K, 2), in rad.
+            qd: Joint velocities, shape (K, 2), in rad/s.
+        """
         arm = self.place(q)
         position = arm.end_effector_position()
         J = arm.position_jacobian()
@@ -327,7 +449,9 @@ class PlanarArmRows(NamedTuple):
         )
 
     def hanging_angle(self, q: Array) -> float:
-        """Returns the largest angle of a link to straight down, in rad.
+        """Returns the largest angle between a link and the direction straight down, in rad.
+
+        A small angle means that the arm hangs down, as it does after a fall.
 
         Args:
             q: Joint angles of one pose, shape (2,), in rad.
@@ -447,14 +571,18 @@ def _put_end_effectors(
 
 
 class ChainArmRows(NamedTuple):
-    """A chain of n joints, for many poses. The recursions of the simulation kernel compute it.
+    """A serial arm with n joints, for computations over K poses at once.
 
-    theta determines M, C and G. The inertia of the drives (armature) is part of M. The control
-    laws know friction and drives, so that their torques include them.
+    The arm is a chain of rigid links. Torques are computed by the same recursions from link to
+    link as in the simulation. The parameters theta determine the inertia matrix M, the Coriolis
+    matrix C and the gravity torque G of the links. The inertia of the drives (armature) and the
+    friction of the joints are known to the control laws, so that the torques of the laws
+    include them.
 
     Attributes:
-        theta: True parameters, shape (10 n,).
-        chain: Joints, gravity and end effector.
+        theta: True dynamic parameters, shape (10 n,): mass, first moment and inertia of each
+            link.
+        chain: Description of joints, gravity and end effector.
     """
 
     theta: Array
@@ -467,7 +595,11 @@ class ChainArmRows(NamedTuple):
 
     @property
     def gravity_parameters(self) -> NDArray[np.bool_]:
-        """True for the parameters of the gravity torque: m and m c of every link."""
+        """Marks the parameters on which the gravity torque depends, shape (10 n,).
+
+        The entries are True for the mass m and the first moment m c of every link, where c is
+        its centre of mass.
+        """
         return np.arange(len(self.theta)) % LINK_PARAMETERS < 4
 
     @property
@@ -488,18 +620,33 @@ class ChainArmRows(NamedTuple):
     def weightless(self) -> "ChainArmRows":
         """Returns the same chain without gravity and Coulomb friction.
 
-        The torque of this chain is linear in v and a.
+        The torque of this chain is linear in the reference velocity v and acceleration a, so
+        that the effects of parts of a motion can be computed separately and added.
         """
         bare = self._replace_in_joints(coulomb=0.0)
         weightless_chain = bare.chain._replace(gravity_m_s2=(0.0, 0.0, 0.0))
         return bare._replace(chain=weightless_chain)
 
     def without_drives(self) -> "ChainArmRows":
-        """Returns this chain without armature and friction, whose torque is linear in theta."""
+        """Returns the same chain without the inertia of the drives and without friction.
+
+        The torque of this chain is linear in the parameters theta, as estimation requires.
+        """
         return self._replace_in_joints(coulomb=0.0, viscous=0.0, armature_kg_m2=0.0)
 
     def multiply_inertia(self, q: Array, x: Array) -> Array:
-        """Returns (M(q) + armature) x, shape (K, n), by one recursion without gravity."""
+        """Returns the product of the inertia matrix, with drives, and a vector, in each pose.
+
+        The product (M(q) + armature) x is computed by one recursion along the chain without
+        gravity, so that the matrix itself is never formed.
+
+        Args:
+            q: Joint angles, shape (K, n), in rad.
+            x: The vectors, such as velocities or accelerations, shape (K, n).
+
+        Returns:
+            The products, shape (K, n).
+        """
         still = np.zeros_like(q)
         arm = self.weightless()
         return arm.law_torque(
@@ -518,14 +665,21 @@ class ChainArmRows(NamedTuple):
         v: Array,
         a: Array,
     ) -> Array:
-        """Returns Y(q, qd, v, a) theta_hat + armature a + friction(v), shape (K, n), in N m.
+        """Returns the torque with which a law compensates the dynamics that it estimates.
+
+        It is Y(q, qd, v, a) theta_hat + armature a + friction(v), with the regressor Y of the
+        links. The law knows the inertia of the drives (armature) and the friction.
 
         Args:
-            theta_hat: Parameter estimates, shape (K, 10 n), or (1, 10 n) for all rows.
+            theta_hat: Estimates of the dynamic parameters, shape (K, 10 n), or (1, 10 n) if
+                they are the same in all rows.
             q: Joint angles, shape (K, n), in rad.
             qd: Joint velocities, shape (K, n), in rad/s.
             v: Reference velocities, shape (K, n), in rad/s.
             a: Reference accelerations, shape (K, n), in rad/s^2.
+
+        Returns:
+            Torque, shape (K, n), in N m.
         """
         torque = np.zeros_like(q)
         _put_torques(
@@ -548,7 +702,20 @@ class ChainArmRows(NamedTuple):
         a: Array,
         r: Array,  # noqa: ARG002 - as of the planar arm
     ) -> Array:
-        """Returns Y'r of r = qd - v, with the regressor Y, shape (K, 10 n)."""
+        """Returns Y'r, the direction in which the adaptive law changes the parameter estimates.
+
+        Y' is the transposed regressor of Eq. (12), and r = qd - v the filtered error.
+
+        Args:
+            q: Joint angles, shape (K, n), in rad.
+            qd: Joint velocities, shape (K, n), in rad/s.
+            v: Reference velocities, shape (K, n), in rad/s.
+            a: Reference accelerations, shape (K, n), in rad/s^2.
+            r: Filtered errors, shape (K, n), in rad/s.
+
+        Returns:
+            Gradient, shape (K, 10 n).
+        """
         gradient = np.zeros((len(q), len(self.theta)))
         _put_gradients(
             chain=self._rows,
@@ -562,7 +729,14 @@ class ChainArmRows(NamedTuple):
         return gradient
 
     def gravity_torque(self, q: Array) -> Array:
-        """Returns the gravity torque G(q), shape (K, n), in N m."""
+        """Returns the torque G(q) that holds the chain against gravity, in N m.
+
+        Args:
+            q: Joint angles, shape (K, n), in rad.
+
+        Returns:
+            Torque, shape (K, n).
+        """
         still = np.zeros_like(q)
         return self.law_torque(
             theta_hat=self.theta[np.newaxis],
@@ -601,7 +775,14 @@ class ChainArmRows(NamedTuple):
         return energy
 
     def friction(self, speed: Array) -> Array:
-        """Returns the friction torque against a motion of the joints, shape (K, n), in N m."""
+        """Returns the torque of the joints' friction, which opposes a motion, in N m.
+
+        Args:
+            speed: Joint velocities, shape (K, n), in rad/s.
+
+        Returns:
+            Torque, shape (K, n), with the sign of the velocity.
+        """
         viscous = self._column("viscous") * speed
         # a smooth sign of the speed
         x = speed / COULOMB_SPEED
@@ -610,9 +791,17 @@ class ChainArmRows(NamedTuple):
         return viscous + coulomb
 
     def stop_torque(self, q: Array, qd: Array) -> Array:
-        """Returns the torque of the mechanical stops on the joints, shape (K, n), in N m.
+        """Returns the torque of the mechanical stops on the joints, in N m.
 
-        Stops are springs with dampers that never pull.
+        A stop limits the angle of a joint. It acts like a spring with a damper that pushes the
+        joint back and never pulls it.
+
+        Args:
+            q: Joint angles, shape (K, n), in rad.
+            qd: Joint velocities, shape (K, n), in rad/s.
+
+        Returns:
+            Torque, shape (K, n). Zero for joints that do not touch a stop.
         """
         stiffness = self._column("stop_stiffness")
         damping = self._column("stop_damping")
@@ -627,17 +816,32 @@ class ChainArmRows(NamedTuple):
         return lower_stop - upper_stop
 
     def place_end_effector(self, q: Array, qd: Array) -> EndEffectorRows:
-        """Returns the motion of the end effector in space, in the frame of the base."""
+        """Returns position, velocity and Jacobian of the end effector in each of K poses.
+
+        All are expressed in the frame of the base.
+
+        Args:
+            q: Joint angles, shape (K, n), in rad.
+            qd: Joint velocities, shape (K, n), in rad/s.
+        """
         position, full_J, _ = self._place(q)
         J = np.ascontiguousarray(full_J[:, :3])
         speed = np.einsum("kij,kj->ki", J, qd)
         return EndEffectorRows(position, speed, J)
 
     def jacobian_rate(self, q: Array, qd: Array) -> Array:
-        """Returns the derivative of the end effector's Jacobian along qd, shape (K, 3, n).
+        """Returns the time derivative of the Jacobian of the end effector's position.
 
-        Column i turns with all joints up to i. Motion of the joints after i moves the end
-        effector about the axis of joint i.
+        Column i of the Jacobian is the velocity of the end effector for unit speed of joint i.
+        It changes for two reasons: it turns with all joints up to i, and the joints after i
+        move the end effector relative to the axis of joint i.
+
+        Args:
+            q: Joint angles, shape (K, n), in rad.
+            qd: Joint velocities, shape (K, n), in rad/s.
+
+        Returns:
+            Derivative, shape (K, 3, n).
         """
         _, J, _ = self._place(q)
         per_joint = J.transpose(0, 2, 1)
@@ -655,10 +859,12 @@ class ChainArmRows(NamedTuple):
         return rate.transpose(0, 2, 1)
 
     def hanging_angle(self, q: Array) -> float:
-        """Returns the angle of a pendulum with the same share of its potential energy, in rad.
+        """Returns how far the chain is from hanging down, as the angle of a pendulum, in rad.
 
-        The least and the largest potential energy are searched joint by joint from this pose
-        on, without regard to stops. A chain without weight never hangs: its angle is infinite.
+        The pendulum has the same position between its least and its largest potential energy.
+        Both extremes of the chain's energy are searched joint by joint from this pose on,
+        without regard to mechanical stops. A chain without weight never hangs: its angle is
+        infinite.
 
         Args:
             q: Joint angles of one pose, shape (n,), in rad.
@@ -703,7 +909,12 @@ ArmRows = PlanarArmRows | ChainArmRows
 
 
 def build_arm_rows(scenario: Scenario, site: str) -> ArmRows:
-    """Returns the arm of a site, for computations over many poses."""
+    """Returns the model of a site's arm, for computations over many poses at once.
+
+    Args:
+        scenario: The description of the experiment, which defines the arm.
+        site: Name of the site, the process that runs the arm.
+    """
     model = scenario.arms[site]
     spec = scenario.sites[site]
     if model.chain is None:
@@ -717,14 +928,15 @@ def build_arm_rows(scenario: Scenario, site: str) -> ArmRows:
 
 
 def joint_positions_m(arm: ArmModel, q: Array) -> Array:
-    """Returns the positions of base, joints and end effector in K poses, in m.
+    """Returns the positions of the base, the joints and the end effector, for drawing an arm.
 
     Args:
         arm: The arm.
-        q: Joint angles, shape (K, n), in rad.
+        q: Joint angles in K poses, shape (K, n), in rad.
 
     Returns:
-        Positions, shape (K, L, 2), or (K, L, 3) for chains.
+        Positions of these L points in m, shape (K, L, 2) for the planar arm, or (K, L, 3) for
+        chains.
     """
     if arm.chain is not None:
         return _chain_positions_m(arm.chain, q)
@@ -779,12 +991,17 @@ DEPENDENT_SHARE = 1e-9
 
 
 class BaseParameters(NamedTuple):
-    """Combinations of parameters that torques determine: base = combination theta.
+    """Base parameters of an arm: the combinations of its parameters that torques determine.
+
+    No measurement of torque and motion can determine every dynamic parameter theta of a chain
+    by itself. It determines only the B linear combinations in the rows of `combination`, so
+    that the base parameters are combination theta.
 
     Attributes:
         kept: For each combination, the index of the parameter after which the combination is
             named, ascending, shape (B,).
-        combination: Factors of all parameters, 1 for the naming parameter, shape (B, P).
+        combination: Factors of all P parameters in each combination, shape (B, P). The factor
+            of the parameter that gives the name is 1.
     """
 
     kept: NDArray[np.int64]
@@ -792,11 +1009,17 @@ class BaseParameters(NamedTuple):
 
 
 def stack_regressors(arm: ChainArmRows, states: int) -> Array:
-    """Returns the regressors of random states, stacked, shape (states n, 10 n).
+    """Returns the regressors of random motions, stacked into one matrix.
+
+    The regressor maps the dynamic parameters to joint torques. The column space of this matrix
+    shows which combinations of parameters have an effect on torques.
 
     Args:
-        arm: The chain.
-        states: Number of random states.
+        arm: The chain with n joints.
+        states: Number of random states, each with angles, velocities and accelerations.
+
+    Returns:
+        Matrix, shape (states n, 10 n).
     """
     random = np.random.default_rng(1)
     n = len(arm.chain.joints)
@@ -855,13 +1078,14 @@ def _find_chain_base(chain: ChainSetup, learnt: tuple[bool, ...]) -> BaseParamet
 
 
 def find_base_parameters(arm: ArmRows, learnt: NDArray[np.bool_]) -> BaseParameters:
-    """Returns the combinations of learnt parameters that torques determine.
+    """Finds the combinations of the learnt parameters that torques determine.
 
-    The five parameters of the planar arm are base parameters already.
+    The five parameters of the planar arm are base parameters already, so that each is a
+    combination of its own.
 
     Args:
         arm: The arm.
-        learnt: True for each parameter that is learnt, shape (P,).
+        learnt: True for each parameter that the control law learns, shape (P,).
     """
     if isinstance(arm, ChainArmRows):
         return _find_chain_base(arm.chain, tuple(learnt.tolist()))
@@ -873,8 +1097,10 @@ def find_base_parameters(arm: ArmRows, learnt: NDArray[np.bool_]) -> BaseParamet
 def find_pseudo_inertias(theta: Array) -> Array:
     """Returns the pseudo-inertia of every link, shape (n, 4, 4).
 
-    It is [[S, m c], [m c', m]] with S = tr(I) / 2 - I, the mass m, the first moment m c and the
-    inertia I of the link.
+    This symmetric matrix contains the ten parameters of a link, and is positive definite if and
+    only if a rigid body can have these parameters. It is [[S, m c], [m c', m]] with S = tr(I) /
+    2 - I. Here m is the mass of the link, m c its first moment, I its inertia, and tr the
+    trace.
 
     Args:
         theta: Parameters of the links, shape (10 n,).
@@ -900,9 +1126,13 @@ def find_pseudo_inertias(theta: Array) -> Array:
 
 
 def find_consistent_links(theta: Array) -> list[bool]:
-    """Returns for each link whether a rigid body with its parameters can exist.
+    """Finds for each link whether a rigid body with its parameters can exist.
 
-    The condition is that the link's pseudo-inertia is positive definite (Wensing et al. 2018).
+    The condition is that the link's pseudo-inertia (see `find_pseudo_inertias`) is positive
+    definite (Wensing et al. 2018).
+
+    Args:
+        theta: Parameters of the links, shape (10 n,).
     """
     pseudo_inertias = find_pseudo_inertias(theta)
     eigenvalues = np.linalg.eigvalsh(pseudo_inertias)

@@ -21,11 +21,14 @@ class BodyTurns:
         self._signs: dict[int, QuaternionSigns] = {}
 
     def align(self, bodies: Sequence[float]) -> Array:
-        """Returns the poses of a frame with chosen signs, shape (7 b,).
+        """Returns the poses of a frame, with each quaternion near that of the frame before.
 
         Args:
             bodies: Pose of each of the b bodies: position x, y, z in m, and unit quaternion w,
                 x, y, z.
+
+        Returns:
+            The poses, shape (7 b,), in which the signs of some quaternions are reversed.
         """
         pose_length = POSITION + len(QUATERNION_AXES)
         numbers = np.array(bodies, dtype=np.float64)

@@ -49,17 +49,20 @@ EXTERNAL_SOURCES = ("hands", "walls", "stops")
 
 @dataclass(frozen=True)
 class SiteEnergy:
-    """Energies of a site over its K records and K - 1 tick periods.
+    """Everything that changes the energy function V_i of a site, over K records.
+
+    V_i is the part of a site i in the energy function of the stability proof. Its change over a
+    tick period must equal the energies listed here. There are K - 1 periods between K records.
 
     Attributes:
         motion: Motion of the site, from which its energies are computed.
-        parts: The energy function V_i of the site, by its parts.
-        dissipation: Dissipated energy in each period, by kind.
+        parts: The values of V_i, split into its parts.
+        dissipation: Dissipated energy in each period, by kind, such as damping.
         transfer: Energy in each period that the site gives to its followers, less the energy
             that it gets from the sites that it follows.
-        work: Work on the site in each period, by source.
-        sampling: Work in each period that arises because the continuous law is executed in
-            ticks.
+        work: Work on the site in each period, by source, such as the operator.
+        sampling: Work in each period that arises because the continuous control law is executed
+            only once per tick.
     """
 
     motion: SiteMotion
@@ -71,14 +74,21 @@ class SiteEnergy:
 
     @cached_property
     def judged(self) -> Bools:
-        """True if the energies of a period follow from records alone, shape (K - 1,)."""
+        """Marks the periods whose energies follow from records alone, shape (K - 1,).
+
+        Other periods contain interpolated motion and are not judged.
+        """
         known_views = [view.known for view in self.followed.values()]
         known = [self.motion.records.known_periods, *known_views]
         return np.asarray(np.logical_and.reduce(known))
 
     @cached_property
     def residual(self) -> Array:
-        """V_i - V_i(0) + dissipation + transfer - work over judged periods, shape (K,)."""
+        """The part of the change of V_i that no known energy explains, shape (K,), in J.
+
+        It is V_i - V_i(0) + dissipation + transfer - work, summed over the judged periods up to
+        each record. It includes the work of sampling.
+        """
         dissipated = [kind.total for kind in self.dissipation.values()]
         worked = [source.total for source in self.work.values()]
         change = np.diff(self.parts.total) + self.transfer.total
@@ -88,7 +98,7 @@ class SiteEnergy:
 
     @cached_property
     def unexplained(self) -> Array:
-        """The residual without the work of sampling, shape (K,), in J."""
+        """The residual less the work that arises from execution in ticks, shape (K,), in J."""
         sampling = _accumulate(self.sampling.total, self.judged)
         return self.residual - sampling
 
@@ -104,7 +114,10 @@ class SiteEnergy:
 
     @property
     def largest_age_s(self) -> float:
-        """The largest age of a sample in use, in s. 0 if no sample came into use."""
+        """The largest age of a state that the site received and used, in s.
+
+        It is 0 if the site never used a state of a peer.
+        """
         t_s = self.motion.records.t_s
         largest_s = []
         for view in self.followed.values():
@@ -115,9 +128,10 @@ class SiteEnergy:
 
     @property
     def begin_s(self) -> float:
-        """Time of the first tick at which V_i follows from records, in s.
+        """Time of the first tick at which V_i can be computed from records, in s.
 
-        It is infinite if there is no such tick.
+        V_i depends on the motion of the peers since the oldest sample in use. If there is no
+        such tick, the time is infinite.
         """
         known = []
         for view in self.followed.values():
@@ -205,15 +219,20 @@ def derive_site_energies(
     pasts: Mapping[str, PeerTrajectory],
     dominance: Callable[[str, Array], DominanceHistory],
 ) -> dict[str, SiteEnergy]:
-    """Computes the energies of sites over some records.
+    """Computes the energy functions V_i of sites, and what changes them, from some records.
 
     Every site must have an energy function.
 
     Args:
-        scenario: Scenario of the run.
-        records: Records of every site.
-        pasts: Motion of every site, back to the oldest sample that was in use.
-        dominance: Function that returns the dominance factors of a site at times in s.
+        scenario: The description of the experiment.
+        records: Records of every site, by name.
+        pasts: Motion of every site, back to the time at which the oldest sample in use was
+            sent.
+        dominance: Function that returns the dominance factors of a site, the weights with which
+            it follows its peers, at given times in s.
+
+    Returns:
+        The energies, by name of the site.
     """
     energies = {}
     constants = {site: energy_terms.derive_site_constants(scenario, site) for site in records}
@@ -248,7 +267,13 @@ def derive_site_energies(
 
 
 def find_common_times(energies: Mapping[str, SiteEnergy]) -> Array:
-    """Returns the ticks of the fastest site at which every V_i is known, shape (T,), in s."""
+    """Returns the times at which the energy functions V_i of all sites are known, in s.
+
+    They are ticks of the site with the highest tick rate, shape (T,).
+
+    Args:
+        energies: Energies of the sites, by name.
+    """
     records = [energy.motion.records for energy in energies.values()]
     fastest = max(records, key=lambda site_records: site_records.rate_hz)
     times = fastest.t_s
@@ -293,27 +318,35 @@ class EnergyBalance:
 
     @cached_property
     def V(self) -> Array:  # noqa: N802 - the paper's symbol
-        """The energy function, shape (T,), in J."""
+        """The energy function of the stability proof, summed over the sites, shape (T,), in J."""
         return _sum(self.parts)
 
     @cached_property
     def residual(self) -> Array:
-        """V - V(0) + dissipation - work over the judged periods, shape (T,), in J."""
+        """The part of the change of V that no known energy explains, shape (T,), in J.
+
+        It is V - V(0) + dissipation - work, summed over the judged periods, which are those
+        that rest on records alone. It includes the work of sampling.
+        """
         dissipation = _sum(self.dissipation)
         work = _sum(self.work)
         return self._accumulate_judged(self.V + dissipation - work)
 
     @cached_property
     def unexplained(self) -> Array:
-        """The residual less the work of sampling and the transfer, shape (T,), in J."""
+        """The residual less the work of sampling and the transferred energy, shape (T,), in J.
+
+        A large value means that the log contradicts the model, or that records are wrong.
+        """
         explained = self._accumulate_judged(self.sampling - self.transfer)
         return self.residual - explained
 
     @cached_property
     def unsupplied(self) -> Array:
-        """V less the work of operators and environments, over the judged periods, in J.
+        """The part of V that operators and environments did not supply, shape (T,), in J.
 
-        According to the theorem this quantity, of shape (T,), does not rise.
+        It is V less their work, summed over the judged periods. According to the stability
+        theorem it never rises.
         """
         rise = self._accumulate_judged(self.V - self.external_work)
         unsupplied: Array = self.V[0] + rise
@@ -335,13 +368,19 @@ class EnergyBalance:
 
     @property
     def external(self) -> dict[str, Array]:
-        """Work of operators, environments and stops, of sources that did any work."""
+        """Work of those operators, environments and stops that did any work, by source, in J.
+
+        Each entry has the shape (T,).
+        """
         sources = self._work_from_outside
         return {name: work for name, work in sources.items() if work.any()}
 
     @cached_property
     def scale(self) -> float:
-        """Reference for residuals: the largest V, or the largest work if larger, in J."""
+        """The energy to which errors of the balance are compared, in J.
+
+        It is the largest V, or the largest work if that is larger.
+        """
         energies = [self.V, *self.work.values()]
         return max(float(np.abs(energy).max()) for energy in energies)
 
@@ -353,13 +392,14 @@ class EnergyBalance:
 def compute_energy_balance(
     energies: Mapping[str, SiteEnergy], *, paper_weights: bool = False
 ) -> EnergyBalance:
-    """Computes the energy balance of a group of sites.
+    """Adds up the energies of several sites to the energy balance of the group.
 
     Args:
         energies: Energies of the sites in scenario order. No site may follow a site outside the
             group.
-        paper_weights: True to give all sites the same weight, as in the paper. The balance need
-            not close then.
+        paper_weights: True to give all sites the same weight in V, as in the paper. The
+            energies that sites transfer to each other may then not cancel, so that the balance
+            does not close.
     """
     times = find_common_times(energies)
     weights_by_grid = {}
@@ -559,9 +599,16 @@ def _interpolate_dominance(
 
 
 def find_dominance_matrices(energies: Mapping[str, SiteEnergy]) -> Array:
-    """Returns all matrices of dominance factors that were in force, shape (M, N, N).
+    """Finds all matrices of dominance factors that were in force during a run.
 
-    For a ramp, the matrices at its ends are returned.
+    Entry (i, j) is the weight with which site i follows site j. If the factors change gradually
+    along a ramp, only the matrices at the ends of the ramp are returned.
+
+    Args:
+        energies: Energies of the N sites, by name.
+
+    Returns:
+        The M matrices, shape (M, N, N).
     """
     motions = [energy.motion for energy in energies.values()]
     first_s = motions[0].records.t_s[:1]
@@ -579,7 +626,14 @@ def find_dominance_matrices(energies: Mapping[str, SiteEnergy]) -> Array:
 
 
 def rise_above_minimum(values: Array) -> Array:
-    """Returns how far a quantity is above its minimum up to each time, shape (T,)."""
+    """Returns how far a quantity is above its smallest earlier value, at each time.
+
+    Args:
+        values: Values of the quantity over time, shape (T,).
+
+    Returns:
+        The rise, shape (T,). It is 0 where a new minimum is reached.
+    """
     minimum_so_far = np.minimum.accumulate(values)
     return values - minimum_so_far
 

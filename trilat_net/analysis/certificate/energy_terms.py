@@ -58,24 +58,27 @@ JUMP_TOLERANCE = 1e-12
 
 
 class SiteConstants(NamedTuple):
-    """Constants of a site. Vectors per joint have the shape (n,), vectors per parameter (P,).
+    """Gains, limits and arm parameters of a site, as the energy function V_i needs them.
 
-    In task space, vectors per coordinate of the task have the shape (m,).
+    Vectors per joint have the shape (n,), and vectors per arm parameter (P,). In task space,
+    where a site follows with its end effector, vectors per coordinate of the task have the
+    shape (m,). The module's docstring defines r, e, ed and the gains.
 
     Attributes:
         arm: The arm with its true parameters.
-        Lambda: Gain of the error, in 1/s. Per coordinate in task space.
-        Kp: Gain of r, in N m s/rad.
+        Lambda: Gain of the error e, in 1/s. Per coordinate in task space.
+        Kp: Gain of the filtered error r, in N m s/rad.
         Kd: Gain of ed, in N m s/rad. In task space per coordinate, in N s/m.
-        Gamma: Adaptation gains.
+        Gamma: Gains of the adaptation of the estimates.
         low: Lower limits of the estimates.
         high: Upper limits of the estimates.
         tau_limit: Largest torque of a joint, in N m, shape () or (n,).
         axes: For each coordinate of the task, 1 if the site follows along it, else 0. Lambda
             and Kd are then 0 too. Empty in joint space.
-        rho: Largest robust torque of each joint, in N m.
+        rho: Largest robust torque of each joint, an additional torque against r, in N m. 0 if
+            the law has none.
         width: Value of r at which the robust torque is 0.71 of the largest, in rad/s.
-        friction: Share of the joints' friction that the law compensates.
+        friction: Fraction of the joints' friction that the law compensates.
         tau_rate: Largest rate of the torque of a joint, in N m/s, shape () or (n,).
     """
 
@@ -100,20 +103,32 @@ class SiteConstants(NamedTuple):
 
     @property
     def weighing_Kd(self) -> Array:  # noqa: N802 - the paper's symbol
-        """Kd as the weights of V use it, shape (m,). NaN along axes that are not followed."""
+        """The gain Kd from which the weights of the sites in V are computed, shape (m,).
+
+        It is NaN along axes that the site does not follow, where Kd has no meaning.
+        """
         if not self.axes:
             return self.Kd
         is_free = np.array(self.axes) == 0.0
         return np.where(is_free, np.nan, self.Kd)
 
     def robust_torque(self, r: Array) -> Array:
-        """Returns the robust torque that opposes r in addition to Kp r, shape (K, n)."""
+        """Returns the magnitude of the robust torque, which acts against r in addition to Kp r.
+
+        It limits the effect of disturbances that the adaptation cannot learn.
+
+        Args:
+            r: Filtered errors of the site, shape (K, n), in rad/s.
+
+        Returns:
+            Torque with the sign of r, shape (K, n), in N m.
+        """
         root = np.sqrt(r**2 + self.width**2)
         return self.rho * r / root
 
     @property
     def unknown_friction(self) -> Array:
-        """Share of each joint's friction that the law does not compensate, shape (n,)."""
+        """Fraction of each joint's friction that the law does not compensate, shape (n,)."""
         unit_speeds = np.ones((1, len(self.Kp)))
         friction_torque = self.arm.friction(unit_speeds)[0]
         has_friction = friction_torque != 0.0
@@ -127,10 +142,10 @@ class SiteConstants(NamedTuple):
 
 
 def derive_site_constants(scenario: Scenario, site: str) -> SiteConstants:
-    """Returns the constants of a site whose control law is the paper's.
+    """Collects the constants of a site whose control law is the adaptive law of the paper.
 
     Args:
-        scenario: Scenario of the run.
+        scenario: The description of the experiment, which defines the gains.
         site: Name of the site.
     """
     spec = scenario.sites[site]
@@ -155,19 +170,21 @@ def derive_site_constants(scenario: Scenario, site: str) -> SiteConstants:
 
 
 class PeriodEnds(NamedTuple):
-    """The motion of a site at both ends of all K - 1 tick periods, shape (K - 1, n) each.
+    """The state of a site at both ends of all K - 1 tick periods, shape (K - 1, n) each.
 
-    At the end of a period a new sample comes into use, and e jumps. `left` means the start of
-    the period, `right` its end before the jump, and `middle` half-way through the jump. In task
-    space, e and its jumps have m coordinates, in m.
+    At the end of a period a new sample of a peer comes into use, and the error e jumps. In the
+    names of the attributes, `left` means the start of the period, `right` its end before the
+    jump, and `middle` half-way through the jump. In task space, e and its jumps have m
+    coordinates, in m.
 
     Attributes:
         following: True if the site followed its peers at both ends, shape (K - 1,).
-        link: For each peer, the jump of e by the change of its sample's age, shape
-            (peers, K - 1, n), in rad.
-        dominance: Jump of e by a step of dominance factors, in rad.
-        rule: Jump of e by the rule for silent peers, in rad.
-        r_left: r = qd + Lambda e at the start, in rad/s.
+        link: For each peer, the jump of e because the age of its sample changes, shape (peers,
+            K - 1, n), in rad.
+        dominance: Jump of e because dominance factors change in a step, in rad.
+        rule: Jump of e because of the rule for silent peers, which replaces the reference when
+            samples stop arriving, in rad.
+        r_left: Filtered error r = qd + Lambda e at the start, in rad/s.
         r_right: r before the jump, in rad/s.
         r_middle: r half-way through the jump, in rad/s.
         e_middle: e half-way through the jump, in rad.
@@ -215,7 +232,10 @@ class SiteMotion:
 
     @cached_property
     def following(self) -> Following:
-        """The maps from an error of the reference to motion and torque of the joints."""
+        """The functions that turn errors of the reference into motion and torque of the joints.
+
+        They differ between sites that follow joint by joint and with the end effector.
+        """
         records = self.records
         c = self.constants
         return build_following(c.arm, records.q, records.qd, c.Lambda)
@@ -232,7 +252,10 @@ class SiteMotion:
 
     @cached_property
     def Yr(self) -> Array:  # noqa: N802 - the paper's symbol
-        """Y'r of Eq. (15), with the regressor Y of the arm's dynamics, shape (K, P)."""
+        """Y'r of Eq. (15), the direction in which the law adapts its estimates, shape (K, P).
+
+        Y' is the transposed regressor of the arm's dynamics, and r the filtered error.
+        """
         records = self.records
         v, a = self.following.compute_reference(slice(None), records.e, records.ed)
         return self.constants.arm.gradient(
@@ -245,7 +268,11 @@ class SiteMotion:
 
     @cached_property
     def mean_Yr(self) -> Array:  # noqa: N802 - the paper's symbol
-        """Y'r with which the law advances the estimate over a period, shape (K - 1, P)."""
+        """The value of Y'r with which the law advances its estimates over each tick period.
+
+        Its shape is (K - 1, P). Y is the regressor of the arm's dynamics, and r the filtered
+        error.
+        """
         if self.scheme is Scheme.DIGITAL:
             return self.Yr[:-1]
         Yr_left = self.Yr[:-1]
@@ -253,13 +280,13 @@ class SiteMotion:
         return 0.5 * (Yr_left + Yr_right)
 
     def law_torque(self, rows: Ints) -> Array:
-        """Returns the torque of the control law, Eq. (13), without its limit, in N m.
+        """Returns the torque that the control law of Eq. (13) demands, before it is limited.
 
         Args:
-            rows: Rows of the records, shape (K,).
+            rows: Rows of the records at which the law is evaluated, shape (K,).
 
         Returns:
-            Torque, shape (K, n).
+            Torque, shape (K, n), in N m.
         """
         return self.control_torque(
             rows,
@@ -342,7 +369,7 @@ class SiteMotion:
 
     @cached_property
     def limited(self) -> Bools:
-        """True for each torque at its limit or at its rate limit, shape (K, n)."""
+        """Marks each torque at its limit or at the limit of its rate, shape (K, n)."""
         low, high = self.torque_bounds
         c = self.constants
         tau = self.records.tau
@@ -440,7 +467,14 @@ class FunctionalParts(NamedTuple):
 
 
 def evaluate_functional(site: SiteMotion) -> FunctionalParts:
-    """Returns the energy function V_i of a site along its records."""
+    """Computes the energy function V_i of a site at each of its K records.
+
+    Args:
+        site: Motion of the site.
+
+    Returns:
+        The four parts of V_i, of which the sum is V_i.
+    """
     records = site.records
     c = site.constants
     r = site.r
@@ -479,12 +513,16 @@ def _energy_in_transit(c: SiteConstants, view: DelayedPeer) -> Array:
 
 
 class Increment(NamedTuple):
-    """An amount of energy in each tick period, shape (K - 1,) each, in J.
+    """An amount of energy in each tick period, computed by the trapezoid rule, in J.
+
+    Each attribute has the shape (K - 1,) for K records. At the end of a period, when a new
+    sample comes into use, the error e of the site jumps, so that some energies change in a
+    step.
 
     Attributes:
         left: Contribution of the start of the period to the trapezoid rule.
         right: Contribution of the end of the period, before the jump of e.
-        jump: Amount at the jump.
+        jump: Amount by which the energy changes at the jump.
     """
 
     left: Array
@@ -530,13 +568,19 @@ def _zero_increment(site: SiteMotion) -> Increment:
 
 
 def compute_dissipation(site: SiteMotion) -> dict[str, Increment]:
-    """Returns the energy that a site dissipates, by kind.
+    """Computes the energy that a site dissipates in each tick period, by kind.
+
+    The module's docstring defines the symbols. The kinds are the integrals of these powers:
 
     - damping: r'Kp r, and r times the robust torque;
-    - disagreement: 1/2 sum_j alpha_ij |qd_i - qd_j(t - T_ij)|^2;
+    - disagreement: 1/2 sum_j alpha_ij |qd_i - qd_j(t - T_ij)|^2, where T_ij is the delay from j
+      to i;
     - friction, of joints that have any: r'(friction(qd) - friction(qd - r));
-    - open axes, if not all sites follow along all axes: the energy that sites do not return to
+    - open axes, if not all sites follow along all axes: the power that sites do not return to
       each other along these axes.
+
+    Args:
+        site: Motion of the site.
     """
     records = site.records
     c = site.constants
@@ -582,14 +626,15 @@ def compute_dissipation(site: SiteMotion) -> dict[str, Increment]:
 
 
 def compute_transfer(site: SiteMotion, axes: Array) -> Increment:
-    """Returns the energy that a site gives to its followers, less the energy that it gets.
+    """Computes the energy that a site gives to its followers, less the energy that it gets.
 
-    It is int (1/2 |qd_i|^2 - 1/2 sum_j alpha_ij |qd_j|^2) dt, and cancels in the weighted sum
-    over all sites.
+    It is int (1/2 |qd_i|^2 - 1/2 sum_j alpha_ij |qd_j|^2) dt, with the velocities qd of the
+    sites, |x|^2 = x'Kd x, and the dominance factors alpha_ij with which site i follows peer j.
+    In the weighted sum over all sites these energies cancel.
 
     Args:
         site: Motion of the site.
-        axes: Weight of each axis, 1 or 0, shape (m,) or ().
+        axes: Weight of each axis, 1 to include it or 0, shape (m,) or ().
     """
     dominance = site.dominance
     c = site.constants._replace(Kd=axes * site.constants.Kd)
@@ -613,9 +658,13 @@ def _weighted_square(c: SiteConstants, x: Array) -> Array:
 
 
 def compute_work(site: SiteMotion) -> dict[str, Increment]:
-    """Returns the work on a site, by source.
+    """Computes the work on a site in each tick period, by source.
 
-    The sources are all terms besides the transfer that may raise V_i.
+    The sources are all effects that may raise the site's energy function V_i, except the
+    transfer between sites: operators, environments, links, changes and limits.
+
+    Args:
+        site: Motion of the site.
     """
     torque = site.torque
     records = site.records
@@ -643,12 +692,14 @@ def compute_work(site: SiteMotion) -> dict[str, Increment]:
 
 
 def torque_work(site: SiteMotion, now: Array, held: Array) -> Increment:
-    """Returns the work int r' tau_h dt of an external torque on the arm.
+    """Computes the work int r' tau_h dt of an external torque tau_h on the arm.
+
+    r is the filtered error of the site, on which the torque does work in the proof.
 
     Args:
         site: Motion of the site.
-        now: Part of the torque that follows the motion, shape (K, n), in N m.
-        held: Part of the torque that is held during every period, shape (K, n), in N m.
+        now: Part of the torque that follows the motion continuously, shape (K, n), in N m.
+        held: Part of the torque that is computed once per tick and held, shape (K, n), in N m.
     """
     torque_left = now[:-1] + held[:-1]
     torque_right = now[1:] + held[:-1]
@@ -682,14 +733,19 @@ def link_work(site: SiteMotion, j: int) -> Increment:
 
 
 def dominance_change_work(site: SiteMotion) -> Increment:
-    """Returns the work of a change of dominance factors on V_i, along a ramp or at a step.
+    """Computes the work of a change of dominance factors on V_i, along a ramp or at a step.
 
-    Along a ramp its power is
+    A dominance factor alpha_ij is the weight with which site i follows peer j. Along a ramp
+    with the rates alpha_ij', the power of this work is
 
-        1/2 sum_j alpha_ij' int qd_j' Kd qd_j ds + qd_i' Kd sum_j alpha_ij' q_j(t - T_ij).
+        1/2 sum_j alpha_ij' int qd_j' Kd qd_j ds + qd_i' Kd sum_j alpha_ij' q_j(t - T_ij),
 
-    The second term arises because ed, and with it the damping, contains the ramp. The work of a
-    change of the weights beta is not included.
+    with the delay T_ij and the gain Kd. The second term arises because ed, the derivative of
+    the error, and with it the damping, contains the ramp. The work of a change of the weights
+    beta of the sites in V is not included.
+
+    Args:
+        site: Motion of the site.
     """
     records = site.records
     c = site.constants
@@ -723,7 +779,13 @@ def dominance_change_work(site: SiteMotion) -> Increment:
 
 
 def stale_rule_work(site: SiteMotion) -> Increment:
-    """Returns the work of the rule for silent peers, while it replaces Eq. (6)."""
+    """Computes the work of the rule for silent peers, while it replaces the reference.
+
+    When samples of a peer stop arriving, the rule determines the reference instead of Eq. (6).
+
+    Args:
+        site: Motion of the site.
+    """
     dominance = site.dominance
     ends = site.ends
     ruled = ~ends.following
@@ -754,9 +816,14 @@ def stale_rule_work(site: SiteMotion) -> Increment:
 
 
 def torque_limit_work(site: SiteMotion) -> Increment:
-    """Returns the work int r' (tau - tau_law) dt of torques that are not those of the law.
+    """Computes the work of the part of the torque that the control law did not demand.
 
-    Torques differ from tau_law of Eq. (13) at their limits, and while the arm comes to rest.
+    It is int r' (tau - tau_law) dt, with the filtered error r, the recorded torque tau and the
+    torque tau_law of Eq. (13). They differ where a torque is limited, and while the arm comes
+    to rest.
+
+    Args:
+        site: Motion of the site.
     """
     records = site.records
     power = np.zeros(len(records.known))
@@ -770,9 +837,13 @@ def torque_limit_work(site: SiteMotion) -> Increment:
 
 
 def unknown_friction_work(site: SiteMotion) -> Increment:
-    """Returns the work -int r' friction(v) dt of friction that the law does not compensate.
+    """Computes the work of the part of the friction that the law does not compensate.
 
-    v = qd - r is the reference velocity.
+    It is -int r' friction(v) dt, with the filtered error r and the reference velocity v = qd -
+    r.
+
+    Args:
+        site: Motion of the site.
     """
     records = site.records
     c = site.constants
@@ -790,10 +861,16 @@ def unknown_friction_work(site: SiteMotion) -> Increment:
 
 
 def singular_pose_work(site: SiteMotion) -> Increment:
-    """Returns the work of the damping of the inverse Jacobian near singular poses.
+    """Computes the work that arises because motion is damped near singular poses.
 
-    The work is int (r'M(a - v') - (J r - x' - Lambda e)'Kd ed) dt. Both terms are zero if J J+
-    = I.
+    In task space the inverse of the Jacobian J is damped near singular poses, where the end
+    effector cannot move in some direction. The damped inverse J+ makes J J+ differ from the
+    unit matrix. The work is int (r'M(a - v') - (J r - x' - Lambda e)'Kd ed) dt, with the
+    reference velocity v of the joints, the acceleration a that the law uses for it, and the
+    velocity x' of the end effector. Both terms are zero if J J+ = I.
+
+    Args:
+        site: Motion of the site.
     """
     ends = site.ends
     e_right = 2.0 * ends.e_middle - site.records.e[1:]
@@ -844,13 +921,17 @@ def _singular_pose_power(
 
 
 def measure_torque_error(site: SiteMotion) -> Array:
-    """Returns how far the recorded torques are from the control law, Eq. (13), in N m.
+    """Computes how far the recorded torques are from those of the control law, Eq. (13).
 
-    The law is evaluated within its limits.
+    The law is evaluated from the recorded motion, within its limits. A large error means that
+    the site ran another law than the scenario states.
+
+    Args:
+        site: Motion of the site.
 
     Returns:
-        The largest difference of all joints, shape (K,). 0 in rows without a record, and while
-        the arm comes to rest.
+        The largest difference of all joints, shape (K,), in N m. It is 0 in rows without a
+        record, and while the arm comes to rest.
     """
     records = site.records
     low, high = site.torque_bounds
@@ -864,12 +945,16 @@ def measure_torque_error(site: SiteMotion) -> Array:
 
 
 def estimate_work(site: SiteMotion) -> Increment:
-    """Returns the work of estimates that do not follow the adaptive law, Eq. (15).
+    """Computes the work of parameter estimates that do not follow the adaptive law, Eq. (15).
 
-    Such estimates are held at the limits of their box, or are not adapted at all. The box
-    reduces 1/2 (theta_hat - theta)' Gamma^-1 (theta_hat - theta), since it contains theta. For
-    a parameter that is not adapted, or not while the arm comes to rest, no term cancels the
-    power r' Y (theta_hat - theta).
+    Such estimates are held at the limits of their permitted range, or are not adapted at all. A
+    limit only reduces the energy 1/2 (theta_hat - theta)' Gamma^-1 (theta_hat - theta), since
+    the range contains the true parameters theta. For a parameter that is not adapted, or not
+    while the arm comes to rest, no term of V_i cancels the power r' Y (theta_hat - theta),
+    where Y is the regressor and r the filtered error.
+
+    Args:
+        site: Motion of the site.
     """
     records = site.records
     c = site.constants
