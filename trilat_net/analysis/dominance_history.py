@@ -33,13 +33,17 @@ RAMP_TIME_TOLERANCE_S = 5e-10
 
 
 class DominanceHistory(NamedTuple):
-    """Dominance factors with which a site follows its P peers, in scenario order, over time.
+    """Dominance factors with which a site follows its P peers, over time.
+
+    A dominance factor is the weight with which an arm follows a peer, another site. The peers
+    are in scenario order.
 
     Attributes:
         alpha: Factors at every row, shape (K, P).
         rate: Their time derivatives as the controller takes them into account, shape (K, P), in
             1/s.
-        before: Factors at the end of every period, before a step there, shape (K - 1, P).
+        before: Factors at the end of every tick period, before they change in a step there,
+            shape (K - 1, P).
     """
 
     alpha: Array
@@ -57,8 +61,9 @@ class DominanceHistory(NamedTuple):
 def trace_dominance(log: Log, site: str, t_s: Array) -> DominanceHistory:
     """Returns the dominance factors of a site at successive ticks.
 
-    If the site lost a peer and continues without it, the factors of the others are scaled to
-    the sum 1.
+    They change by the timeline of the scenario and by commands during the run. If the site lost
+    a peer and continues without it, the factors of the others are scaled so that their sum is
+    1.
 
     Args:
         log: The log of the run.
@@ -91,9 +96,14 @@ def trace_dominance(log: Log, site: str, t_s: Array) -> DominanceHistory:
 
 
 def list_ramps(log: Log, site: str) -> tuple[Array, list[DominanceRamp]]:
-    """Returns the dominance factors of a site at the start, and all of their later changes.
+    """Lists how the dominance factors of a site were planned and commanded to change.
 
-    The changes are ramps: those of the scenario and those of the recorded commands.
+    Every change is a ramp from the old to the new factors. A step is a ramp without length.
+    Both the changes of the scenario and the recorded commands are included.
+
+    Args:
+        log: The log of the run.
+        site: Name of the site.
 
     Returns:
         The factors at the start, shape (P,).
@@ -110,11 +120,16 @@ def list_ramps(log: Log, site: str) -> tuple[Array, list[DominanceRamp]]:
 
 
 def find_users(scenario: Scenario) -> tuple[str, list[str]]:
-    """Finds the shared slave of a scenario and its users.
+    """Finds the slave that several users control together, and the users.
+
+    A user moves the arm of a master.
+
+    Args:
+        scenario: The description of the experiment.
 
     Returns:
         Name of the first slave. Empty if there is none.
-        Names of all masters, at which the users are.
+        Names of all masters, each of which stands for its user.
     """
     slaves = []
     masters = []
@@ -128,15 +143,17 @@ def find_users(scenario: Scenario) -> tuple[str, list[str]]:
 
 
 class UserShares(NamedTuple):
-    """Dominance factors of the users of a slave, over K times.
+    """How a slave divides its motion between its users, at K times.
 
-    A program holds the arm of one user. While another user leads, somebody intervenes.
+    A slave follows the master of each user with a weight, the dominance factor. In some
+    experiments a program moves the arm of one user. While another user leads, a person
+    intervenes.
 
     Attributes:
         shares: The slave's dominance factors for its U users, shape (K, U).
-        leader: Index of the user with the largest factor, shape (K,). It is the program's user
-            if no factor is larger.
-        program: Index of the user whose arm the program holds.
+        leader: Index of the user with the largest factor, shape (K,). If no factor is larger
+            than the others, it is the index of the program's user.
+        program: Index of the user whose arm the program moves.
     """
 
     shares: Array
@@ -145,12 +162,14 @@ class UserShares(NamedTuple):
 
 
 def find_user_shares(scenario: Scenario, alpha: Array, program: str = "") -> UserShares:
-    """Returns the dominance factors of the users in the slave of `find_users`, and who leads.
+    """Returns how the slave of a scenario divides its motion between its users.
+
+    `find_users` determines the slave and the users.
 
     Args:
-        scenario: Scenario of the run.
-        alpha: Dominance factors of the slave, shape (K, P).
-        program: Name of the user whose arm a program holds. By default the last user.
+        scenario: The description of the experiment.
+        alpha: Dominance factors of the slave for its P peers, shape (K, P).
+        program: Name of the user whose arm a program moves. By default the last user.
 
     Raises:
         UsageError: There is no such user.
@@ -173,7 +192,9 @@ def find_user_shares(scenario: Scenario, alpha: Array, program: str = "") -> Use
 
 
 def find_lost_peers(log: Log, site: str, t_s: Array) -> NDArray[np.bool_]:
-    """Finds the times at which a site continued without a peer, see `core.lost_peers`.
+    """Finds the times at which a site continued without a peer that it had lost.
+
+    A peer is lost if it leaves the session or stays silent, see `core.lost_peers`.
 
     Args:
         log: The log of the run.
@@ -181,7 +202,7 @@ def find_lost_peers(log: Log, site: str, t_s: Array) -> NDArray[np.bool_]:
         t_s: Times, shape (K,), in s.
 
     Returns:
-        True for each lost peer, shape (K, P).
+        True while the peer is lost, shape (K, P), with a column for each of the P peers.
     """
     part = log[site]
     peer_count = len(part.peers)
@@ -239,18 +260,18 @@ def drop_finished_ramps(
     ramps: Sequence[DominanceRamp],
     from_s: float,
 ) -> tuple[Array, list[DominanceRamp]]:
-    """Returns fewer ramps with which the factors are the same from a time on.
+    """Simplifies the history of dominance factors before a given time.
 
-    Ramps that have finished before this time are left out, and the start factors are changed
-    accordingly.
+    Ramps that have finished before this time are left out, and the start factors are changed so
+    that the factors from this time on stay the same.
 
     Args:
         start: Factors at the start of the session, shape (P,).
         ramps: All ramps.
-        from_s: Time from which the factors must be the same, in s.
+        from_s: Time from which the factors must stay the same, in s.
 
     Returns:
-        The new start factors.
+        The new start factors, shape (P,).
         The remaining ramps.
     """
     sorted_ramps = sorted(ramps, key=lambda ramp: ramp.start_ns)
@@ -272,13 +293,13 @@ def evaluate_ramps(
     t_s: Array,
     h_s: float,
 ) -> DominanceHistory:
-    """Returns the dominance factors over time.
+    """Computes dominance factors over time from their start values and their changes.
 
     Args:
         start: Factors at the start of the session, shape (P,).
-        ramps: Ramps of the factors.
-        t_s: Ascending times, one period apart, shape (K,), in s.
-        h_s: The period, in s.
+        ramps: Changes of the factors.
+        t_s: Ascending times, one tick period apart, shape (K,), in s.
+        h_s: The tick period, in s.
     """
     alpha = np.tile(start, (len(t_s), 1))
     rate = np.zeros((len(t_s), len(start)))
@@ -320,16 +341,19 @@ KD_SHAPE_TOLERANCE = 1e-9
 
 
 class LyapunovWeights(NamedTuple):
-    """The weights beta of the sites in the energy function V, as far as they exist.
+    """Weights beta of the N sites in the energy function V of the stability proof.
+
+    With these weights the energies that sites transfer to each other cancel in V. They follow
+    from the matrix alpha of the dominance factors and from the gains Kd of the sites.
 
     Attributes:
         beta: Weight of each site, shape (N,), with the sum N. With equal dominance factors each
             weight is 1, as in the paper.
-        groups: The closed groups of sites, as tuples of indices: no site of a group follows a
-            site outside. If there is a single group, pi is unique, though some of its entries
-            may be 0.
-        scales: c_i of Kd_i = c_i Kbar, with 1 for the first site, shape (N,). None if the Kd
-            differ in shape.
+        groups: Groups of sites that follow nobody outside their group, as tuples of indices.
+            With a single group the left eigenvector pi of alpha is unique, though some of its
+            entries may be 0. With several groups beta is not unique.
+        scales: Factors c_i such that Kd_i = c_i Kbar with a common Kbar, and c_i = 1 for the
+            first site, shape (N,). None if no such factors exist.
     """
 
     beta: Array
@@ -360,13 +384,17 @@ def find_closed_groups(alpha: Array) -> tuple[tuple[int, ...], ...]:
 
 
 def left_perron_vector(alpha: Array) -> Array:
-    """Returns the vector pi >= 0 with pi' alpha = pi' and the sum 1, shape (N,).
+    """Returns the left eigenvector pi of the dominance factors for the eigenvalue 1.
 
-    pi is 0 for sites outside closed groups. With several closed groups pi is not unique: each
-    group then counts by its number of sites.
+    It satisfies pi >= 0, pi' alpha = pi', and its sum is 1. A closed group is a group of sites
+    that follow nobody outside the group. pi is 0 for sites outside closed groups. With several
+    closed groups pi is not unique: each group then counts by its number of sites.
 
     Args:
         alpha: Matrix of the dominance factors, shape (N, N).
+
+    Returns:
+        The vector, shape (N,).
     """
     pi = np.zeros(len(alpha))
     groups = find_closed_groups(alpha)
@@ -379,15 +407,16 @@ def left_perron_vector(alpha: Array) -> Array:
 
 
 def find_kd_scales(Kd: Array) -> Array | None:
-    """Returns the scalars c_i of Kd_i = c_i Kbar with c_1 = 1.
+    """Finds the factors c_i by which the gains Kd of the sites differ.
 
-    If all Kd are zero, nothing couples the sites, and any scalars are right: they are 1.
+    They satisfy Kd_i = c_i Kbar with a common Kbar, and c_1 = 1. If all gains are zero, nothing
+    couples the sites, and any factors are right: they are 1.
 
     Args:
-        Kd: Gains, shape (N, n). NaN along an axis that a site does not follow.
+        Kd: Gains of the N sites, shape (N, n). NaN along an axis that a site does not follow.
 
     Returns:
-        The scalars, shape (N,). None if there are none.
+        The factors, shape (N,). None if the gains do not differ by factors only.
     """
     if not np.nan_to_num(Kd).any():
         return np.ones(len(Kd))
@@ -408,13 +437,15 @@ def find_kd_scales(Kd: Array) -> Array | None:
 
 
 def compute_lyapunov_weights(alpha: Array, Kd: Array) -> LyapunovWeights:
-    """Computes the weights beta_i = pi_i / c_i of the sites in the energy function.
+    """Computes the weights of the sites in the energy function V of the stability proof.
 
-    If the Kd differ in shape, pi alone is returned as beta. V may then rise.
+    They are beta_i = pi_i / c_i, scaled to the sum N. pi is the left eigenvector of the
+    dominance factors (`left_perron_vector`), and c_i are the factors between the gains
+    (`find_kd_scales`). If no such factors exist, pi alone determines beta, and V may rise.
 
     Args:
         alpha: Matrix of the dominance factors, shape (N, N).
-        Kd: Gains, shape (N, n).
+        Kd: Gains of the N sites, shape (N, n).
     """
     pi = left_perron_vector(alpha)
     scales = find_kd_scales(Kd)

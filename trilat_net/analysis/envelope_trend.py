@@ -73,13 +73,15 @@ class EnvelopeTrend(StrEnum):
 class EnvelopeFit(NamedTuple):
     """Trend of an envelope over the second half of a run, computed by `fit_envelopes`.
 
+    An envelope is a bound that an oscillating quantity touches in its maxima.
+
     Attributes:
-        trend: Class of the trend.
+        trend: Class of the trend, such as growing or decaying.
         rate_per_s: Slope of the logarithm of the maxima, in 1/s: the envelope is proportional
             to exp(rate t). NaN if there are too few points.
-        calm: True if two conditions hold: the envelope falls, or the upper bound excludes a
-            rise by a quarter within the half; and the last quarter's maximum is at most 1.5
-            times the maximum of the quarter before.
+        calm: True if the envelope is not about to grow. First, it falls, or the upper bound of
+            its rate excludes a rise by a quarter within the half. Second, the maximum of the
+            last quarter is at most 1.5 times the maximum of the quarter before.
     """
 
     trend: EnvelopeTrend
@@ -108,17 +110,20 @@ def fit_envelopes(
     *,
     falls_first: bool = False,
 ) -> list[EnvelopeFit]:
-    """Determines the trends of several envelopes, as the module's docstring defines them.
+    """Determines whether envelopes grow, decay or neither, over the second half of a run.
+
+    The module's docstring defines the classes.
 
     Args:
         t_s: Ascending times, shape (K,), in s.
-        values: The envelopes, for example the largest |e| since the time before, shape (K, C).
-        floor: Floor of the envelopes, in place of `FLOOR_RAD`.
+        values: The envelopes, such as the largest error |e| since the time before, shape (K,
+            C).
+        floor: Value below which an envelope counts as zero, in place of `FLOOR_RAD`.
         falls_first: True if an envelope that rises after a fall counts as growing too, because
-            other modes are known to cause the fall.
+            the fall is known to have another cause than the rise.
 
     Returns:
-        The trend of each envelope.
+        The trend of each of the C envelopes.
     """
     envelopes = values.shape[1]
     no_fit = EnvelopeFit(EnvelopeTrend.UNDECIDED, math.nan)

@@ -69,10 +69,14 @@ def find_task_reference(
 
 
 class JointFollowing(NamedTuple):
-    """The maps of a site that follows joint by joint. `TaskFollowing` has the same methods.
+    """How a site that follows joint by joint turns errors into motion and torque.
+
+    Its coordinates are the joint angles, so that every function is a product with a gain, or
+    the identity. `TaskFollowing` has the same methods for sites that follow with the end
+    effector. In all methods `rows` selects the K rows of the records that are evaluated.
 
     Attributes:
-        Lambda: Gain of the error, shape (n,), in 1/s.
+        Lambda: Gain of the synchronisation error e, shape (n,), in 1/s.
     """
 
     Lambda: Array
@@ -83,19 +87,43 @@ class JointFollowing(NamedTuple):
         e: Array,
         ed: Array,
     ) -> tuple[Array, Array]:
-        """Returns the reference velocity -Lambda e and its derivative, shape (K, n)."""
+        """Returns the reference velocity v = -Lambda e of the joints, and its derivative.
+
+        Args:
+            rows: Rows of the records. Not needed here, as the result depends on no pose.
+            e: Synchronisation errors, shape (K, n), in rad.
+            ed: Their derivatives, shape (K, n), in rad/s.
+
+        Returns:
+            Reference velocity, shape (K, n), in rad/s.
+            Its derivative, shape (K, n), in rad/s^2.
+        """
         return -self.Lambda * e, -self.Lambda * ed
 
     def compute_jump_of_r(self, rows: Rows, de: Array) -> Array:  # noqa: ARG002
-        """Returns the jump of r due to a jump of e, shape (K, n)."""
+        """Returns the jump of the filtered error r when the error e jumps, shape (K, n).
+
+        As r = qd + Lambda e, the jump is Lambda de.
+
+        Args:
+            rows: Rows of the records. Not needed here, as the result depends on no pose.
+            de: Jumps of e, shape (K, n), in rad.
+        """
         return self.Lambda * de
 
     def compute_joint_torque(self, rows: Rows, force: Array) -> Array:  # noqa: ARG002
-        """Returns the joint torque of a force along the shared coordinates, shape (K, n)."""
+        """Returns the joint torque of a force along the shared coordinates, shape (K, n).
+
+        The shared coordinates are the joint angles here, so that the force is the torque.
+
+        Args:
+            rows: Rows of the records. Not needed here, as the result depends on no pose.
+            force: Generalised force, shape (K, n), in N m.
+        """
         return force
 
     def without_posture(self) -> "JointFollowing":
-        """Returns the same maps: a site that follows joint by joint has no posture."""
+        """Returns this object, because joint-by-joint following has no preferred posture."""
         return self
 
     def compute_damping_deviation(
@@ -110,15 +138,21 @@ class JointFollowing(NamedTuple):
 
 @dataclass(frozen=True)
 class TaskFollowing:
-    """The maps of a site that follows with its end effector, over K rows.
+    """How a site that follows with its end effector turns errors into motion and torque.
+
+    The arm has n joints, and its end effector follows along some of the m coordinates of the
+    task. Joints that the task leaves free move towards a preferred posture. Near singular
+    poses, where the end effector cannot move in some direction, the inverse of the Jacobian is
+    damped. Arrays have a row for each of the K records.
 
     Attributes:
-        Lambda: Gain of the error, 0 along an axis that the site does not follow, shape (m,).
+        Lambda: Gain of the error, shape (m,), in 1/s. 0 along an axis that the site does not
+            follow.
         J: Jacobian of the followed axes, shape (K, m, n).
         Jd: Time derivative of the Jacobian, shape (K, m, n).
-        psi: Velocity towards the preferred posture, shape (K, n), in rad/s.
-        psi_rate: Derivative of psi, shape (K, n).
-        inverse: Inverse of J J' with its damping, shape (K, m, m).
+        psi: Velocity of the joints towards the preferred posture, shape (K, n), in rad/s.
+        psi_rate: Derivative of psi, shape (K, n), in rad/s^2.
+        inverse: Inverse of J J' + damping, shape (K, m, m).
         damping: Damping near singular poses, shape (K,), in m^2.
         damping_rate: Derivative of the damping, shape (K,), in m^2/s.
         least: Lower bound of the least singular value of J, from which the damping is computed,
@@ -141,7 +175,19 @@ class TaskFollowing:
         return y
 
     def compute_reference(self, rows: Rows, e: Array, ed: Array) -> tuple[Array, Array]:
-        """Returns the reference velocity v of the joints and its derivative a, shape (K, n)."""
+        """Returns the reference velocity of the joints, and its derivative.
+
+        `find_task_reference` has the equations.
+
+        Args:
+            rows: Rows of the records whose pose is used.
+            e: Synchronisation errors of the end effector, shape (K, m).
+            ed: Their derivatives, shape (K, m).
+
+        Returns:
+            Reference velocity v, shape (K, n), in rad/s.
+            Its derivative a, shape (K, n), in rad/s^2.
+        """
         # `find_task_reference` has the rows on the last axis
         inverse = np.moveaxis(self.inverse[rows], 0, -1)
         psi = self.psi[rows]
@@ -158,12 +204,24 @@ class TaskFollowing:
         return v.T, a.T
 
     def compute_jump_of_r(self, rows: Rows, de: Array) -> Array:
-        """Returns the jump J+ Lambda de of r due to a jump de of e, shape (K, n)."""
+        """Returns the jump of the filtered error r when the error e jumps, shape (K, n).
+
+        It is J+ Lambda de, with the damped inverse J+ of the Jacobian.
+
+        Args:
+            rows: Rows of the records whose pose is used.
+            de: Jumps of e, shape (K, m).
+        """
         y = self._solve(rows, self.Lambda * de)
         return self.compute_joint_torque(rows, y)
 
     def compute_joint_torque(self, rows: Rows, force: Array) -> Array:
-        """Returns the joint torque J'f of a force f at the end effector, shape (K, n)."""
+        """Returns the joint torque J'f of a force f at the end effector, shape (K, n), in N m.
+
+        Args:
+            rows: Rows of the records whose pose is used.
+            force: Force along the followed axes, shape (K, m), in N.
+        """
         torque: Array = np.einsum("kij,ki->kj", self.J[rows], force)
         return torque
 
@@ -180,12 +238,23 @@ class TaskFollowing:
         return self._solve(slice(None), along_axes)
 
     def without_posture(self) -> "TaskFollowing":
-        """Returns the same maps without the motion to the posture: linear in e and ed."""
+        """Returns the same functions without the motion towards the preferred posture.
+
+        The reference velocity is then linear in the errors e and ed.
+        """
         still = np.zeros_like(self.psi)
         return replace(self, psi=still, psi_rate=still)
 
     def compute_damping_deviation(self, rows: Rows, e: Array) -> tuple[Array, Array]:
-        """Returns the effect of the damping near singular poses. It is zero elsewhere.
+        """Returns what the damping near singular poses changes in the equations of the proof.
+
+        Without damping, J r = x' + Lambda e and a = v' hold exactly, where r is the filtered
+        error, x' the velocity of the end effector, v the reference velocity of the joints and a
+        the acceleration that the law uses for it. The result is zero away from singular poses.
+
+        Args:
+            rows: Rows of the records whose pose is used.
+            e: Synchronisation errors of the end effector, shape (K, m).
 
         Returns:
             J r - x' - Lambda e, shape (K, m).
@@ -217,10 +286,10 @@ def build_following(
     qd: Array,
     Lambda: Array,
 ) -> Following:
-    """Returns the maps of a site over its joint motion.
+    """Builds the functions that turn a site's errors into motion and torque of its joints.
 
     Args:
-        arm: Arm of the site.
+        arm: Arm of the site. Its task decides whether the site follows with the end effector.
         q: Joint angles, shape (K, n), in rad.
         qd: Joint velocities, shape (K, n), in rad/s.
         Lambda: Gain of the error, 0 along axes that are not followed, shape (n,) or (m,).

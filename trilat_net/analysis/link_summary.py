@@ -38,17 +38,20 @@ from .timeline import StatedModel, list_changes, list_stated_models
 
 
 class PredictedDelivery(NamedTuple):
-    """Delivery of the samples 0 to M - 1 of a link, as the delay model of the link predicts it.
+    """Fate of the first M samples of a link, as the delay model of the link predicts it.
 
-    Times are in ns after the start of the session.
+    A sample is the state that a site publishes in one tick. The delay model of the scenario
+    makes the network late, lossy or out of order in a repeatable way, so that the prediction
+    can be compared with the records. Times are in ns after the start of the session.
 
     Attributes:
         stamp_ns: Times at which the peer sent the samples, shape (M,).
-        due_ns: Times at which the samples come into use, shape (M,). `LOST` for a lost sample.
+        due_ns: Times at which the samples come into use at the receiver, shape (M,). `LOST` for
+            a lost sample.
         drawn_ns: Times at which they would come into use because of the delay alone, without
             duplicates, reordering and play-out buffer, shape (M,).
-        measured: True if the delay is that of the real network, so that a sample is due as soon
-            as it arrives, shape (M,).
+        measured: True if the delay is that of the real network, so that a sample comes into use
+            as soon as it arrives, shape (M,).
         copies: Number of duplicates that the link makes.
     """
 
@@ -66,20 +69,23 @@ class PredictedDelivery(NamedTuple):
 
     @property
     def drawn_ms(self) -> Array:
-        """Delays that the program adds to the samples that are not lost, in ms."""
+        """Delays that the program adds to the samples which are not lost, in ms.
+
+        There is one entry for each of these samples.
+        """
         delivered = ~self.lost & ~self.measured
         return (self.drawn_ns[delivered] - self.stamp_ns[delivered]) / 1e6
 
     def release(self, rate_hz: int) -> Ints:
-        """Returns the receiver's ticks at which the samples come into use, shape (M,).
+        """Computes the ticks of the receiver in which the samples should come into use.
 
-        A sample comes into use at this tick if it has arrived by then.
+        A sample that arrives too late comes into use in a later tick, or never.
 
         Args:
-            rate_hz: Tick rate of the receiver.
+            rate_hz: Tick rate of the receiver, in Hz.
 
         Returns:
-            The ticks. `LOST` for a lost sample.
+            The tick of each sample, shape (M,). `LOST` for a lost sample.
         """
         ticks = first_ticks(np.maximum(self.due_ns, self.stamp_ns + 1), rate_hz)
         return np.where(self.lost, LOST, ticks)
@@ -137,14 +143,14 @@ def predict_delivery(
 
 
 class Arrivals(NamedTuple):
-    """Arrivals of samples over a link, in the order of the records.
+    """Samples that arrived at a site over a link, in the order in which they arrived.
 
     Attributes:
         tick: Ticks in which the receiver accepted the samples, shape (A,).
-        sample: Numbers of the samples, shape (A,).
+        sample: Numbers of the samples, counted by the sender from 0, shape (A,).
         delay_us: One-way delays in the records, shape (A,), in microseconds.
-        refused: Number of further arrivals whose time stamp is out of range, or whose tick the
-            sender never executes.
+        refused: Number of further arrivals that the receiver rejected, because their time stamp
+            is out of range or the sender never executes their tick.
     """
 
     tick: Ints
@@ -154,7 +160,10 @@ class Arrivals(NamedTuple):
 
     @property
     def first(self) -> "Arrivals":
-        """The first arrival of each sample, ordered by sample."""
+        """The first arrival of each sample, ordered by the number of the sample.
+
+        Duplicates are left out.
+        """
         sample, rows = np.unique(self.sample, return_index=True)
         return Arrivals(self.tick[rows], sample, self.delay_us[rows], self.refused)
 
@@ -198,10 +207,13 @@ def read_arrivals(log: Log, site: str) -> dict[str, Arrivals]:
 def count_sent(log: Log, peer: str, newest: int) -> int:
     """Returns the number of samples that a peer has sent, as far as the log shows.
 
+    A sample is the state that a site publishes in one tick of its control loop.
+
     Args:
         log: The log of the run.
         peer: Name of the peer.
-        newest: Number of the newest sample that arrived anywhere. -1 if no sample did.
+        newest: Number of the newest sample of the peer that arrived at any site. -1 if no
+            sample arrived.
     """
     part = log[peer]
     end_ticks = [
@@ -217,12 +229,12 @@ def mark_judged_samples(
     stamp_ns: Ints,
     arrivals: Arrivals,
 ) -> Bools:
-    """Finds the samples of which it is known whether they arrived.
+    """Finds the samples of which the log shows whether they arrived. They are "judged".
 
     A sample that did not arrive counts as lost only if it could have arrived before the end of
     the run: it is older than the newest arrival, or it was sent so early that the slowest
-    arrival would have been in time. It is unknown whether a sample arrived if the record of a
-    tick in which it may have arrived is missing.
+    arrival would have been in time. A sample is not judged if the record of a tick in which it
+    may have arrived is missing.
 
     Args:
         log: The log of the run.
@@ -231,7 +243,7 @@ def mark_judged_samples(
         arrivals: First arrivals of the samples.
 
     Returns:
-        True for each sample whose fate is known, shape (M,).
+        True for each judged sample, shape (M,).
     """
     part = log[site]
     count = len(stamp_ns)
@@ -265,7 +277,17 @@ ONE_WAY_SCHEMA_VERSION = 2
 
 
 class ValueStatistics(NamedTuple):
-    """Statistics of numbers: mean, standard deviation, percentiles and extremes."""
+    """Statistics of a list of numbers, in the unit of the numbers.
+
+    Attributes:
+        mean: Arithmetic mean.
+        deviation: Standard deviation.
+        p50: Median.
+        p95: Value that 95 % of the numbers do not exceed.
+        p99: Value that 99 % of the numbers do not exceed.
+        min: Smallest number.
+        max: Largest number.
+    """
 
     mean: float
     deviation: float
@@ -393,25 +415,29 @@ class SampleCounts(NamedTuple):
 
 
 class LinkSummary(NamedTuple):
-    """Summary of the directed link from a peer to a site.
+    """Summary of what a link did in a run: its delay, its losses and its counts.
 
-    docs/definitions.md ("Links") defines the quantities. A quantity that the log does not
-    determine is None.
+    A link is the directed connection from a peer to a site. docs/definitions.md ("Links")
+    defines the quantities. A quantity that the log does not determine is None. The age of a
+    sample is the time since the peer sent it. A sample is judged if the log shows whether it
+    arrived.
 
     Attributes:
         peer: Name of the sender.
         site: Name of the receiver.
-        stated: Delay models of the link over time, as the scenario and the changes state them.
-        drawn_ms: Delays that these models gave to the samples.
-        age_ms: Effective delay: the age of the sample in use.
+        stated: Delay models that the scenario and its changes prescribe for the link, in the
+            order of time.
+        drawn_ms: Statistics of the delays that these models gave to the samples, in ms.
+        age_ms: Statistics of the effective delay, which is the age of the sample in use at each
+            tick, in ms.
         ages: Histogram of the effective delay.
         first_use_s: Time at which the first sample came into use, in s.
-        ticks_without_new: Share of ticks in which no new sample came into use.
-        silence_ms: Longest time between two new samples in use.
+        ticks_without_new: Fraction of the ticks in which no new sample came into use.
+        silence_ms: Longest time between two new samples in use, in ms.
         counts: Numbers of samples.
-        loss: Share of judged samples that could not come into use.
-        burst: Mean number of successive samples that were lost.
-        one_way_us: Measured one-way delays.
+        loss: Fraction of the judged samples that could not come into use.
+        burst: Mean number of successive samples that were lost together.
+        one_way_us: Statistics of the measured one-way delays, in microseconds.
     """
 
     peer: str
@@ -430,12 +456,12 @@ class LinkSummary(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Name of the link in scenarios, "j->i"."""
+        """Name of the link as in scenarios, for example "m1->s" from peer m1 to site s."""
         return f"{self.peer}->{self.site}"
 
     @property
     def plain(self) -> bool:
-        """True if one constant delay describes everything that the link did."""
+        """True if the link did nothing but delay every sample by the same time."""
         counts = self.counts
         is_as_stated = counts is None or not (counts.late or counts.missing)
         return is_as_stated and has_one_constant_delay(self.stated)
@@ -488,9 +514,15 @@ def summarise_links(log: Log) -> list[LinkSummary]:
 
 
 def sample_ages_ns(log: Log, peer: str, site: str) -> Ints:
-    """Returns the age of the sample in use at every tick, in ns.
+    """Returns how old the peer's state was that a site used, at every tick, in ns.
 
-    Ticks before the first sample came into use are left out.
+    Args:
+        log: The log of the run.
+        peer: Name of the site that sent the states.
+        site: Name of the site that used them.
+
+    Returns:
+        The ages. Ticks before the first state came into use are left out.
     """
     part = log[site]
     used = part.used[peer]
@@ -500,7 +532,14 @@ def sample_ages_ns(log: Log, peer: str, site: str) -> Ints:
 
 
 def compute_statistics(values: ArrayLike) -> ValueStatistics | None:
-    """Returns the statistics of numbers. None without numbers."""
+    """Computes mean, standard deviation, percentiles and extremes of some numbers.
+
+    Args:
+        values: The numbers.
+
+    Returns:
+        The statistics. None if there are no numbers.
+    """
     array = np.asarray(values, dtype=np.float64)
     if not array.size:
         return None

@@ -110,7 +110,7 @@ class EndBehaviour(StrEnum):
 
     @property
     def stability(self) -> Stability:
-        """The judgement of a run about which nothing else is known."""
+        """The stability judgement that this behaviour suggests, if nothing else is known."""
         if self in (EndBehaviour.CONVERGED, EndBehaviour.DECAYS):
             return Stability.STABLE
         if self in (EndBehaviour.HARDLY, EndBehaviour.UNDECIDED, EndBehaviour.COASTS):
@@ -123,27 +123,32 @@ _FALLING = (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY)
 
 
 class RunEnd(NamedTuple):
-    """End of a run: its behaviour and the numbers on which the behaviour is based.
+    """How a run ends, and the numbers that show it.
 
-    The object describes all sites of the run, or a single joint while the joints are compared.
+    The trends of the synchronisation error e and of the joint velocity qd over the last part of
+    the run decide. The object describes all sites of the run, or a single joint while the
+    joints are compared.
 
     Attributes:
-        behaviour: Behaviour of the worst joint.
+        behaviour: Behaviour of the worst joint, such as settled or growing.
         error: Trend of that joint's |e|.
         speed: Trend of that joint's |qd|.
         end_error_rad: Largest |e| of the last second, of all joints.
         end_speed_rad_s: Largest |qd| of the last second, of all joints.
         where: Name of the worst joint. Empty if there are no records.
-        reasons: Sentences on everything that leaves the run open.
+        reasons: Sentences that say why the stability of the run remains open. Empty if it is
+            decided.
         operator_acts: True if an operator changes its action in the judged part, instead of
             only holding an arm.
-        diverged_at_s: Time at which the first site exceeded its limits. None if no site did.
-        frequency_hz: Frequency of a bounded oscillation. None otherwise.
+        diverged_at_s: Time at which the first site exceeded its limits, in s. None if no site
+            did.
+        frequency_hz: Frequency of a bounded oscillation. None if there is none.
         missing_sites: Sites without any record, which leave the run undecided.
         error_unit: Unit of |e|: "rad", or "m" if the sites follow positions in task space.
         counts_from_s: Time from which the run counts, in s. The second half of the time after
-            it is judged.
-        quiet_from_s: Time from which no operator acts and the loop does not change, in s.
+            it is the judged part.
+        quiet_from_s: Time from which no operator acts and the control loop does not change, in
+            s.
     """
 
     behaviour: EndBehaviour
@@ -163,9 +168,10 @@ class RunEnd(NamedTuple):
 
     @property
     def stability(self) -> Stability:
-        """The judgement of the run.
+        """The judgement of the run: stable, not stable, or open.
 
-        Motion that an operator may have caused is left open, unless a site diverged.
+        It stays open if an operator may have caused the motion at the end, unless a site
+        exceeded its limits.
         """
         stability = self.behaviour.stability
         if stability is not Stability.NOT_STABLE:
@@ -177,7 +183,7 @@ class RunEnd(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The behaviour with its numbers, and the reasons, as in the certificate's JSON."""
+        """A sentence with the behaviour, its numbers, and the reasons that leave it open."""
         return "; ".join([self._behaviour_text, *self.reasons])
 
     @property
@@ -211,18 +217,24 @@ class RunEnd(NamedTuple):
 
 
 class RunTrace(NamedTuple):
-    """The data from which the end of a run is judged, per site in scenario order.
+    """The reduced data from which the end of a run is judged, per site in scenario order.
+
+    To save memory, the records of a site are reduced to one row per interval of 1 /
+    `BUCKETS_PER_S` seconds since the start of the session.
 
     Attributes:
-        buckets: For every interval of 1 / `BUCKETS_PER_S` since the start of the session, the
-            largest |e| and |qd| and the last angle q of every joint, shape (K, 3 n). The values
-            are -1 in an interval without a record. There may be columns for more joints than
-            the site has. The last interval of a site may be incomplete, and no trend uses it.
-        tau_x: Torque of operator and environment at the last record, shape (n,), in N m.
-        diverged_at_s: Time at which the first site exceeded its limits. None if no site did.
+        buckets: For each site, an array with one row per interval, shape (K, 3 n). A row
+            contains the largest |e|, the largest |qd|, and the last angle q of every joint. It
+            contains -1 in an interval without a record. There may be columns for more joints
+            than the site has. The last interval may be incomplete, and no trend uses it.
+        tau_x: For each site, the torque of operator and environment at the last record, shape
+            (n,), in N m.
+        diverged_at_s: Time at which the first site exceeded its limits, in s. None if no site
+            did.
         pushed_until_s: Last time at which an operator pushed whose action is not part of the
             scenario, in s. 0 if none did.
-        changed_until_s: Last time at which a command changed the loop, in s. 0 if none did.
+        changed_until_s: Last time at which a command changed the control loop, in s. 0 if none
+            did.
     """
 
     buckets: Sequence[Array]
@@ -243,21 +255,22 @@ def reduce_to_buckets(
     q: Array,
     into: Array,
 ) -> Array:
-    """Adds further records of a site to the envelopes from which the end of its run is judged.
+    """Adds further records of a site to the data from which the end of its run is judged.
 
-    In task space e has as many columns as the task has coordinates. Columns that e, qd or q
-    lack are filled with zeros.
+    The records of an interval (bucket) are reduced to the largest |e|, the largest |qd| and the
+    last q of each joint, see `RunTrace`. In task space e has as many columns as the task has
+    coordinates. Columns that e, qd or q lack are filled with zeros.
 
     Args:
         bucket: Index of the interval of each record, ascending, shape (K,).
-        e: Errors, shape (K, n).
+        e: Synchronisation errors, shape (K, n).
         qd: Joint velocities, shape (K, n), in rad/s.
         q: Joint angles, shape (K, n), in rad.
-        into: Envelopes of all earlier records, see `RunTrace`. They may be changed in place,
-            and may have spare rows.
+        into: Data of all earlier records. They may be changed in place, and may have spare
+            rows.
 
     Returns:
-        The envelopes with the new records.
+        The data with the new records.
     """
     if not len(bucket):
         return into
@@ -288,7 +301,11 @@ def reduce_to_buckets(
 
 
 def trace_log(log: Log) -> RunTrace:
-    """Returns the data from which the end of a recorded run is judged."""
+    """Reduces the records of a log to the data from which the end of the run is judged.
+
+    Args:
+        log: The log of the run.
+    """
     buckets = []
     tau_x = []
     push_times_s = []
@@ -333,9 +350,13 @@ def _find_unscripted_push_s(log: Log, part: SiteLog) -> float:
 
 
 def classify_log_end(log: Log) -> RunEnd:
-    """Judges the end of a recorded run.
+    """Judges from a log whether the motion died away at the end of the run.
 
-    The end of a torn or empty log is undecided. A bounded oscillation gets its frequency.
+    A log that is torn or empty leaves the end undecided. If the run ends in a bounded
+    oscillation, its frequency is computed too.
+
+    Args:
+        log: The log of the run.
     """
     end = classify_run_end(log.scenario, trace_log(log))
     if end.behaviour is not EndBehaviour.BOUNDED:
@@ -345,15 +366,15 @@ def classify_log_end(log: Log) -> RunEnd:
 
 
 def classify_run_end(scenario: Scenario, trace: RunTrace) -> RunEnd:
-    """Judges the end of a run.
+    """Judges from reduced data whether the motion died away at the end of a run.
 
     The worst joint of all sites decides. A run that is stable by the trends of its joints is
-    left open if its sites do not agree, if arms fell, or if the loop changed until shortly
-    before the end.
+    left open if its sites do not agree, if arms fell, or if the control loop changed until
+    shortly before the end.
 
     Args:
-        scenario: Scenario of the run.
-        trace: Envelopes of the run, see `RunTrace`.
+        scenario: The description of the experiment.
+        trace: The reduced data of the run.
     """
     sites = _split_buckets(scenario, trace)
     # the last interval may be incomplete
@@ -898,11 +919,14 @@ def _find_odd_pose(scenario: Scenario, sites: Sequence[Array]) -> Iterable[str]:
 
 
 def find_hanging_sites(scenario: Scenario, ends: Mapping[str, Array]) -> list[str]:
-    """Finds the sites whose arms hang down at the end, but did not hang down at the start.
+    """Finds the sites whose arms fell: they hang down at the end, but did not at the start.
 
     Args:
-        scenario: Scenario of the run.
-        ends: Last joint angles of the sites to be judged, shape (n,) each, in rad.
+        scenario: The description of the experiment, with the start poses.
+        ends: Last joint angles of the sites to be judged, by name, shape (n,) each, in rad.
+
+    Returns:
+        Names of these sites. Empty if no arm fell.
     """
     hanging = []
     for site, q in ends.items():

@@ -31,12 +31,13 @@ T = TypeVar("T")
 
 
 class SiteRun(NamedTuple):
-    """A site of a recorded run.
+    """One site of a recorded run: its motion, its torques and whom it follows.
 
     Attributes:
-        records: Records of the site, one for every tick.
-        torque: External torque on the site's arm, by source.
-        dominance: Dominance factors with which the site follows its peers.
+        records: Records of the site, with one row for every tick.
+        torque: External torque on the site's arm, divided into operator and environment.
+        dominance: Dominance factors, the weights with which the site follows its peers, over
+            time.
     """
 
     records: AlignedRecords
@@ -45,14 +46,16 @@ class SiteRun(NamedTuple):
 
 
 class RunView:
-    """A recorded run as the metrics see it.
+    """A recorded run, with everything that several metrics need, computed at most once.
+
+    Every metric receives this object and reads sites, links and walls from it.
 
     Args:
         log: The log of the run.
 
     Attributes:
         log: The log of the run.
-        scenario: The scenario of the run.
+        scenario: The description of the experiment.
     """
 
     def __init__(self, log: Log) -> None:
@@ -61,7 +64,14 @@ class RunView:
         self._results: dict[Callable[[RunView], Any], Any] = {}
 
     def compute_once(self, compute: Callable[["RunView"], T]) -> T:
-        """Returns the result of a function of this view, which is called at most once."""
+        """Returns the result of a function of this view, which is called only the first time.
+
+        Later calls with the same function return the stored result. Metrics share intermediate
+        results in this way.
+
+        Args:
+            compute: The function.
+        """
         if compute not in self._results:
             self._results[compute] = compute(self)
         return cast(T, self._results[compute])
@@ -97,7 +107,7 @@ class RunView:
 
     @cached_property
     def links(self) -> dict[str, LinkSummary]:
-        """Summaries of the links by name, "j->i"."""
+        """Summaries of all links by name, such as "m1->s" from site m1 to site s."""
         return {link.name: link for link in summarise_links(self.log)}
 
     @cached_property
@@ -110,11 +120,10 @@ class RunView:
         return walls
 
     def list_subjects(self, kind: str) -> Iterable[str]:
-        """Lists the names of what a kind of metric describes.
+        """Lists the names of the sites, links or walls for which a metric is computed.
 
         Args:
-            kind: "site", "link", "wall", or "run". The run is a single subject with an empty
-                name.
+            kind: "site", "link", "wall", or "run". For "run" the list has a single empty name.
         """
         if kind == "run":
             return [""]

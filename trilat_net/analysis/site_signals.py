@@ -42,23 +42,41 @@ P is 5 for the planar arm and 10 n for a chain.
 
 
 def reference_angles(part: SiteLog) -> Array:
-    """Returns the references q_des of the joints, Eq. (6), shape (K, n), in rad.
+    """Returns the angles that the joints of a site should reach, in rad.
 
-    In task space the joints have no reference, and q is returned.
+    The reference q_des, Eq. (6), is the weighted mean of the peers' delayed angles. In task
+    space the joints have no reference, and the angles q themselves are returned.
+
+    Args:
+        part: Log of the site.
+
+    Returns:
+        Angles, shape (K, n).
     """
     return part.q if part.layout.task else part.q_des
 
 
 def follows_in_task_space(log: Log) -> bool:
-    """Returns True if sites follow with their end effectors, so that errors are along axes."""
+    """Returns True if the sites follow each other with their end effectors.
+
+    Their errors are then along axes in space, and not at joints.
+
+    Args:
+        log: The log of the run.
+    """
     arms = log.scenario.arms.values()
     return any(arm.shares_pose for arm in arms)
 
 
 def joint_error_rates(part: SiteLog) -> Array:
-    """Returns the velocity errors qd - qd_des, Eq. (18), shape (K, n), in rad/s.
+    """Returns the velocity errors of a site, the rates of its synchronisation errors.
 
-    In task space xd - xd_des is returned, shape (K, m).
+    Args:
+        part: Log of the site.
+
+    Returns:
+        qd - qd_des of Eq. (18), shape (K, n), in rad/s. In task space xd - xd_des of the end
+        effector, shape (K, m).
     """
     if part.layout.task:
         # in task space the column qd_des holds xd_des
@@ -70,7 +88,13 @@ def joint_error_rates(part: SiteLog) -> Array:
 
 
 def shared_unit(log: Log) -> str:
-    """Returns the unit of the shared coordinates and their errors: "rad", "m" or "m, rad"."""
+    """Returns the unit of the coordinates that the sites share, and of their errors.
+
+    It is "rad" for joint angles, "m" for positions and "m, rad" for poses of end effectors.
+
+    Args:
+        log: The log of the run.
+    """
     first_site = log.sites[0]
     space = log.scenario.sites[first_site].task.space
     if space == "joints":
@@ -120,7 +144,14 @@ def largest_magnitude(values: Array) -> Array:
 
 
 def largest_remaining_error(part: SiteLog) -> Array:
-    """Returns the largest error of any joint from each record to the last, shape (K,)."""
+    """Returns for each record the largest error of any joint from there to the end.
+
+    Args:
+        part: Log of the site.
+
+    Returns:
+        Largest error, shape (K,). It never rises.
+    """
     largest = largest_magnitude(joint_errors(part))
     from_the_end = np.maximum.accumulate(largest[::-1])
     return from_the_end[::-1]
@@ -146,7 +177,15 @@ def settling_time_s(part: SiteLog) -> float | None:
 
 
 def settling_time_of_all_s(times_s: Sequence[float | None]) -> float | None:
-    """Returns the time at which the last site has settled, in s. None if some site has not."""
+    """Returns the time at which the last site has settled, in s.
+
+    Args:
+        times_s: Settling time of each site, from `settling_time_s`. None for a site that has
+            not settled.
+
+    Returns:
+        The largest time. None if some site has not settled.
+    """
     settled_s = [time_s for time_s in times_s if time_s is not None]
     if len(settled_s) < len(times_s):
         return None
@@ -177,12 +216,15 @@ def operator_displacement(log: Log, twin: Log, site: str) -> tuple[Ints, Array, 
 
 
 class DecimatedTrace(NamedTuple):
-    """Signals reduced to P points, ready to be drawn. Each visible gap is a row of NaN.
+    """Signals reduced to few points, so that they can be drawn quickly.
+
+    A gap in the records that would be visible is marked by a row of NaN, which interrupts the
+    curve.
 
     Attributes:
-        tick: Ticks of the points, shape (P,).
-        t_s: Their times, shape (P,), in s.
-        values: Values of the C columns, shape (P, C).
+        tick: Ticks of the P points, shape (P,).
+        t_s: Times of the points, shape (P,), in s.
+        values: Values of the C signals, shape (P, C).
     """
 
     tick: Ints
@@ -191,14 +233,19 @@ class DecimatedTrace(NamedTuple):
 
 
 def extreme_rows(values: Array, buckets: int) -> Ints:
-    """Returns the rows to keep: the first, the last, and each bucket's extremes per column.
+    """Chooses the rows of some signals that a plot needs, so that no peak gets lost.
 
-    Buckets have equal numbers of rows. NaN is never an extreme. A bucket in which a column is
-    NaN throughout keeps its first row.
+    The rows are divided into intervals with equal numbers of rows (buckets). In each bucket the
+    rows with the largest and the smallest value of each column are kept. The first and the last
+    row are kept as well. NaN is never an extreme. A bucket in which a column is NaN throughout
+    keeps its first row.
 
     Args:
-        values: The columns, shape (K, C).
+        values: The signals in columns, shape (K, C).
         buckets: Number of buckets.
+
+    Returns:
+        Indices of the rows.
     """
     rows, columns = values.shape
     if rows <= 2 * buckets or not columns:
@@ -230,14 +277,15 @@ def decimate(
     values: Array,
     buckets: int,
 ) -> DecimatedTrace:
-    """Reduces signals to at most 2 C + 3 points per bucket, C being the number of columns.
+    """Reduces signals to the points that a plot needs, so that no peak gets lost.
 
-    One bucket per pixel of a plot is enough.
+    The time is divided into buckets, of which each keeps at most 2 C + 3 points for C columns,
+    among them the extremes of each column. One bucket per pixel of a plot is enough.
 
     Args:
         tick: Ascending ticks, shape (K,).
         t_s: Their nominal times, shape (K,), in s.
-        values: The columns, shape (K, C).
+        values: The signals in columns, shape (K, C).
         buckets: Number of buckets.
     """
     if not len(tick):

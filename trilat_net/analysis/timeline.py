@@ -48,12 +48,16 @@ class AppliedChange(NamedTuple):
 
     @property
     def subject(self) -> str:
-        """What was changed: a link "j->i", a site, or the dominance factors of a site."""
+        """Name of what was changed: a link such as "m1->s", or a site.
+
+        For dominance factors, the weights with which a site follows its peers, it names the
+        site.
+        """
         return self.change.link or self.change.site or f"shares of {self.change.dominance}"
 
     @property
     def text(self) -> str:
-        """The state after the change, as a phrase."""
+        """A phrase that describes the state after the change."""
         change = self.change
         if change.order:
             order = change.order.replace("_", " ")
@@ -65,12 +69,14 @@ class AppliedChange(NamedTuple):
 
 
 class ModeInterval(NamedTuple):
-    """An interval during which a site did not follow its peers: it held, braked or returned.
+    """An interval of time in which a site did not follow its peers.
+
+    Instead it held its position, braked, or returned to following.
 
     Attributes:
-        mode: Name of the mode.
+        mode: Name of the mode in which the site was.
         from_s: Time of the first tick in this mode, in s.
-        to_s: Time of the first tick after it, or the end of the site's last period, in s.
+        to_s: Time of the first tick after it, or the end of the site's last tick period, in s.
     """
 
     mode: str
@@ -79,17 +85,17 @@ class ModeInterval(NamedTuple):
 
     @property
     def meaning(self) -> ModeMeaning:
-        """What a site does in this mode."""
+        """An explanation of what a site does in this mode."""
         return MODES[self.mode]
 
 
 class StatedModel(NamedTuple):
-    """The delay model that the scenario or a change states for a link, from some time on.
+    """A delay model that the scenario, or a change of it, prescribes for a link.
 
     Attributes:
-        from_s: The model applies to samples that were sent from this time on, in s after the
-            start of the session.
-        link: The model.
+        from_s: Time from which the model applies, in s after the start of the session. It
+            applies to samples sent from this time on.
+        link: The model: delay, losses and order of the samples.
     """
 
     from_s: float
@@ -158,9 +164,12 @@ def list_stated_models(
 
 
 def recorded_end_s(log: Log) -> float:
-    """Returns the end of a run in s: the end of the period of the last record.
+    """Returns the time at which the last record's tick period ends, in s.
 
-    Without any record it is the planned end.
+    If there are no records, it is the planned end of the run.
+
+    Args:
+        log: The log of the run.
     """
     parts = [log[site] for site in log.sites]
     recorded = [part for part in parts if len(part)]
@@ -219,7 +228,10 @@ class RaisedAlarm(NamedTuple):
 def list_alarms(log: Log) -> list[RaisedAlarm]:
     """Lists the alarms of all sites, in the order of their start.
 
-    An alarm because of an ordered stop names whoever ordered it.
+    If somebody ordered a site to stop, the reason of the alarm names this person.
+
+    Args:
+        log: The log of the run.
 
     Raises:
         LogError: A record names a change that is not valid.

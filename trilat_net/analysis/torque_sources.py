@@ -31,13 +31,25 @@ SCRIPT_TORQUE_TOLERANCE = 1e-8
 
 
 def list_walls(spec: SiteSpec) -> list[TorqueSource]:
-    """Returns the walls of a site, in scenario order."""
+    """Lists the virtual walls that the end effector of a site may touch, in scenario order.
+
+    Args:
+        spec: Description of the site.
+    """
     actors = [source.actor for source in spec.environment]
     return [actor for actor in actors if actor.kind is TorqueKind.WALL]
 
 
 def wall_depth(wall: TorqueSource, end_effector: EndEffectorRows) -> Array:
-    """Returns the depth of an end effector in a wall, shape (K,), in m. Negative outside."""
+    """Returns how deep an end effector is in a virtual wall, in m.
+
+    Args:
+        wall: The wall.
+        end_effector: Motion of the end effector over K poses.
+
+    Returns:
+        Depth, shape (K,). It is negative outside the wall.
+    """
     surface_point = np.array(wall.a)
     normal = np.array(wall.b)
     depth: Array = (surface_point - end_effector.position) @ normal
@@ -76,13 +88,18 @@ def _is_active(source: TorqueSource, t_s: Array) -> Bools:
 
 
 def compute_target_motion(source: TorqueSource, t_s: Array) -> tuple[Array, Array]:
-    """Returns the target of a spring and its velocity, shape (K, n) each.
+    """Computes where the target of an operator's spring is, and how fast it moves.
 
-    The target moves from a to b with minimum jerk.
+    An operator is modelled by a spring between the arm and a target. The target moves from a to
+    b on a path with minimum jerk.
 
     Args:
         source: The spring.
         t_s: Times, shape (K,), in s.
+
+    Returns:
+        Position of the target, shape (K, n), in the coordinates of the spring.
+        Velocity of the target, shape (K, n).
     """
     span_s = source.move_end_s - source.move_start_s
     progress = (t_s > source.move_start_s).astype(np.float64)
@@ -108,13 +125,19 @@ def compute_spring_effort(
     position: Array,
     speed: Array,
 ) -> Array:
-    """Returns the effort K (target - position) + B (target velocity - speed), shape (K, n).
+    """Computes the torque, or the force, of a spring that pulls an arm to its target.
+
+    It is K (target - position) + B (target velocity - speed), with the stiffness K and the
+    damping B of the spring.
 
     Args:
-        source: A spring with stiffness K and damping B.
+        source: The spring.
         t_s: Times, shape (K,), in s.
-        position: Joint angles, or position of the end effector, shape (K, n).
-        speed: Their velocities, shape (K, n).
+        position: Joint angles in rad, or position of the end effector in m, shape (K, n).
+        speed: Their time derivatives, shape (K, n).
+
+    Returns:
+        Torque in N m if the spring acts on joints, or force in N, shape (K, n).
     """
     target, target_velocity = compute_target_motion(source, t_s)
     spring = np.array(source.K) * (target - position)
@@ -228,9 +251,11 @@ def compute_live_torque(
 
 
 class TorqueSplit(NamedTuple):
-    """The external torque on an arm by its sources, shape (K, n) each, in N m.
+    """The external torque on an arm, divided by who applies it, in N m.
 
-    The torque of the arm's mechanical stops is not included.
+    Each attribute has the shape (K, n) unless stated otherwise. Torques that follow the motion
+    continuously and torques that are computed once per tick do different work within a tick, so
+    that they are kept apart. The torque of the arm's mechanical stops is not included.
 
     Attributes:
         end_effector: Motion of the end effector.
@@ -238,8 +263,9 @@ class TorqueSplit(NamedTuple):
         operator_held: Operator's torque that is computed once per tick and held.
         environment_now: Environment's torque that follows the motion continuously.
         environment_held: Environment's torque that is computed once per tick and held.
-        script: Plan of the operator, see `compute_operator_script`. None if not requested, or
-            if the operator's torque does not agree with the scenario.
+        script: The part of the operator's action that the scenario plans, see
+            `compute_operator_script`. None if not requested, or if the operator's torque does
+            not agree with the scenario.
     """
 
     end_effector: EndEffectorRows
@@ -261,11 +287,13 @@ class TorqueSplit(NamedTuple):
 
 
 def split_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit:
-    """Splits the torque on a site's arm by its sources, without the operator's plan.
+    """Divides the external torque on a site's arm into operator and environment.
+
+    The operator's plan is left out. `attribute_torque` adds it.
 
     Args:
         records: Records of the site.
-        scenario: Scenario of the run.
+        scenario: The description of the experiment.
     """
     spec = scenario.sites[records.site]
     t_s = records.nominal_s
@@ -388,14 +416,14 @@ def _evaluate_scripted_torque(source: TorqueSource, t_s: Array) -> Array:
 
 
 def attribute_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit:
-    """Splits the torque on a site's arm by its sources, with the operator's plan.
+    """Divides the external torque on a site's arm, and adds the operator's plan.
 
     If the scenario has no operator, the operator's torque is set to zero where only rounding
     errors are left.
 
     Args:
         records: Records of the site.
-        scenario: Scenario of the run.
+        scenario: The description of the experiment.
     """
     split = split_torque(records, scenario)
     t_s = records.nominal_s
@@ -473,13 +501,25 @@ class WallEnergy(NamedTuple):
 
 
 def list_sampled_walls(spec: SiteSpec) -> list[TorqueSource]:
-    """Returns the walls of a site that hold their force for a tick, and have a stiffness."""
+    """Lists the stiff walls of a site whose force is computed once per tick and held.
+
+    Only such walls can generate energy.
+
+    Args:
+        spec: Description of the site.
+    """
     walls = list_walls(spec)
     return [wall for wall in walls if wall.sampled and any(wall.K)]
 
 
 def find_wall_energies(log: Log) -> list[WallEnergy]:
-    """Returns the energies of all sampled walls that were touched, in scenario order."""
+    """Computes the energies that the touched walls of a run generated, in scenario order.
+
+    Only sampled walls are included, whose force is computed once per tick and held.
+
+    Args:
+        log: The log of the run.
+    """
     energies = []
     for site, records in align_records(log).items():
         spec = log.scenario.sites[site]

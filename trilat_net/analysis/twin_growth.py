@@ -82,22 +82,23 @@ MOST_LOG = 700.0
 
 
 class PushGrowth(NamedTuple):
-    """How one push developed over the judged part of a run.
+    """How the effect of one push developed over the judged part of a run.
 
-    If a run has several groups of sites that do not follow each other, a push has one such
-    object for each group.
+    A push is a small disturbance in a repetition of the run, called a twin. Its effect is the
+    difference between the twin and the run. If a run has several groups of sites that do not
+    follow each other, a push has one such object for each group.
 
     Attributes:
-        push: The push.
-        trend: Class of the trend of the difference between the twin and the run.
+        push: The push: what was changed, when and by how much.
+        trend: Class of the trend of the difference, such as growing.
         rate_per_s: Rate of the difference, which is proportional to exp(rate t), in 1/s. NaN if
             the judged part is too short.
         factor: Factor by which the difference changed over the judged part. 0 if it died down
             to the rounding errors.
         joint: Name of the joint at which the difference is largest at the end.
         group: Index of the group of sites.
-        becomes_rad_s: Largest difference in the last second, in rad/s, with all scalings
-            undone.
+        becomes_rad_s: Largest difference in the last second, in rad/s, converted back to the
+            size of the push.
         ended_s: Time at which the twin ended before the run, in s, because the difference died
             down to the rounding errors or the twin diverged. None if the twin did not end
             early.
@@ -114,9 +115,10 @@ class PushGrowth(NamedTuple):
 
 
 class RestDeparture(NamedTuple):
-    """A stretch of time in which a run and its twins moved away from a rest by themselves.
+    """A time in which a run and its twins moved away from rest by themselves.
 
-    Nobody acts on the arms during this time, so that the rest position is unstable.
+    Twins are repeated runs with a small push. Nobody acts on the arms during this time, which
+    shows that the rest position is unstable.
 
     Attributes:
         from_s: Start, in s.
@@ -132,12 +134,15 @@ class RestDeparture(NamedTuple):
 
 
 class TwinGrowth(NamedTuple):
-    """How all pushes of a run developed, computed by `judge_twins`.
+    """Whether small pushes of a run grow or die away, computed by `judge_twins`.
+
+    Each push is made in a repeated run, called a twin. Its difference from the run is then
+    observed.
 
     Attributes:
         why: The reason why there are no twins. Empty if there are.
-        from_s: Start of the judged part, in s.
-        to_s: End of the judged part, in s.
+        from_s: Start of the part of the run that is judged, in s.
+        to_s: End of this part, in s.
         pushes: Growth of every push, in every group of sites that follow each other.
         departure: Fastest departure of the run from a rest. None if there was none.
         same_platform: False if the run was recorded on another platform, so that the last bits
@@ -172,9 +177,10 @@ class TwinGrowth(NamedTuple):
 
     @property
     def grows(self) -> bool:
-        """True if at least half of the pushes of some group of sites grow throughout.
+        """True if at least half of the pushes in some group of sites grow all the time.
 
-        If links are random, the pushes must also grow by a factor of two over the judged part.
+        A group contains sites that follow each other. If the delays of links are random, the
+        pushes must also grow by a factor of two over the judged part.
         """
         return self.grows_by(DOUBLES if self.links_random else 1.0, always=True)
 
@@ -196,10 +202,11 @@ class TwinGrowth(NamedTuple):
 
     @property
     def needs_s(self) -> float | None:
-        """Length of a run that would show clearly that the pushes die away, in s.
+        """Length that the run should have to show clearly that pushes die away, in s.
 
-        Four halvings at the rate of the worst push are added to the end of the judged part.
-        None if the pushes do not fall, or if it is clear already that they die away.
+        The slowest push, at its present rate, would halve four times between the end of the
+        judged part and this time. None if the pushes do not fall, or if it is clear already
+        that they die away.
         """
         worst = self.worst
         if worst is None or not worst.rate_per_s < 0.0 or self.trend is EnvelopeTrend.DECAYS:
@@ -208,10 +215,10 @@ class TwinGrowth(NamedTuple):
 
     @property
     def excluded_rate_per_s(self) -> float:
-        """Rate above which the twins exclude growth, in 1/s.
+        """Growth rate that the twins exclude: no disturbance grows faster than this, in 1/s.
 
-        A mode with a larger rate would have grown by `CLEAR_GROWTH` in the judged part, and
-        would have been seen. Infinite unless every push dies away.
+        A motion with a larger rate would have grown by `CLEAR_GROWTH` in the judged part, and
+        would have been seen. The value is infinite unless every push dies away.
         """
         judged_s = self.to_s - self.from_s
         dies = self.trend is EnvelopeTrend.DECAYS and judged_s > 0.0
@@ -415,15 +422,18 @@ def judge_twins(
     counts_from_s: float,
     quiet_from_s: float,
 ) -> TwinGrowth:
-    """Returns how the pushes of a run's twins developed.
+    """Judges whether the pushes in the twins of a run grow or die away.
+
+    A twin is a repetition of the run with a small push. Its difference from the run is
+    evaluated over the judged part of the run.
 
     Args:
-        scenario: Scenario of the run.
+        scenario: The description of the experiment.
         twins: The twins.
         counts_from_s: Time from which the run counts, in s. The second half of the time after
             it is judged.
-        quiet_from_s: Time from which nobody acts on the run, and its loop does not change, in
-            s. Departures from a rest are searched from there on.
+        quiet_from_s: Time from which nobody acts on the run, and its control loop does not
+            change, in s. Departures from a rest are searched from there on.
     """
     t_s = twins.paths[0].t_s
     has_motion = twins.speed.any(axis=1) | np.isfinite(twins.paths[0].largest).any(axis=1)
@@ -467,10 +477,10 @@ def judge_twins(
 
 
 def measure_amplitude(path: TwinPath, group: Sequence[int]) -> Array:
-    """Returns the amplitude of the difference between a twin and its run, as a logarithm.
+    """Computes the size of the difference between a twin and its run, as a logarithm.
 
-    A push that died down to the rounding errors is repeated. Each stretch from one push to the
-    next (a leg) is evaluated by itself.
+    A twin is a repetition of the run with a small push. A push that died down to the rounding
+    errors is repeated. Each stretch from one push to the next (a leg) is evaluated by itself.
 
     Args:
         path: The twin's difference from its run.
@@ -696,7 +706,7 @@ class PushedTwins(Result):
     linear: LinearSizes | None = None
 
     def describe(self, pushed: PushGrowth) -> str:
-        """Returns a sentence on how a push developed.
+        """Returns a sentence that tells the user how a push developed.
 
         Args:
             pushed: Growth of the push.

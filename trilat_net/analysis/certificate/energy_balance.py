@@ -104,7 +104,11 @@ class SiteEnergy:
 
     @property
     def followed(self) -> dict[str, DelayedPeer]:
-        """The peers that the site follows at any time, with their motion as it sees them."""
+        """The peers that the site follows at some time, with their motion as it is received.
+
+        A peer is another site. It is followed if its dominance factor, the weight with which
+        the arm follows it, is ever different from zero.
+        """
         alpha = self.motion.dominance.alpha
         followed = {}
         for j, (peer, view) in enumerate(self.motion.peers.items()):
@@ -318,7 +322,10 @@ class EnergyBalance:
 
     @cached_property
     def V(self) -> Array:  # noqa: N802 - the paper's symbol
-        """The energy function of the stability proof, summed over the sites, shape (T,), in J."""
+        """The energy function of the stability proof over time, shape (T,), in J.
+
+        It is the weighted sum of the energy functions of the sites.
+        """
         return _sum(self.parts)
 
     @cached_property

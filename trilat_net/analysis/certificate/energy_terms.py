@@ -113,7 +113,7 @@ class SiteConstants(NamedTuple):
         return np.where(is_free, np.nan, self.Kd)
 
     def robust_torque(self, r: Array) -> Array:
-        """Returns the magnitude of the robust torque, which acts against r in addition to Kp r.
+        """Returns the robust torque, which the law subtracts in addition to Kp r.
 
         It limits the effect of disturbances that the adaptation cannot learn.
 
@@ -302,16 +302,19 @@ class SiteMotion:
         ed: Array,
         r: Array,
     ) -> Array:
-        """Returns the torque of the control law, Eq. (13), for given errors.
+        """Returns the torque of the control law, Eq. (13), for errors that were not recorded.
+
+        Pose and estimates are the recorded ones. This shows, for example, the torque just
+        before a new sample came into use.
 
         Args:
-            rows: Rows whose pose and estimate are used.
-            e: Errors in place of the recorded ones, shape (K, n).
+            rows: Rows whose pose and estimate are used, shape (K,).
+            e: Synchronisation errors, shape (K, n).
             ed: Their derivatives, shape (K, n).
-            r: Filtered errors in place of the recorded ones, shape (K, n).
+            r: Filtered errors, shape (K, n).
 
         Returns:
-            Torque without its limit, shape (K, n), in N m.
+            Torque before it is limited, shape (K, n), in N m.
         """
         records = self.records
         c = self.constants
