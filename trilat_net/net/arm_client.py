@@ -76,6 +76,9 @@ R = TypeVar("R", bound=Request)
 class SiteSender:
     """Sends numbered messages to one channel of a site.
 
+    A site is a process that runs one arm and its control loop. The messages of a sender are
+    numbered, so that the site detects lost, repeated and reordered messages.
+
     Args:
         bus: Network connection.
         clock: Clock of this process.
@@ -105,12 +108,16 @@ class SiteSender:
         self._publish = bus.publisher(topics.key(session, site, channel))
 
     def send(self, kind: type[R], **fields: object) -> R:
-        """Sends the next message, and returns it.
+        """Sends a new message with the next number to the site.
 
         Args:
             kind: Class of the message.
             **fields: Fields of the message other than the site, the boot and the number. They
-                may replace the time stamp `sent_ns`.
+                may replace the time stamp `sent_ns`, which is otherwise the present time of the
+                clock.
+
+        Returns:
+            The message that was sent.
         """
         header = {"site": self._site, "boot": self.boot, "n": self.number + 1}
         stamp = {"sent_ns": self._clock.monotonic_ns()}
@@ -120,7 +127,13 @@ class SiteSender:
         return message
 
     def repeat(self, message: R) -> None:
-        """Sends a message again with the same number, to show that the program still runs."""
+        """Sends a message again with the same number, to show that the program still runs.
+
+        The site recognises the number, and does not execute the message a second time.
+
+        Args:
+            message: Message that `send` has returned.
+        """
         self._publish(encode(message))
 
 
@@ -164,15 +177,21 @@ class SiteClient:
 
     @property
     def record(self) -> State | None:
-        """Newest record of the site, the result of one tick. None before the first record."""
+        """Newest record of the site that has arrived. None before the first tick of the site.
+
+        A record is the result of one tick, a period of the control loop. It contains the joint
+        angles and the torque.
+        """
         self._read_messages()
         return self._record
 
     @property
     def fresh(self) -> bool:
-        """True if the newest record is at most `FRESH_NS` old and the run continues.
+        """True if the newest record can still be used to control the arm.
 
-        It is False before the first tick, after the run, and once the run has diverged.
+        This is the case if the record is at most `FRESH_NS` old and the run continues. It is
+        False before the first tick (period of the control loop), after the run, and once the
+        run has diverged.
         """
         record = self.record
         if record is None or self._is_over or record.mode == "diverged":
@@ -181,7 +200,7 @@ class SiteClient:
 
     @property
     def over(self) -> bool:
-        """True once the run of the site has ended, or the site is gone."""
+        """True once the run of the site has ended, or the process of the site is gone."""
         self._read_messages()
         return self._is_over
 
@@ -317,7 +336,14 @@ class SwitchClient(OutsideClient):
     """Member whose keys the program uses. Empty stands for the site."""
 
     def send(self, *, held: bool) -> None:
-        """Reports whether somebody holds the switch."""
+        """Reports to the site whether somebody holds the dead-man switch.
+
+        The program of the switch must report at least every 100 ms, because the arm stops
+        otherwise.
+
+        Args:
+            held: True while somebody holds the switch. False stops the arm at once.
+        """
         self._sender.send(ArmEnable, held=held)
 
 
@@ -368,7 +394,7 @@ class ArmClient(OutsideClient):
 
         The arm must brake
 
-        - before the first tick and after the run,
+        - before the first tick (period of the control loop) and after the run,
         - if the newest record is older than `FRESH_NS`,
         - `BRAKE_NS` after a fault or after the release of the dead-man switch. Until then the
           torque brings the arm to rest.
@@ -403,6 +429,8 @@ def make_hand_sender(
     The operator is identified by a random number in 1 ... 2^32 - 1. Records store the number as
     a float, which represents these numbers exactly. In a record, the number 0 means that no
     operator moves the arm.
+
+    The operator is the person or program that moves an arm.
 
     Args:
         bus: Network connection of the operator's program.
@@ -483,8 +511,8 @@ class Hand(SiteClient):
             *place_m: Coordinates x and y of the target, for an arm in space also z, in m.
 
         Returns:
-            The number of the message. Each record states in `hand` which message the site
-            follows.
+            The number of the message. The property `number` has this value once the site
+            follows the message.
 
         Raises:
             UsageError: The scenario's operator is not moved in this way, or a number is not
@@ -523,7 +551,10 @@ class Hand(SiteClient):
         return self._send("push", force_n)
 
     def release(self) -> None:
-        """Releases the arm. The force fades within 100 ms."""
+        """Ends the operator's influence on the arm. The force fades within 100 ms.
+
+        Afterwards, `move`, `turn` or `push` may take hold of the arm again.
+        """
         with self._lock:
             is_gripping = self._message is not None
             self._message = None
@@ -532,7 +563,11 @@ class Hand(SiteClient):
 
     @property
     def holds(self) -> bool:
-        """True if this program is the operator that moves the arm in the newest record."""
+        """True if this program is the operator that moves the arm in the newest record.
+
+        A record is the result of one period of the site's control loop. It is False if another
+        operator moves the arm, or none.
+        """
         hand = self.in_force
         return hand is not None and hand.source == self._sender.boot
 
@@ -552,7 +587,8 @@ class Hand(SiteClient):
     def in_force(self) -> HandInForce | None:
         """Operator who moves the arm in the newest record, with the present target or force.
 
-        The operator may be another program. None before the first record.
+        The operator may be another program than this one. None before the first record, the
+        result of one period of the site's control loop.
         """
         record = self.record
         if record is None or not record.hand:

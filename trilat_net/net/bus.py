@@ -28,12 +28,17 @@ Polled = TypeVar("Polled", covariant=True)
 
 
 class PolledRing(Protocol[Polled]):
-    """A queue of limited length, for entries that have arrived."""
+    """Interface of a queue of limited length, from which entries are removed one by one.
+
+    A control loop reads the messages that have arrived from such queues, because reading them
+    never waits. `BoundedRing` and the queues of Zenoh implement this interface.
+    """
 
     def poll(self) -> Polled | None:
-        """Removes the oldest entry and returns it, or None if the queue is empty.
+        """Removes the oldest entry from the queue and returns it, without waiting.
 
-        It never waits.
+        Returns:
+            The entry. None if the queue is empty.
         """
 
 
@@ -46,14 +51,21 @@ StampedInbox = PolledRing[tuple[Polled, int]]
 
 
 class Query(Protocol):
-    """A query that has arrived and waits for a reply."""
+    """Interface of a query that another member has sent, and that waits for a reply.
+
+    A query is a request under a key, to which each receiver can reply with one payload.
+    """
 
     @property
     def payload(self) -> bytes:
-        """Payload of the query. Empty if there is none."""
+        """Content of the query, as the sender encoded it. Empty if the query has no content."""
 
     def reply(self, payload: bytes) -> None:
-        """Sends the reply to the query."""
+        """Sends a reply to the member that sent the query.
+
+        Args:
+            payload: The encoded reply.
+        """
 
 
 QueryInbox = PolledRing[Query]
@@ -61,17 +73,19 @@ QueryInbox = PolledRing[Query]
 
 
 class Bus(Protocol):
-    """Network connection of one member.
+    """Interface of the network connection of a member, a process that takes part in a session.
 
-    Keys that are passed for receiving may contain wildcards: `*` for one part of a key, `**`
-    for any number of parts.
+    All messages, queries and signs of life of a member pass through one such connection. A
+    message is a payload of bytes under a key, which is a text of parts between slashes. Keys
+    that are passed for receiving may contain wildcards: `*` stands for one part, and `**` for
+    any number of parts. `ZenohBus` implements this interface for a real network.
     """
 
     def publisher(self, key: str, *, patient: bool = False) -> Callable[[bytes], None]:
         """Returns a function that publishes payloads under a key.
 
         Args:
-            key: The key.
+            key: The key, without wildcards.
             patient: False if a payload is dropped when the network is too slow. True if the
                 function waits instead, for some seconds at most. That is for senders without a
                 control loop that must not lose messages.
@@ -81,8 +95,9 @@ class Bus(Protocol):
         """Returns a queue of the messages that other members publish under a key.
 
         Args:
-            key: The key.
-            capacity: Number of messages that the queue holds.
+            key: The key, which may contain wildcards.
+            capacity: Number of messages that the queue holds. If it is full, the oldest message
+                is dropped.
         """
 
     def stamped_inbox(
@@ -94,39 +109,57 @@ class Bus(Protocol):
     ) -> StampedInbox[T]:
         """Returns a queue whose messages are decoded on arrival, with their times of arrival.
 
+        The time of arrival is read in the network thread that receives the message. It is
+        therefore correct even if the owner of the queue reads the message much later.
+
         Args:
-            key: The key.
+            key: The key, which may contain wildcards.
             now_ns: Function that reads the local clock, in ns.
             read: Function that decodes a payload, in a network thread. It must not raise an
                 error. `bytes` leaves the payload as it is.
-            capacity: Number of messages that the queue holds.
+            capacity: Number of messages that the queue holds. If it is full, the oldest message
+                is dropped.
         """
 
     def tap(self, key: str, callback: Callable[[str, bytes], None]) -> None:
-        """Calls `callback(key, payload)` for every message under a key, in a network thread."""
+        """Calls a function for every message under a key, as soon as the message arrives.
+
+        Args:
+            key: The key, which may contain wildcards.
+            callback: Function that receives the key and the payload of each message. It is
+                called in a network thread, and must be fast.
+        """
 
     def query_inbox(self, key: str) -> QueryInbox:
-        """Returns a queue of the queries that other members send under a key."""
+        """Returns a queue of the queries that other members send under a key.
+
+        The caller removes the queries from the queue, and replies to them when it has time. In
+        contrast, `respond` replies at once.
+
+        Args:
+            key: The key, which may contain wildcards.
+        """
 
     def respond(self, key: str, answer: Callable[[bytes], bytes | None]) -> None:
         """Replies to the queries under a key at once, in a network thread.
 
         Args:
-            key: The key.
-            answer: Function that returns the payload of the reply to a payload, or None for no
-                reply. It must be fast, because messages wait meanwhile, and must not raise an
-                error.
+            key: The key, which may contain wildcards.
+            answer: Function that receives the payload of a query, and returns the payload of
+                the reply. It returns None to send no reply. It must be fast, because messages
+                wait meanwhile, and must not raise an error.
         """
 
     def query(self, key: str, payload: bytes = b"") -> Inbox:
         """Sends a query to all members that serve a matching key.
 
         Args:
-            key: The key.
+            key: The key, which may contain wildcards.
             payload: Payload of the query.
 
         Returns:
-            A queue for the replies.
+            A queue into which the replies are put as they arrive. It stays empty if no member
+            replies.
         """
 
     def announce(self, key: str) -> None:
@@ -135,16 +168,18 @@ class Bus(Protocol):
         The token disappears when the connection is closed or lost.
 
         Args:
-            key: Key of the token.
+            key: Key of the token, which contains the name of this member.
         """
 
     def presence(self, key: str) -> PresenceInbox:
-        """Returns a queue of the tokens that appear and disappear under a key.
+        """Returns a queue that tells which other members have appeared or disappeared.
 
-        The first entries are the tokens that exist already.
+        Each member is represented by a liveliness token, see `announce`. An entry of the queue
+        is the key of a token, and True if the token has appeared, or False if it has
+        disappeared. The first entries are the tokens that exist already.
 
         Args:
-            key: The key.
+            key: Key of the tokens, which may contain wildcards.
         """
 
     def close(self) -> None:
@@ -197,11 +232,15 @@ class BoundedRing(Generic[T]):
         self._entries: deque[T] = deque(maxlen=capacity)
 
     def put(self, entry: T) -> None:
-        """Adds an entry. If the queue is full, the oldest entry is dropped."""
+        """Adds an entry to the queue. If the queue is full, its oldest entry is dropped."""
         self._entries.append(entry)
 
     def poll(self) -> T | None:
-        """Removes the oldest entry and returns it, or None if the queue is empty."""
+        """Removes the oldest entry from the queue and returns it, without waiting.
+
+        Returns:
+            The entry. None if the queue is empty.
+        """
         return self._entries.popleft() if self._entries else None
 
 
@@ -209,6 +248,9 @@ class StampingRing(BoundedRing[tuple[T, int]]):
     """A queue of messages that are decoded on arrival, with their times of arrival.
 
     One thread may call `receive` while another thread calls `poll`.
+
+    The time is read before a message is decoded, so that the time of decoding does not count as
+    a delay of the network.
 
     Args:
         now_ns: Function that reads the local clock, in ns.
@@ -224,6 +266,13 @@ class StampingRing(BoundedRing[tuple[T, int]]):
         self._read = read
 
     def receive(self, payload: bytes) -> None:
-        """Adds a message. The time is read before the message is decoded."""
+        """Decodes a message, and adds it to the queue with its time of arrival.
+
+        The clock is read before the message is decoded. If the queue is full, the oldest
+        message is dropped.
+
+        Args:
+            payload: The encoded message.
+        """
         now_ns = self._now_ns()
         self._entries.append((self._read(payload), now_ns))

@@ -16,29 +16,39 @@ NS_PER_S = 1_000_000_000
 
 
 class Clock(Protocol):
-    """Interface of the clocks of this program."""
+    """Interface of the clocks that this program uses.
+
+    A clock reads a monotonic time, which never steps, and the time of day, which may step.
+    Control loops are timed by the monotonic time. Tests replace the clock of the machine by
+    clocks of their own.
+    """
 
     def monotonic_ns(self) -> int:
         """Returns the reading of a clock that never steps, in ns. Its zero is arbitrary."""
 
     def unix_ns(self) -> int:
-        """Returns the time since 1970 in ns, as the time of day of the machine. It may step."""
+        """Returns the time of day of the machine, as the time since 1970 in ns.
+
+        It may step at any moment, for example when the machine synchronises its clock with
+        others. Durations are therefore computed from `monotonic_ns`.
+        """
 
     def sleep_until(self, deadline_ns: int) -> None:
         """Sleeps until the monotonic clock reads `deadline_ns`.
 
-        Returns at once if that has passed.
+        Returns at once if that time has passed already.
         """
 
     def identity(self) -> str:
         """Returns a text that identifies the monotonic clock.
 
         Readings of two processes can be compared only if their clocks have the same identity.
+        This is the case for processes on one machine.
         """
 
 
 class SystemClock:
-    """The clocks of this machine."""
+    """The clocks of this machine, as the operating system provides them."""
 
     monotonic_ns = staticmethod(time.perf_counter_ns)
     """The clock of `time.monotonic_ns`, except on Windows, where that clock steps by 16 ms."""
@@ -47,7 +57,7 @@ class SystemClock:
     def sleep_until(self, deadline_ns: int) -> None:
         """Sleeps until the monotonic clock reads `deadline_ns`.
 
-        Returns at once if that has passed.
+        Returns at once if that time has passed already.
         """
         remaining_ns = deadline_ns - self.monotonic_ns()
         if remaining_ns > 0:
@@ -94,13 +104,13 @@ class SkewedClock:
         self._start_ns = clock.monotonic_ns()
 
     def monotonic_ns(self) -> int:
-        """Returns the reading of the skewed clock, in ns."""
+        """Returns the reading of the skewed clock in ns, by the equation of the class."""
         passed_ns = self._clock.monotonic_ns() - self._start_ns
         drift_ns = passed_ns * self._drift_ppb // NS_PER_S
         return self._start_ns + self._offset_ns + passed_ns + drift_ns
 
     def unix_ns(self) -> int:
-        """Returns the time of day of the other clock, in ns since 1970."""
+        """Returns the time of day of the other clock unchanged, in ns since 1970."""
         return self._clock.unix_ns()
 
     def sleep_until(self, deadline_ns: int) -> None:
@@ -115,7 +125,11 @@ class SkewedClock:
         self._clock.sleep_until(self._start_ns + other_passed_ns)
 
     def identity(self) -> str:
-        """Returns a text that identifies the skewed clock, with its offset, drift and start."""
+        """Returns a text that identifies the skewed clock.
+
+        The text contains the offset in ns, the drift in ns/s and the start in ns, so that
+        readers of a log can convert readings of this clock to those of the other clock.
+        """
         return (
             f"{self._clock.identity()}, skewed by {self._offset_ns} ns "
             f"and {self._drift_ppb} ns/s since {self._start_ns} ns"
