@@ -52,11 +52,17 @@ _BLOCK = 64
 
 
 def default_endpoint(session: str, index: int) -> str:
-    """Returns the endpoint at which a site listens by default.
+    """Returns the network endpoint at which a site listens by default.
+
+    The port is computed from the name of the session and the index, so that every process finds
+    the endpoint without any configuration.
 
     Args:
         session: Name of the session.
-        index: Index of the site in the scenario.
+        index: Index of the site in the scenario, from 0.
+
+    Returns:
+        The endpoint on this machine, as in "tcp/127.0.0.1:10241".
     """
     port = _FIRST_PORT + zlib.crc32(session.encode()) % _BLOCKS * _BLOCK + index % _BLOCK
     return f"tcp/127.0.0.1:{port}"
@@ -113,7 +119,7 @@ def find_free_endpoints(count: int) -> list[str]:
     """Returns endpoints on this machine whose ports no program uses at this moment.
 
     Args:
-        count: Number of endpoints.
+        count: Number of endpoints to find.
     """
     with ExitStack() as stack:
         return _bind_ports(stack, [0] * count, shared=False)
@@ -235,7 +241,7 @@ class Connection:
     def describe_end(self) -> str:
         """Returns a warning for the user if the validity of the keys ends within `ENDS_SOON`.
 
-        Empty if the keys are valid for longer, or if there are no keys.
+        The warning is empty if the keys are valid for longer, or if there are no keys.
         """
         if self.keys_end is None or self.keys_end - datetime.now(UTC) > ENDS_SOON:
             return ""
@@ -278,9 +284,9 @@ def secure_connection(
         The connection, with the keys.
 
     Raises:
-        UsageError: With keys, an endpoint is not encrypted, or the user's settings contradict
-            the keys. Without keys, other machines can reach an endpoint. Or the keys cannot be
-            used.
+        UsageError: One of three cases: The keys cannot be used. There are keys, but an endpoint
+            is not encrypted or the user's settings contradict the keys. There are no keys,
+            although other machines can reach an endpoint.
     """
     if isinstance(keys, str | Path):
         from .member_keys import read_member_keys  # loads the cryptography package
@@ -380,7 +386,14 @@ ENCRYPTED = ("tls/", "quic/")
 def find_endpoint_addresses(endpoints: Sequence[Endpoint]) -> list[str]:
     """Returns the addresses of endpoints as text, including those of grouped endpoints.
 
-    A Zenoh file may group several addresses into one endpoint, a table with the key "locators".
+    A user's Zenoh file may group several addresses into one endpoint, which is then a table
+    with the key "locators".
+
+    Args:
+        endpoints: Endpoints as text, or such tables.
+
+    Returns:
+        All addresses, in the order of the endpoints.
     """
     addresses: list[str] = []
     for endpoint in endpoints:
@@ -393,7 +406,13 @@ def find_endpoint_addresses(endpoints: Sequence[Endpoint]) -> list[str]:
 
 
 def is_loopback(address: str) -> bool:
-    """Returns True if an address can be reached from this machine only."""
+    """Returns True if an address can be reached from this machine only.
+
+    Such addresses need no encryption, because no other machine can connect to them.
+
+    Args:
+        address: Address of an endpoint, as in "tcp/127.0.0.1:7447".
+    """
     protocol, _, rest = address.partition("/")
     host_and_port = re.split(r"[?#]", rest)[0]  # without Zenoh's settings
     host = host_and_port.rpartition(":")[0].strip("[]")

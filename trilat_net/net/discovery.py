@@ -64,7 +64,8 @@ def find_members(
 ) -> Iterator[Info]:
     """Queries the members of a session, and yields their identities as they arrive.
 
-    The query is repeated, so that the identity of a member is yielded repeatedly.
+    The query is repeated until the search ends, because a reply may be lost. The identity of a
+    member is therefore yielded repeatedly.
 
     Args:
         bus: Network connection that reaches the session.
@@ -75,6 +76,9 @@ def find_members(
 
     Raises:
         SessionError: The time is over, and none of the replies that arrived could be decoded.
+
+    Yields:
+        The identity of a member, as soon as a reply has arrived.
     """
     query = MemberQuery(bus, clock, session)
     has_readable_reply = False
@@ -105,9 +109,9 @@ def connect_to_session(
     """Connects to the sites of a session, as a context manager that closes the connection.
 
     If the endpoints are not known (`connection.connect` is None), they are found in two ways.
-    If all sites of the session are known to run on this machine, their endpoints are used.
-    Otherwise the first site of the session, at its default endpoint on this machine, is queried
-    for the names of the other sites, whose default endpoints follow from the names.
+    If files on this machine show that all sites of the session run here, their endpoints are
+    used. Otherwise the first site of the session, at its default endpoint on this machine, is
+    queried for the names of the other sites, whose default endpoints follow from the names.
 
     Args:
         connection: Endpoints and mode of the caller.
@@ -119,9 +123,9 @@ def connect_to_session(
         timeout_s: Longest wait for the first site or for a router, in s. None waits without a
             limit.
         say: Function that prints a line for the user.
-        recorder_boot: Boot of the caller, if the caller is a recorder. The recorder is
-            announced during the search, so that the session waits for it. None for other
-            callers.
+        recorder_boot: Random number that identifies this start of the caller, if the caller is
+            a recorder. The recorder is announced during the search, so that the session waits
+            for it. None for other callers.
 
     Yields:
         The network connection. None if `stopped` returned True.

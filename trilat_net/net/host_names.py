@@ -21,14 +21,17 @@ class UnknownHost(UsageError):  # noqa: N818 - it names an outcome
 
 
 def check_hosts(endpoints: Iterable[str]) -> None:
-    """Raises an error for the first endpoint whose host name cannot be resolved.
+    """Checks that the host names of all endpoints can be resolved to addresses.
+
+    Zenoh would try to resolve an unknown name for ever, so the names are checked before a
+    connection is opened. IP addresses need no check.
 
     Args:
         endpoints: Endpoints such as tcp/arm.example:7447, or web addresses such as
             tcp://arm.example:8786.
 
     Raises:
-        UnknownHost: A host name cannot be resolved.
+        UnknownHost: A host name cannot be resolved. The error is about the first such endpoint.
     """
     for endpoint in endpoints:
         match = _ENDPOINT.fullmatch(endpoint)

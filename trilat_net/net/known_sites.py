@@ -47,16 +47,20 @@ _NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL
 class KnownSite(msgspec.Struct, frozen=True):
     """Content of the file in which a running site stores how it can be reached.
 
+    A site is a process that runs one arm and its control loop. With this file, other programs
+    on the same machine find the site without searching the network.
+
     Attributes:
         session: Name of the session.
         site: Name of the site.
         sites: Names of all sites of the session.
-        mode: Mode of the site's network connection.
+        mode: Mode of the site's network connection: "peer", "client" or "router", see
+            `Connection`.
         keyed: True if the site encrypts its messages with keys.
-        places: Endpoints at which the site, and the members that it connects to, can be
-            reached.
+        places: Endpoints at which the site can be reached, and those of the members that it
+            connects to.
         stop: The message that stops the arm, encoded.
-        pid: Process number of the site.
+        pid: Number of the site's process in the operating system.
         machine: Identity of the machine's clock. It changes when the machine is restarted.
     """
 
@@ -140,6 +144,9 @@ def find_known_sites(session: str) -> list[KnownSite]:
 
     Args:
         session: Name of the session.
+
+    Returns:
+        The content of the file of each site. Empty if no site of the session runs here.
     """
     running = []
     machine = SystemClock().identity()
@@ -167,7 +174,11 @@ def _is_alive(pid: int) -> bool:
 
 
 def list_endpoints(known_sites: Sequence[KnownSite]) -> list[Endpoint]:
-    """Returns the endpoints at which sites can be reached, each endpoint once."""
+    """Returns the network endpoints at which some sites can be reached, each endpoint once.
+
+    Args:
+        known_sites: The sites, as `find_known_sites` returns them.
+    """
     endpoints: list[Endpoint] = []
     for known in known_sites:
         for endpoint in known.places:
@@ -204,12 +215,16 @@ def find_known_endpoints(session: str, connection: "Connection") -> list[Endpoin
 def stop_at_once(arguments: Sequence[str]) -> int | list[str]:
     """Stops arms immediately, as the command line of `trilat stop` requests.
 
+    Only the sites that run on this machine can be stopped in this way, because their endpoints
+    are known from files. Nothing else is loaded before, so that the arms stop without delay.
+
     Args:
         arguments: Command line after `trilat stop`.
 
     Returns:
-        The exit code if all arms have been stopped, or if the keys are missing. Otherwise the
-        arguments with which the command has to continue.
+        The exit code of the command, if all arms have been stopped or if the keys are missing.
+        Otherwise the arguments with which the full command has to continue, for example to
+        search the network for the remaining sites.
     """
     options, sites, is_simple = _parse_arguments(arguments)
     session = options["--session"]

@@ -75,7 +75,7 @@ class MemberKeys(NamedTuple):
 
     Attributes:
         member: Name of the member.
-        members: Names of all members.
+        members: Names of all members of the session that the keys were created for.
         ends: End of the keys, in UTC. The certificate is valid for `STOPPING_TIME` longer.
         settings: Zenoh settings that use the keys, see `make_zenoh_config`.
     """

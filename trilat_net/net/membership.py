@@ -44,7 +44,11 @@ from .wire import M, decode, encode, split_states
 
 
 def new_boot() -> int:
-    """Returns a random 64-bit number that identifies one start of one process."""
+    """Returns a random 64-bit number that identifies one start of one process (a "boot").
+
+    If a process is restarted under the same name, the other processes recognise it by the new
+    number.
+    """
     return secrets.randbits(64)
 
 
@@ -55,7 +59,9 @@ def describe_member(
     scenario: str = "",
     **fields: object,
 ) -> Info:
-    """Returns the identity with which a member of this process introduces itself.
+    """Composes the identity with which a member introduces itself to the others of a session.
+
+    A member is a process that takes part in a session.
 
     Args:
         member: Name of the member.
@@ -63,6 +69,10 @@ def describe_member(
         clock: Clock of the member.
         scenario: Text of the scenario file. Empty if the member does not know the scenario.
         **fields: Further fields of `Info`.
+
+    Returns:
+        The identity, which also contains the scenario, the name of the machine and the identity
+        of its clock.
     """
     digest = hashlib.sha256(scenario.encode()).hexdigest() if scenario else ""
     basic_fields = {
@@ -82,6 +92,11 @@ def liveliness_token(session: str, member: str, boot: int) -> str:
 
     Zenoh tells all members of the session when a token appears, and when the process that
     declared the token has disappeared.
+
+    Args:
+        session: Name of the session.
+        member: Name of the member.
+        boot: Random number that identifies the start of the member's process.
     """
     return topics.key(session, member, topics.ALIVE) + f"/{boot}"
 
@@ -91,6 +106,13 @@ def read_messages(inbox: Inbox, kind: type[M]) -> Iterator[M]:
 
     Payloads that cannot be decoded as this type are skipped without an error, because any
     program on the network can publish under the key of the inbox.
+
+    Args:
+        inbox: Queue of the encoded messages that have arrived.
+        kind: Expected type of the messages.
+
+    Yields:
+        The decoded messages, in the order of their arrival.
     """
     while (message := inbox.poll()) is not None:
         # Sites and recorders count the payloads that they cannot decode.
@@ -174,11 +196,18 @@ class EventPublisher:
         return event
 
     def update(self, **fields: object) -> None:
-        """Changes fields of the identity. Later queries receive the changed identity."""
+        """Changes fields of the identity. Later queries receive the changed identity.
+
+        Args:
+            **fields: New values of fields of `Info`. All other fields stay unchanged.
+        """
         self.info = msgspec.structs.replace(self.info, **fields)
 
     def answer_queries(self) -> None:
-        """Replies with the current identity to all queries that are waiting."""
+        """Replies with the current identity of the member to all queries that are waiting.
+
+        The method does not wait, so that a control loop may call it.
+        """
         while (query := self._queries.poll()) is not None:
             query.reply(encode(self.info))
 
@@ -262,7 +291,8 @@ class Membership:
         late: Rules about sites that join late.
 
     Attributes:
-        others: Identity of each other member that is known and present, by name.
+        others: Identity of each other member that is present and has introduced itself, by
+            name.
         alive: Boots (numbers of process starts) of the members that are present, as text.
         gone: Boots of the members that have disappeared, as text.
     """
@@ -290,17 +320,24 @@ class Membership:
 
     @property
     def local_info(self) -> Info:
-        """Identity of this member."""
+        """Identity of this member, as it is sent to the other members."""
         return self._publisher.info
 
     @property
     def is_leader(self) -> bool:
-        """True if this member is the first site of the scenario, which starts the session."""
+        """True if this member is the leader: the first site of the scenario.
+
+        The leader decides when the session starts, and all other sites follow its schedule.
+        """
         return self._sites[:1] == (self.local_info.member,)
 
     @property
     def unreadable(self) -> dict[str, str]:
-        """For each member of the session whose reply cannot be decoded, the reason."""
+        """Reasons why the replies of members could not be decoded, by the name of the member.
+
+        For example, a member may run another version of the program. Empty if all replies could
+        be decoded.
+        """
         expected_members = (*self._sites, topics.RECORDER)
         return {
             name: reason
@@ -309,17 +346,24 @@ class Membership:
         }
 
     def boots(self) -> dict[str, int]:
-        """Returns the present members, including this member, with the boot of each.
+        """Returns the members that are present, including this one, with the boot of each.
 
         The boot is the random number that identifies the start of the member's process.
+
+        Returns:
+            The boots, by the name of the member.
         """
         boots = {name: info.boot for name, info in self.others.items()}
         return boots | {self.local_info.member: self.local_info.boot}
 
     def clocks(self) -> dict[str, str]:
-        """Returns the clock of each member that is present, including this member.
+        """Returns the identity of the clock of each member that is present, including this one.
 
-        Members with the same clock run on the same machine.
+        Members whose clocks have the same identity run on the same machine, so that their times
+        can be compared directly.
+
+        Returns:
+            The identities, by the name of the member.
         """
         clocks = {name: info.clock for name, info in self.others.items()}
         return clocks | {self.local_info.member: self.local_info.clock}
@@ -328,7 +372,11 @@ class Membership:
         """Lists the members that must still appear before the session can start.
 
         These are the sites of the scenario that are not known yet, except those that need not
-        be awaited. The recorder is listed if a member needs it or if its token has appeared.
+        be awaited. The recorder is listed if it is not known yet, and either a member needs it
+        or its liveliness token shows that it is about to join.
+
+        Returns:
+            The names. Empty if the session can start.
         """
         members = [self.local_info, *self.others.values()]
         needs_recorder = any(info.needs_recorder for info in members)
@@ -340,11 +388,11 @@ class Membership:
         return [name for name in awaited if name not in not_missing]
 
     def has_restarted(self, name: str, boot: int) -> bool:
-        """Returns True if a start of a member is gone, and another start has replaced it.
+        """Returns True if a process of a member is gone, and another process has replaced it.
 
         Args:
             name: Name of the member.
-            boot: Number that identifies the start in question.
+            boot: Number that identifies the start of the former process.
         """
         info = self.others.get(name)
         return info is not None and info.boot != boot and str(boot) not in self.alive

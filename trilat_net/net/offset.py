@@ -62,9 +62,13 @@ _WEIGHTING_ROUNDS = 3
 class OffsetLimit(NamedTuple):
     """Upper limit (ceiling) or lower limit (floor) of an offset.
 
+    Each message between two machines limits the offset between their clocks, because a message
+    cannot arrive before it was sent. Messages in one direction give ceilings, those in the
+    other direction floors.
+
     Attributes:
         local_ns: Time on the local clock for which the limit holds, in ns.
-        offset_ns: The limit, in ns.
+        offset_ns: The limit of the offset, the other clock minus the local clock, in ns.
     """
 
     local_ns: int
@@ -91,14 +95,25 @@ class OffsetEstimate(NamedTuple):
     drift_high: float
 
     def extrapolate_ns(self, local_ns: int) -> int:
-        """Returns the estimated offset at another time of the local clock, in ns."""
+        """Returns the estimated offset at another time of the local clock, in ns.
+
+        The offset is assumed to grow with the estimated drift.
+
+        Args:
+            local_ns: The time on the local clock, in ns.
+        """
         return self.offset_ns + round((local_ns - self.local_ns) * self.drift / NS_PER_S)
 
     def widen(self, *limits: OffsetLimit | None) -> "OffsetEstimate":
-        """Returns the estimate with wider limits, which include limits that contradict it.
+        """Returns the estimate with limits so wide that further limits do not contradict it.
 
         Args:
-            *limits: Ceilings and floors. None is ignored.
+            *limits: Ceilings and floors that the true offset is known to satisfy. None is
+                ignored.
+
+        Returns:
+            A new estimate. Its limits include all these limits at the times for which they
+            hold.
         """
         offsets = [limit.offset_ns for limit in limits if limit is not None]
         low_ns = min([self.low_ns, *offsets])
@@ -107,6 +122,9 @@ class OffsetEstimate(NamedTuple):
 
     def error_bound_ns(self, local_ns: int, offset_ns: int) -> int:
         """Returns the largest possible error of a value that is used for the offset, in ns.
+
+        The true offset lies anywhere between the limits of this estimate, which become wider
+        with the distance from the time of the estimate.
 
         Args:
             local_ns: Time on the local clock, in ns.
@@ -126,6 +144,9 @@ def exact_offset(offset_ns: int) -> OffsetEstimate:
     """Returns the estimate of a constant offset that is known exactly.
 
     Such an offset exists between two readings of the same clock.
+
+    Args:
+        offset_ns: The offset, the other clock minus the local clock, in ns.
     """
     return OffsetEstimate(
         local_ns=0,
@@ -139,12 +160,23 @@ def exact_offset(offset_ns: int) -> OffsetEstimate:
 
 
 def format_offset(offset_ns: int, bound_ns: int) -> str:
-    """Formats an offset and its error bound for the user."""
+    """Formats an offset between two clocks, and its error bound, for the user.
+
+    Args:
+        offset_ns: The offset, in ns.
+        bound_ns: Largest possible error of the offset, in ns.
+
+    Returns:
+        A short text with units, for example for an event or a table.
+    """
     return f"offset {offset_ns / 1e9:.6f} s +- {-(-bound_ns // 1000)} us"
 
 
 class OffsetEstimator:
     """Estimates the offset of another clock from the limits of the latest windows.
+
+    Time stamps of messages are evaluated in windows of time. Each window contributes its lowest
+    upper limit (ceiling) and its highest lower limit (floor).
 
     Attributes:
         broken: Number of times that the limits contradicted each other. The older half of them
@@ -161,8 +193,9 @@ class OffsetEstimator:
         """Adds the limits of one window.
 
         Args:
-            ceiling: Lowest ceiling of the window. None if no sample was acknowledged.
-            floor: Highest floor of the window. None if no message arrived.
+            ceiling: Lowest ceiling of the window. None if the other machine acknowledged no
+                sample of this one.
+            floor: Highest floor of the window. None if no message of the other machine arrived.
         """
         if ceiling is not None:
             self._ceilings.append(ceiling)
@@ -386,7 +419,7 @@ class SlewedOffset:
 
     @property
     def estimate(self) -> OffsetEstimate:
-        """Latest estimate, which the smoothed offset approaches or follows."""
+        """Latest estimate, which the smoothed offset approaches or has reached already."""
         return self._segment.estimate
 
     @property
