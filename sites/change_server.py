@@ -112,7 +112,7 @@ class ChangeServer:
         """Replies to all waiting requests, and returns the changes for the next tick.
 
         Args:
-            k: Next tick.
+            k: Number of the next tick, a period of the control loop.
 
         Returns:
             The changes that the site applies in that tick.

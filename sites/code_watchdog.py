@@ -70,7 +70,7 @@ class WatchedCode:
         usage: Function that returns the computing time and the context switches of the thread.
 
     Attributes:
-        hiccups: Number of calls that took longer than a period.
+        hiccups: Number of calls that took longer than the period between two calls.
         longest_ns: Duration of the longest call, in ns.
         longest_tick: Tick of that call. It is -1 before the first call.
     """
@@ -107,7 +107,7 @@ class WatchedCode:
         """Calls the code, and measures how long it takes.
 
         Args:
-            k: The tick.
+            k: Number of the tick, a period of the control loop, in which the code is called.
             call: Function that calls the code.
 
         Returns:
@@ -166,9 +166,10 @@ class WatchedCode:
             raise self._fail(k, problem)
 
     def describe_hiccups(self) -> str:
-        """Returns a sentence about the calls that took longer than a period.
+        """Describes the calls that took longer than a period of the control loop, for the user.
 
-        Empty if there were none.
+        Returns:
+            A sentence with their number and the longest duration. Empty if there were none.
         """
         if not self.hiccups:
             return ""
@@ -202,13 +203,14 @@ class WatchedCode:
 
 
 class CodeWatchdog:
-    """Context manager that interrupts user code that hangs inside the `with` block.
+    """Interrupts a user's code that hangs, as a context manager.
 
-    It uses the signal SIGALRM, which Python handles in the main thread only. In other threads,
-    and on Windows, nothing is interrupted.
+    The code is watched inside the `with` block. The object uses the signal SIGALRM, which
+    Python handles in the main thread only. In other threads, and on Windows, nothing is
+    interrupted.
 
     Args:
-        *codes: The code to watch.
+        *codes: The user's code to watch.
 
     Attributes:
         codes: The code to watch. More can be added before the `with` block.

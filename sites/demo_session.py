@@ -117,10 +117,10 @@ class SessionProcess:
         self._signalled = False
 
     def end(self, number: int) -> None:
-        """Sends the process a signal, unless it has ended.
+        """Ends the process with a signal. Nothing happens if the process has ended already.
 
         Args:
-            number: Number of the signal.
+            number: Number of the signal in the operating system.
         """
         if self.code is None:
             self._signalled = True
@@ -200,7 +200,14 @@ class ProcessStarter:
         return process
 
     def signal(self, process: SessionProcess, number: int) -> None:
-        """Sends a process a signal. A process that has not started yet then does not start."""
+        """Sends a signal to a process.
+
+        If the process has not been started yet, it will not be started at all.
+
+        Args:
+            process: The process, as `start` returned it.
+            number: Number of the signal in the operating system.
+        """
         self._send_order(process.name, [], number, process.output)
         # This signal interrupts a starter that is still importing modules. A starter that is
         # ready has blocked it.
@@ -247,7 +254,10 @@ class ProcessStarter:
                         os.kill(process.pid, signal.SIGINT)
 
     def close(self) -> None:
-        """Ends the starter. All other processes must have ended."""
+        """Ends the starter, the process that starts all other processes of the session.
+
+        All other processes must have ended before.
+        """
         self._pipe.close()
         self._starter.send_signal(signal.SIGINT)
         self._starter.wait()

@@ -59,9 +59,9 @@ class DeviceHand:
         reach: Region that the arm can reach. The target never leaves it.
 
     Attributes:
-        states: Number of states that were read.
-        jumps: Number of states that moved nothing because they were jumps.
-        unreadable: Number of states that moved nothing because they were not finite.
+        states: Number of states of the device (position, velocity, buttons) that were read.
+        jumps: Number of states that were ignored because the position had jumped.
+        unreadable: Number of states that were ignored because they contained NaN or infinity.
         trips_ns: Times from a position of the device until the force that it caused was
             rendered, in ns.
     """
@@ -94,7 +94,7 @@ class DeviceHand:
         self.release()
 
     def release(self) -> None:
-        """Releases the arm until the clutch is pressed again."""
+        """Releases the arm until the clutch, a button of the device, is pressed again."""
         self._hand.release()
         # The target is empty while the arm is not held.
         self._target: list[float] = []
@@ -107,7 +107,7 @@ class DeviceHand:
         self._sent.clear()
 
     def serve(self) -> None:
-        """Reads a state of the device, moves the target, and renders a force.
+        """Reads a state of the device, moves the target, and applies a force to the person.
 
         The call takes one period of the device.
 

@@ -56,6 +56,9 @@ def describe_site(
 ) -> SiteRow:
     """Composes the row of a site from its newest record and statistics.
 
+    A site is a process that runs one arm and its control loop. A row of the display shows the
+    state of one site.
+
     Args:
         scenario: Scenario of the session.
         name: Name of the site.
@@ -145,16 +148,21 @@ def _describe_hold(hand: HandInForce | None) -> str:
 
 
 def describe_angles(q: Sequence[float]) -> str:
-    """Returns the text of joint angles.
+    """Formats the joint angles of an arm for the display.
 
     Args:
         q: Joint angles in rad.
+
+    Returns:
+        The angles as one short text.
     """
     return " ".join(f"{angle:+.3f}" for angle in q) + " rad"
 
 
 def describe_row(row: SiteRow) -> str:
-    """Returns the row of a site as a line of text, with the most important columns.
+    """Returns the state of a site as one line of text, for outputs without a table.
+
+    The line contains only the most important columns.
 
     Args:
         row: The texts of the row, by the headings of the columns.
@@ -180,7 +188,7 @@ def frame_alarms(alarms: Sequence[tuple[str, LifeAlarm]]) -> list[Panel]:
     by itself.
 
     Args:
-        alarms: Name of the site, and the alarm.
+        alarms: For each alarm, the name of the site and the alarm.
     """
     blocks = []
     for name, alarm in alarms:
@@ -220,12 +228,16 @@ class SessionDisplay:
 
     @property
     def due(self) -> bool:
-        """True if it is time for the next update."""
+        """True if enough time has passed since the last update of the display."""
         period_ns = TABLE_NS if self._live else LINES_NS
         return self._clock.monotonic_ns() - self._updated_ns >= period_ns
 
     def say(self, text: str) -> None:
-        """Prints a line above the table."""
+        """Prints a line for the user above the table, where it stays.
+
+        Args:
+            text: The line.
+        """
         self._console.print(text, highlight=False, markup=False, soft_wrap=True)
 
     def show(
@@ -261,6 +273,9 @@ class SessionDisplay:
 
 class SessionMonitor:
     """Receives the messages of all sites of a session, and shows them on a display.
+
+    The program of a user who watches the session creates this object and calls `poll`
+    repeatedly.
 
     Args:
         bus: Network connection that reaches the session.

@@ -81,11 +81,13 @@ def _parse_header(payload: bytes) -> tuple[int, ...] | None:
 
 
 def answer_benchmarks(bus: Bus, member: str) -> None:
-    """Sends back the messages of benchmarks until the connection is closed.
+    """Sends each message of a benchmark back to its sender, until the connection is closed.
+
+    This is the work of the far end. The near end measures the round trip times.
 
     Args:
         bus: Network connection of the far end.
-        member: Name of the far end.
+        member: Name of the far end, under which its messages are published.
     """
     put = bus.publisher(topics.key(SESSION, member, topics.SAMPLE))
 
@@ -103,6 +105,9 @@ def answer_benchmarks(bus: Bus, member: str) -> None:
 
 class NearEnd:
     """Sends messages to the far end, and measures when they come back.
+
+    The far end sends each message back at once, so that the near end measures round trip times
+    with its own clock.
 
     Args:
         bus: Network connection of the near end.
@@ -139,7 +144,9 @@ class NearEnd:
                     yield number, arrived_ns - sent_ns
 
     def wait_for_far_end(self) -> bool:
-        """Sends messages until the far end replies.
+        """Waits until messages reach the far end and come back.
+
+        Messages are sent repeatedly, because the connection may not be complete yet.
 
         Returns:
             True once the far end has replied. False if it does not reply within `CONNECT_NS`.
@@ -313,8 +320,8 @@ class ScenarioNeeds(NamedTuple):
             it. None if the linear theory does not cover the scenario.
         stable_ms: Intervals of the delay of all links for which the control loop is stable.
             None if the linear theory does not cover the scenario.
-        words: Sentence about these intervals, or the reason why the theory does not cover the
-            scenario.
+        words: Sentence for the user about these intervals, or the reason why the theory does
+            not cover the scenario.
     """
 
     sample_bytes: int
@@ -398,10 +405,12 @@ def _measure_sample(scenario: Scenario) -> int:
 def judge_network(needs: ScenarioNeeds, row: Mapping[str, Any]) -> dict[str, Any]:
     """Judges whether a network is good enough for a scenario.
 
-    A site uses a sample from its first tick after the sample has arrived (rule L2). Samples
-    therefore have an age of whole ticks. The p99 delay of the network counts. It has no effect
-    if it is shorter than the time for which the scenario itself holds samples. The network is
-    good if the loop is stable at that age, and if at most `MAX_LOST` of the samples are lost.
+    A sample is the state that a site publishes in each tick, a period of its control loop. The
+    receiver uses it from its first tick after the sample has arrived. Samples therefore have an
+    age of whole ticks. The delay of the network that counts is its 99th percentile. It has no
+    effect if it is shorter than the time for which the scenario itself holds samples. The
+    network is good if the loop is stable at that age, and if at most `MAX_LOST` of the samples
+    are lost.
 
     Args:
         needs: Requirements of the scenario.
@@ -450,7 +459,7 @@ class NetworkBenchmark(Result):
         duration_s: Duration of all cases together, in s.
         needs: Requirements of the scenario.
         rows: Measurements, one row per message size, message rate and transport.
-        judged: Verdicts, one per transport, see `judge_network`.
+        judged: Verdict for each transport, whether it is good enough, see `judge_network`.
     """
 
     scenario: str
@@ -465,7 +474,10 @@ class NetworkBenchmark(Result):
         return all(verdict["good"] for verdict in self.judged)
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns plain values, with the keys of `trilat ping --benchmark --json`."""
+        """Returns the result as plain values, which can be written as JSON.
+
+        The keys are those that `trilat ping --benchmark --json` prints.
+        """
         return {
             "scenario": self.scenario,
             "duration_s": self.duration_s,
@@ -476,7 +488,10 @@ class NetworkBenchmark(Result):
         }
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns one flat row per message size, rate and transport, with times in us."""
+        """Returns the measurements as rows of a table, with times in us.
+
+        There is one row per message size, message rate and transport.
+        """
         flat_rows = []
         for row in self.rows:
             times = row["one_way_us"] or dict.fromkeys(("p50", "p99", "max"))

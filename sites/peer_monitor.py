@@ -43,7 +43,7 @@ class PeerMonitor:
         session: Name of the session.
         site: Name of the site.
         peers: Names of its peers, the sites whose samples it receives.
-        admits: True if sites may leave and come back.
+        admits: True if the scenario lets sites leave a running session and come back.
 
     Attributes:
         boots: Boot (number of the process start) of each member of the session, by name.
@@ -98,11 +98,14 @@ class PeerMonitor:
 
     @property
     def all_stored(self) -> bool:
-        """True if at least one recorder, and each that is present, has stored everything."""
+        """True if every recorder that is present has stored all messages of this site.
+
+        It is False if no recorder is present. The site may then not end without losing data.
+        """
         return bool(self.stored) and self.recorders <= self.stored
 
     def watch(self, publisher: EventPublisher, t_ns: int) -> None:
-        """Updates the list of members, and publishes an event for each that joins or is lost.
+        """Updates the list of members, and publishes an event for each that joins or leaves.
 
         Args:
             publisher: Publishes the events of this site.
@@ -157,10 +160,10 @@ class PeerMonitor:
                 self.departed[member] = (t_ns, sentence)
 
     def mark_present(self, member: str, t_ns: int) -> None:
-        """Marks a site as present because its samples arrive, although its token was lost.
+        """Marks a site as present because its samples arrive, although it seemed to be lost.
 
-        A site whose end event was received stays departed. A site that has just departed does
-        so as well: its last samples may still arrive.
+        A site that has published its end is not marked. Neither is a site that has just left,
+        because its last samples may still arrive.
 
         Args:
             member: Name of the site.
@@ -283,7 +286,7 @@ class PeerMonitor:
         """Receives the confirmations of recorders that they have stored all data of this site.
 
         Args:
-            ticks: Number of ticks of this site.
+            ticks: Number of ticks (periods of the control loop) that this site has executed.
 
         Returns:
             True if at least one further recorder has confirmed since the last call.

@@ -67,12 +67,22 @@ class ChannelBuffer:
         self._head = 0
 
     def start_at(self, number: int) -> None:
-        """Sets the number of the first message. No message must have been stored before."""
+        """Sets the number that the first message will have.
+
+        Args:
+            number: The number. No message must have been stored before.
+        """
         self.next_number = number
         self.oldest = number
 
     def store(self, payload: bytes) -> None:
-        """Adds the next message. The oldest messages are removed to make room for it."""
+        """Stores a message under the next number.
+
+        If there is no room for it, the oldest messages are removed.
+
+        Args:
+            payload: The encoded message.
+        """
         length = len(payload)
         offset = self._head % self._size
         if offset + length > self._size:
@@ -94,7 +104,7 @@ class ChannelBuffer:
             self.oldest += 1
 
     def skip(self, count: int) -> None:
-        """Adds empty messages, for numbers that the site never publishes.
+        """Stores empty messages, for numbers under which the site never publishes a message.
 
         Args:
             count: Number of empty messages.
@@ -131,8 +141,11 @@ class ChannelBuffer:
 class RetransmitBuffer:
     """Stores the recently published messages of a site, and answers the queries of recorders.
 
+    If a message is lost on the network, the recorder notices the gap in the numbers, and asks
+    the site to send the message again.
+
     Args:
-        site: The site in the simulation kernel.
+        site: The site in the simulation kernel, which computes its arm and its control law.
         boot: Random number that identifies this start of the site.
         queries: Queue of the queries.
 
@@ -155,7 +168,14 @@ class RetransmitBuffer:
         }
 
     def start_at(self, tick: int) -> None:
-        """Sets the first tick of the site, before any message is stored."""
+        """Sets the first tick of a site that joins a running session.
+
+        The numbers of its records and statistics then begin at the numbers of this tick. The
+        method must be called before any message is stored.
+
+        Args:
+            tick: Number of the first tick, a period of the control loop.
+        """
         link_number = count_messages(topics.LINK, tick, self._site.rate_hz)
         self.channels[topics.STATE].start_at(tick)
         self.channels[topics.LINK].start_at(link_number)
@@ -167,7 +187,7 @@ class RetransmitBuffer:
         stored under wrong numbers.
 
         Args:
-            first: First skipped tick.
+            first: First skipped tick, a period of the control loop.
             next_tick: First tick after the skipped ones.
         """
         skipped_ticks = next_tick - first

@@ -90,7 +90,7 @@ class ShareHistory:
     def add_change(self, change: str) -> None:
         """Adds a change that an event of the site reports.
 
-        Changes of other settings are ignored, and so are texts that are no change.
+        Changes of other settings are ignored, and so are texts that do not describe a change.
 
         Args:
             change: Text of the change, as the field `command` of the event contains it.
@@ -269,35 +269,41 @@ class RunningSession:
             say(f"{site}: {device_hand.describe()}")
 
     def stop(self, *sites: str) -> list[str]:
-        """Stops some arms at once while the session continues, as `trilat stop` does.
+        """Stops some arms at once, while the session continues.
+
+        The command `trilat stop` does the same. The other arms are not stopped.
 
         Args:
-            *sites: Names of the sites. All sites if no name is given.
+            *sites: Names of the sites whose arms are stopped. All sites if no name is given.
 
         Returns:
-            The reply of each site.
+            One sentence per site: its reply, in the order of the sites.
         """
         return _read_replies(self.send_order(sites, "stop"))
 
     def enable(self, *sites: str) -> list[str]:
-        """Lets stopped arms follow their peers again, as `trilat enable` does.
+        """Lets stopped arms follow their peers again, the other sites of the session.
+
+        The command `trilat enable` does the same.
 
         Args:
             *sites: Names of the sites. All sites if no name is given.
 
         Returns:
-            The reply of each site.
+            One sentence per site: its reply, in the order of the sites.
         """
         return _read_replies(self.send_order(sites, "enable"))
 
     def reset(self, *sites: str) -> list[str]:
-        """Clears the fault of arms, unless its reason persists, as `trilat reset` does.
+        """Clears the fault of arms, so that they can be enabled again.
+
+        A fault whose reason persists is not cleared. The command `trilat reset` does the same.
 
         Args:
             *sites: Names of the sites. All sites if no name is given.
 
         Returns:
-            The reply of each site.
+            One sentence per site: its reply, in the order of the sites.
         """
         return _read_replies(self.send_order(sites, "reset"))
 
@@ -346,7 +352,7 @@ class RunningSession:
         All sites end at the same time of the session, about half a second from now.
 
         Returns:
-            The reply of each site.
+            One sentence per site: its reply, in the order of the sites.
 
         Raises:
             SessionError: The session has not begun, or a site does not reply.
@@ -454,7 +460,7 @@ class RunningSession:
             **to: The new settings, as in `delay_ms=350`.
 
         Returns:
-            The reply of the receiving site.
+            The reply of the receiving site, which carries out the change, as a sentence.
 
         Raises:
             RunFailed: The site has refused the change.
@@ -470,7 +476,7 @@ class RunningSession:
             ramp_s: Duration of the change, in s.
 
         Returns:
-            The reply of the site.
+            The reply of the site, as a sentence.
 
         Raises:
             RunFailed: The site has refused the change.
@@ -593,10 +599,10 @@ class RunningSession:
         recorder stores.
 
         Args:
-            text: The text.
+            text: Text of the mark, for a reader of the log.
 
         Returns:
-            The reply of the site.
+            The reply of the site, as a sentence.
         """
         with self.reach() as bus:
             scenario, infos = self._find_sites(bus)
@@ -605,7 +611,10 @@ class RunningSession:
 
     @contextmanager
     def episode(self, name: str) -> Iterator[Callable[[bool], None]]:
-        """Marks the beginning and the end of an episode in the log, as a context manager.
+        """Marks an episode, a part of the run with a name, in the log, as a context manager.
+
+        The beginning and the end of the `with` block are stored as marks. Tools that read the
+        log can then divide the run into episodes, for example one per attempt at a task.
 
         >>> with tn.session("paper").episode("reach 3") as judge:  # doctest: +SKIP
         ...     judge(True)

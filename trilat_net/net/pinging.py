@@ -100,6 +100,9 @@ def answer_pings(
 ) -> None:
     """Replies to pings in a network thread, until the network connection is closed.
 
+    A ping is a query to which a member replies at once with two time stamps (`Pong`). From the
+    replies, the sender computes round trip times and the offset between the clocks.
+
     Args:
         bus: Network connection of the member.
         clock: Clock of the member.
@@ -167,14 +170,15 @@ class RoundTrips:
     `Pinger` creates one object for each start of a member.
 
     Args:
-        required: Number of round trips without a contradiction after which the clock counts as
-            known.
+        required: Number of round trips after which the offset of the clock counts as known, if
+            they do not contradict each other.
 
     Attributes:
-        rtts_ns: The latest round trip times in ns, without the time between the member's two
-            stamps.
+        rtts_ns: The latest round trip times in ns, without the time that the member took to
+            reply.
         shortest_ns: The shortest round trip time in ns. 0 before the first round trip.
-        estimator: Collected limits of the offset of the member's clock.
+        estimator: Estimator of the offset of the member's clock, which stores the limits from
+            all round trips.
         latest: Latest estimate of that offset. None before the first estimate.
     """
 
@@ -189,7 +193,7 @@ class RoundTrips:
 
     @property
     def is_known(self) -> bool:
-        """True once enough round trips agree with each other."""
+        """True once the clock offset is known, as enough round trips agree with each other."""
         return self._agreeing >= self._required
 
     def receive(self, pinged_ns: int, pong: Pong, now_ns: int) -> None:
@@ -251,8 +255,8 @@ class Pinger:
         bus: Network connection of this member.
         clock: Clock of this member.
         session: Name of the session.
-        required: Number of round trips without a contradiction after which a clock counts as
-            known.
+        required: Number of round trips after which the offset of a clock counts as known, if
+            they do not contradict each other.
 
     Attributes:
         trips: Round trips to each member, by its boot, the random number that identifies the
@@ -276,7 +280,8 @@ class Pinger:
         """Sends a ping if it is due, and evaluates the replies that have arrived.
 
         Args:
-            boots: Boots of the members whose replies are accepted.
+            boots: Boots of the members whose replies are accepted. A boot is a number that
+                identifies one start of a process.
         """
         period_ns = PING_REST_NS if self.knows_clocks(boots) else PING_PACE_NS
         if boots and self._query.repeat(period_ns):
@@ -296,10 +301,11 @@ class Pinger:
                 trips.receive(pinged_ns, pong, now_ns)
 
     def knows_clocks(self, boots: Collection[int]) -> bool:
-        """Returns True if the clock offsets of some members are known.
+        """Returns True if the clock offset of each of some members is known.
 
         Args:
-            boots: Boots of the members.
+            boots: Boots of these members, the numbers that identify the starts of their
+                processes.
         """
         return all(boot in self.trips and self.trips[boot].is_known for boot in boots)
 
@@ -310,7 +316,7 @@ class Pinger:
         other machines are pinged.
 
         Args:
-            boot: Boot of the member.
+            boot: Boot of the member, the number that identifies the start of its process.
         """
         trips = self.trips.get(boot)
         if trips is None or trips.latest is None:
@@ -320,23 +326,27 @@ class Pinger:
     def estimator(self, boot: int) -> OffsetEstimator | None:
         """Returns the estimator of a member's clock offset, with all limits from pings.
 
-        None if the member has not replied to any ping.
+        The result is None if the member has not replied to any ping.
 
         Args:
-            boot: Boot of the member.
+            boot: Boot of the member, the number that identifies the start of its process.
         """
         trips = self.trips.get(boot)
         return None if trips is None else trips.estimator
 
     def slowest_ns(self) -> int:
-        """Returns the round trip time to the slowest member in ns, 0 if none is measured yet.
+        """Returns the largest round trip time to any member, in ns.
 
-        The round trip time of a member is the shortest one that was measured.
+        The round trip time of a member is the shortest one that was measured, because longer
+        ones contain waiting times. The result is 0 if nothing has been measured yet.
         """
         return max((trips.shortest_ns for trips in self.trips.values()), default=0)
 
     def pause_ns(self, otherwise_ns: int) -> int:
         """Returns how long the caller may wait until the next poll, in ns.
+
+        While replies to pings are expected, the pause is short, so that they are evaluated
+        soon.
 
         Args:
             otherwise_ns: Pause while no reply to a ping is expected, in ns.
@@ -349,13 +359,16 @@ class Pinger:
 def describe_clocks(pinger: Pinger, boots: Mapping[str, int], local_ns: int) -> list[str]:
     """Describes the clocks of the members on other machines, for the user.
 
+    Members on this machine use the same clock and are left out.
+
     Args:
         pinger: Round trips to the members.
-        boots: Boot of each member, by name.
+        boots: Boot of each member, the number that identifies the start of its process, by
+            name.
         local_ns: Time on the local clock for which the offsets are stated, in ns.
 
     Returns:
-        One sentence for each of these members.
+        One sentence for each member on another machine.
     """
     texts = []
     for name, boot in boots.items():

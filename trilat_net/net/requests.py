@@ -30,7 +30,11 @@ BACKFILL_BYTES = 40_000
 
 
 class Request(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Base class of these messages, with the present version of the schema."""
+    """Base class of the messages of this module: requests, replies to them, and measurements.
+
+    Every message contains the version of the schema, so that a member with another version of
+    the program recognises that it cannot read the message.
+    """
 
     v: int = VERSION
 
@@ -69,10 +73,10 @@ class ChangeRequest(Request, frozen=True, kw_only=True):
         dominance: Site that changes the weights with which it follows its peers.
         to: The new settings of the link, or the new weights.
         ramp_s: Duration of the transition to the new weights, in s.
-        stop_s: Time since the epoch at which the run ends, in s. The last tick of the site is
-            before this time.
-        mark: Text for the log.
-        order: Order that the site executes in its next tick.
+        stop_s: Time at which the run ends, in s since the epoch, the common start of the
+            session. The last tick of the site is before this time.
+        mark: Text that is stored in the log as a mark of the present moment.
+        order: Order to the site, such as "stop", which it executes in its next tick.
         source: Who requests the change: a noun phrase such as "the experimenter", which the
             event of the site repeats. A request without a source has the same bytes as that of
             a program that does not know this field.
@@ -94,7 +98,8 @@ class ChangeReply(Request, frozen=True, kw_only=True):
     Attributes:
         member: Name of the site.
         accepted: True if the site applies the change.
-        text: Tick from which the change holds, or the reason why it was refused.
+        text: Sentence for the user: the tick from which the change holds, or the reason why it
+            was refused.
         tick: First tick, at the tick rate of the site, for which the change holds. It is -1 if
             the change was refused.
     """
@@ -108,11 +113,12 @@ class ChangeReply(Request, frozen=True, kw_only=True):
 class BackfillRequest(Request, frozen=True, kw_only=True):
     """Request of a recorder to a site, to send messages again that were lost on the way.
 
-    The number of a record is its tick. Statistics and events are numbered from 0.
+    A record is the result of one tick of a control loop, and its number is that of the tick.
+    Statistics and events are numbered from 0.
 
     Attributes:
-        channel: Channel of the messages.
-        first, last: Range of the numbers of the messages.
+        channel: Channel of the messages: records, statistics or events.
+        first, last: Numbers of the first and the last requested message.
     """
 
     channel: Literal["state", "link", "event"]
@@ -225,7 +231,10 @@ class HandMessage(Request, frozen=True, kw_only=True):
 
 
 class PeerSeen(Request, frozen=True, kw_only=True):
-    """State of a peer in a `HandViewMessage`. The fields are those of `PeerView`."""
+    """State of one peer in a `HandViewMessage`, as the site of the operator sees it.
+
+    A peer is another site whose states the site receives. The fields are those of `PeerView`.
+    """
 
     alpha: float
     tick: int
@@ -237,9 +246,11 @@ class PeerSeen(Request, frozen=True, kw_only=True):
 
 
 class HandViewMessage(Request, frozen=True, kw_only=True):
-    """State of a site in one tick, for a user's operator program in another process.
+    """State of a site in one period of its control loop, for an operator in another process.
 
     The fields other than `site` and `boot` are those of `HandView`, which the program receives.
+
+    The operator is a program of the user that decides how the arm of the site moves.
 
     Attributes:
         site: Name of the site whose arm the operator moves.

@@ -85,7 +85,11 @@ _GID_BYTES = 16
 
 
 class EndpointKind(StrEnum):
-    """Kind of an endpoint, as its liveliness token states it."""
+    """Kind of an endpoint of a ROS 2 node: a publisher, a subscription, or a service.
+
+    The value is the text by which the liveliness token of the endpoint states its kind. A
+    liveliness token is a key that shows other programs that the endpoint exists.
+    """
 
     PUBLISHER = "MP"
     SUBSCRIPTION = "MS"
@@ -106,7 +110,11 @@ class QualityOfService(NamedTuple):
     depth: int = 10
 
     def encode(self) -> str:
-        """Returns the text for tokens. Values that are the defaults of ROS 2 are left out."""
+        """Returns the quality of service as text for a liveliness token.
+
+        A liveliness token shows other programs that an endpoint exists. As in ROS 2 itself,
+        values that are the defaults are left out.
+        """
         reliability = "" if self.reliable else "2"
         durability = "1" if self.latched else ""
         depth = "" if self.depth == 42 else self.depth
@@ -115,6 +123,9 @@ class QualityOfService(NamedTuple):
 
 class Attachment(NamedTuple):
     """Attachment of every message, request and response.
+
+    ROS 2 programs that communicate over Zenoh attach it, so that receivers can number and time
+    the messages of each sender.
 
     Attributes:
         number: Number of the message, from 1.
@@ -165,6 +176,9 @@ def name_dds_type(kind: str) -> str:
     """Returns the name of a message type as it is written in keys and tokens.
 
     For "std_msgs/msg/String" it is "std_msgs::msg::dds_::String_".
+
+    Args:
+        kind: Name of the type.
     """
     package, group, name = kind.split("/")
     return f"{package}::{group}::dds_::{name}_"
@@ -203,7 +217,10 @@ class Ros2Member(NamedTuple):
     name: str
 
     def token(self) -> str:
-        """Returns the liveliness token from which other programs learn that the node exists."""
+        """Returns the liveliness token of the node.
+
+        While this program declares the token, other ROS 2 programs see that the node exists.
+        """
         return f"@ros2_lv/{self.domain}/{self.zid}/0/0/NN/{self._path()}"
 
     def endpoint_token(
@@ -261,7 +278,11 @@ def describe_mismatch(token: str, domain: int, kind: str) -> str:
 
 
 def make_gid(token: str) -> bytes:
-    """Returns 16 bytes that identify an endpoint, computed from its token."""
+    """Returns 16 bytes that identify an endpoint, computed from its token.
+
+    Args:
+        token: Liveliness token of the endpoint, which no other endpoint has.
+    """
     return hashlib.sha256(token.encode()).digest()[:_GID_BYTES]
 
 
@@ -301,7 +322,13 @@ class Refusals:
         self._lock = threading.Lock()
 
     def add(self, reason: str) -> None:
-        """Counts a refusal. The method may be called in any thread."""
+        """Counts a message that was refused. The method may be called in any thread.
+
+        The user is told when the reason occurs for the first time.
+
+        Args:
+            reason: Why the message was refused.
+        """
         with self._lock:
             if reason not in self.counts and len(self.counts) >= _MAX_REASONS:
                 reason = "further reasons, which are counted together"
@@ -315,7 +342,7 @@ class Refusals:
 
         Args:
             topic: Name of the topic, which the reason mentions.
-            act: Function that processes a message.
+            act: Function that processes a message. It raises an error to refuse the message.
         """
 
         def guarded(*args: P.args, **named: P.kwargs) -> None:
@@ -361,7 +388,11 @@ class TopicPublisher:
         return self._latched or bool(self._declared.matching_status.matching)
 
     def put(self, data: bytes) -> None:
-        """Publishes a message, encoded in CDR, with the next number."""
+        """Publishes a message on the topic, with the next number and the time of sending.
+
+        Args:
+            data: The message, encoded in CDR, the binary format of ROS 2.
+        """
         self._number += 1
         attachment = Attachment(self._number, self._clock.unix_ns(), self._gid)
         self._declared.put(data, attachment=attachment.encode())
@@ -441,6 +472,8 @@ class Ros2Graph:
         """True while the router is connected.
 
         The session reconnects when the router is back.
+
+        It may be False for some time if the router is restarted.
         """
         return bool(self._session.info.routers_zid())
 
@@ -565,12 +598,16 @@ class Ros2Graph:
         self._declarations.append(self._session.declare_subscriber(key, handler))
 
     def serve(self, service: str, kind: str, answer: Callable[[bytes], bytes]) -> None:
-        """Offers a service. The requests of all services are processed one after another.
+        """Offers a service to ROS programs.
+
+        The requests of all services are processed one after another, so that `answer` may take
+        time.
 
         Args:
             service: Name of the service.
             kind: Name of its type.
-            answer: Function that returns the response to a request, both encoded in CDR.
+            answer: Function that receives a request and returns the response, both encoded in
+                CDR, the binary format of ROS 2.
         """
         key, _ = self._declare(EndpointKind.SERVER, service, kind, QualityOfService())
 

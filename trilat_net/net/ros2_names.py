@@ -12,11 +12,14 @@ Each part consists of letters, digits and _, and does not start with a digit.
 
 
 def check_ros_name(name: str, kind: str) -> str:
-    """Returns a name of ROS 2 without its leading slash.
+    """Checks that a text is a valid name of ROS 2.
 
     Args:
-        name: The name.
+        name: The name, which may begin with a slash.
         kind: What the name denotes, such as "topic", for the error message.
+
+    Returns:
+        The name without the leading slash.
 
     Raises:
         UsageError: The name is not valid.

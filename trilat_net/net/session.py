@@ -59,6 +59,8 @@ class SessionJoin:
     it as soon as they know it. It then creates this object, which announces the process, and
     calls `poll` regularly until the epoch is returned.
 
+    The first site of the scenario is the leader, which decides when the session starts.
+
     Args:
         bus: Network connection of this member.
         clock: Clock of this member.
@@ -119,9 +121,10 @@ class SessionJoin:
 
     @property
     def reason(self) -> str:
-        """Why this site could not join a running session. Empty if the reason is not known.
+        """Why this site could not join a running session, as text for an error message.
 
-        The reason is a refusal, or the names of the running sites that have not admitted it.
+        The reason is the text with which a running site has refused it, or the names of the
+        running sites that have not admitted it. Empty if the reason is not known.
         """
         running = {info.member for info in self.membership.list_running()}
         missing = sorted(running - self._admitted_by)
@@ -131,9 +134,10 @@ class SessionJoin:
 
     @property
     def announced_first_tick(self) -> int:
-        """First tick that this site named when it requested to join a running session.
+        """First tick that this site announced when it requested to join a running session.
 
-        It is 0 if the site has not requested to join.
+        The site executes its control loop from this tick on. The value is 0 if the site has not
+        requested to join.
         """
         if self._coming is None:
             return 0

@@ -82,7 +82,11 @@ class TickSchedule:
         self._slew_per_ns = 0.0
 
     def due_ns(self, k: int) -> int:
-        """Returns the time at which tick `k` is due, on the site's clock, in ns."""
+        """Returns the time at which a tick is due, on the site's clock, in ns.
+
+        Args:
+            k: Number of the tick.
+        """
         passed_ns = k * NS_PER_S // self._rate_hz - self._base_nominal_ns
         return self._base_ns + passed_ns + int(passed_ns * self._slew_per_ns)
 
@@ -93,7 +97,8 @@ class TickSchedule:
         time constant `_CORRECTION_TIME_S`. It is limited to `SLEW_LIMIT`.
 
         Args:
-            k: The tick. It must not be earlier than the tick of the previous adjustment.
+            k: Number of the tick. It must not be earlier than the tick of the previous
+                adjustment.
             error_ns: Lateness of the tick compared with the leader's schedule, in ns.
             drift: Rate of the leader's clock relative to the site's clock, in ns/s.
         """
@@ -115,10 +120,12 @@ _NO_DELAY_NS = 1 << 62
 
 
 class SentStamps:
-    """Ring of the times at which the latest samples of this site were sent, by tick.
+    """Stores the times at which the latest samples of this site were sent, by tick.
 
     When a peer's echo of a sample arrives, its sending time is looked up here. The capacity of
     16 384 ticks is enough for round trips of several seconds.
+
+    A sample is the state that a site publishes in one tick, a period of its control loop.
     """
 
     def __init__(self, capacity: int = 1 << 14) -> None:
@@ -126,13 +133,24 @@ class SentStamps:
         self._entries = array("q", [-1, 0]) * capacity  # tick and sending time, alternately
 
     def record(self, tick: int, sent_ns: int) -> None:
-        """Stores the time on the local clock at which the sample of a tick was sent."""
+        """Stores when the sample of a tick was sent. The oldest stored time is overwritten.
+
+        Args:
+            tick: Number of the tick.
+            sent_ns: Time of sending on the local clock, in ns.
+        """
         slot = 2 * (tick % self._capacity)
         self._entries[slot] = tick
         self._entries[slot + 1] = sent_ns
 
     def find_ns(self, tick: int) -> int | None:
-        """Returns when the sample of a tick was sent, or None if that is no longer stored."""
+        """Returns when the sample of a tick was sent, on the local clock, in ns.
+
+        None if that time is not stored any more, or if no sample was sent in that tick.
+
+        Args:
+            tick: Number of the tick.
+        """
         slot = 2 * (tick % self._capacity)
         return self._entries[slot + 1] if self._entries[slot] == tick else None
 
@@ -175,7 +193,8 @@ class LinkTimingMonitor:
     Attributes:
         peer: Clock of the sending peer.
         offset: Offset of the peer's clock over time, with which delays are computed.
-        faults: Number of impossible stamps, and of windows that contradict earlier ones.
+        faults: Number of clock faults: impossible time stamps, and windows that contradict
+            earlier ones.
         newest: Newest sample of the peer whose arrival this site has not confirmed yet: its
             tick, and its arrival on the local clock in ns. None if all are confirmed.
         worst_ns: Longest time by which a sample seemed to arrive before it was sent, since the
@@ -280,7 +299,13 @@ class LinkTimingMonitor:
         return delay_ns
 
     def is_receiving(self, now_ns: int) -> bool:
-        """Returns True if a sample of the peer has arrived within the last UNHEARD_NS."""
+        """Returns True if a sample of the peer has arrived within the last UNHEARD_NS.
+
+        A sample is the state that the peer publishes in each period of its control loop.
+
+        Args:
+            now_ns: Present time on the local clock, in ns.
+        """
         return self._received_ns >= 0 and now_ns - self._received_ns <= UNHEARD_NS
 
     def is_acknowledged(self, now_ns: int) -> bool | None:
@@ -449,13 +474,22 @@ class SiteTiming:
         self._fault_notice_ns = [-FAULT_EVERY_NS] * len(peers)
 
     def deadline_ns(self, k: int) -> int:
-        """Returns the time at which the site wakes up for tick `k`, on its clock, in ns."""
+        """Returns the time at which the site wakes up for a tick, on its own clock, in ns.
+
+        This is the time at which the tick is due, plus the delay `turn_ns`.
+
+        Args:
+            k: Number of the tick.
+        """
         return self.schedule.due_ns(k) + self.turn_ns
 
     def list_initial_notices(self) -> list[ClockNotice]:
         """Lists the events that state the offsets of the peers' clocks at tick 0.
 
         Peers on this machine have no offset and are left out.
+
+        Returns:
+            One event per peer on another machine. Empty if there are no such peers.
         """
         return [
             _describe_estimate(monitor, 0, self._epoch_ns)
@@ -512,7 +546,15 @@ class SiteTiming:
         return [_describe_estimate(monitor, k, due_ns)]
 
     def record_sent(self, tick: int, now_ns: int) -> int:
-        """Stores when the sample of a tick was sent, and returns it in ns since the epoch."""
+        """Stores when the sample of a tick was sent, so that its delay can be measured later.
+
+        Args:
+            tick: Number of the tick.
+            now_ns: Time of sending on the site's clock, in ns.
+
+        Returns:
+            The time of sending, in ns since the epoch, the common start of the session.
+        """
         self._sent.record(tick, now_ns)
         return now_ns - self._epoch_ns
 
@@ -542,7 +584,7 @@ class SiteTiming:
         The leader is the first site of the scenario. All sites follow its schedule.
 
         Args:
-            k: Next tick. The adjusted schedule applies from this tick on.
+            k: Number of the next tick. The adjusted schedule applies from this tick on.
             now_ns: Present time on the site's clock, in ns.
 
         Returns:
@@ -738,6 +780,9 @@ class LoopStats:
     def count_tick(self, late_us: int, busy_us: int, skipped: int = 0) -> None:
         """Updates the statistics with one tick.
 
+        The statistics contain the sums since the start, and the largest values since the last
+        publication.
+
         Args:
             late_us: Time by which the tick began late, in us.
             busy_us: Computing time of the previous tick, in us.
@@ -767,10 +812,13 @@ class LoopStats:
     def pop_stats(
         self, output: TickRecord, measured: Mapping[str, Any] | None = None
     ) -> LinkStats:
-        """Returns the statistics after a tick, and resets the largest lateness and time.
+        """Returns the statistics after a tick, and resets their largest times.
+
+        These are the largest lateness of a tick and the largest computing time since the last
+        call.
 
         Args:
-            output: Record of the tick.
+            output: Result of the tick.
             measured: Timing fields of `LinkStats`. None leaves them at their defaults.
         """
         peers = self._site.peers

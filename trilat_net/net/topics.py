@@ -57,6 +57,9 @@ STATS_PER_SECOND = 10
 class KeyParts(NamedTuple):
     """Parts of a key.
 
+    A key is the text under which a message is published. A member is a process that takes part
+    in a session, and a channel is one stream of its messages.
+
     Attributes:
         session: Name of the session.
         member: Name of the member.
@@ -110,10 +113,13 @@ def key(session: str, member: str, channel: str) -> str:
 
 
 def parse_key(key: str) -> KeyParts | None:
-    """Splits a key into session, member, channel and boot.
+    """Splits a key into the names of the session, the member and the channel, and the boot.
 
     Returns:
         The parts. None if the key belongs to another program.
+
+    Args:
+        key: The key under which a message has arrived, or that of a liveliness token.
     """
     root, _, rest = key.partition("/")
     parts = rest.split("/")
@@ -124,16 +130,25 @@ def parse_key(key: str) -> KeyParts | None:
 
 
 def ticks_per_stats(rate_hz: int) -> int:
-    """Returns the number of ticks from one message with statistics to the next."""
+    """Returns the number of ticks from one message with statistics to the next.
+
+    A tick is one period of a site's control loop. Statistics are published ten times a second.
+
+    Args:
+        rate_hz: Tick rate of the site.
+    """
     return max(1, rate_hz // STATS_PER_SECOND)
 
 
 def number_message(channel: str, tick: int, rate_hz: int) -> int:
-    """Returns the number of the record of a tick, or of the statistics after it.
+    """Returns the number of the message that a site publishes after a tick.
+
+    Records, the results of ticks, have the number of their tick. Statistics, which are
+    published less often, are numbered from 0.
 
     Args:
-        channel: `STATE` or `LINK`.
-        tick: The tick.
+        channel: `STATE` for records, or `LINK` for statistics.
+        tick: Number of the tick, a period of the control loop.
         rate_hz: Tick rate of the site.
     """
     return tick // ticks_per_stats(rate_hz) if channel == LINK else tick
@@ -143,8 +158,8 @@ def count_messages(channel: str, ticks: int, rate_hz: int) -> int:
     """Returns how many records, or statistics, a site publishes in its first ticks.
 
     Args:
-        channel: `STATE` or `LINK`.
-        ticks: Number of ticks.
+        channel: `STATE` for records, or `LINK` for statistics.
+        ticks: Number of ticks, periods of the control loop.
         rate_hz: Tick rate of the site.
     """
     if channel != LINK:
@@ -159,7 +174,7 @@ def count_under_way(channel: str, rate_hz: int) -> int:
     These are the messages of the last 20 ms, which may not have left the machine yet.
 
     Args:
-        channel: `STATE` or `LINK`.
+        channel: `STATE` for records, or `LINK` for statistics.
         rate_hz: Tick rate of the site.
     """
     ticks_in_20_ms = rate_hz // 50
@@ -172,10 +187,13 @@ def skipped_numbers(
     skipped: int,
     rate_hz: int,
 ) -> tuple[int, int]:
-    """Returns between which numbers the messages of skipped ticks are missing.
+    """Returns which numbers the messages of skipped ticks would have had.
+
+    A site that is late may skip ticks, periods of its control loop, and then publishes no
+    messages for them. Their numbers remain unused, and must not count as lost messages.
 
     Args:
-        channel: `STATE` or `LINK`.
+        channel: `STATE` for records, or `LINK` for statistics.
         tick: First tick after the skipped ones.
         skipped: Number of skipped ticks.
         rate_hz: Tick rate of the site.

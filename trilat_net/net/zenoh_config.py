@@ -92,9 +92,11 @@ LISTEN_EXIT_ON_FAILURE = {"router": True, "peer": True, "client": True}
 def limit_sizes(name: str, messages: list[str], size: int) -> dict[str, Any]:
     """Returns a Zenoh filter that drops incoming messages above a size.
 
+    Without the filter, another program could occupy the memory of a member with huge messages.
+
     Args:
         name: Name of the filter.
-        messages: Kinds of messages that it concerns.
+        messages: Kinds of messages, in the words of Zenoh, to which the limit applies.
         size: Largest permitted size, in bytes.
     """
     return {
@@ -124,7 +126,7 @@ def make_zenoh_config(
     Args:
         listen: Endpoints at which the member listens.
         connect: Endpoints to which the member connects.
-        mode: Mode of the member.
+        mode: Mode of the member: "peer", "client" or "router".
         user_settings: Settings that take precedence, from a user's file (`ZenohFile.settings`)
             or from keys.
     """
@@ -312,7 +314,8 @@ class ZenohFile:
         """Returns the endpoints that the file names.
 
         Args:
-            side: "listen" or "connect".
+            side: "listen" for the endpoints at which the member listens, or "connect" for those
+                to which it connects.
             mode: Mode of the member, as the file may name other endpoints for each mode.
 
         Returns:
@@ -603,10 +606,13 @@ ROLES = {
 
 
 def make_access_rules(members: Sequence[str]) -> dict[str, Any]:
-    """Returns the Zenoh settings that permit each member only what its role needs.
+    """Returns the Zenoh settings that let each member send only what its role requires.
+
+    A member proves its role by the name in its certificate.
 
     Args:
-        members: Names of all members. Those that are not names of special roles are sites.
+        members: Names of all members of the session. Members other than the recorder, the
+            operator and the router are sites.
     """
     rules: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []
