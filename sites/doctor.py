@@ -85,7 +85,7 @@ MIN_PUNCTUAL_SHARE = 0.99
 
 
 class DoctorFinding(NamedTuple):
-    """Result of one check.
+    """Result of one check of this machine, which `trilat doctor` prints as one line.
 
     Attributes:
         check: Subject of the check, such as "keys" or "disk".
@@ -113,10 +113,13 @@ def examine_machine(
         connection: Endpoints at which this machine would listen, or to which it would connect.
         keys: Folder of a member's keys. None if there is none.
         folder: Folder where results would be stored.
-        session: Name of a running session with whose members the clocks are compared. None
-            skips that comparison.
+        session: Name of a running session with whose members the clocks are compared. None if
+            the comparison is not made.
         clock: Clock of this process.
         insecure: True if everybody on the network is trusted.
+
+    Yields:
+        The findings, in the order of the checks.
     """
     member_keys = yield from examine_keys(keys)
     yield from examine_links(connection, keys, member_keys, insecure=insecure)
@@ -131,13 +134,16 @@ def examine_machine(
 
 
 def examine_keys(folder: Path | None) -> Generator[DoctorFinding, None, MemberKeys | None]:
-    """Checks if the keys are valid, until when they are, and if others can read them.
+    """Checks if a member's keys are valid, for how long, and if other users can read them.
 
     Args:
         folder: Folder of a member's keys. None if there is none.
 
     Returns:
         The keys. None if there are no keys, or if they cannot be used.
+
+    Yields:
+        The findings about the keys.
     """
     if folder is None:
         yield DoctorFinding(
@@ -183,6 +189,10 @@ def examine_links(
         folder: Folder of a member's keys. None if there is none.
         member_keys: The keys. None if there are no keys, or if they cannot be used.
         insecure: True if everybody on the network is trusted.
+
+    Yields:
+        The findings about the endpoints. There is a single one if no endpoint can be used at
+        all.
     """
     try:
         safe = secure_connection(connection, member_keys, insecure=insecure)
@@ -343,6 +353,9 @@ def examine_clock(clock: Clock) -> Iterator[DoctorFinding]:
 
     Args:
         clock: Clock of this process.
+
+    Yields:
+        One finding about the clocks.
     """
     begun_ns = clock.monotonic_ns()
     wall_ns = clock.unix_ns()
@@ -433,7 +446,14 @@ _RIGHTS_CODE = (
 
 
 def examine_rights() -> Iterator[DoctorFinding]:
-    """Checks which real-time settings the operating system grants to a site."""
+    """Checks which real-time settings the operating system grants to a site.
+
+    A site needs for example a high priority, so that its control loop is not interrupted by
+    other programs.
+
+    Yields:
+        One finding per setting. A single warning if the settings could not be tried.
+    """
     obtained: dict[str, str] | None = _run_in_process(_RIGHTS_CODE)
     if obtained is None:
         yield DoctorFinding("rights", "warn", "could not be tried")
@@ -467,6 +487,9 @@ class Rehearsal(LoopStats):
     The loop does the same work as in a session, except that no messages are exchanged. This
     object takes the place of two objects of the loop: of its statistics, so that the lateness
     of each tick can be stored, and of the `RunningSite`, whose methods do nothing here.
+
+    A tick is one period of the control loop. It is late if it begins after the time at which it
+    was due.
 
     Args:
         scenario: The scenario.
@@ -504,16 +527,38 @@ class Rehearsal(LoopStats):
         return self._late_us
 
     def count_tick(self, late_us: int, busy_us: int, skipped: int = 0) -> None:
-        """Updates the statistics with a tick, and stores its lateness, see `LoopStats`."""
+        """Adds one tick to the statistics, and stores its lateness.
+
+        The loop calls the method in place of `LoopStats.count_tick`.
+
+        Args:
+            late_us: Time by which the tick began late, in us.
+            busy_us: Computing time of the previous tick, in us.
+            skipped: Number of ticks that were skipped before this tick.
+        """
         super().count_tick(late_us, busy_us, skipped)
         self._late_us.append(late_us)
 
     def step(self, k: int, arrivals: Sequence[Arrival]) -> TickRecord:
-        """Computes a tick without any samples of peers."""
+        """Computes one tick of the site as if no samples of peers had arrived.
+
+        The loop calls the method in place of `RunningSite.step`.
+
+        Args:
+            k: Number of the tick.
+            arrivals: Samples that have arrived, which is none.
+
+        Returns:
+            The record of the tick.
+        """
         return self._site.step(TickInput(k, arrivals))
 
     def run_housekeeping(self, *_: object) -> bool:
-        """Does nothing, and returns False, which lets the loop continue."""
+        """Does nothing, in place of the method of `RunningSite` that works for the network.
+
+        Returns:
+            False, which lets the loop continue.
+        """
         return False
 
     # The other methods of `RunningSite` that the loop calls.
@@ -549,12 +594,12 @@ def rehearse_rates(clock: Clock) -> list[tuple[int, int, int]]:
 
 
 def is_held(rate_hz: int, late_us: int) -> bool:
-    """Returns True if ticks with a given lateness count as punctual at a tick rate.
+    """Returns True if a site holds a tick rate although its ticks are late by some time.
 
-    They do so up to `MAX_LATE_PERIODS` periods of the rate.
+    It does so if the lateness is at most `MAX_LATE_PERIODS` periods of the rate.
 
     Args:
-        rate_hz: The tick rate.
+        rate_hz: The tick rate, in ticks (periods of the control loop) per second.
         late_us: The lateness, in us.
     """
     return late_us <= MAX_LATE_PERIODS * 1e6 / rate_hz
@@ -572,6 +617,8 @@ def examine_rate() -> DoctorFinding:
     """Finds the highest tick rate that a single site achieves on this machine at present.
 
     Each rate of `RATES_HZ` is tried for `REHEARSAL_S`, until one is achieved.
+
+    A tick is one period of the control loop.
     """
     if not is_core_cached():
         return DoctorFinding(
@@ -602,7 +649,10 @@ def examine_rate() -> DoctorFinding:
 
 
 def examine_room(folder: Path) -> Iterator[DoctorFinding]:
-    """Checks the free disk space, the load of the processors, and if the code is compiled.
+    """Checks the free disk space, the load of the processors, and the compiled code.
+
+    If the control code has not been compiled and cached yet, the first run takes longer to
+    start.
 
     Args:
         folder: Folder where results would be stored. It need not exist.
@@ -641,13 +691,13 @@ class DoctorReport(Result):
     """All findings about this machine, in the order of the checks.
 
     Attributes:
-        findings: The findings.
+        findings: Result of each check.
     """
 
     findings: list[DoctorFinding]
 
     def headline(self) -> str:
-        """Returns how many findings are failures, warnings and successes."""
+        """Returns one line with the numbers of failed checks, warnings and passed checks."""
         states = [finding.state for finding in self.findings]
         return (
             f"{states.count('fail')} fail, {states.count('warn')} warn, {states.count('ok')} ok"
@@ -658,7 +708,7 @@ class DoctorReport(Result):
         return {"findings": self.to_rows()}
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns one row per finding, with the fields of `DoctorFinding`."""
+        """Returns the findings as table rows, with the fields of `DoctorFinding` as columns."""
         return [finding._asdict() for finding in self.findings]
 
 

@@ -60,7 +60,11 @@ If the site itself was suspended, it cannot know which messages it would have re
 
 
 class ExternalArm:
-    """Receives the measurements of one external arm, and measures its silence.
+    """Receives the measurements of one external arm, and watches for interruptions.
+
+    An external arm is a real or simulated arm outside of this program, whose driver sends the
+    joint angles and velocities. If no measurement arrives for some time, the site has to stop
+    the arm.
 
     Args:
         site: Site of the arm in the simulation kernel.
@@ -158,8 +162,8 @@ class ExternalArm:
         measurements during the run, they are dropped.
 
         Args:
-            q0_rad: Joint angles in rad from which the arm starts according to the scenario. The
-                peers assume them.
+            q0_rad: Joint angles in rad from which the arm starts according to the scenario, and
+                which the peers assume.
 
         Returns:
             A warning if the arm is elsewhere. Empty if it is there.
@@ -337,12 +341,19 @@ class DeadManSwitch:
 
     @property
     def held(self) -> bool:
-        """True if a program holds the switch, and no program that holds it is silent."""
+        """True if the switch counts as held: at least one program reports that it is held.
+
+        It is False if any program that holds the switch has been silent for too long.
+        """
         holders = self._list_holders()
         return bool(holders) and not any(map(self._is_silent, holders))
 
     def poll(self) -> None:
-        """Accepts the waiting reports, and releases the switch for silent programs."""
+        """Receives the waiting reports, and updates whether the switch counts as held.
+
+        If a program that holds the switch has been silent for too long, the switch counts as
+        released.
+        """
         while (message := self._ring.poll()) is not None:
             payload, received_ns = message
             self._accept(payload, received_ns)

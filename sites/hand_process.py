@@ -57,8 +57,8 @@ class HandProcess(SiteClient):
         session: Name of the session.
 
     Attributes:
-        answered: Number of views to which the class has replied.
-        skipped: Number of views that were too old.
+        answered: Number of views (states that the site sent) to which the class has replied.
+        skipped: Number of views that were skipped because they were too old.
     """
 
     def __init__(
@@ -87,9 +87,12 @@ class HandProcess(SiteClient):
         self._max_waiting = max(1, int(hand_site.delay_s * hand_site.rate_hz))
 
     def serve(self) -> None:
-        """Sends the decision of the class for the oldest waiting view that is not too old.
+        """Lets the user's class decide about one state of the site, and sends the decision.
 
         Until the first view has arrived, this process is announced to the site regularly.
+
+        The site regularly sends a view, its present state. The oldest waiting view that is not
+        too old is used. If no view is waiting, nothing is decided.
 
         Raises:
             RunFailed: The class failed. The arm has been released.
@@ -147,6 +150,9 @@ def read_view(message: HandViewMessage) -> HandView:
 
     Args:
         message: The message. Its lists of numbers become arrays.
+
+    Returns:
+        The view.
     """
 
     def read_fields(source: Any, names: tuple[str, ...]) -> Any:

@@ -76,6 +76,8 @@ def _read_messages(
 class HandServer:
     """Moves the arm of a site as requested by people and programs that connect to the session.
 
+    Such a person or program is an operator. Only one operator moves the arm at a time.
+
     Args:
         site: The site in the simulation kernel.
         hand: Settings of the live operator in the scenario.
@@ -116,7 +118,7 @@ class HandServer:
         """Applies the waiting messages, and returns the operator's influence on a tick.
 
         Args:
-            k: The tick.
+            k: Number of the tick, a period of the control loop.
 
         Returns:
             Who moves the arm, and with which target or force, as the vector of numbers that
@@ -228,7 +230,7 @@ class RemoteHand(HandPlayer):
 
         Args:
             site: The site in the simulation kernel.
-            k: The tick.
+            k: Number of the tick, a period of the control loop.
 
         Returns:
             The vector of numbers that `HandInForce` describes.
@@ -238,10 +240,10 @@ class RemoteHand(HandPlayer):
         return super().track(site, k)
 
     def request_action(self, k: int, arrays: SiteArrays) -> None:
-        """Sends the process the view of a tick.
+        """Sends the operator's process the view of a tick, to request a decision.
 
         Args:
-            k: The tick.
+            k: Number of the tick, a period of the control loop.
             arrays: State of the site in the simulation kernel.
         """
         view = self.view(k, arrays)

@@ -26,11 +26,11 @@ _TIME_COLUMNS = slice(0, 8)  # without guests, whose time the column "user" incl
 
 
 class ProcessorTimes(NamedTuple):
-    """Time that all processors have spent since the start of the machine, in system ticks.
+    """Times that all processors of the machine have spent since its start, in system ticks.
 
     Attributes:
-        idle: Time without work.
-        total: Total time.
+        idle: Time without work, summed over the processors.
+        total: Time with and without work, summed over the processors.
     """
 
     idle: int
@@ -38,7 +38,9 @@ class ProcessorTimes(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> "ProcessorTimes":
-        """Parses the first line of /proc/stat, the sum of all processors (proc_stat(5)).
+        """Parses the times from the content of /proc/stat, as proc_stat(5) describes it.
+
+        The first line of the file is used, which is the sum of all processors.
 
         Args:
             text: Content of the file.
@@ -50,11 +52,13 @@ class ProcessorTimes(NamedTuple):
 def measure_busy_share(clock: Clock) -> float | None:
     """Measures the fraction of time in which the processors of this machine are busy.
 
+    On a busy machine, the control loops of the sites may be late.
+
     Args:
         clock: Clock of this process.
 
     Returns:
-        The fraction between 0 and 1. None if it is not known.
+        The fraction between 0 and 1. None if the operating system does not report it.
     """
     with suppress(OSError, ValueError, IndexError):
         before = ProcessorTimes.parse(_STATISTICS.read_text(encoding="ascii"))

@@ -41,13 +41,18 @@ _MCL_ONFAULT = 4
 def prepare(cpu: int | None, sites: int = 1) -> dict[str, str]:
     """Requests all real-time settings for this process.
 
+    Real-time settings, such as a high priority and memory that is never swapped to the disk,
+    make the control loop start its periods on time. Settings that are not permitted are left
+    out.
+
     Args:
         cpu: Processor to which the process is bound. None permits all processors.
         sites: Number of sites of the session on this machine. If there are too many, the
             scheduling stays normal.
 
     Returns:
-        Description of each setting that was obtained, or of the reason why it was not, by name.
+        For each setting, by its name, a description of what was obtained, or the reason why it
+        was not obtained.
     """
     cpus = os.cpu_count() or 1
     has_room = sites <= SITES_PER_PROCESSOR * cpus

@@ -148,7 +148,7 @@ class TargetTopic:
         """Sends the target in a message to the site. It is called in a thread of Zenoh.
 
         Args:
-            data: The encoded message.
+            data: The message, encoded in CDR, the binary format of ROS 2.
             attachment: Attachment of the message, which identifies the publisher.
 
         Raises:
@@ -167,7 +167,7 @@ class TargetTopic:
             self._received_ns = self._clock.monotonic_ns()
 
     def watch(self) -> None:
-        """Releases the arm if no target has arrived for `SILENCE_NS`."""
+        """Releases the arm if the ROS program has sent no target for `SILENCE_NS`."""
         with self._lock:
             if self._received_ns is None:
                 return
@@ -209,7 +209,7 @@ class DominanceTopic:
         """Stores the weights in a message. It is called in a thread of Zenoh.
 
         Args:
-            data: The encoded message.
+            data: The message, encoded in CDR, the binary format of ROS 2.
             attachment: Attachment of the message, which identifies the publisher.
 
         Raises:
@@ -290,7 +290,7 @@ class RobotArm:
         A message with none of the joints belongs to another robot and is ignored.
 
         Args:
-            data: The encoded message.
+            data: The message, encoded in CDR, the binary format of ROS 2.
             attachment: Attachment of the message, which identifies the publisher.
 
         Raises:
@@ -314,7 +314,10 @@ class RobotArm:
             self._client.send(q, qd, stamp_ns=state.stamp_ns)
 
     def send_command(self) -> None:
-        """Publishes the torque of the newest record if it is new, or the safe command."""
+        """Sends the robot the newest torque of the site, or the safe command if it must brake.
+
+        A torque that has been sent already is not sent again.
+        """
         # A site that was restarted needs another client, as a client follows one process.
         if self._client.over:
             with self._lock:
@@ -339,7 +342,7 @@ class RobotArm:
         return self.armed and len(torque) == len(self._joint_order)
 
     def send_safe_command(self) -> None:
-        """Publishes the safe command."""
+        """Sends the robot the command that its settings name for braking or holding still."""
         self._safe_ns = self._clock.monotonic_ns()
         self._commands.put(self._pack(*self._safe_command))
 
@@ -473,6 +476,8 @@ class Bridge:
     When the object has been created, ROS programs see its topics and services. `run` then
     publishes the records, events and statistics of the session.
 
+    A record is the result of one tick, a period of a site's control loop.
+
     Args:
         ends: Connections to ROS and to the session.
         scenario: Scenario of the session.
@@ -480,7 +485,7 @@ class Bridge:
 
     Attributes:
         targets: Topics that command an arm, by name.
-        dominance: Topics that set the weights of a site, by name.
+        dominance: Topics that set the weights with which a site follows its peers, by name.
     """
 
     def __init__(self, ends: BridgeEnds, scenario: Scenario, epoch_unix_ns: int) -> None:
@@ -665,8 +670,8 @@ def describe_target(
         frame: Frame of the positions and forces in the messages.
 
     Returns:
-        Name and type of the topic, a function that converts a message to a target, and a
-        function that sends the target to the site.
+        Four values: the name of the topic, its type, a function that converts a message to a
+        target, and a function that sends the target to the site.
     """
     live = scenario.sites[site].find_live_hand(is_open=True)
     assert live is not None
@@ -683,7 +688,16 @@ def describe_target(
 
 
 def list_joint_names(scenario: Scenario, site: str) -> list[tuple[str, ...]]:
-    """Lists for each joint its name in ROS topics and its name in the scenario."""
+    """Lists the names by which ROS messages may call each joint of an arm.
+
+    Args:
+        scenario: Scenario of the session.
+        site: Name of the site of the arm.
+
+    Returns:
+        For each joint, its name in the ROS topics of this program, and its name in the
+        scenario.
+    """
     topic_names = Ros2SiteChannels(scenario, site).joints
     pairs = zip(topic_names, scenario.arms[site].joint_names, strict=True)
     return [tuple(dict.fromkeys(pair)) for pair in pairs]

@@ -38,7 +38,7 @@ class BridgeEnds(NamedTuple):
         bus: Network connection to the session.
         clock: Clock of this process.
         session: Name of the session.
-        table: Names of the topics.
+        table: Names of the ROS topics, as the user has configured them.
     """
 
     graph: Ros2Graph
@@ -71,7 +71,8 @@ class SiteTopics:
     Attributes:
         frame: Name of the frame of the site's end effector.
         shares: Weights with which the site follows its peers, over time.
-        newest: Record that was published last. None before the first one.
+        newest: Record (result of one tick of the site) that was published last. None before the
+            first one.
     """
 
     def __init__(
@@ -123,7 +124,11 @@ class SiteTopics:
                 self._frames.put(data)
 
     def publish_statistics(self, stats: LinkStats) -> None:
-        """Publishes the statistics of the site on all topics that have subscribers."""
+        """Publishes the statistics of the site on all topics that have subscribers.
+
+        Args:
+            stats: Statistics of the site's control loop and of its links.
+        """
         for topic, data in self._messages.pack_statistics(stats):
             if self._has_listener(topic):
                 self._publishers[topic].put(data)

@@ -48,8 +48,10 @@ class PingReport(Result):
 
     Attributes:
         session: Name of the session.
-        members: One row per member, with the round trip times and the offset of its clock.
-        links: One row per link between two sites, as the receiving site measures it.
+        members: One table row per member, with the round trip times of the pings, and the
+            offset of the member's clock from the clock of this process.
+        links: One table row per link, the directed connection between two sites, as the
+            receiving site measures it.
     """
 
     session: str
@@ -57,7 +59,10 @@ class PingReport(Result):
     links: list[dict[str, Any]]
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns the rows of the members."""
+        """Returns the rows of the members, for a table or a data frame.
+
+        The links are left out, because they have other columns.
+        """
         return self.members
 
 
@@ -96,7 +101,10 @@ class SessionPing:
         self._first_ns: int | None = None
 
     def poll(self) -> None:
-        """Receives what has arrived, and sends the pings and queries that are due."""
+        """Receives the messages that have arrived, and sends pings and queries that are due.
+
+        The method does not wait.
+        """
         for info in self._members.poll():
             self.infos[info.member] = info
             self._first_ns = self._first_ns or self._clock.monotonic_ns()
@@ -110,7 +118,7 @@ class SessionPing:
         return {info.boot for info in self.infos.values()}
 
     def is_over(self, timeout_ns: int, begun_ns: int) -> bool:
-        """Returns True once the pings of every member are complete, or once they are given up.
+        """Returns True once the pings to every member are complete, or have been given up.
 
         Args:
             timeout_ns: Longest wait for the first reply, in ns.
@@ -128,7 +136,7 @@ class SessionPing:
         return elapsed_ns > GATHERING_NS and is_complete
 
     def report(self) -> PingReport:
-        """Returns the results of the measurement."""
+        """Returns the results of the measurement up to the present time."""
         members = [self._describe_member(info) for _, info in sorted(self.infos.items())]
 
         links = []
@@ -258,7 +266,7 @@ class TopicDelays(Result):
     Attributes:
         topic: Name of the topic.
         lasted_s: Duration of the measurement, in s.
-        publishers: One row per publisher.
+        publishers: One table row per publisher, with the number and the delays of its messages.
     """
 
     topic: str
@@ -266,7 +274,7 @@ class TopicDelays(Result):
     publishers: list[dict[str, Any]]
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns the rows of the publishers."""
+        """Returns the rows of the publishers, for a table or a data frame."""
         return self.publishers
 
 

@@ -83,8 +83,11 @@ class PeerInbox:
     samples are dropped: those far in the future, and those that the peer's arm cannot have
     reached from its previous sample within its speed limit.
 
+    A sample is the state that a peer publishes in each tick, a period of its control loop.
+
     Args:
-        links: Links from the peers. All other sequences have the same order.
+        links: Directed connections from the peers to this site. All other sequences have the
+            same order.
         rings: Inboxes of the samples, with the time of each arrival.
         boots: Boot of each peer.
         monitors: Timing monitors of the links.
@@ -368,10 +371,10 @@ class StateBlock:
         """Sends the waiting samples to the peers, unless they are held until a later tick.
 
         Args:
-            k: The present tick.
+            k: Number of the present tick.
             send: Function that sends the sample of a record. It returns the sending time and
-                the confirmations of received samples ("echoes") that the sample contained.
-                Both become part of the record.
+                the confirmations of received samples ("echoes") that the sample contained. Both
+                become part of the record.
         """
         is_wake_tick = (k + 1 - self._turn) % self._ticks_per_wake == 0
         if not self.holds_samples or is_wake_tick:
@@ -385,7 +388,14 @@ class StateBlock:
         self._waiting_records.clear()
 
     def flush(self, send: Callable[[TickRecord], tuple[Any, ...]]) -> None:
-        """Sends all waiting samples to the peers, and then all records to the recorders."""
+        """Sends everything that is waiting: the samples to the peers, then the records.
+
+        Records are the results of ticks, and samples are the parts of them that the peers need.
+        The records go to the recorders.
+
+        Args:
+            send: Function that sends the sample of a record, see `send_samples`.
+        """
         self._send_waiting_samples(send)
         site = self._site
         records = self._records

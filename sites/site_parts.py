@@ -90,7 +90,9 @@ class SiteOptions:
 
 
 class SiteParts:
-    """All parts of one site. A part that the scenario does not need is None.
+    """All parts of one site, a process that runs one arm and its control loop.
+
+    The constructor creates the parts that the scenario needs. All other parts are None.
 
     Args:
         scenario: Scenario of the session.
@@ -108,7 +110,8 @@ class SiteParts:
         hand: The live operator, a person or program that moves the arm.
         step: Function that computes one tick. If the control law is the user's own, the
             watchdog measures its computing time.
-        rings: Queues of the samples from the peers, in the order of the links.
+        rings: Queues of the samples, the states that the peers publish, in the order of the
+            links.
         buffer: Recent messages, for recorders that missed them.
         states: Records on their way to the recorders.
         monitor: Presence of the other members of the session.
@@ -312,13 +315,13 @@ class SiteParts:
         return store_and_publish
 
     def pop_changes(self, k: int) -> list[CoreChange]:
-        """Returns the changes that the site applies in a tick.
+        """Returns the changes that the site applies in a tick, a period of its control loop.
 
         They are the accepted requests, and changes that follow from the state of an external
         arm: skipped ticks, silence of the arm, and a released or held dead-man switch.
 
         Args:
-            k: The tick.
+            k: Number of the tick.
         """
         changes = list(self.changes.pop_changes(k))
         if self.arm is None:
@@ -363,9 +366,9 @@ WARM_UP_TICKS = 200
 
 
 def warm_up(scenario: Scenario, name: str, clock: Clock | None = None) -> None:
-    """Executes some ticks of a temporary site, so that all code is compiled and in memory.
+    """Executes the control loop of a temporary site, so that all code is compiled.
 
-    The first ticks of the actual site would otherwise be late.
+    The first ticks (periods of the control loop) of the actual site would otherwise be late.
 
     Args:
         scenario: The scenario.

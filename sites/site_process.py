@@ -93,6 +93,8 @@ def run_site(
 ) -> int:
     """Runs one site of a scenario from its start to its end.
 
+    A site is a process that runs one arm and its control loop.
+
     Args:
         scenario: Scenario of the session.
         name: Name of the site.
@@ -155,6 +157,9 @@ def join_and_run(parts: SiteParts) -> int:
     Raises:
         SessionError: The session could not begin.
         RunFailed: The run failed.
+
+    Args:
+        parts: Parts of the site.
     """
     timeout_ns = int(parts.options.join_timeout_s * 1e9)
     give_up_ns = parts.clock.monotonic_ns() + timeout_ns
@@ -172,7 +177,9 @@ def join_and_run(parts: SiteParts) -> int:
 
 
 def join_session(parts: SiteParts, give_up_ns: int) -> "RunningSite | None":
-    """Announces the site, and waits for the other members and the epoch.
+    """Announces the site, and waits for the other members and for the start of the session.
+
+    The members agree on the epoch, the common start time of the session.
 
     Args:
         parts: Parts of the site.
@@ -363,7 +370,11 @@ class RunningSite:
         )
 
     def run(self) -> None:
-        """Runs the ticks of the scenario until the last one, or until the run ends early."""
+        """Runs the control loop of the site until the last tick, or until the run ends early.
+
+        A tick is one period of the control loop. The run may end early because of a failure, a
+        signal, or a request of another member.
+        """
         parts = self._parts
         # Samples may wait for the next block only if all peers share this machine.
         parts.states.holds_samples &= all(meter.peer.is_own for meter in self._timing.monitors)
@@ -467,10 +478,10 @@ class RunningSite:
         return bool(is_ended) or parts.interrupt.is_requested() or self._has_given_up
 
     def step(self, k: int, arrivals: Sequence[Arrival]) -> TickRecord | None:
-        """Executes tick `k`: reads the inputs, computes the torque, and moves a simulated arm.
+        """Executes one tick: reads the inputs, computes the torque, and moves a simulated arm.
 
         Args:
-            k: Number of the tick.
+            k: Number of the tick, a period of the control loop.
             arrivals: Samples of the peers that have arrived since the previous tick.
 
         Returns:
@@ -718,10 +729,12 @@ class RunningSite:
         )
 
     def report_tick(self, output: TickRecord) -> None:
-        """Publishes the changes that took effect in a tick, and a change of the site's mode.
+        """Publishes events about the changes that took effect in a tick.
 
         If ticks were skipped before this tick, they are only stored here. `run_housekeeping`
         publishes the skipped ticks of several reports together.
+
+        Examples are a new delay of a link, and a new mode of the site, such as "fault".
 
         Args:
             output: Record of the tick.

@@ -21,7 +21,7 @@ Vector = tuple[float, float, float]
 
 
 class DeviceState(NamedTuple):
-    """Measured state of a device.
+    """Measured state of an input device: the motion of its handle, and its buttons.
 
     >>> tn.DeviceState((0.0, -0.12, 0.15), (0.0, 0.0, 0.0), {"a": True}).buttons["a"]
     True
@@ -43,6 +43,9 @@ class Device(Protocol):
     A device is a context manager. If the connection to the device is lost, the `with` block is
     left and entered again.
 
+    An input device, such as a haptic device, is moved by a person, and moves the target of an
+    arm. To support another device, a user writes a class with these methods.
+
     >>> tn.session("play").lead("m1", MyDevice())  # doctest: +SKIP
     """
 
@@ -55,10 +58,20 @@ class Device(Protocol):
         """Ends the force of the device, and closes the connection."""
 
     def read(self) -> DeviceState:
-        """Returns the newest state. Raises OSError if the device is silent or gone."""
+        """Returns the newest state of the device.
+
+        Raises:
+            OSError: The device is silent or gone.
+        """
 
     def render(self, force_n: Vector) -> None:
-        """Applies a force to the person who holds the device, in N."""
+        """Applies a force to the person who holds the device.
+
+        A device without motors does nothing.
+
+        Args:
+            force_n: Coordinates x, y and z of the force, in N.
+        """
 
 
 def open_device(text: str) -> Device:

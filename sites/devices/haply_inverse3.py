@@ -139,9 +139,13 @@ class HaplyInverse3:
         )
 
     def render(self, force_n: Vector) -> None:
-        """Sends a force in N to the device. The message also requests the next state.
+        """Sends a force to the device, which applies it to the person.
 
-        Nothing is sent before the first state, which contains the identity of the device.
+        The message also requests the next state. Nothing is sent before the first state, which
+        contains the identity of the device.
+
+        Args:
+            force_n: Coordinates x, y and z of the force, in N.
         """
         if self._socket is None or not self._id:
             return
