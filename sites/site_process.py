@@ -151,15 +151,15 @@ def join_and_run(parts: SiteParts) -> int:
     A site with an external arm, or with an operator program in another process, first waits for
     the first message from there.
 
+    Args:
+        parts: Parts of the site.
+
     Returns:
         Exit code of the process.
 
     Raises:
         SessionError: The session could not begin.
         RunFailed: The run failed.
-
-    Args:
-        parts: Parts of the site.
     """
     timeout_ns = int(parts.options.join_timeout_s * 1e9)
     give_up_ns = parts.clock.monotonic_ns() + timeout_ns

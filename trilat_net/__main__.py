@@ -18,7 +18,11 @@ from contextlib import suppress
 
 
 def main() -> None:
-    """Prepares the process, and runs the command of the command line."""
+    """Runs the command that the command line names, as the program `trilat`.
+
+    The command `trilat stop` is executed before the rest of the program is loaded, so that it
+    stops arms without delay.
+    """
     # With Python's default thresholds, garbage collection takes a ninth of the start-up time.
     gc.set_threshold(100_000, 20, 20)
 

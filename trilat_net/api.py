@@ -83,9 +83,13 @@ def simulate(
     Args:
         scenario: The scenario, which describes the experiment: the name of a shipped scenario,
             a path, a TOML text, its tables, or a `Scenario`.
-        set: Overrides, as in `{"control.Kd": 5}` or `["control.Kd=5"]`.
+        set: Settings that replace those of the scenario ("overrides"), as in `{"control.Kd":
+            5}` or `["control.Kd=5"]`.
         duration_s: Duration of the run, in s. By default that of the scenario.
-        seed: Seed of random delays and losses. By default that of the scenario.
+        seed: Seed of the random delays and losses of messages. By default that of the scenario.
+
+    Returns:
+        The log, which contains one record per control period and site.
 
     Raises:
         ScenarioError: The scenario or an override is not valid.
@@ -148,12 +152,17 @@ def verify(
 
     Args:
         log: The log, or its path.
-        virtual: True to compare the log with a run in virtual time too.
+        virtual: True to compare the log also with a run in virtual time, in which one process
+            computes all arms and the network.
         min_coverage: Smallest fraction of the ticks (control periods) of each site that must be
             compared for the check to pass.
         resume_every: Number of ticks after which the state of each site is restored from the
             log, again and again. This reveals state of a user's control law that the log lacks.
             0 never restores.
+
+    Returns:
+        The result of the comparison. Its property `passed` is True if all numbers are equal, if
+        enough ticks were compared, and if the log is unchanged since it was written.
 
     Raises:
         LogError: The log cannot be read.
@@ -170,7 +179,9 @@ def certify(
     own_laws: bool = False,
     twins: int = TWINS,
 ) -> Certificate:
-    """Judges if a run is stable, not stable or open, and why; the command is `trilat certify`.
+    """Judges if a run is stable; the command is `trilat certify`.
+
+    The judgement is "stable", "not stable", or "open" if neither can be shown, and has reasons.
 
     >>> print(tn.certify(tn.simulate("free")).stability)
     stable
@@ -183,6 +194,9 @@ def certify(
             that they declare and for twins.
         twins: Number of twins, which are repetitions of the run with a small disturbance. They
             show whether disturbances grow.
+
+    Returns:
+        The judgement with its reasons.
 
     Raises:
         LogError: The log cannot be read.
@@ -204,6 +218,9 @@ def metrics(log: AnyLog) -> LogMetrics:
     Args:
         log: The log, or its path.
 
+    Returns:
+        The metrics of the run, of each site and of each link, with their units.
+
     Raises:
         LogError: The log cannot be read.
     """
@@ -213,7 +230,7 @@ def metrics(log: AnyLog) -> LogMetrics:
 def report(
     log: AnyLog, out: str | Path | None = None, *, force: bool = False, png: bool = False
 ) -> "Conclusion":
-    """Writes a report of a log: a page and a summary; the command is `trilat report`.
+    """Writes a report of a log, with figures and a summary; the command is `trilat report`.
 
     >>> path = tn.simulate("two_sites", duration_s=0.1).save("run.mcap")
     >>> tn.report(path, "report").passed
@@ -224,6 +241,10 @@ def report(
         out: Folder of the report. By default the name of the file without .mcap.
         force: True to use a folder that is not empty.
         png: True to write every figure as a PNG file too.
+
+    Returns:
+        The conclusion of the report: the checks of the log, the judgement whether the run was
+        stable, and the paths of the files.
 
     Raises:
         UsageError: The folder is not empty, or the log is not in a file.
@@ -261,13 +282,17 @@ def linear(
     Args:
         scenario: The scenario, which describes the experiment: the name of a shipped scenario,
             a path, a TOML text, its tables, or a `Scenario`.
-        set: Overrides, as in `{"control.d": 0.9}`.
+        set: Settings that replace those of the scenario, as in `{"control.d": 0.9}`.
         pose: Joint angles of all sites, in rad. By default those at the end of a run.
-        roots: Number of roots.
-        over: Ranges of keys in which edges of stability are searched, as in
-            `["control.d=0.1:3"]`.
+        roots: Number of characteristic roots, the exponents of the loop's motions, that are
+            computed.
+        over: Ranges of settings in which edges of stability (values at which the stability
+            changes) are searched, as in `["control.d=0.1:3"]`.
         ports: True to analyse passivity and the impedances that operators feel.
         operators: Files of measured operators, from `trilat identify hand --json`.
+
+    Returns:
+        The analysis, with its verdict.
 
     Raises:
         ScenarioError: The scenario is not valid, or has no linear loop.
@@ -319,23 +344,28 @@ def sweep(
     Args:
         scenario: The scenario, which describes the experiment: the name of a shipped scenario,
             a path, a TOML text, its tables, or a `Scenario`.
-        over: Axes of the grid: lists or arrays of values by key, as in
-            `{"link.delay_ms": range(0, 1601, 50)}`, or texts, as in
-            `["link.delay_ms=0:1600:50"]`.
-        set: Overrides of all cells of the grid, as in `{"control.Kd": 5}`.
-        seeds: Number of seeds, or the seeds. Each cell has a run per seed.
+        over: Axes of the grid: lists or arrays of values by key, as in `{"link.delay_ms":
+            range(0, 1601, 50)}`, or texts, as in `["link.delay_ms=0:1600:50"]`.
+        set: Settings that replace those of the scenario in all cells of the grid, as in
+            `{"control.Kd": 5}`.
+        seeds: Number of seeds of random delays and losses, or the seeds. Each cell, a point of
+            the grid, has one run per seed.
         laws: Names or classes of control laws, which are a further axis of the grid.
         duration_s: First duration of the runs of a cell, in s.
         longest_s: Longest duration of the runs of a cell whose stability is still open, in s.
-            By default eight times `duration_s`, or `duration_s` if twins judge.
-        judge: "verdict" or "twins". With "twins" the exponent with which small disturbances
-            grow is measured in each cell, in addition to its verdict.
+            By default eight times `duration_s`, or `duration_s` if `judge` is "twins".
+        judge: "verdict" or "twins". Twins are two runs that differ by a small disturbance. With
+            "twins", the exponent with which the disturbance grows is measured in each cell, in
+            addition to its verdict.
         metrics: Keys of docs/metrics.md that are measured in each run. They become columns of
             the rows.
         out: Folder of the results. A sweep in it is continued. By default the next free
             runs/sweep-NAME-N.
         jobs: Number of processes. None uses one per core.
         on: Address of a Dask scheduler, or an executor, that executes the runs instead.
+
+    Returns:
+        The verdict and the metrics of each cell.
 
     Raises:
         ScenarioError: The scenario, an axis or one of its values is not valid.
@@ -384,13 +414,16 @@ def margin(
         along: The key and its range, as in "control.d=0.2:3".
         over: Axes of a grid at whose points the edge is searched, as in `sweep`:
             `{"link.delay_ms": [100, 200]}`.
-        set: Overrides of all runs.
+        set: Settings that replace those of the scenario in all runs.
         tolerance: Largest width of the interval that contains an edge, relative to its value.
-        seeds: Number of seeds, or the seeds.
+        seeds: Number of seeds of random delays and losses, or the seeds.
         laws: Names or classes of control laws, which are a further axis of the grid.
         duration_s: First duration of a run, in s.
         jobs: Number of processes. None uses one per core.
         on: Address of a Dask scheduler, or an executor, that executes the runs instead.
+
+    Returns:
+        For each point of the grid, the intervals of the key that contain an edge.
 
     Raises:
         ScenarioError: The scenario or one of the values is not valid.
@@ -439,15 +472,19 @@ def tune(
         scenario: The scenario, which describes the experiment: the name of a shipped scenario,
             a path, a TOML text, its tables, or a `Scenario`.
         laws: Names or classes of the laws. Empty selects all laws for any number of sites.
-        set: Overrides, as in `{"link.delay_ms": 100}`.
+        set: Settings that replace those of the scenario, as in `{"link.delay_ms": 100}`.
         budget: Number of candidates per law.
         seed: Seed of the search, which draws the candidates.
         seeds: Number of seeds of the scenario over which each candidate is averaged.
-        objective: "error" or "settling", the objective of the search in addition to effort.
+        objective: What the search minimises besides the effort of the arms: "error", the
+            tracking error, or "settling", the settling time.
         gravity_percent: Gravity that all laws assume, in % of the true gravity.
         duration_s: Duration of a run, in s. By default that of the scenario.
         jobs: Number of processes. None uses one per core.
         on: Address of a Dask scheduler, or an executor, that executes the runs instead.
+
+    Returns:
+        The candidates of each law, with their gains and results.
 
     Raises:
         ScenarioError: The scenario is not valid, or laws cannot be compared in it.
@@ -493,14 +530,17 @@ def bench(
         study: Part of the suite: full, small or round-trips.
         tasks: Names of the selected tasks. Empty selects all tasks of the study.
         laws: Names of the selected laws. Empty selects all laws of the study.
-        links: Names of the selected links, as in "rtt68-loss10" or "4g". Empty selects all
-            links of the study.
-        seeds: Number of seeds. By default that of the study.
-        confirm: True to run unstable cells again for 100 s, which refutes or confirms the
-            verdict.
+        links: Names of the selected links (network conditions), as in "rtt68-loss10" or "4g".
+            Empty selects all links of the study.
+        seeds: Number of seeds of random delays and losses. By default that of the study.
+        confirm: True to run each unstable combination again for 100 s, which confirms or
+            refutes the verdict.
         out: Folder of the results. A suite in it is continued. By default runs/bench-STUDY.
         jobs: Number of processes. None uses one per core.
         on: Address of a Dask scheduler, or an executor, that executes the runs instead.
+
+    Returns:
+        The runs of all combinations of tasks, laws and links, with their results.
 
     Raises:
         UsageError: There is no such study, task, law or link, or the folder contains something
@@ -522,7 +562,8 @@ def view(*files: str | Path, full: bool = False, save: str | Path | None = None)
 
     Args:
         files: Path of the log, or paths of its parts.
-        full: True to show every record instead of the decimated channels.
+        full: True to show the record of every control period. False shows fewer, evenly spaced
+            ones.
         save: Path of a Rerun file to write instead of opening the viewer.
 
     Raises:

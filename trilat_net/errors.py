@@ -56,7 +56,7 @@ def _name_argument(match: re.Match[str]) -> str:
 class TrilatError(Exception):
     """Base class of all errors that a user can act on.
 
-    A command that ends with the error has the exit code `exit_code`.
+    A command that ends with such an error has the exit code `exit_code` of its class.
     """
 
     exit_code = 1
@@ -116,8 +116,8 @@ class WireError(TrilatError):
     """A payload from another machine that is not a message of this program.
 
     Args:
-        reason: Category under which such payloads are counted.
-        detail: The problem of this payload.
+        reason: Category of the problem, by which refused payloads are counted.
+        detail: What is wrong with this payload, for the message of the error.
     """
 
     def __init__(self, reason: str, detail: str) -> None:
@@ -135,26 +135,32 @@ class SessionError(TrilatError):
 
 
 class LogError(TrilatError):
-    """A log that is missing, incomplete, or not written by this program."""
+    """A log that is missing, incomplete, or not written by this program.
+
+    A log is the MCAP file with the recorded data of a run.
+    """
 
     exit_code = 2
 
 
 class LogRefused(LogError):  # noqa: N818 - it names an outcome
-    """A log that this machine cannot write any further, for example because the disk is full.
+    """The disk refused to store more data of a log, for example because it is full.
 
-    Records that were written before are kept.
+    Data that was written before is kept.
     """
 
     exit_code = 5
 
 
 class NotRepeatable(LogError):  # noqa: N818 - it names an outcome
-    """A run that cannot be executed again from its log. The message gives the reason."""
+    """A run that cannot be executed again from its log.
+
+    The message gives the reason, for example that the log lacks the inputs of a site.
+    """
 
 
 class NothingSaved(LogError):  # noqa: N818 - it names an outcome
-    """A damaged file from which nothing could be recovered."""
+    """Recovery of a damaged file that has found no data that could be saved."""
 
     exit_code = 1
 
@@ -167,7 +173,7 @@ class RunFailed(TrilatError):  # noqa: N818 - it names an outcome, as the exit s
 
 
 class PeerLeft(RunFailed):
-    """A run that another site left before the end, without joining again."""
+    """A run that ended early because another site had left the session and not come back."""
 
     exit_code = 3
 
@@ -203,6 +209,8 @@ class LawFailed(CodeFailed):
     """A user's control law that failed.
 
     It raised an exception, was too slow, or returned unusable results.
+
+    A control law is the class that computes the torques of an arm.
     """
 
     kind = "law"
@@ -212,13 +220,18 @@ class PlantFailed(CodeFailed):
     """A user's model of an arm (plant) that failed.
 
     It raised an exception, was too slow, or returned unusable results.
+
+    A plant is the class that simulates the motion of an arm.
     """
 
     kind = "plant"
 
 
 class RuntimeFault(TrilatError):  # noqa: N818 - a fault of ours, by its name in docs/design.md
-    """A state that the program must never reach, which is a bug of the program."""
+    """A state that the program must never reach, which shows a bug of the program itself.
+
+    Users cannot correct it, and should report it.
+    """
 
 
 def count_nouns(count: object, singular: str, plural: str = "") -> str:

@@ -28,9 +28,10 @@ from .errors import ScenarioError, count_nouns
 
 
 class Frozen(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Base class of the types of a scenario.
+    """Base class of the types that describe the tables of a scenario file.
 
-    Its objects are immutable. Unknown keys of a table are refused.
+    The objects are immutable. If a table contains a key that the type does not have, the table
+    is refused, because the key is probably misspelt.
     """
 
 
@@ -92,6 +93,9 @@ StructType = type[msgspec.Struct]
 
 class VectorCounts(NamedTuple):
     """How many numbers the vectors of a site have, which depends on its arm.
+
+    A scenario may state one number where a vector is needed. The counts say how long the vector
+    becomes, and check vectors that are given in full.
 
     Attributes:
         joints: Length of a vector with one number per joint.
@@ -204,7 +208,7 @@ def find_count_problem(
         counts: Lengths of the vectors of the site.
 
     Returns:
-        The key and the problem. None if all lengths are right.
+        The key and the problem. None if all vectors have the right lengths.
     """
     vectors = {**_vector_keys(kind, "per"), **_vector_keys(kind, "point")}
     for key, per in vectors.items():
@@ -220,12 +224,24 @@ def find_count_problem(
 
 
 def is_number(value: Any) -> TypeGuard[float]:
-    """Returns True for a number in a scenario. The values true and false are not numbers."""
+    """Returns True if a value of a scenario is a number.
+
+    The values true and false are not numbers, although they are integers in Python.
+
+    Args:
+        value: A value as it was read from TOML.
+    """
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def is_distribution(value: Any) -> bool:
-    """Returns True for a distribution in place of a number, as { uniform = [1, 2] }."""
+    """Returns True if a value of a scenario is a distribution in place of a number.
+
+    Each run draws the number from the distribution, for example `{ uniform = [1, 2] }`.
+
+    Args:
+        value: A value as it was read from TOML.
+    """
     return isinstance(value, dict) and not value.keys().isdisjoint(("normal", "uniform"))
 
 
@@ -243,7 +259,14 @@ def split_refusal(error: msgspec.ValidationError) -> tuple[str, str]:
 
 
 def reword_problem(problem: str) -> str:
-    """Rewords a message of msgspec for the author of a scenario, in terms of TOML."""
+    """Rewords an error message of msgspec in terms of TOML, for the author of a scenario.
+
+    Args:
+        problem: The message, without the path of the key.
+
+    Returns:
+        The reworded message. A message without terms of msgspec is returned unchanged.
+    """
     replacements = (("`", ""), ("Expected ", "expected "), ("array", "list"), ("str", "text"))
     for old, new in replacements:
         problem = problem.replace(old, new)
@@ -300,12 +323,16 @@ def check_keys(table: Any, valid: Sequence[str], path: str) -> TomlTable:
 
 
 def field_names(kind: StructType) -> tuple[str, ...]:
-    """Returns the keys that a table of a type may have."""
+    """Returns the keys that a table of a scenario may have.
+
+    Args:
+        kind: Type of the table.
+    """
     return kind.__struct_encode_fields__
 
 
 def check_choice(word: Any, valid: Sequence[str], path: str) -> None:
-    """Refuses a word that is not among the valid ones.
+    """Checks that a word of a scenario is among the valid ones.
 
     Args:
         word: A value of a scenario.
@@ -322,9 +349,10 @@ def check_choice(word: Any, valid: Sequence[str], path: str) -> None:
 
 
 def check_finite(value: Any, path: str) -> None:
-    """Refuses numbers that are infinite, NaN, or integers of more than 64 bits.
+    """Checks that all numbers of a scenario's value are finite and fit into 64 bits.
 
-    Tables and lists are checked with everything that they contain.
+    Numbers that are infinite, NaN, or integers of more than 64 bits are refused. Tables and
+    lists are checked with everything that they contain.
 
     Args:
         value: A value of a scenario.

@@ -37,10 +37,10 @@ STUDY_LIBRARIES = ("loky", "matplotlib", "scipy")
 
 
 def require_libraries(*names: str) -> None:
-    """Refuses a command before it starts if a library that it needs is missing.
+    """Checks that the libraries that a command needs are installed, before it starts.
 
     Args:
-        names: The libraries. By default all of `STUDY_LIBRARIES`.
+        names: Names of the libraries. By default all of `STUDY_LIBRARIES`.
 
     Raises:
         UsageError: A library is not installed. The message has the command that installs it.
@@ -111,6 +111,9 @@ def find_page(name: str) -> Path:
 
     Args:
         name: File name of the page, as in "json.md".
+
+    Returns:
+        The path. It is not checked whether the file exists.
     """
     beside_sources = Path(__file__).parents[1] / "docs" / name
     if beside_sources.is_file():
@@ -235,7 +238,11 @@ def reading(path: Path, kind: type[TrilatError] = LogError) -> Iterator[BinaryIO
 
 
 def digest_file(path: Path) -> str:
-    """Returns the SHA-256 digest of a file's content, in hexadecimal."""
+    """Returns the SHA-256 digest of a file's content, in hexadecimal.
+
+    Args:
+        path: The file, which is read in parts, so that it may be large.
+    """
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
@@ -244,6 +251,11 @@ def read_foreign_permissions(path: Path) -> int:
     """Returns the permission bits that a file grants to its group and to all other users.
 
     The result is 0 on Windows, which has access control lists instead.
+
+    A file with a secret should grant no such permissions.
+
+    Args:
+        path: The file.
     """
     return 0 if os.name == "nt" else path.stat().st_mode & 0o077
 
@@ -269,7 +281,12 @@ SYSTEM_FOLDERS = ("/dev", "/dev/fd", "/proc/self/fd")
 
 
 def refuse_link(path: Path) -> None:
-    """Refuses an output path that is a symbolic link.
+    """Checks that an output path is not a symbolic link.
+
+    Another user could have created the link, so that the output would replace a file elsewhere.
+
+    Args:
+        path: The output path.
 
     Raises:
         UsageError: The path is a symbolic link outside of `SYSTEM_FOLDERS`.
@@ -321,6 +338,9 @@ def extend_file(path: Path) -> BinaryIO:
 def make_results_folder(folder: Path | None, name: str, *, force: bool | None) -> Path:
     """Makes a folder for results.
 
+    Commands write their results only into a folder without other content, unless the user
+    permits it.
+
     Args:
         folder: The folder. None uses the next free folder `runs/NAME-N`.
         name: NAME of that folder.
@@ -365,7 +385,7 @@ def _make_next_folder(name: str) -> Path:
 def refuse_existing(
     path: Path, *, force: bool, unfinished: Path | None = None, manifest: str | None = None
 ) -> None:
-    """Refuses an output path at which something exists already.
+    """Checks that an output path is free, so that no earlier output is overwritten.
 
     An empty folder is accepted as the place of an output folder. With `force`, an earlier
     output of the same kind is accepted too, but never another kind of file or folder.
@@ -400,7 +420,9 @@ def refuse_existing(
 
 
 def publish_file(unfinished: Path, path: Path, *, force: bool) -> None:
-    """Gives a complete file its final name.
+    """Gives a file that has been written completely its final name.
+
+    Readers therefore never see a part of the file under that name.
 
     Args:
         unfinished: Path of the complete file, in the same folder.
@@ -472,16 +494,19 @@ def write_whole(
 
 @contextmanager
 def stage_output(path: Path, *, force: bool, manifest: str | None = None) -> Iterator[Path]:
-    """Yields a temporary path, which gets the name of the output if the block succeeds.
+    """Lets the caller write an output at a temporary path, as a context manager.
 
-    If the block raises an exception, nothing is left of the output, and an earlier output
-    stays.
+    If the block succeeds, the output gets its final name. If the block raises an exception,
+    nothing is left of the output, and an earlier output stays.
 
     Args:
         path: The output, which is a file or a folder.
         force: True if an earlier output of the same kind may be replaced.
         manifest: Name of a file that marks an earlier output folder, see `refuse_existing`. If
             it is set, the temporary path is a folder. None if the output is a file.
+
+    Yields:
+        The temporary path.
 
     Raises:
         UsageError: The name is taken, or the path is not writable.

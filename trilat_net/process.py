@@ -34,7 +34,10 @@ _PARENT_POLL_S = 0.5
 
 @contextmanager
 def pause_gc() -> Iterator[None]:
-    """Pauses the garbage collector inside the block."""
+    """Pauses the garbage collector of Python inside the `with` block.
+
+    Code that creates many objects then runs faster, because the collector does not search them.
+    """
     was_enabled = gc.isenabled()
     gc.disable()
     try:
@@ -57,7 +60,8 @@ def freeze_gc() -> None:
 def disable_gc() -> None:
     """Stops the garbage collector for the rest of a process whose loop must not pause.
 
-    Garbage is collected once before.
+    Garbage is collected once before. Afterwards, only objects in reference cycles stay in
+    memory.
     """
     freeze_gc()
     gc.disable()
@@ -88,9 +92,12 @@ class LinePrinter:
         self._thread.join(1.0)
 
     def put(self, text: str) -> None:
-        """Adds a line to the lines that wait to be printed.
+        """Adds a line to the lines that wait to be printed. The method does not wait.
 
-        The line is lost if too many wait.
+        The line is lost if too many lines wait already.
+
+        Args:
+            text: The line.
         """
         with suppress(queue.Full):
             self._lines.put_nowait(text)
@@ -127,7 +134,8 @@ class Interrupt:
 
     Attributes:
         number: Number of the first signal. 0 if no signal has arrived.
-        compiles: The argument.
+        compiles: True if a signal may end the process while the compiler runs, as in the
+            arguments.
         raises: True inside `raising`, where a signal raises KeyboardInterrupt.
     """
 
@@ -188,7 +196,7 @@ class Interrupt:
             raise KeyboardInterrupt
 
     def is_requested(self) -> bool:
-        """Returns True once a signal has requested the end of the program."""
+        """Returns True once a signal, such as Ctrl-C, has requested the end of the program."""
         return self.number != 0
 
     def is_repeated(self) -> bool:
@@ -200,7 +208,7 @@ class Interrupt:
 
     @property
     def exit_code(self) -> int:
-        """Exit code of a process that the signal ended: 128 + number, as in shells."""
+        """Exit code of a process that the signal ended: 128 + its number, as in shells."""
         return 128 + self.number
 
 
@@ -335,7 +343,10 @@ def raise_priority(nice: int) -> bool:
 
 
 def count_cores() -> int:
-    """Returns the number of processors that this process may use."""
+    """Returns the number of processors that this process may use.
+
+    It may be smaller than the number of processors of the machine, for example in a container.
+    """
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

@@ -28,17 +28,23 @@ class Result:
     """
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns plain values, with the keys that the command prints with --json."""
+        """Returns the result as plain values, which can be written as JSON.
+
+        The keys are those that the command prints with --json.
+        """
         return dict(vars(self))
 
     def to_rows(self) -> Sequence[Mapping[str, Any]]:
-        """Returns the rows of the table of `to_frame`: by default a row of all plain values."""
+        """Returns the result as rows of a table, for `to_frame`.
+
+        By default, there is one row with all plain values of the result.
+        """
         values = self.to_dict().items()
         row = {key: value for key, value in values if not isinstance(value, dict | list)}
         return [row]
 
     def summary(self) -> str:
-        """Returns the text that the command prints."""
+        """Returns the text about the result that the command prints in the terminal."""
         return str(_texts().summarize(self))
 
     def to_frame(self) -> "pandas.DataFrame":
@@ -51,7 +57,7 @@ class Result:
         return pandas.DataFrame(list(self.to_rows()))
 
     def headline(self) -> str:
-        """Returns the result in one line: by default the first line of its text."""
+        """Returns the result in one line of text, by default the first line of its summary."""
         for line in self.summary().splitlines():
             if line.strip():
                 return line.strip()
@@ -75,5 +81,12 @@ JsonObject = dict[str, Any]
 
 
 def finite_or_none(value: float) -> float | None:
-    """Returns a number as JSON can contain it: None for NaN and infinity."""
+    """Returns a number in the form in which JSON can contain it.
+
+    Args:
+        value: The number.
+
+    Returns:
+        The number. None if it is NaN or infinite, which JSON cannot express.
+    """
     return value if math.isfinite(value) else None

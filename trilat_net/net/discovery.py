@@ -74,11 +74,11 @@ def find_members(
         stopped: Function that returns True to end the search.
         timeout_s: Duration of the search, in s. None searches without a limit.
 
-    Raises:
-        SessionError: The time is over, and none of the replies that arrived could be decoded.
-
     Yields:
         The identity of a member, as soon as a reply has arrived.
+
+    Raises:
+        SessionError: The time is over, and none of the replies that arrived could be decoded.
     """
     query = MemberQuery(bus, clock, session)
     has_readable_reply = False

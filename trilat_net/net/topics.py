@@ -115,11 +115,11 @@ def key(session: str, member: str, channel: str) -> str:
 def parse_key(key: str) -> KeyParts | None:
     """Splits a key into the names of the session, the member and the channel, and the boot.
 
-    Returns:
-        The parts. None if the key belongs to another program.
-
     Args:
         key: The key under which a message has arrived, or that of a liveliness token.
+
+    Returns:
+        The parts. None if the key belongs to another program.
     """
     root, _, rest = key.partition("/")
     parts = rest.split("/")
