@@ -71,7 +71,7 @@ The panel "given" also shows the kind "taken", the energy that a law dissipated.
 def draw_functional(
     log: Log, certificate: Certificate, form: FigureSize = REPORT_SIZE
 ) -> Figure:
-    """Draws the energy function V of the stability proof and its energy balance over time, in J.
+    """Draws the energy function V of the stability proof and its energy balance over time, J.
 
     V decreases if the controllers dissipate more than the operators put in. The panels are,
     from the top: V and the contribution of each site; the parts of V; dissipation and work; and
