@@ -136,7 +136,9 @@ TRACE_KEYS = ("file", "of")
 
 
 def resolve_scenario(tables: TomlTable, folder: Path | None) -> TomlTable:
-    """Returns the tables of a scenario file with every default and every file written out.
+    """Writes out every default of a scenario file, and every file that it names.
+
+    The result describes the experiment completely, without any other file.
 
     Args:
         tables: Tables of the scenario file, as its author wrote them.

@@ -35,14 +35,14 @@ _MAX_PATTERNS = 64
 
 
 class RestBounds(NamedTuple):
-    """Bounds of a stop that begins with a certain speed of the joints.
+    """Bounds of how an arm comes to rest after a stop, from a certain speed of its joints.
 
     Attributes:
         rest_s: Time within which the arm is at rest, in s. Infinite if its motors cannot hold
             it against gravity.
         bearable_share: Fraction of the speed up to which the motors can balance the Coriolis
             torques between the joints. It may exceed 1.
-        kinetic_j: Largest kinetic energy at the speed, in J.
+        kinetic_j: Largest kinetic energy of the arm at this speed, in J.
         blend_j: Largest energy that the last torques before the stop add, in J.
         peak_rad_s: Largest speed of each joint that the energy permits, in rad/s, shape (n,).
     """
@@ -70,13 +70,14 @@ class _ArmSamples(NamedTuple):
 
 
 def find_rest_bounds(scenario: Scenario, site: str, qd: Array | None = None) -> RestBounds:
-    """Computes the bounds of a stop.
+    """Computes bounds of the time, energy and speeds with which an arm comes to rest.
 
     Args:
-        scenario: The scenario. The site has the stale rule "glide".
-        site: Name of the site.
-        qd: Speed of each joint at the beginning, in rad/s, shape (n,). By default, the speed
-            limits.
+        scenario: Description of the experiment. The site must have the stale rule "glide",
+            under which an arm is stopped by damping.
+        site: Name of the site whose arm stops.
+        qd: Speed of each joint at the beginning of the stop, in rad/s, shape (n,). By default,
+            the speed limits of the site.
     """
     spec = scenario.sites[site]
     setup = scenario.setup(site)

@@ -27,10 +27,12 @@ from .validate import check_change, check_links_memory
 
 
 class LinkTables(dict[str, dict[str, Any]]):
-    """Current table of every link of a run, by name.
+    """Current settings of every link during a run, by the name of the link.
 
-    A table changes when a change of its link takes effect. `advance_to` applies the changes of
-    the timeline; a caller that accepts a requested change stores the new table itself.
+    A link is the directed connection between two sites, and its settings are a table of a
+    scenario. They change when a change of the link takes effect. `advance_to` applies the
+    changes of the timeline; a caller that accepts a requested change stores the new table
+    itself.
 
     Args:
         links: Links at the start of the run, by name.
@@ -42,7 +44,11 @@ class LinkTables(dict[str, dict[str, Any]]):
         self._planned = deque(change for change in timeline if change.link)
 
     def advance_to(self, t_ns: int) -> None:
-        """Applies the planned changes up to the time `t_ns`, in ns after the epoch."""
+        """Applies the planned changes that take effect up to a time.
+
+        Args:
+            t_ns: The time, in ns after the epoch (the common start time).
+        """
         while self._planned and self._planned[0].start_ns <= t_ns:
             change = self._planned.popleft()
             self[change.link] = change.to
@@ -51,13 +57,18 @@ class LinkTables(dict[str, dict[str, Any]]):
 def resolve_change(
     scenario: Scenario, current_links: LinkTables, written: dict[str, Any], from_ns: int
 ) -> Change:
-    """Completes and checks a change that was requested during a run.
+    """Completes and checks a change that a user requested during a run.
+
+    The request may state only those keys of a link that change. The other keys are added.
 
     Args:
         scenario: Scenario of the run.
         current_links: Current table of every link.
         written: The change in the form of a scenario's timeline, without `at_s`.
         from_ns: Time at which the change takes effect, in ns after the epoch.
+
+    Returns:
+        The change, complete in itself.
 
     Raises:
         ScenarioError: There is no such link or site, or a value is not valid.
@@ -89,9 +100,13 @@ def resolve_change(
 
 
 def find_owner(change: Change) -> str:
-    """Returns the name of the site that carries out a change.
+    """Returns the name of the site that must carry out a change.
 
-    A change of a link is carried out by the site that receives its samples.
+    A change of a link is carried out by the site that receives its samples. Any other change
+    names its site.
+
+    Args:
+        change: Change of a link or of dominance factors, or a command to a site.
     """
     return change.site or change.dominance or change.link.partition("->")[2]
 
@@ -99,7 +114,9 @@ def find_owner(change: Change) -> str:
 def make_site_order(
     scenario: Scenario, site: str, order: SiteOrder, from_ns: int, ticks: int = 0
 ) -> Change:
-    """Returns a command to a site as a change.
+    """Converts a command to a site, such as stop, to the form of a change of the run.
+
+    In this form, the command can be sent and recorded like any other change.
 
     Args:
         scenario: Scenario of the run.
@@ -165,9 +182,14 @@ def describe_change(change: Change, ordered_by: str = "") -> str:
 
 
 def find_requester(sentence: str) -> str:
-    """Returns who requested a stop, from the sentence of `describe_change`.
+    """Extracts from the sentence about a stop who requested it.
 
-    Empty if the sentence does not describe a stop, or does not say who requested it.
+    Args:
+        sentence: Sentence that `describe_change` returned.
+
+    Returns:
+        The requester as a noun phrase. Empty if the sentence is not about a stop, or does not
+        say who requested it.
     """
     match = re.fullmatch(r"\S+ was stopped by (.+) at [\d.]+ s", sentence)
     return "" if match is None else match[1]
@@ -188,7 +210,12 @@ def count_skipped_ticks(texts: Sequence[str]) -> int:
 
 
 def to_core_change(scenario: Scenario, change: Change) -> CoreChange:
-    """Returns a change in the form in which the simulation kernel of its site applies it."""
+    """Converts a change to the form in which the simulation kernel of its site applies it.
+
+    Args:
+        scenario: Scenario of the run.
+        change: Change of a link or of dominance factors, or a command to a site.
+    """
     text = msgspec.json.encode(change).decode()
     site = find_owner(change)
     if change.order:

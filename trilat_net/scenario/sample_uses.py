@@ -29,15 +29,16 @@ _BLOCK = 8192
 
 
 class LinkSchedule:
-    """Computes when the samples of a link are due at the receiver.
+    """Computes when the samples of a link should arrive at the receiver.
 
-    The kernel's own function computes the times. It works on a row that describes the link,
-    with all its models and outages. A model applies to samples that are sent at its first stamp
-    or later.
+    A sample is the state that a site publishes in one tick. The times follow from the delays
+    and losses that the scenario states. They are computed by the same function as during a run.
+    It reads a row of data that describes the link with all its models and outages. A model
+    applies to samples that are sent at its first stamp or later.
 
     Args:
-        setup: Setup of the link.
-        changed_models: Models that the link gets by changes during the run.
+        setup: Setup of the link in the form that the kernel uses.
+        changed_models: Models of delay and loss that the link gets by changes during the run.
 
     Attributes:
         models: All models of the link, in the order of their first stamps.
@@ -71,7 +72,7 @@ class LinkSchedule:
         self._block = np.empty(_BLOCK, dtype=np.int64)
 
     def draw(self, end: int) -> IntArray:
-        """Computes when the next samples are due.
+        """Computes when the next samples of the link are due at the receiver.
 
         The first of these samples is the one after the last sample of the previous call.
 
@@ -79,7 +80,8 @@ class LinkSchedule:
             end: Number of the sample after the last one.
 
         Returns:
-            Due times in ns after the epoch. LOST for a sample that is lost.
+            Due times in ns after the epoch, one per sample. A sample that is lost has the value
+            LOST.
         """
         first = int(self.row.scheduled) + 1
         due_ns = np.empty(max(0, end - first), dtype=np.int64)
@@ -119,7 +121,15 @@ class LinkSchedule:
 
 
 def first_ticks(due_ns: IntArray, rate_hz: int) -> IntArray:
-    """Returns the first ticks at or after some times in ns, like `core.ticks.first_tick_at`."""
+    """Returns the first tick at or after each of some times, like `core.ticks.first_tick_at`.
+
+    Args:
+        due_ns: Times in ns after the epoch (the common start time).
+        rate_hz: Tick rate, in Hz.
+
+    Returns:
+        Numbers of the ticks, one per time.
+    """
     return -(-due_ns * rate_hz // NS_PER_S)
 
 
@@ -194,16 +204,17 @@ def count_silences(used: IntArray, receiver_hz: int, silence_ns: int) -> int:
 
 
 class PictureDelay:
-    """Delay of the picture `[sites.NAME.view]` in which a user sees the other arms.
+    """Delay of the picture in which the user of a site sees the other arms.
 
-    The picture is transmitted over a link of its own, with random draws of its own (L4). The
-    user sees a sample from the site's first tick at or after its arrival over that link (L2),
-    until a newer one is shown. Without a view in the scenario, the user sees the samples that
-    the controller uses.
+    The table `[sites.NAME.view]` of a scenario describes it. The picture is transmitted over a
+    link of its own, with random draws of its own (L4). The user sees a sample from the site's
+    first tick at or after its arrival over that link (L2), until a newer one is shown. Without
+    such a table, the user sees the samples that the controller uses. A sample is the state that
+    a site publishes in one tick.
 
     Args:
-        scenario: The scenario.
-        site: Name of the site.
+        scenario: Description of the experiment.
+        site: Name of the site whose user looks at the picture.
     """
 
     def __init__(self, scenario: Scenario, site: str) -> None:

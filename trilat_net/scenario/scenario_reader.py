@@ -70,7 +70,7 @@ def read_shipped(name: str) -> str:
 
 
 def read_template() -> str:
-    """Returns the template of `trilat scenario new`, a valid scenario with comments.
+    """Returns the text that `trilat scenario new` writes: a valid scenario with comments.
 
     >>> tn.load_scenario(tn.read_template()).names
     ('m1', 'm2', 's')
@@ -85,7 +85,9 @@ def load_scenario(
     duration_s: float | None = None,
     seed: int | None = None,
 ) -> Scenario:
-    """Loads a scenario and applies overrides. The command is `trilat scenario show`.
+    """Loads the description of an experiment, and changes single values of it if requested.
+
+    The corresponding command is `trilat scenario show`.
 
     >>> tn.load_scenario("paper", {"control.Kd": 5}).names
     ('m1', 'm2', 's')
@@ -151,7 +153,7 @@ def _change_scenario(
 
 
 class ExperimentText(NamedTuple):
-    """Text of an experiment as its author wrote it.
+    """Description of an experiment as its author wrote it, before it is checked.
 
     Attributes:
         label: Name by which a command finds the experiment: the name of a scenario in the
@@ -167,7 +169,11 @@ class ExperimentText(NamedTuple):
     folder: Path | None
 
     def load(self, overrides: Sequence[str] = ()) -> Scenario:
-        """Returns the scenario of the text with overrides applied.
+        """Converts the text to a checked scenario.
+
+        Args:
+            overrides: Texts KEY=VALUE, each of which replaces one value. By default, there are
+                none.
 
         Raises:
             ScenarioError: The result is not a valid scenario.
@@ -199,7 +205,13 @@ def read_experiment(source: str | Path | Mapping[str, Any] | Scenario) -> Experi
 
 
 def reseed_scenario(scenario: Scenario, seed: int) -> Scenario:
-    """Returns the same experiment with another seed, which gives other random numbers.
+    """Returns the same experiment with other random numbers.
+
+    Numbers that the scenario states as distributions are drawn again.
+
+    Args:
+        scenario: The experiment.
+        seed: Seed of the random numbers. The same seed always gives the same numbers.
 
     Raises:
         ScenarioError: The seed is not valid, or a number that is drawn with it is out of range.
@@ -230,7 +242,11 @@ def read_source(source: str | Path) -> tuple[str, Path]:
 
 
 def find_site(scenario: Scenario, name: str) -> SiteSpec:
-    """Returns a site of a scenario by its name.
+    """Looks up a site of a scenario by its name.
+
+    Args:
+        scenario: Description of the experiment.
+        name: Name of the site.
 
     Raises:
         ScenarioError: There is no such site.
@@ -255,7 +271,7 @@ def parse_scenario(
     overrides: Mapping[str, Any] | Sequence[str] = (),
     folder: Path | None = Path(),
 ) -> Scenario:
-    """Returns the scenario that a TOML text describes.
+    """Converts a TOML text to a checked scenario.
 
     Args:
         text: The TOML text.

@@ -89,7 +89,7 @@ class OnStale(Frozen, frozen=True, omit_defaults=True):
 
     @property
     def rule(self) -> site_setup.StaleRule:
-        """Rule in the form that the simulation kernel uses."""
+        """The reaction in the form in which the simulation kernel uses it."""
         if self.action == "glide":
             return site_setup.StaleRule(
                 action=site_setup.StaleAction.GLIDE,
@@ -148,9 +148,9 @@ class Limits(Frozen, frozen=True):
 
     @property
     def motion(self) -> site_setup.MotionLimits:
-        """Limits of the motion in the form that the simulation kernel uses.
+        """Limits of speeds and positions in the form in which the simulation kernel uses them.
 
-        A limit that the author left out is infinite.
+        A limit that the author of the scenario left out is infinite.
         """
         return site_setup.MotionLimits(
             q_min=-math.inf if self.q_min_rad is None else self.q_min_rad,
@@ -161,7 +161,10 @@ class Limits(Frozen, frozen=True):
 
 
 class SiteSpec(Frozen, frozen=True):
-    """Description of a site: an arm with its control loop.
+    """Description of a site in a scenario: an arm with its control loop.
+
+    A site is a process that runs one arm. Its peers are the other sites whose states it
+    receives.
 
     Attributes:
         role: Role of the site for people who read figures, and for the stale rule "degrade". It
@@ -199,7 +202,9 @@ class SiteSpec(Frozen, frozen=True):
     view: Link | None = None
 
     def find_live_hand(self, *, is_open: bool = False) -> LiveHand | None:
-        """Returns the operator who may move the arm while the session runs.
+        """Finds the operator of the site who may move the arm while the session runs.
+
+        An operator is a person or program that moves the arm.
 
         Args:
             is_open: If True, an operator counts only if any member of the session may take the
@@ -275,21 +280,26 @@ class Change(Frozen, frozen=True, omit_defaults=True):
 
     @property
     def start_ns(self) -> int:
-        """Time at which the change takes effect, in ns after the epoch."""
+        """Time at which the change takes effect, in ns after the common start time of the sites."""
         return round(self.at_s * 1e9)
 
     @property
     def after(self) -> LinkBase:
-        """Link after the change."""
+        """The link after the change, with all its keys.
+
+        It exists only for a change of a link.
+        """
         return msgspec.convert(self.to, Link)
 
 
 def scheduled_links(timeline: Sequence[Change], name: str) -> Iterator[tuple[int, LinkBase]]:
-    """Yields the states that a link takes during the run, apart from its state at the start.
+    """Yields the settings that a link takes during a run because of planned changes.
+
+    The settings at the start of the run are not included.
 
     Args:
         timeline: Changes of the run, in the order of their times.
-        name: Name of the link.
+        name: Name of the link, for example "m1->s".
 
     Yields:
         The send time of the first affected sample, in ns after the epoch, and the link.
@@ -396,12 +406,14 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names of the sites, in order."""
+        """Names of the sites, in the order of the scenario file."""
         return tuple(self.sites)
 
     @cached_property
     def arms(self) -> dict[str, ArmModel]:
-        """Model of each site's arm, by the name of the site.
+        """Models of the arms, by the name of the site.
+
+        A model contains the parameters and the geometry of the arm.
 
         Raises:
             ScenarioError: The URDF file of an arm cannot be used.
@@ -421,7 +433,10 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @cached_property
     def alpha(self) -> Array:
-        """Matrix of dominance factors, shape (N, N), Eq. (6)."""
+        """Matrix of dominance factors, shape (N, N), Eq. (6).
+
+        The entry of row i and column j is the weight with which site i follows site j.
+        """
         return np.array(
             [[self.dominance[i].get(j, 0.0) for j in self.names] for i in self.names]
         )
@@ -476,7 +491,10 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @cached_property
     def sha256(self) -> str:
-        """SHA-256 hash of the canonical text. It identifies the experiment."""
+        """SHA-256 hash of the canonical text.
+
+        Two scenarios have the same hash only if they describe the same experiment.
+        """
         return hashlib.sha256(self.text.encode()).hexdigest()
 
     def assign_colours(self, colours: int) -> list[int]:
@@ -511,11 +529,21 @@ class Scenario(Frozen, frozen=True, dict=True):
         return [*assigned, *free]
 
     def ticks(self, site: str) -> int:
-        """Returns the number of ticks of a site in the whole run."""
+        """Returns how many ticks a site executes in the whole run.
+
+        A tick is one period of the site's control loop.
+
+        Args:
+            site: Name of the site.
+        """
         return max(1, round(self.duration_s * self.sites[site].rate_hz))
 
     def peers(self, site: str) -> tuple[str, ...]:
-        """Returns the names of the other sites, in the order of the scenario."""
+        """Returns the names of all other sites, in the order of the scenario.
+
+        Args:
+            site: Name of the site whose peers are returned.
+        """
         return tuple(name for name in self.names if name != site)
 
     def _all_links(self) -> list[LinkBase]:
@@ -537,17 +565,23 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @property
     def measured(self) -> bool:
-        """True if a link injects no delay, so that the real network decides."""
+        """True if at least one link has no artificial delay, so that the real network decides.
+
+        Such a scenario can only run live.
+        """
         return any(link.measured for link in self._all_links())
 
     @property
     def external(self) -> tuple[str, ...]:
-        """Names of the sites whose arms are real robots or computed by a user's class."""
+        """Names of the sites whose arms the program does not simulate itself.
+
+        Such an arm is a real robot, or a user's class computes its motion.
+        """
         return tuple(name for name, spec in self.sites.items() if spec.plant != "simulated")
 
     @property
     def slave(self) -> str:
-        """Name of the first site whose role is slave. The last site if there is no slave."""
+        """Name of the first site with the role "slave", or of the last site if there is none."""
         slaves = [name for name, spec in self.sites.items() if spec.role == "slave"]
         return slaves[0] if slaves else self.names[-1]
 
@@ -558,7 +592,10 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @property
     def open_hands(self) -> tuple[str, ...]:
-        """Names of the sites whose arms any member of the session may move."""
+        """Names of the sites whose arms any member of the session may move.
+
+        A member is a process that takes part in the session.
+        """
         return tuple(
             name
             for name, spec in self.sites.items()
@@ -575,21 +612,34 @@ class Scenario(Frozen, frozen=True, dict=True):
         return all(spec.on_stale.action == "glide" for spec in self.sites.values())
 
     def draw_seed(self, site: str) -> int:
-        """Returns the seed for the random numbers of a user's code at a site.
+        """Returns the seed with which a user's code at a site should draw random numbers.
 
-        The seed depends on the name of the site, so that sites with the same code draw
-        different numbers.
+        It depends on the seed of the scenario and the name of the site, so that sites with the
+        same code draw different numbers.
+
+        Args:
+            site: Name of the site.
         """
         return zlib.crc32(f"{self.seed}/{site}".encode())
 
     def channel(self, site: str) -> LawChannel:
-        """Returns the layout of the vectors that the law of a site sends to its peers."""
+        """Returns the layout of the numbers that the control law of a site sends to its peers.
+
+        Args:
+            site: Name of the site.
+        """
         sends: SentVectorSpecs = getattr(self.sites[site].control, "sends", {})
         layout = site_setup.Layout.of_arm(self.arms[site].chain)
         return build_channel(sends, layout, len(self.names) - 1)
 
     def layout(self, site: str) -> site_setup.Layout:
-        """Returns the lengths of the vectors in a site's records."""
+        """Returns the lengths of the vectors in the records of a site.
+
+        A record is the stored result of one tick.
+
+        Args:
+            site: Name of the site.
+        """
         live_hand = self.sites[site].find_live_hand()
         actors = () if live_hand is None else (live_hand.actor,)
         layout = site_setup.Layout.of_arm(
@@ -609,7 +659,14 @@ class Scenario(Frozen, frozen=True, dict=True):
         return plant.bodies if isinstance(plant, OwnPlant) else {}
 
     def setup(self, site: str) -> site_setup.SiteSetup:
-        """Returns the setup from which the simulation kernel builds a site."""
+        """Returns everything from which the simulation kernel builds a site.
+
+        It contains the arm, the control law, the links and the limits in the form of the
+        kernel.
+
+        Args:
+            site: Name of the site.
+        """
         spec = self.sites[site]
         arm = self.arms[site]
         index = self.names.index(site)
@@ -669,10 +726,13 @@ class Scenario(Frozen, frozen=True, dict=True):
         )
 
     def gains(self, site: str) -> site_setup.Gains:
-        """Returns the gains of a site's law.
+        """Returns the gains of a site's control law in the form of the simulation kernel.
 
         Under the stale rule "glide", they include bounds of the parameters that an adaptive law
         estimates.
+
+        Args:
+            site: Name of the site.
         """
         spec = self.sites[site]
         arm = self.arms[site]
@@ -745,7 +805,9 @@ class Scenario(Frozen, frozen=True, dict=True):
     def ramp(
         self, site: str, shares: dict[str, float], start_ns: int, ramp_s: float
     ) -> DominanceRamp:
-        """Returns a change of a site's dominance factors in the form that the kernel uses.
+        """Returns a gradual change of a site's dominance factors in the form of the kernel.
+
+        A dominance factor is the weight with which the site follows a peer.
 
         Args:
             site: Name of the site.
@@ -758,7 +820,16 @@ class Scenario(Frozen, frozen=True, dict=True):
         return DominanceRamp(start_ns, start_ns + round(ramp_s * 1e9), alpha)
 
     def scripted_ramps(self, site: str) -> list[DominanceRamp]:
-        """Returns the planned changes of a site's dominance factors."""
+        """Returns the changes of a site's dominance factors that the scenario plans.
+
+        A dominance factor is the weight with which the site follows a peer.
+
+        Args:
+            site: Name of the site.
+
+        Returns:
+            The changes in the form of the simulation kernel. Empty if none is planned.
+        """
         return [
             self.ramp(site, change.to, change.start_ns, change.ramp_s)
             for change in self.timeline
@@ -766,7 +837,11 @@ class Scenario(Frozen, frozen=True, dict=True):
         ]
 
     def without_hands(self) -> "Scenario":
-        """Returns the same experiment without the operators who move the arms."""
+        """Returns the same experiment without operators.
+
+        Operators are the persons or programs who move the arms. Walls and other environments
+        remain.
+        """
         sites = {
             name: msgspec.structs.replace(spec, hands=()) for name, spec in self.sites.items()
         }

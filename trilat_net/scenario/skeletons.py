@@ -17,7 +17,9 @@ from .resolve import SHIPPED_FOLDER
 
 
 def new_law(path: str | Path, *, force: bool = False) -> list[Path]:
-    """Writes the skeleton of a control law and its test. The command is `trilat new law`.
+    """Writes a file with an incomplete control law to start from, and a file with its test.
+
+    The corresponding command is `trilat new law`.
 
     >>> [path.name for path in tn.new_law("mylaw.py")]
     ['mylaw.py', 'test_mylaw.py']
@@ -36,10 +38,10 @@ def new_law(path: str | Path, *, force: bool = False) -> list[Path]:
 
 
 def new_hand(path: str | Path, *, force: bool = False) -> list[Path]:
-    """Writes the skeleton of an operator and its test. The command is `trilat new hand`.
+    """Writes a file with an incomplete operator to start from, and a file with its test.
 
-    The operator is a program that moves an arm in place of a person. The arguments are those of
-    `new_law`.
+    An operator is a program that moves an arm in place of a person. The corresponding command
+    is `trilat new hand`. The arguments are those of `new_law`.
 
     >>> [path.name for path in tn.new_hand("myhand.py")]
     ['myhand.py', 'test_myhand.py']
@@ -48,10 +50,10 @@ def new_hand(path: str | Path, *, force: bool = False) -> list[Path]:
 
 
 def new_plant(path: str | Path, *, force: bool = False) -> list[Path]:
-    """Writes the skeleton of a plant and its test. The command is `trilat new plant`.
+    """Writes a file with an incomplete plant to start from, and a file with its test.
 
-    A plant is a program that computes the motion of an arm. The arguments are those of
-    `new_law`.
+    A plant is a program that computes the motion of an arm. The corresponding command is
+    `trilat new plant`. The arguments are those of `new_law`.
 
     >>> [path.name for path in tn.new_plant("myplant.py")]
     ['myplant.py', 'test_myplant.py']

@@ -75,7 +75,7 @@ _plain_sincos = getattr(sincos, "py_func", sincos)
 
 
 class UrdfPayload(NamedTuple):
-    """Body that is fixed to the tip of an arm.
+    """Body, such as a tool, that is fixed to the tip of an arm.
 
     Attributes:
         mass_kg: Mass, in kg.
@@ -90,7 +90,7 @@ class UrdfPayload(NamedTuple):
 
 
 class UrdfJoint(NamedTuple):
-    """A moving joint of an arm, and the body that it moves.
+    """A moving joint of an arm in a URDF file, and the body that it moves.
 
     Attributes:
         name: Name of the joint.
@@ -126,7 +126,9 @@ class UrdfJoint(NamedTuple):
 
 
 class UrdfChain(NamedTuple):
-    """An arm: the moving joints between a base and a tip.
+    """An arm in a URDF file: the moving joints between a base and a tip.
+
+    `read_urdf` returns it.
 
     Attributes:
         base: Name of the link that does not move.
@@ -237,11 +239,11 @@ def read_urdf(
     *,
     balance: bool = False,
 ) -> UrdfChain:
-    """Returns the arm between two links of a robot.
+    """Reads the arm between two links of a robot from a URDF file.
 
-    A link on a fixed joint is part of the moving link that carries it. The same holds for a
-    branch with joints of its own, such as fingers: these joints are held at zero, and a note
-    says so.
+    URDF is the usual XML format for the links and joints of a robot. A link on a fixed joint is
+    part of the moving link that carries it. The same holds for a branch with joints of its own,
+    such as fingers: these joints are held at zero, and a note says so.
 
     Args:
         text: URDF document.
