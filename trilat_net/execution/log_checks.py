@@ -59,7 +59,10 @@ class LogCheckReport(CheckReport):
         return self.result.identical
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the report as plain values, with the keys of `trilat verify --json`."""
+        """Returns the whole report as plain values, ready for JSON.
+
+        The keys are those of `trilat verify --json`.
+        """
         result = self.result
         first_difference = None
         if result.first is not None:

@@ -137,7 +137,7 @@ class LinkEffect(NamedTuple):
 
     @property
     def differs(self) -> bool:
-        """True if the ages in the rerun differ from those in the log."""
+        """True if the samples of the link had other ages in the rerun than in the log."""
         return any(pair.before != pair.after for pair in (self.age_mean_ms, self.age_max_ms))
 
 
@@ -331,16 +331,17 @@ class Rerun(Result):
         return open_log(stream)
 
     def write(self, stream: Sink, views_hz: float = 0.0) -> None:
-        """Writes the rerun as a log to a stream, which is not closed.
+        """Writes the rerun to a stream in the form of a log.
 
-        The records of executed sites contain no measured values, such as computing times and
-        round trips. Recorded sites are copied byte for byte. The file states the SHA-256 hash
-        of its source log, the executed sites and the changes. Its scenario is that of the
-        rerun.
+        Such a log can be read, shown and checked like that of a run. The records of executed
+        sites contain no measured values, such as computing times and round trips. Recorded
+        sites are copied byte for byte. The file states the SHA-256 hash of its source log, the
+        executed sites and the changes. Its scenario is that of the rerun.
 
         Args:
-            stream: Stream to which the log is written.
-            views_hz: Rate of the additional channels for viewers, in Hz, see `LogWriter`.
+            stream: Stream to which the log is written. It is not closed.
+            views_hz: Rate of the additional channels for viewers, in Hz, see `LogWriter`. 0
+                means none.
 
         Raises:
             LogError: The start time that the log states is not a time.
@@ -430,7 +431,10 @@ class Rerun(Result):
         return list(self.to_dict()["sites"].values())
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the result as plain values, with the keys of `trilat rerun --json`."""
+        """Returns the whole result as plain values, ready for JSON.
+
+        The keys are those of `trilat rerun --json`.
+        """
         return {
             "log": self.before.source,
             "mode": self.request.mode,

@@ -108,11 +108,14 @@ class RerunRequest:
 def resolve_rerun_request(
     log: Log, replace: Sequence[str], overrides: RerunOverrides, *, closed_loop: bool
 ) -> RerunRequest:
-    """Checks the request for a rerun, and returns it with the resolved scenario.
+    """Checks a user's request for a rerun, and applies its changes to the scenario of the log.
+
+    A rerun executes sites of a log again, usually with changed settings. In a closed loop, all
+    sites are executed. Otherwise the sites that are not executed keep their records.
 
     Args:
         log: The log.
-        replace: Names of the sites to execute.
+        replace: Names of the sites to execute. Empty in a closed loop.
         overrides: Changed settings, in the form that `load_scenario` accepts.
         closed_loop: If True, all sites are executed.
 
@@ -459,12 +462,15 @@ class RerunSite:
 
     @property
     def is_done(self) -> bool:
-        """True if the site has executed its last tick."""
+        """True if the site has executed its last tick, so that nothing is left to do."""
         return self.diverged or self.k > self._last_tick
 
     @property
     def t_ns(self) -> int:
-        """Nominal time of the next tick, in ns after the epoch."""
+        """Nominal time of the tick that is executed next, in ns after the epoch.
+
+        The epoch is the common start time of the sites.
+        """
         return self.k * NS_PER_S // self._site.rate_hz
 
     def execute_tick(self) -> RerunTick:

@@ -393,11 +393,11 @@ class SiteVerifier:
         )
 
     def run(self, report: Callable[[int], None] | None = None) -> None:
-        """Executes every record of the site.
+        """Executes every record of the site again, and adds the findings to the result.
 
         Args:
             report: Function that is called now and then with the number of records of all sites
-                so far.
+                so far. None if nobody wants to know.
         """
         result = self._result
         name = self._log.name

@@ -82,7 +82,7 @@ class SiteEntry(NamedTuple):
 
 
 class SiteChannels:
-    """Channels of one site in a log that is being written.
+    """Channels of one site in a log that is being written: records, statistics and events.
 
     The `make_…` methods convert ticks and messages to entries, and `write` writes an entry to
     the log. An account for each channel counts the messages, so that the log can state whether
@@ -118,16 +118,17 @@ class SiteChannels:
     def make_tick_entries(
         self, output: TickRecord, stats: LinkStats | None, law_failure: Exception | None = None
     ) -> Sequence[SiteEntry]:
-        """Returns the entries that follow the record of an executed tick.
+        """Returns the messages of a tick that follow its record: statistics and events.
 
         Args:
-            output: Record of the tick.
-            stats: Link statistics, if they are due in this tick.
-            law_failure: Error of a user's control law that changed the site's mode, if any.
+            output: Record of the tick: the stored result.
+            stats: Statistics of the site's links. None if they are not due in this tick.
+            law_failure: Error of a user's control law that changed the mode of the site. None
+                if there was no error.
 
         Returns:
             An entry for the statistics, and an entry for an event if the mode of the site has
-            changed.
+            changed. Empty if there is nothing to report.
         """
         self.ticks = output.tick + 1
         self._last_ns = output.t_ns
@@ -177,7 +178,9 @@ class SiteChannels:
         return self.make_new_event_entry("end", text, end_ns)
 
     def make_new_event_entry(self, kind: str, text: str, t_ns: int) -> SiteEntry:
-        """Returns the entry of a new event of the site, with the next event number.
+        """Returns a new event of the site as a message for the log.
+
+        The event gets the next event number of the site.
 
         Args:
             kind: Kind of the event, for programs.
@@ -274,12 +277,13 @@ class SiteChannels:
         )
 
     def write(self, entry: SiteEntry, writer: LogWriter, epoch_unix_ns: int = 0) -> None:
-        """Writes an entry to a log, and counts it in the account of its channel.
+        """Writes a message of the site to the log, and counts it in the account of its channel.
 
         Args:
-            entry: The entry.
+            entry: The message, as one of the `make_…` methods returned it.
             writer: Writer of the log.
-            epoch_unix_ns: Unix time of the epoch, in ns.
+            epoch_unix_ns: Unix time of the epoch (the common start time of the sites), in ns. 0
+                in virtual time.
         """
         number = number_message(entry.channel, entry.sequence, self._rate_hz)
         self.accounts[entry.channel].receive(number)
@@ -664,7 +668,7 @@ class SimulatedLog(Log):
         self._write = write
 
     def save(self, path: str | Path, *, force: bool = False) -> Path:
-        """Writes the log to a file, as `trilat sim -o` does, and returns its path.
+        """Writes the log to a file, as `trilat sim -o` does.
 
         The scenario runs a second time, because the file additionally contains channels for
         viewers.
@@ -672,6 +676,9 @@ class SimulatedLog(Log):
         Args:
             path: The file.
             force: If True, an existing file is replaced.
+
+        Returns:
+            The path of the file.
 
         Raises:
             UsageError: The file exists, or cannot be created.

@@ -231,7 +231,7 @@ class VirtualComparison(NamedTuple):
 
     @property
     def lost(self) -> list[LateSample]:
-        """Samples that the network lost, so that they never arrived."""
+        """Samples that the network lost, although the scenario states that they arrive."""
         return [sample for sample in self.absent if sample.arrived_tick is None]
 
     @property

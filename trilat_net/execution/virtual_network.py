@@ -65,10 +65,13 @@ class Network(Protocol):
 
 
 class PromptNetwork:
-    """Network that delivers each sample in the receiver's first tick after the sample was sent.
+    """Network without any delay of its own.
+
+    Each sample arrives in the receiver's first tick after it was sent. The delays that a
+    scenario states are applied later, by the receiver.
 
     Args:
-        rates: Tick rate of each site, in Hz.
+        rates: Tick rate of each site, in Hz, by name.
     """
 
     def __init__(self, rates: Mapping[str, int]) -> None:
@@ -149,10 +152,10 @@ class RecordedNetwork:
         return sent_count == len(entries)
 
     def deliver(self, receiver: str, k: int) -> list[Arrival]:
-        """Returns the samples that arrive in tick `k` of a receiver.
+        """Returns the samples that, according to the log, arrive in tick `k` of a receiver.
 
         A sample that its sender has not produced does not arrive. After a gap in the log, more
-        samples may be assumed to arrive than a tick accepts (`MAX_ARRIVALS`); then only the
+        samples may be assumed to arrive than a tick accepts (`MAX_ARRIVALS`). Then only the
         newest are returned.
         """
         peers = self._peers[receiver]
@@ -352,11 +355,12 @@ def retime_deliveries(
     rates_hz: Sequence[int],
     new_rates_hz: Sequence[int],
 ) -> Deliveries:
-    """Returns the arrivals over the same network for sites with other tick rates.
+    """Converts the arrivals of a log to arrivals for sites with other tick rates.
 
-    For each sample of the new run, the last sample of the log that was not sent later serves as
-    its model. The new sample takes as long from its time stamp to the tick of its arrival as
-    the model did. If the model never arrived, the new sample does not arrive either.
+    The network stays the same. For each sample of the new run, the last sample of the log that
+    was not sent later serves as its model. The new sample takes as long from its time stamp to
+    the tick of its arrival as the model did. If the model never arrived, the new sample does
+    not arrive either.
 
     Args:
         deliveries: Arrivals at the site in the log.

@@ -73,9 +73,10 @@ _IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 class Arm(fields.Frozen, frozen=True):
-    """Table of an arm: the planar arm of two links, or a chain of joints from a URDF file.
+    """Table of an arm in a scenario.
 
-    The defaults of the planar arm are those of the paper, with point masses at the ends of the
+    An arm is either the planar arm of two links, or a chain of joints from a URDF file. The
+    defaults of the planar arm are those of the paper, with point masses at the ends of the
     links. Each key belongs to one of the two kinds of arm, or to both.
 
     Attributes:
@@ -159,7 +160,9 @@ CHAIN_KEYS = fields.field_names(Arm)[fields.field_names(Arm).index("base") :]
 
 
 class Task(fields.Frozen, frozen=True, omit_defaults=True):
-    """Table of a task: the coordinates that the sites share.
+    """Table of a task in a scenario: the coordinates in which the sites follow each other.
+
+    A site is a process that runs one arm, and its peers are the other sites.
 
     Attributes:
         space: "joints": The sites share joint angles. "position": They share the positions of
@@ -342,7 +345,14 @@ class ArmModel(NamedTuple):
         return rows
 
     def end_effector_orientation(self, q: Vector) -> tuple[float, float, float]:
-        """Returns the end effector's orientation in the pose `q`, a rotation vector in rad."""
+        """Returns the orientation of the end effector in the pose `q`.
+
+        Args:
+            q: Joint angles in rad, or m for a prismatic joint, shape (n,).
+
+        Returns:
+            A rotation vector, whose direction is the axis and whose length is the angle in rad.
+        """
         if self.chain is None:
             return 0.0, 0.0, q[0] + q[1]
         rows = self._place_links(q)
@@ -390,7 +400,10 @@ class ArmModel(NamedTuple):
 
     @property
     def shares_pose(self) -> bool:
-        """True if the sites share the position or pose of their end effectors."""
+        """True if the sites share the position or pose of their end effectors.
+
+        Otherwise they share their joint angles.
+        """
         return self.chain is not None and self.chain.task is not None
 
     @property
@@ -544,7 +557,11 @@ def _build_planar_chain(arm: Arm, task: Task) -> ChainSetup:
 
 
 def read_arm(arm: Arm, urdf_texts: Mapping[str, str]) -> UrdfChain:
-    """Reads the chain of joints between the base and the tip of an arm from its URDF file.
+    """Reads the joints between the base and the tip of an arm from its URDF file.
+
+    Args:
+        arm: Table of the arm in the scenario, which names the file, the base and the tip.
+        urdf_texts: Texts of the URDF files of the scenario, by name.
 
     Raises:
         ScenarioError: There is no such file, or it cannot be used. The error contains the path
@@ -768,11 +785,11 @@ def compute_rest_gains(
 
 
 def bound_estimates(gains: Gains, arm: ArmModel, limit_nm: Vector, g_m_s2: float) -> Gains:
-    """Returns the gains of an adaptive law with bounds for the parameters that it estimates.
+    """Adds bounds to the gains of an adaptive control law, for the parameters it estimates.
 
-    The motors of the arm can hold it against gravity, which bounds the parameters. With the
-    largest torque T of a joint, the gravitational acceleration g and the length l of a link
-    (for a chain, the reach of the arm):
+    The motors of the arm can hold it against gravity, which bounds the parameters. Let T be the
+    largest torque of a joint, g the gravitational acceleration, and l the length of a link (for
+    a chain, the reach of the arm):
 
     - a first moment (mass times distance) is at most T / g;
     - a second moment (moment of inertia) is at most l T / g;

@@ -133,14 +133,18 @@ def window_quantities(joints: int) -> tuple[str, ...]:
 
 
 def number_window_joints(written: Any, joint_names: Mapping[str, tuple[str, ...]]) -> Any:
-    """Replaces the names of joints in the keys of windows by their numbers.
+    """Replaces the names of joints in expectations by their numbers.
 
-    For example, q_elbow_rad becomes q3_rad if the elbow is the third joint.
+    Expectations for a part of a run (a window) have keys such as q_elbow_rad. This key becomes
+    q3_rad if the elbow is the third joint.
 
     Args:
         written: Windows as their author wrote them. A value that is not a list of tables is
             returned unchanged, and is refused later.
         joint_names: Names of the joints of each site's arm, in their order.
+
+    Returns:
+        The windows with the new keys.
 
     Raises:
         ScenarioError: A window has an unknown key, or the same key twice.
@@ -302,7 +306,7 @@ class Expect(
 
     @property
     def has_expectations(self) -> bool:
-        """True if at least one key states an expectation.
+        """True if the scenario states at least one expectation that a run must satisfy.
 
         A tolerance alone is not an expectation.
         """

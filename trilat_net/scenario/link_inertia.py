@@ -46,7 +46,10 @@ class LinkInertia(fields.Frozen, frozen=True, omit_defaults=True):
     inertia_kg_m2: TensorEntries | None = None
 
     def list_given_keys(self) -> list[str]:
-        """Returns the names of those keys that the author of the scenario stated."""
+        """Returns the names of those keys that the author of the scenario stated.
+
+        The other values are those of the URDF file.
+        """
         keys = fields.field_names(LinkInertia)
         return [key for key in keys if getattr(self, key) is not None]
 

@@ -89,7 +89,7 @@ class OnStale(Frozen, frozen=True, omit_defaults=True):
 
     @property
     def rule(self) -> site_setup.StaleRule:
-        """The reaction in the form in which the simulation kernel uses it."""
+        """The reaction in the form in which the simulation kernel uses it, with times in ns."""
         if self.action == "glide":
             return site_setup.StaleRule(
                 action=site_setup.StaleAction.GLIDE,
@@ -280,7 +280,10 @@ class Change(Frozen, frozen=True, omit_defaults=True):
 
     @property
     def start_ns(self) -> int:
-        """Time at which the change takes effect, in ns after the common start time of the sites."""
+        """Time at which the change takes effect, in ns after the epoch.
+
+        The epoch is the common start time of the sites.
+        """
         return round(self.at_s * 1e9)
 
     @property
@@ -443,10 +446,10 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @cached_property
     def controls(self) -> tuple[ChosenLaw, ...]:
-        """Control law of every site.
+        """Control law of every site with its gains, in the order of the sites.
 
-        Some laws have gains that follow from the dominance factors at the start. These gains
-        are filled in.
+        Some laws have gains that follow from the dominance factors at the start. A dominance
+        factor is the weight with which a site follows a peer. These gains are filled in.
         """
         laws = [spec.control for spec in self.sites.values()]
         return tuple(law.resolve_shares(self.names, self.alpha) for law in laws)
@@ -464,9 +467,10 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @cached_property
     def text(self) -> str:
-        """Canonical TOML text of the scenario.
+        """The scenario as a TOML text, in a unique (canonical) form.
 
-        Loading the text gives the same scenario. Keys without effect are left out.
+        Loading the text gives the same scenario. Keys without effect are left out, so that they
+        do not change the hash of the scenario.
         """
         tables: dict[str, Any] = msgspec.to_builtins(self)
         descriptions = {key: tables.pop(key) for key in ("name", "title", "about", "assumed")}
@@ -555,12 +559,19 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @property
     def random(self) -> bool:
-        """True if any number is drawn at random, so that another seed gives another run."""
+        """True if any number of the experiment is random.
+
+        Then another seed gives another run. The numbers may be drawn when the scenario is
+        loaded, or during the run.
+        """
         return bool(self.drawn) or self.links_random
 
     @property
     def links_random(self) -> bool:
-        """True if a link draws its delays or losses at random during the run."""
+        """True if a link draws its delays, losses or duplicates at random during the run.
+
+        A link may also do so only after a planned change.
+        """
         return any(link.random for link in self._all_links())
 
     @property
@@ -581,13 +592,19 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @property
     def slave(self) -> str:
-        """Name of the first site with the role "slave", or of the last site if there is none."""
+        """Name of the first site with the role "slave".
+
+        It is the name of the last site if no site has this role.
+        """
         slaves = [name for name, spec in self.sites.items() if spec.role == "slave"]
         return slaves[0] if slaves else self.names[-1]
 
     @property
     def outside(self) -> tuple[str, ...]:
-        """Names of the sites whose arms are real robots."""
+        """Names of the sites whose arms are real robots.
+
+        The motion of such an arm is measured. Empty if there are none.
+        """
         return tuple(name for name, spec in self.sites.items() if spec.plant == "external")
 
     @property
@@ -648,12 +665,17 @@ class Scenario(Frozen, frozen=True, dict=True):
         return layout._replace(bodies=_POSE_NUMBERS * len(self.bodies_m(site)))
 
     def bodies_m(self, site: str) -> dict[str, tuple[float, float, float]]:
-        """Returns the sizes of the bodies that a site's plant moves in addition to its arm.
+        """Returns the sizes of the objects that a user's plant moves in addition to the arm.
 
-        Only a user's class can move bodies, for example a box that the arm pushes.
+        A plant is a program that computes the motion of the arm of a site. For example, the arm
+        may push a box.
+
+        Args:
+            site: Name of the site.
 
         Returns:
-            Extents of each body along its own axes, in m, by name.
+            Extents of each body along its own axes x, y and z, in m, by name. Empty if there
+            are none.
         """
         plant = self.sites[site].plant
         return plant.bodies if isinstance(plant, OwnPlant) else {}
@@ -702,10 +724,14 @@ class Scenario(Frozen, frozen=True, dict=True):
         )
 
     def motion_limits(self, site: str) -> site_setup.MotionLimits:
-        """Returns the limits of a site's motion, with room for its start pose.
+        """Returns the limits of a site's motion during a run.
 
         A joint may start a little beyond `q_min_rad` or `q_max_rad`, up to a margin. For such a
-        joint, the limit on that side is moved outward by the margin for the whole run.
+        joint, the limit on that side is moved outward by the margin for the whole run, so that
+        the site does not stop at once.
+
+        Args:
+            site: Name of the site.
         """
         spec = self.sites[site]
         arm = self.arms[site]

@@ -15,7 +15,9 @@ from .arms import build_arm
 
 
 class SimulatedArm:
-    """An arm that starts in the start pose of its site, and moves when a program calls `move`.
+    """Simulation of one arm, for users' programs that compute the motion of an arm.
+
+    It starts in the start pose of its site, and moves when a program calls `move`.
 
     >>> arm = tn.SimulatedArm(tn.load_scenario("two_sites"), "s")
     >>> arm.move([0.0, 0.0], 0.001)

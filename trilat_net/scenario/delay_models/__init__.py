@@ -37,7 +37,7 @@ OutageTime = Annotated[float, Meta(ge=0.0, le=1e9)]
 
 
 class DelayMoments(NamedTuple):
-    """Mean and standard deviation of the delay of a link, in ms."""
+    """Mean and standard deviation of the random delay of a link, both in ms."""
 
     mean_ms: float
     deviation_ms: float
@@ -78,9 +78,11 @@ class _LossChain(NamedTuple):
 
 
 class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
-    """Directed link between two sites, with everything except the delay itself.
+    """Directed connection between two sites, with everything except the delay itself.
 
-    A subclass defines the delay by overriding the methods whose names begin with an underscore.
+    A sample is the state that a site publishes in one tick; the link carries it to the
+    receiver. A subclass defines the delay by overriding the methods whose names begin with an
+    underscore.
 
     Attributes:
         loss: Fraction of samples that are lost in the long run.
@@ -152,13 +154,19 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
 
     @property
     def random(self) -> bool:
-        """True if the delay, the losses or the duplicates are drawn at random."""
+        """True if the delay, the losses or the duplicates of the link are drawn at random.
+
+        Then another seed of the scenario gives another run.
+        """
         is_delay_drawn = self._delay().kind not in _DETERMINISTIC_KINDS
         return is_delay_drawn or 0.0 < self.loss < 1.0 or 0.0 < self.duplicate < 1.0
 
     @property
     def measured(self) -> bool:
-        """True if the link injects no delay, so that the real network decides."""
+        """True if the link adds no artificial delay.
+
+        Samples then arrive as the real network of a live session delivers them.
+        """
         return self._delay().kind == DelayKind.MEASURED
 
     @property
@@ -167,7 +175,7 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         return None
 
     def to_core_model(self, from_ns: int = 0) -> LinkModel:
-        """Returns the link in the form that the simulation kernel uses.
+        """Returns the delay and losses of the link in the form that the simulation kernel uses.
 
         Args:
             from_ns: Send time of the first sample to which this state of the link applies, in
@@ -257,7 +265,8 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
     def describe(self) -> str:
         """Returns a short text for the user about the link.
 
-        It contains the kind of the delay, its mean and its standard deviation.
+        It contains the kind of the delay with its mean and standard deviation, and the other
+        properties that the link has, such as losses.
         """
         parts = [self._describe_delay()]
         if self.loss:

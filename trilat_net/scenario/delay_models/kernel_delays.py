@@ -219,7 +219,9 @@ class HyperExponentialDelay(LinkBase, frozen=True, kw_only=True, tag="hyperexpon
 
 
 class CorrelatedDelay(NormalDelay, frozen=True, kw_only=True, tag="ar1"):
-    """Normal delay that is correlated from sample to sample. Negative delays become zero.
+    """Delay with a normal distribution that is correlated from sample to sample.
+
+    If one sample is slow, the next one probably is too. Negative delays become zero.
 
     Attributes:
         correlation: Correlation between the delays of two consecutive samples, before negative
@@ -250,7 +252,10 @@ class CorrelatedDelay(NormalDelay, frozen=True, kw_only=True, tag="ar1"):
 
 
 class NoDelay(LinkBase, frozen=True, kw_only=True, tag="none"):
-    """Link without delay: the receiver uses a sample from its next tick on."""
+    """Link without artificial delay.
+
+    The receiver uses a sample from its next tick on.
+    """
 
     def _delay(self) -> LinkModel:
         """Returns the kernel's model of a link without delay, which is its default."""

@@ -52,9 +52,12 @@ _AXES_TEXTS = {
 
 
 class Pulse(ActorBase, frozen=True, tag="pulse"):
-    """Operator who pushes smoothly once.
+    """Operator who pushes the arm once, with a torque that rises and falls smoothly.
 
         torque = peak sin^2(pi (t - start) / (end - start))
+
+    t is the time from the start of the run. Before the start and after the end, the torque is
+    zero.
 
     Attributes:
         start_s: Start of the push, in s.
@@ -114,7 +117,7 @@ class MovingSpring(ActorBase, frozen=True, kw_only=True):
         held_arm.draws.follow_start(table, end_key, table[start_key], path)
 
     def find_problem(self) -> fields.KeyProblem | None:
-        """Returns a contradiction between the times of the motion, or None if there is none."""
+        """Returns a contradiction between the times of the motion. None if there is none."""
         problem = super().find_problem()
         if problem is not None or self.move_end_s >= self.move_start_s:
             return problem
@@ -203,7 +206,9 @@ class RecordedTorque(ActorBase, frozen=True, tag="recorded"):
 
 
 class Chirp(TimedActor, frozen=True, tag="chirp"):
-    """Operator whose torque is a sine with a linearly changing frequency, swept repeatedly.
+    """Operator whose torque is a sine, for example to measure a frequency response.
+
+    The frequency changes linearly from its first to its last value. This sweep is repeated.
 
     Attributes:
         peak_nm: Amplitude on each joint, in N m.
@@ -232,6 +237,8 @@ class Chirp(TimedActor, frozen=True, tag="chirp"):
 
 class Multisine(TimedActor, frozen=True, tag="multisine"):
     """Operator whose torque is a sum of sines with equal amplitude.
+
+    Such a torque excites several frequencies at once.
 
     Attributes:
         amplitude_nm: Amplitude of each sine on each joint, in N m.

@@ -122,12 +122,15 @@ class HandSite(NamedTuple):
 
     @property
     def program(self) -> str:
-        """Name of the program's class in the scenario."""
+        """Class of the program as the scenario names it, for example "my_policy:Reach"."""
         return self.spec.code if isinstance(self.spec, ProgramHand) else "a program"
 
     @property
     def has_separate_process(self) -> bool:
-        """True if the program runs in a process of its own in a live session."""
+        """True if the program runs in a process of its own in a live session.
+
+        Otherwise it runs in the process of the site.
+        """
         return isinstance(self.spec, ProgramHand) and self.spec.process
 
     @property
@@ -171,7 +174,7 @@ class HandSite(NamedTuple):
 
 
 class HandPlayer:
-    """Calls the program that operates an arm, and applies its actions at the site.
+    """Calls the program that operates an arm, and passes its actions to the site.
 
     If the program fails, it lets go of the arm for the rest of the run.
 
