@@ -108,7 +108,7 @@ def run_log_checks(
     """Executes the sites of a log again, and checks the log against the results.
 
     Args:
-        log: The log.
+        log: Log of a run or of a rerun that is to be checked.
         virtual: If True, the log is also compared with a simulation of its scenario in virtual
             time, as `compare_with_virtual` does.
         progress: Function that is called now and then with the amount of work done and the

@@ -380,7 +380,7 @@ class Rerun(Result):
         """Writes the rerun as a log to a file, with additional channels for viewers.
 
         Args:
-            path: The file.
+            path: File to which the log is written.
             force: If True, an existing file is replaced.
 
         Raises:
@@ -465,7 +465,7 @@ def rerun(
     False
 
     Args:
-        log: The log, or its path.
+        log: Log of a run, or the path of its file.
         replace: Names of the sites to execute. All other sites keep their records and do not
             react.
         set: Changed settings of these sites, for example `{"control.Kd": 5}`.
@@ -510,7 +510,7 @@ def collect_rerun_metadata(log: Log, request: RerunRequest) -> dict[str, str]:
     """Returns the metadata with which the log of a rerun tells where it comes from.
 
     Args:
-        log: The source log.
+        log: The log that was executed again.
         request: Executed sites and changed settings of the rerun.
 
     Returns:

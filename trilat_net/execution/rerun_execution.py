@@ -114,7 +114,7 @@ def resolve_rerun_request(
     sites are executed. Otherwise the sites that are not executed keep their records.
 
     Args:
-        log: The log.
+        log: Log of a run, which contains its scenario.
         replace: Names of the sites to execute. Empty in a closed loop.
         overrides: Changed settings, in the form that `load_scenario` accepts.
         closed_loop: If True, all sites are executed.

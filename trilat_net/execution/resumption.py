@@ -45,7 +45,7 @@ def read_output(state: State, peers: tuple[str, ...]) -> TickRecord:
     that of executing the tick again.
 
     Args:
-        state: The record.
+        state: Record of a tick, as the log contains it.
         peers: Names of the other sites, in the order of the scenario.
     """
     mode = MODES.get(state.mode, MODES["diverged"]).mode

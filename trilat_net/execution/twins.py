@@ -194,7 +194,7 @@ def parse_push(
 
     Args:
         scenario: Description of the experiment.
-        target: The description.
+        target: Description of what is pushed, for example "m1.q1".
         size: Size of the push, in rad, rad/s, or the unit of an estimate.
         at_s: Time of the push, in s after the epoch (the common start time).
 

@@ -136,7 +136,7 @@ def equal_record(logged: State, computed: TickRecord, peers: tuple[str, ...]) ->
     differs.
 
     Args:
-        logged: Record in the log.
+        logged: Record of a tick, as the log contains it.
         computed: Result of executing the same tick again.
         peers: Names of the other sites, in the order of the scenario.
     """
@@ -161,7 +161,7 @@ def find_first_difference(
     """Finds the first field in which a record differs from executing its tick again.
 
     Args:
-        logged: Record in the log.
+        logged: Record of a tick, as the log contains it.
         computed: Result of executing the same tick again.
         peers: Names of the other sites, in the order of the scenario.
         equal: Function that decides whether two numbers count as equal.
@@ -669,7 +669,7 @@ def verify(
     in the same folder.
 
     Args:
-        log: The log.
+        log: Log of a run or of a rerun that is to be checked.
         progress: Function that is called now and then with the number of executed records and
             their total.
         min_coverage: Smallest fraction of the ticks of every site that must be judged.

@@ -298,7 +298,7 @@ def render_accounts(sites: Iterable[SiteChannels]) -> dict[str, str]:
     A log contains these texts, so that a reader notices missing messages.
 
     Args:
-        sites: Channels of the sites.
+        sites: Channels of the sites, after all their messages have been written.
 
     Returns:
         One text for each channel, by topic.
@@ -392,7 +392,7 @@ def execute_virtual(
     are executed. If a site diverges, the run ends with the ticks of that time.
 
     Args:
-        scenario: The scenario.
+        scenario: Description of the experiment, with its sites and links.
         network: Network between the sites. By default, every sample arrives in the first tick
             after its time stamp.
         commands: Changes that take effect during the run.
@@ -544,7 +544,7 @@ def write_virtual_log(
     after an error.
 
     Args:
-        scenario: The scenario.
+        scenario: Description of the experiment, with its sites and links.
         stream: Stream to which the log is written. It is not closed.
         network: Network between the sites, see `execute_virtual`.
         stopped: Function that is called after each tick. The run ends if it returns True.
@@ -627,8 +627,8 @@ def record_virtual(
     """Runs a scenario in virtual time, and writes the log of the run to a file.
 
     Args:
-        scenario: The scenario.
-        path: The file.
+        scenario: Description of the experiment, with its sites and links.
+        path: File to which the log is written.
         force: If True, an existing file is replaced.
         stopped: Function that is called after each tick. The run ends if it returns True.
         views_hz: Rate of the additional channels for viewers, in Hz.
@@ -674,7 +674,7 @@ class SimulatedLog(Log):
         viewers.
 
         Args:
-            path: The file.
+            path: File to which the log is written.
             force: If True, an existing file is replaced.
 
         Returns:

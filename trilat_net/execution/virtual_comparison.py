@@ -91,7 +91,7 @@ def compare_records(
     """Compares every record of a log with another execution, bit for bit.
 
     Args:
-        log: The log.
+        log: Log whose records are compared.
         executed: Results of the other execution in any order, each with the name of the site.
             Ticks that the log does not contain are skipped.
         arrivals: If True, the same samples must have arrived in each tick as well. Their
@@ -130,7 +130,7 @@ def find_absent_samples(log: Log) -> list[LateSample]:
     sample.
 
     Args:
-        log: The log.
+        log: Log of a live session.
 
     Returns:
         The samples, in the order of the ticks in which they were due. Empty if all were in
@@ -251,7 +251,7 @@ def compare_with_virtual(log: Log, progress: Progress | None = None) -> VirtualC
     once. Both end at the last record of the log.
 
     Args:
-        log: The log.
+        log: Log of a live session, which contains its scenario.
         progress: Function that is called now and then with the number of executed ticks and
             their total.
     """

@@ -190,7 +190,7 @@ def read_deliveries(part: SiteLog) -> Deliveries:
     Ticks without a record are left out; `complete_deliveries` fills them in.
 
     Args:
-        part: Records of the site.
+        part: Records of the site, each of which lists the samples that arrived in its tick.
     """
     counts, rows = part.arrivals
     arrivals = rows.tolist()
@@ -216,15 +216,16 @@ def complete_deliveries(
     """Returns the arrivals at a site for every tick from its first record to its last one.
 
     If the record of a tick is missing, the log does not say which samples arrived in it. A
-    sample that no record lists is assumed to have arrived in such a tick, if one is possible:
-    after the sample was sent, after the arrival of the last earlier sample that a record lists,
-    and before the arrival of the first later one. Of several possible ticks, the one is chosen
-    whose delay is nearest to the median delay of the link.
+    sample that no record lists is assumed to have arrived in such a tick, if one is possible.
+    Three conditions must hold: the tick is after the sample was sent; it is after the arrival
+    of the last earlier sample that a record lists; and it is before the arrival of the first
+    later one. Of several possible ticks, the one is chosen whose delay is nearest to the median
+    delay of the link.
 
     Args:
-        part: Records of the site.
-        rates_hz: Tick rates of its peers, in Hz.
-        ends: Last ticks of its peers.
+        part: Records of the site, each of which lists the samples that arrived in its tick.
+        rates_hz: Tick rates of the sites that send samples to it (its peers), in Hz.
+        ends: Last tick of each peer, in the same order.
 
     Raises:
         LogError: Fewer than half of the ticks have a record.

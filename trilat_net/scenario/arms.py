@@ -753,7 +753,7 @@ def compute_rest_gains(
     positive.
 
     Args:
-        arm: Model of the arm.
+        arm: Model of the arm, which contains its inertia.
         q0: Start pose, for which the inertia of a chain is computed. The inertia of the planar
             arm is that of the stretched pose.
         law_damping: Damping of the control law for each joint, in N m s/rad, shape (n,).
@@ -800,8 +800,8 @@ def bound_estimates(gains: Gains, arm: ArmModel, limit_nm: Vector, g_m_s2: float
     already, and gains of other laws, are returned unchanged.
 
     Args:
-        gains: Gains of the law.
-        arm: Model of the arm.
+        gains: Gains of the control law, with the first estimate of the parameters.
+        arm: Model of the arm, which contains its lengths.
         limit_nm: Largest torque, in N m, as one number or one per joint.
         g_m_s2: Gravitational acceleration, in m/s^2. Without gravity, no bounds follow.
     """

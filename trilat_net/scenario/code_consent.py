@@ -79,7 +79,7 @@ def allow_own_code(
     name harmful code.
 
     Args:
-        scenario: The scenario.
+        scenario: Scenario that names the code.
         codes: Classes that the user named, for example "package.module:Law". If None, the user
             wrote the whole scenario, so all its code may run.
         changed_from: Scenario from which the user made this one. Code that may run there may
@@ -129,8 +129,8 @@ def allow_logged_code(
     `open_log`.
 
     Args:
-        scenario: Scenario of the log.
-        law: Files that the person names.
+        scenario: Scenario of the log, which names the code.
+        law: Python files that the person permits to run. By default, there are none.
         other_version: If True, a file may differ from the one that ran.
         remember: If True, the permission is stored for later logs.
 

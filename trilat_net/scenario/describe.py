@@ -473,7 +473,7 @@ def compare_scenarios(scenarios: Sequence[Scenario]) -> list[ScenarioDifference]
     """Finds the keys in which several experiments differ.
 
     Args:
-        scenarios: The experiments.
+        scenarios: Descriptions of at least two experiments.
 
     Returns:
         One entry for each difference, in the order of the keys. Empty if all are equal.
@@ -549,7 +549,7 @@ def flatten_table(table: Mapping[str, Any], path: str = "") -> list[tuple[str, A
     For example, {"a": {"b": 1}} gives the pair ("a.b", 1).
 
     Args:
-        table: The table.
+        table: Table with values and further tables.
         path: Dotted key of the table itself. Empty for the outermost table.
     """
     pairs: list[tuple[str, Any]] = []

@@ -164,9 +164,9 @@ class Draws:
 
         Args:
             table: Table of the operator. It is changed.
-            key: Key of the pose.
-            pose: Start pose.
-            path: Path of the table.
+            key: Key of the pose in the operator's table.
+            pose: Start pose of the arm.
+            path: Path of the operator's table in the scenario.
         """
         pose_key = dotted_key(f"{path}.{key}")
         known = self._known.get(pose_key)

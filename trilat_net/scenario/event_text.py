@@ -16,7 +16,7 @@ def describe_event(kind: str, text: str, command: str) -> str:
     logs read alike. All other texts are returned unchanged.
 
     Args:
-        kind: Kind of the event.
+        kind: Kind of the event, a short name for programs.
         text: Text of the event, as a site or a recorder published it.
         command: JSON text of the change that the event reports. Empty for other events.
     """

@@ -65,11 +65,12 @@ else:
 
 
 class ExpectWindow(_JointPart, frozen=True, kw_only=True):
-    """Expectations of a part of a run, as [smallest, largest] permitted value of each quantity.
+    """Expectations of a part of a run, which a test of the scenario checks.
 
-    The force of the walls is computed from the logged state. It is the force along the normal,
-    added up over the walls of the scenario. If a run ends before the window ends, the
-    quantities are not measured, and the expectations count as not satisfied.
+    For each quantity, the smallest and the largest permitted value may be stated. The force of
+    the walls is computed from the logged state. It is the force along the normal, added up over
+    the walls of the scenario. If a run ends before the window ends, the quantities are not
+    measured, and the expectations count as not satisfied.
 
     Attributes:
         from_s: Nominal time of the first tick of the window, in s.

@@ -461,7 +461,7 @@ def check_class(source: CodeSource, code: str, path: str, method: str = "torque"
     The check reads the syntax of the file, and runs no code of it.
 
     Args:
-        source: The file.
+        source: File, as it was read from disk.
         code: Module and class, for example "package.module:Law".
         path: Path of the key in the scenario, for error messages.
         method: Method that the class must have.

@@ -65,10 +65,11 @@ def fill_tensor(entries: Sequence[float]) -> Matrix:
 
 
 def balance_tensor(tensor: Matrix) -> Matrix:
-    """Returns the nearest inertia tensor that a body can have.
+    """Returns the inertia tensor nearest to a given one that a real body can have.
 
-    Let I_1, I_2 and I_3 be the principal moments of inertia. The second moments of the mass
-    along the principal axes are
+    The tensor in a URDF file may be impossible, for example because of rounding. Let I_1, I_2
+    and I_3 be the principal moments of inertia. The second moments of the mass along the
+    principal axes are
 
         s_k = (I_1 + I_2 + I_3) / 2 - I_k.
 

@@ -192,15 +192,15 @@ def _split_entry(key: str) -> tuple[str, str]:
 def split_entries(
     tables: TomlTable, pairs: Sequence[Override]
 ) -> tuple[dict[str, Any], list[Override]]:
-    """Separates the overrides that apply to the tables of a file from those that must wait.
+    """Separates overrides that can be applied to a scenario file from those that must wait.
 
-    An override of an entry of a list must wait if the tables do not contain the list. It may be
-    written as a single number, or for all sites; only the resolved scenario contains its
-    entries.
+    An override replaces one value of a scenario. An override of an entry of a list must wait if
+    the file does not contain the list. The list may be written as a single number, or for all
+    sites. Only the resolved scenario contains its entries then.
 
     Args:
         tables: Tables of the scenario file.
-        pairs: The overrides.
+        pairs: The overrides, as pairs of a dotted key and a value.
 
     Returns:
         The overrides that apply to the tables, and those that must wait.
@@ -255,7 +255,7 @@ def _find_model(scenario: Scenario, link: str, overridden: Mapping[str, Any]) ->
 
 
 def apply_overrides(tables: TomlTable, overrides: Mapping[str, Any] | Sequence[str]) -> None:
-    """Writes overrides into the tables of a scenario file, in place.
+    """Replaces single values in the tables of a scenario file.
 
     A number in a key is the index of an entry of a list, counted from 0, as in
     sites.s.environment.0.stiffness_n_m. A key that names a kind (the model or preset of a link,
@@ -263,8 +263,8 @@ def apply_overrides(tables: TomlTable, overrides: Mapping[str, Any] | Sequence[s
     the previous kind.
 
     Args:
-        tables: The tables.
-        overrides: Overrides by key, or texts KEY=VALUE.
+        tables: Tables of the scenario file. They are changed in place.
+        overrides: Values by dotted key, or texts KEY=VALUE.
 
     Raises:
         ScenarioError: An override does not have this form, or its key does not exist.

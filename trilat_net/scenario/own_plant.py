@@ -127,7 +127,7 @@ def resolve_plant(written: Any, path: str) -> Any:
     A text such as "external", and a value of a wrong type, are returned unchanged.
 
     Args:
-        written: Plant as its author wrote it.
+        written: Value of the key `plant` as the author of the scenario wrote it.
         path: Path of the key, for error messages.
 
     Raises:
@@ -191,6 +191,8 @@ def _is_box_size(size: Any) -> bool:
 class PlantPlayer:
     """Runs a user's plant at its site, tick by tick.
 
+    A plant is a program that computes the motion of an arm from the torques of its motors.
+
     Args:
         scenario: The scenario.
         site: Name of the site.
@@ -237,10 +239,12 @@ class PlantPlayer:
         self.state = PlantState(spec.q0_rad, spec.qd0_rad_s, (), bodies)
 
     def move(self, tick: int, tau: Sequence[float]) -> None:
-        """Advances the plant from a tick to the next one.
+        """Lets the plant compute the motion of the arm from a tick to the next one.
+
+        The result is stored in `state`.
 
         Args:
-            tick: The tick.
+            tick: Number of the tick that has been executed.
             tau: Control torque of this tick, in N m, shape (n,).
 
         Raises:
@@ -312,7 +316,13 @@ class PlantPlayer:
 
 
 def make_plant_players(scenario: "Scenario") -> dict[str, PlantPlayer]:
-    """Returns a player for each site with a user's plant, by the name of the site.
+    """Creates the users' plants of all sites that have one.
+
+    Args:
+        scenario: Description of the experiment.
+
+    Returns:
+        An object that runs the plant, by the name of the site. Empty if no site has a plant.
 
     Raises:
         CodeWithheld: A class may not run.

@@ -112,7 +112,7 @@ def read_ping(text: str, every_s: float) -> PingProbes:
     The program that produced the output is recognised by its lines.
 
     Args:
-        text: The output.
+        text: Text that the program printed.
         every_s: Interval between probes, in s. It is used if the lines do not contain times.
 
     Raises:

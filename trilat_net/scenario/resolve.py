@@ -805,7 +805,7 @@ def resolve_dominance_row(written: Any, names: list[str], site: str, path: str) 
 
     Args:
         written: Row as its author wrote it. A peer that it does not name has the factor 0.
-        names: Names of all sites.
+        names: Names of all sites of the scenario.
         site: Name of the site that follows.
         path: Path of the row, for error messages.
 
@@ -837,7 +837,7 @@ def resolve_links(tables: TomlTable, names: list[str], folder: Path | None) -> T
 
     Args:
         tables: Tables of the scenario file.
-        names: Names of the sites.
+        names: Names of all sites, between which there are links.
         folder: Folder of the files of delays that links name. None refuses every file.
     """
     link_names = [f"{peer}->{site}" for site in names for peer in names if peer != site]
@@ -990,7 +990,7 @@ def resolve_timeline(written: Any, links: TomlTable, names: list[str]) -> list[T
     Args:
         written: List `timeline` as its author wrote it.
         links: Resolved links at the start of the run, by name.
-        names: Names of the sites.
+        names: Names of all sites of the scenario.
 
     Raises:
         ScenarioError: A change is not valid, or the changes are not in the order of their
@@ -1037,7 +1037,7 @@ def resolve_target(
     Args:
         change: Table of the change, with a key `link` or `dominance`.
         current_links: Links before the change, by name.
-        names: Names of the sites.
+        names: Names of all sites of the scenario.
         path: Path of the change, for error messages.
 
     Raises:

@@ -62,8 +62,8 @@ def resolve_change(
     The request may state only those keys of a link that change. The other keys are added.
 
     Args:
-        scenario: Scenario of the run.
-        current_links: Current table of every link.
+        scenario: Scenario of the run, against which the change is checked.
+        current_links: Current settings of every link, which complete the change.
         written: The change in the form of a scenario's timeline, without `at_s`.
         from_ns: Time at which the change takes effect, in ns after the epoch.
 
@@ -120,8 +120,8 @@ def make_site_order(
 
     Args:
         scenario: Scenario of the run.
-        site: Name of the site.
-        order: The command.
+        site: Name of the site that must carry out the command.
+        order: The command, for example to stop the arm.
         from_ns: Time of the tick in which the site carries out the command, in ns after the
             epoch.
         ticks: For the command "overrun": number of ticks that the site missed.
@@ -239,7 +239,7 @@ def parse_core_change(scenario: Scenario, site: str, text: str) -> CoreChange:
     Args:
         scenario: Scenario of the run.
         site: Name of the site that published the record.
-        text: JSON text of the change.
+        text: JSON text of the change, as the record contains it.
 
     Raises:
         ScenarioError: The text is not a valid change, or not a change of this site.

@@ -137,10 +137,13 @@ def first_ticks(due_ns: IntArray, rate_hz: int) -> IntArray:
 def draw_used_samples(
     link: LinkBase, key: int, receiver_hz: int, sender_hz: int, duration_s: float
 ) -> IntArray:
-    """Computes which sample a site uses in every tick, if it has only one link.
+    """Computes which sample of a peer a site uses in each of its ticks.
+
+    A peer is another site that sends its state once per tick (a sample). Other links of the
+    site are not considered.
 
     Args:
-        link: The link.
+        link: Link over which the samples arrive.
         key: Key of the link's random draws.
         receiver_hz: Tick rate of the site, in Hz.
         sender_hz: Tick rate of the peer, in Hz.
@@ -184,14 +187,14 @@ def _list_newest(samples: IntArray, releases: IntArray, ticks: int) -> IntArray:
 
 
 def count_silences(used: IntArray, receiver_hz: int, silence_ns: int) -> int:
-    """Counts how often no new sample came into use for longer than a limit.
+    """Counts how often a site receives nothing new from a peer for longer than a limit.
 
     The time before the first sample does not count.
 
     Args:
         used: Number of the sample in use in every tick. -1 before the first sample.
         receiver_hz: Tick rate of the site, in Hz.
-        silence_ns: The limit, in ns.
+        silence_ns: Longest time without a new sample that does not count, in ns.
     """
     new_sample_ticks = np.flatnonzero(np.diff(used, prepend=-1) > 0)
     if not len(new_sample_ticks):
@@ -244,7 +247,9 @@ class PictureDelay:
         self._shown = dict.fromkeys(self._links, -1)
 
     def advance_to(self, tick: int, used: Mapping[str, int]) -> Mapping[str, int]:
-        """Returns the sample of each peer that is shown in a tick of the site.
+        """Returns which sample of each peer the user sees in a tick of the site.
+
+        The peers are the other sites, whose arms the picture shows.
 
         Args:
             tick: The tick. It must not be before that of the previous call.
@@ -266,7 +271,7 @@ class PictureDelay:
         """Returns the samples that are shown in the first ticks of a run.
 
         Args:
-            ticks: Number of ticks.
+            ticks: Number of ticks of the site, from the start of the run on.
 
         Returns:
             For each peer, an array of shape (ticks,), with -1 before the first sample. Empty

@@ -184,7 +184,7 @@ class ExperimentText(NamedTuple):
 
 
 def read_experiment(source: str | Path | Mapping[str, Any] | Scenario) -> ExperimentText:
-    """Returns the text of an experiment, without checking it.
+    """Reads the description of an experiment as its author wrote it, without checking it.
 
     Args:
         source: Name of a scenario in the package, path, TOML text, tables, or a `Scenario`.
@@ -220,11 +220,14 @@ def reseed_scenario(scenario: Scenario, seed: int) -> Scenario:
 
 
 def read_source(source: str | Path) -> tuple[str, Path]:
-    """Returns the TOML text of a scenario, and the folder in which the files are that it names.
+    """Reads the TOML text of a scenario from the package or from a file.
 
     Args:
         source: Name of a scenario in the package, or a path. A text counts as a path if it ends
             in ".toml" or contains a slash or backslash.
+
+    Returns:
+        The text, and the folder that contains the files that the scenario names.
 
     Raises:
         ScenarioError: The source cannot be read.
@@ -274,7 +277,7 @@ def parse_scenario(
     """Converts a TOML text to a checked scenario.
 
     Args:
-        text: The TOML text.
+        text: TOML text of a scenario file.
         source: Name of the text, for error messages.
         overrides: Changed keys, see `load_scenario`.
         folder: Folder of the files that the text names. None refuses a text that names a file.
@@ -348,11 +351,15 @@ def _refuse_long_keys(text: str) -> None:
 
 
 def parse_embedded(text: str, source: str = "") -> Scenario:
-    """Returns the resolved scenario of a log or of another member, which is not trusted.
+    """Converts the text of a scenario from a log or another process to a scenario.
 
-    A table for all links could repeat a long trace of delays for every link, so that a short
-    text would fill the memory. Therefore the traces of all links together may not be longer
-    than the text.
+    Such a text is not trusted. A table for all links could repeat a long trace of delays for
+    every link, so that a short text would fill the memory. Therefore the traces of all links
+    together may not be longer than the text.
+
+    Args:
+        text: TOML text of a resolved scenario, which names no files.
+        source: Name of the text, for error messages.
 
     Raises:
         ScenarioError: The scenario is not valid, names a file, or is larger than its text.
@@ -367,9 +374,10 @@ def parse_embedded(text: str, source: str = "") -> Scenario:
 
 
 def embedded_names_reader(source: str) -> Callable[[str], tuple[str, ...]]:
-    """Returns a function that reads the names of the sites from the text of a scenario.
+    """Returns a function that extracts the names of the sites from the text of a scenario.
 
-    The function does not trust the text, see `parse_embedded`.
+    The text may come from a log or another computer, so that it is not trusted, see
+    `parse_embedded`.
 
     Args:
         source: Name of the text, for error messages.

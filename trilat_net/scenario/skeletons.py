@@ -112,8 +112,8 @@ def name_skeleton_class(module: str, kind: str = "law") -> str:
     The modules mylaw and my_law contain the class MyLaw, and spring contains Spring.
 
     Args:
-        module: Name of the module.
-        kind: "law", "hand" or "plant".
+        module: Name of the Python module that contains the skeleton.
+        kind: What the class is: "law" (a control law), "hand" (an operator) or "plant".
     """
     parts = re.sub(rf"(?<=[a-z0-9]){kind}$", f"_{kind}", module).split("_")
     return "".join(part[:1].upper() + part[1:] for part in parts) or kind.title()

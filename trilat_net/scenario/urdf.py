@@ -246,11 +246,11 @@ def read_urdf(
     such as fingers: these joints are held at zero, and a note says so.
 
     Args:
-        text: URDF document.
+        text: Text of the URDF file.
         base: Name of the link that does not move. By default, the root of the robot.
         tip: Name of the link at the end of the arm. By default, the only moving link that
             carries no other link.
-        payload: Body that the tip carries.
+        payload: Body, such as a tool, that is fixed to the tip. None if there is none.
         links: Masses and inertias that replace those in the file, by the name of the link.
         balance: If True, an impossible inertia is replaced by the nearest possible one.
 

@@ -50,7 +50,7 @@ def refuse_external_arms(scenario: Scenario, exempt: Collection[str] = ()) -> No
     the motion.
 
     Args:
-        scenario: The scenario.
+        scenario: Description of the experiment.
         exempt: Names of sites whose arms may be external, because a log contains their motion.
 
     Raises:
@@ -76,13 +76,16 @@ OUTSIDE_LIMITS = ("tau_rate_limit_nm_s", "qd_des_limit_rad_s", "q_min_rad", "q_m
 
 
 def check_outside_arms(scenario: Scenario) -> None:
-    """Refuses real robots that lack limits, or whose site does not have the stale rule "glide".
+    """Refuses real robots that lack limits, or whose reference could jump.
 
-    The stale rule of a site says how it reacts if the samples of a peer are late or missing.
-    Only under "glide" does the reference never jump.
+    The stale rule of a site says how it reacts if the samples of other sites are late or
+    missing. Only under the rule "glide" does the reference never jump.
 
     The check is made before a session, and not for every scenario, because the scenarios in
     logs of earlier versions may lack these keys.
+
+    Args:
+        scenario: Description of the experiment.
 
     Raises:
         ScenarioError: A key is missing or wrong. The error contains the path of the first such
@@ -113,6 +116,11 @@ def check_outside_arms(scenario: Scenario) -> None:
 def refuse_live_only(scenario: Scenario) -> None:
     """Refuses a scenario that only a live session can run.
 
+    A live session has a real network, and may have real robots.
+
+    Args:
+        scenario: Description of the experiment.
+
     Raises:
         ScenarioError: An arm is external, or a link has the model "measured": it injects no
             delay, so that the real network decides. In virtual time there is no real network.
@@ -130,14 +138,14 @@ def refuse_live_only(scenario: Scenario) -> None:
 
 
 def check_law(name: str, site: SiteSpec, sites: int) -> None:
-    """Refuses a control law that its site cannot carry out, and keys that contradict its plant.
+    """Refuses a control law that its site cannot carry out.
 
-    The plant says who computes or measures the motion of the arm: the program, a user's class,
-    or a real robot.
+    Keys of the site that contradict its plant are refused as well. The plant says who computes
+    or measures the motion of the arm: the program, a user's class, or a real robot.
 
     Args:
-        name: Name of the site.
-        site: The site.
+        name: Name of the site, for error messages.
+        site: Description of the site, with its control law and plant.
         sites: Number of sites of the scenario.
 
     Raises:
@@ -614,11 +622,11 @@ def _check_hands(site: SiteSpec, path: str) -> None:
 def check_links_memory(scenario: Scenario, site: str) -> None:
     """Refuses links of a site whose samples in transit would need too much memory.
 
-    The memory grows with the delay, the tick rate and the number of peers. `MAX_LINKS_BYTES` is
-    the limit.
+    A sample is in transit from its sending until its delay has passed. The memory grows with
+    the delay, the tick rate and the number of sites. `MAX_LINKS_BYTES` is the limit.
 
     Args:
-        scenario: The scenario.
+        scenario: Description of the experiment, with its links and tick rates.
         site: Name of the site that receives the samples.
 
     Raises:
@@ -724,7 +732,7 @@ def check_change(change: Change, path: str) -> None:
     Changes of dominance factors have been checked when they were resolved, and are accepted.
 
     Args:
-        change: The change.
+        change: Change of a link or of dominance factors.
         path: Path of the change, for error messages.
 
     Raises:

@@ -228,7 +228,7 @@ def resolve_operators(
     Args:
         written: List of tables as its author wrote it.
         kinds: Classes that the list may contain, by name.
-        held_arm: Arm of the site.
+        held_arm: Arm of the site, on which the operators act.
         path: Path of the list, for error messages.
 
     Raises:

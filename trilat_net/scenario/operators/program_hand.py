@@ -331,7 +331,14 @@ def make_hand_program(hand_site: HandSite) -> HandProgram:
 
 
 def make_hand_players(scenario: "Scenario") -> dict[str, HandPlayer]:
-    """Returns a player for each site whose operator is a program, by the name of the site.
+    """Creates the programs that operate arms, for all sites that have one.
+
+    Args:
+        scenario: Description of the experiment.
+
+    Returns:
+        An object that calls the program, by the name of the site. Empty if no site has a
+        program.
 
     Raises:
         CodeWithheld: A class may not run.
