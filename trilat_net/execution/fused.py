@@ -332,6 +332,8 @@ class FusedRun:
     ) -> None:
         """Connects live operators to their sites, and allocates memory for their actions.
 
+        A live operator is a person or program that moves an arm while the run is in progress.
+
         Args:
             hands: Live operators, by site.
             setups: Setups of the sites.
@@ -351,7 +353,14 @@ class FusedRun:
         self._inputs = self._inputs._replace(feed=feed)
 
     def _plug_laws(self, setups: Sequence[SiteSetup]) -> None:
-        """Creates the users' control laws, and connects them to the arrays of the run."""
+        """Creates the users' control laws, and connects them to the arrays of the run.
+
+        A law that can be compiled is called within the compiled loop. A law in plain Python is
+        called between the stages of a tick.
+
+        Args:
+            setups: Setups of the sites, in the order of the scenario.
+        """
         self._laws: dict[int, PlainLaw | CompiledLaw] = {}
         self._law_arrays: LawArrays | None = None
         if self._tables.channel is None:
@@ -421,7 +430,10 @@ class FusedRun:
             self._move_plant(i)
 
     def _move_plant(self, i: int) -> int:
-        """Moves the plant of a site up to its next tick, and copies the state of the arm.
+        """Lets a user's plant move the arm of a site up to the next tick of the site.
+
+        A plant is a program that computes the motion of an arm. The new state of the arm is
+        copied to the arrays of the run.
 
         Args:
             i: Index of the site.

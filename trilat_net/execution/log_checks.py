@@ -159,6 +159,8 @@ def _check_log(
 ) -> Iterator[Finding]:
     """Yields the finding of each check that applies to a log.
 
+    A finding says what was checked, what the result is, and whether the log passes.
+
     Args:
         log: The log.
         result: Result of executing the log again.
@@ -211,10 +213,17 @@ def _check_log(
 def _check_virtual_time(
     log: Log, result: VerifyResult, progress: Progress | None
 ) -> Iterator[Finding]:
-    """Yields the findings of the comparison with virtual time.
+    """Yields the findings of the comparison of a log with simulations of its scenario.
 
-    The log is compared with a run in which samples arrive as in the log. It is also compared
-    with a run in which samples arrive at once, unless that is another run by its nature.
+    In the first simulation, samples arrive as in the log. In the second one, they arrive at
+    once. The second one is left out if the run must differ from it by its nature, for example
+    because arms are external.
+
+    Args:
+        log: The log.
+        result: Result of executing the log again.
+        progress: Function that reports the progress of the comparison. None if nobody wants to
+            know.
     """
     comparison = compare_with_virtual(log, progress)
     # The arrivals in a gap are unknown, so a difference after the first gap is excused.
@@ -243,7 +252,14 @@ def _check_virtual_time(
 
 
 def _check_coverage(log: Log, result: VerifyResult) -> Finding:
-    """Returns the finding on missing records. It fails if too few could be judged."""
+    """Returns the finding about records that are missing from the log.
+
+    The log fails if too small a fraction of the ticks of a site could be compared.
+
+    Args:
+        log: The log.
+        result: Result of executing the log again.
+    """
     coverage = result.coverage
     records_in_file = sum(len(log[name]) for name in coverage.expected)
     expected_records = sum(coverage.expected.values())

@@ -144,6 +144,9 @@ class LinkEffect(NamedTuple):
 class _CommonRecords(NamedTuple):
     """Records of a site in a log and in its rerun, paired by their times.
 
+    A rerun may have another tick rate than the log. Only records with equal times can be
+    compared.
+
     Attributes:
         before: Records of the log.
         after: Records of the rerun.
@@ -568,7 +571,11 @@ def _to_plain_value(value: Any) -> Any:
 
 
 def _describe_limits(result: Rerun) -> Iterator[str]:
-    """Yields sentences about facts that limit the result of a rerun."""
+    """Yields sentences that tell the user what limits the meaning of a rerun.
+
+    Args:
+        result: The log and its rerun.
+    """
     log = result.before
     request = result.request
     if request.recorded and request.changes:
@@ -629,9 +636,12 @@ def _describe_site_limits(effect: SiteEffect, absent_ticks: int) -> Iterator[str
 
 
 def _describe_later_changes(result: Rerun) -> Iterator[str]:
-    """Yields sentences about links and dominance factors that change again during the run.
+    """Yields sentences about changed settings that the scenario changes again during the run.
 
-    A changed setting then applies only up to that time.
+    The user's change of a link or dominance factor then applies only up to that time.
+
+    Args:
+        result: The log and its rerun.
     """
     keys = [change.key for change in result.request.changes]
 

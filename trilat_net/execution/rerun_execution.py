@@ -179,7 +179,9 @@ def _refuse_external_sites(original: Scenario, replaced: Sequence[str]) -> None:
 
 
 def _check_key(key: str, replaced: Sequence[str], recorded: Sequence[str]) -> None:
-    """Refuses a changed key that cannot have an effect in a rerun.
+    """Refuses a changed setting that cannot have an effect in a rerun.
+
+    For example, a setting of a site whose records are copied has no effect.
 
     Args:
         key: Dotted path of the key.
@@ -211,9 +213,15 @@ def _check_key(key: str, replaced: Sequence[str], recorded: Sequence[str]) -> No
 
 
 def _check_frame(original: Scenario, requested: Scenario, recorded: Sequence[str]) -> None:
-    """Refuses changes that the arrivals in the log do not cover.
+    """Refuses changes of a rerun that the recorded arrivals of samples do not cover.
 
-    These are other sites, a longer duration, and in open loop other tick rates.
+    These are other sites, a longer duration, and other tick rates if some sites are not
+    executed.
+
+    Args:
+        original: Scenario of the log.
+        requested: Scenario with the changes.
+        recorded: Names of the sites that are not executed.
     """
     if requested.names != original.names:
         raise ScenarioError(
@@ -243,6 +251,11 @@ def _join_scenarios(
 
     The settings of a site include the links over which it receives, and the planned changes of
     these links and of its dominance factors.
+
+    Args:
+        original: Scenario of the log.
+        requested: Scenario with the changes.
+        recorded: Names of the sites that are not executed, and keep their records.
     """
 
     def choose(site: str) -> Scenario:

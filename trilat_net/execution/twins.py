@@ -495,7 +495,9 @@ class _TwinRuns:
         records: Sequence[tuple[Ints, Array]],
         twin_records: Sequence[tuple[Ints, Array]],
     ) -> None:
-        """Adds the differences of a twin in a window to its path.
+        """Adds the course of a twin's difference in one window to its path.
+
+        A window is a part of the run after which the difference may be scaled down.
 
         Args:
             n: Index of the twin.
@@ -512,10 +514,11 @@ class _TwinRuns:
             self._scales[n, cells[0].reshape(-1)] = self._scale[n]
 
     def _renew_difference(self, n: int, end_s: float) -> None:
-        """Scales down a difference that has become large, or reacts to one that has decayed.
+        """Keeps the difference between a twin and the run from becoming too large or small.
 
-        A decayed difference consists only of rounding errors. The twin is then pushed again, or
-        ends.
+        A twin is a second execution of the run that received a small push. A large difference
+        is scaled down, so that it stays small. A decayed difference consists only of rounding
+        errors; the twin is then pushed again, or ends.
 
         Args:
             n: Index of the twin.

@@ -143,7 +143,12 @@ def find_absent_samples(log: Log) -> list[LateSample]:
 
 
 def _find_absent_at_site(log: Log, name: str) -> list[LateSample]:
-    """Returns the samples that had not arrived at one site when they were due."""
+    """Returns the samples that had not arrived at one site when they were due.
+
+    Args:
+        log: Log of a live session.
+        name: Name of the receiver.
+    """
     part = log[name]
     commands = log.commands(name)
     peer_ticks = [log.scenario.ticks(peer) for peer in part.peers]

@@ -609,9 +609,9 @@ def _read_cached(
     *,
     balance: bool,
 ) -> UrdfChain:
-    """Returns the chain of a URDF file, see `read_urdf`.
+    """Reads the chain of joints in a URDF file, see `read_urdf`.
 
-    Repeated calls do not read it again.
+    The result is cached, so that the same file is not read again.
     """
     return read_urdf(
         text=text,

@@ -323,7 +323,9 @@ def find_user_laws(scenario: "Scenario") -> list[LoggedUserLaw]:
 
 
 def _inspect_user_law(key: CodeKey, law: ImportedLaw, sites: tuple[str, ...]) -> LoggedUserLaw:
-    """Returns the state of a user's law: its file, and whether the law may run.
+    """Finds the file of a user's control law, and whether the law may run.
+
+    None of its code is run.
 
     Args:
         key: Class, hash and arguments.

@@ -216,7 +216,8 @@ def _sample_planar_arm(arm: Arm, speed: Array) -> _ArmSamples:
 def _sample_chain(model: ArmModel, q0: Array, speed: Array) -> _ArmSamples:
     """Computes the dynamics of a chain in its start pose and in random poses.
 
-    Friction is left out, because it only dissipates energy.
+    The bounds of a stop are derived from these poses. Friction is left out, because it only
+    dissipates energy.
 
     Args:
         model: Model of the arm.

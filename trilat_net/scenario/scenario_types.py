@@ -784,7 +784,14 @@ class Scenario(Frozen, frozen=True, dict=True):
         )
 
     def _link_setup(self, peer: str, site: str) -> site_setup.LinkSetup:
-        """Returns the setup of the link from a peer to a site, for the simulation kernel."""
+        """Returns the link from a peer to a site in the form of the simulation kernel.
+
+        It includes the planned changes of the link.
+
+        Args:
+            peer: Name of the sender.
+            site: Name of the receiver.
+        """
         name = f"{peer}->{site}"
         first_link = self.links[name]
         later_links = scheduled_links(self.timeline, name)

@@ -164,7 +164,9 @@ class _Pose(NamedTuple):
 
 
 class _Edge(NamedTuple):
-    """Joint of the file, which connects a parent link and a child link.
+    """Joint of a URDF file, which connects a parent link and a child link.
+
+    The links and joints of a robot form a tree. The joints are its edges.
 
     Attributes:
         name: Name of the joint.
@@ -359,7 +361,10 @@ def _list_names(names: Sequence[str]) -> str:
 
 
 def _parse_xml(text: str) -> Element:
-    """Returns the root element of a URDF document.
+    """Parses a URDF document, which may come from a stranger.
+
+    Args:
+        text: The document.
 
     Raises:
         ScenarioError: The text is too long, is not XML, contains a document type or entities,
@@ -424,7 +429,10 @@ def _name_elements(root: Element, tag: str) -> dict[str, Element]:
 
 
 def _read_tree(root: Element) -> _Robot:
-    """Returns the tree of links and joints.
+    """Reads the tree of links and joints from a URDF document.
+
+    Args:
+        root: Root element of the document.
 
     Raises:
         ScenarioError: The links and joints do not form trees: a link hangs on two joints, or on
@@ -557,7 +565,12 @@ def _find_tip(robot: _Robot, base: str) -> str:
 
 
 def _find_path(robot: _Robot, base: str, tip: str) -> list[_Edge]:
-    """Returns the joints from the base to the tip.
+    """Finds the joints on the way from the base of an arm to its tip.
+
+    Args:
+        robot: Tree of links and joints.
+        base: Name of the link that does not move.
+        tip: Name of the link at the end of the arm.
 
     Raises:
         ScenarioError: The tip is not below the base, a joint is of a type that an arm cannot
@@ -602,7 +615,7 @@ def _find_path(robot: _Robot, base: str, tip: str) -> list[_Edge]:
 def _walk_carried(
     robot: _Robot, moving: _Edge, path: Sequence[_Edge], notes: list[str]
 ) -> Iterator[tuple[str, _Pose]]:
-    """Yields all links that one joint of the arm moves, up to the next moving joint of the arm.
+    """Yields all links that one joint moves, up to the next moving joint of the arm.
 
     Args:
         robot: The robot.

@@ -309,6 +309,9 @@ def _check_joint_space(scenario: Scenario) -> None:
 
     All sites share either joint angles or the pose of the end effector. Joint angles can only
     be compared between arms with the same number of joints.
+
+    Args:
+        scenario: Description of the experiment.
     """
     joint_counts = {name: model.counts.joints for name, model in scenario.arms.items()}
     spaces = {name: site.task.space for name, site in scenario.sites.items()}
@@ -457,7 +460,13 @@ def _check_energy_law(
 
 
 def _check_start_poses(scenario: Scenario) -> None:
-    """Refuses joints of chains that start farther beyond a mechanical stop than the margin."""
+    """Refuses start poses in which a joint is far beyond one of its mechanical stops.
+
+    A joint may be beyond a stop by at most the margin of `start_margin`.
+
+    Args:
+        scenario: Description of the experiment.
+    """
     for name, model in scenario.arms.items():
         if model.chain is None:
             continue
@@ -649,6 +658,9 @@ def _check_stale_rules(scenario: Scenario) -> None:
     The stale rule of a site says when the samples of a peer are too old, and what happens then.
     The tick period of a peer alone must not make it count as silent, and the fixed delay of a
     link alone must not make its samples too old.
+
+    Args:
+        scenario: Description of the experiment.
     """
     _check_lost(scenario)
     for name, site in scenario.sites.items():
@@ -682,8 +694,11 @@ def _check_stale_rules(scenario: Scenario) -> None:
 def _check_lost(scenario: Scenario) -> None:
     """Refuses the rule "degrade" if no site can go on without any of the masters.
 
-    Under this rule, a site goes on without a master arm that has become silent. It then needs
-    another site that it follows.
+    Under this rule, a site goes on without a master (an arm that leads) that has become silent.
+    It then needs another site that it follows.
+
+    Args:
+        scenario: Description of the experiment.
     """
     degrading = [
         name for name, site in scenario.sites.items() if site.on_stale.on_lost == "degrade"

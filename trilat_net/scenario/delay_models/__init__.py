@@ -238,7 +238,11 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         return None
 
     def _find_burst_problem(self) -> KeyProblem | None:
-        """Returns a problem of losses in bursts. None if a Markov chain can produce them."""
+        """Returns a problem if losses in bursts have impossible numbers.
+
+        The losses are modelled by a Markov chain, which alternates between good times and
+        bursts. None if such a chain can produce them.
+        """
         if self.loss_burst < 1.0:
             return KeyProblem(
                 "loss_burst", f"must be 0 or at least 1 sample, is {self.loss_burst:g}"
