@@ -661,12 +661,13 @@ def verify(
     min_coverage: float = MIN_COVERAGE,
     resume_every: int = 0,
 ) -> VerifyResult:
-    """Executes every site of a log again, and compares the records with the execution.
+    """Executes every site of a log again, and compares each record with the result.
 
-    In an open-loop rerun, some sites were executed with changed settings, and the records of
-    the others were copied from a source log. The copied records are compared with the source
-    log, and these sites are executed from the source log. This requires that the source log is
-    in the same folder.
+    If all records agree, the log contains what its scenario and its recorded inputs produce. In
+    a rerun in which some sites were executed with changed settings, the records of the others
+    were copied from a source log. The copied records are compared with the source log, and
+    these sites are executed from the source log. This requires that the source log is in the
+    same folder.
 
     Args:
         log: Log of a run or of a rerun that is to be checked.

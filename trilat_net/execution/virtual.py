@@ -387,9 +387,11 @@ def execute_virtual(
 ) -> Iterator[SiteTick]:
     """Executes all sites of a scenario in virtual time, and yields every tick of every site.
 
-    Ticks are executed in the order of their nominal times, and ticks of the same time in the
-    order of the sites. A site for which samples have not been sent yet waits while other sites
-    are executed. If a site diverges, the run ends with the ticks of that time.
+    In virtual time, the sites run in one process, as fast as possible. A tick is one period of
+    a site's control loop. Ticks are executed in the order of their nominal times, and ticks of
+    the same time in the order of the sites. A site for which samples have not been sent yet
+    waits while other sites are executed. If the arm of a site leaves its limits, the run ends
+    with the ticks of that time.
 
     Args:
         scenario: Description of the experiment, with its sites and links.
@@ -538,7 +540,7 @@ def write_virtual_log(
     hands: HandTracks = {},  # noqa: B006
     commands: ChangeSchedule = {},  # noqa: B006
 ) -> bool:
-    """Runs a scenario in virtual time, and writes the log of the run.
+    """Simulates a scenario in virtual time, and writes the log of the run to a stream.
 
     The log is completed in any case: after the last tick, after `stopped` returns True, and
     after an error.
@@ -624,7 +626,7 @@ def record_virtual(
     views_hz: float = VIZ_HZ,
     hands: HandTracks = {},  # noqa: B006
 ) -> bool:
-    """Runs a scenario in virtual time, and writes the log of the run to a file.
+    """Simulates a scenario in virtual time, and writes the log of the run to a file.
 
     Args:
         scenario: Description of the experiment, with its sites and links.

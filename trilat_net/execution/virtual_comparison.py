@@ -243,8 +243,8 @@ class VirtualComparison(NamedTuple):
     def excused_from(self) -> int | None:
         """First tick from which the log may differ from a simulation with a perfect network.
 
-        It is the tick in which the first late or lost sample was due. None if there was no such
-        sample.
+        It is the tick in which the first late or lost sample should have come into use. None if
+        no sample was late or lost.
         """
         return self.absent[0].due_tick if self.absent else None
 

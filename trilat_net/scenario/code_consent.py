@@ -125,8 +125,8 @@ def allow_logged_code(
 ) -> None:
     """Allows the code that a log names to run, as far as a person has permitted it.
 
-    A person permits code by naming its file now, or has stored a permission before. See
-    `open_log`.
+    A log may come from a stranger, so its code does not run without permission. A person
+    permits code by naming its file now, or has stored a permission before. See `open_log`.
 
     Args:
         scenario: Scenario of the log, which names the code.
@@ -264,7 +264,7 @@ def _compare_hashes(key: CodeKey, sha256: str) -> str:
 
 
 class LoggedUserLaw(NamedTuple):
-    """Control law of a user that a log names, with the state of its file on this computer.
+    """Control law of a user that a log names, and whether it may run on this computer.
 
     Attributes:
         code: Class of the law, for example "package.module:Law".

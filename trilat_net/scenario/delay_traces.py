@@ -174,12 +174,13 @@ def format_trace(points: Sequence[TracePoint]) -> str:
 
 @lru_cache(maxsize=64)
 def parse_trace(text: str) -> Points:
-    """Parses the text form of a trace.
+    """Converts the text form of a delay trace to an array.
 
-    The result is cached, because the trace of a link is needed many times.
+    A delay trace is a table of send times and the delay that each message had. The result is
+    cached, because the trace of a link is needed many times.
 
     Args:
-        text: Trace in the form of `format_trace`.
+        text: Trace in the form that `format_trace` returns.
 
     Returns:
         Read-only array of times and delays in microseconds, shape (n, 2). A lost message has
@@ -229,7 +230,9 @@ _DELAY_NAMES = ("delay", "rtt", "latency")
 
 @dataclass(frozen=True, repr=False)
 class MeasuredTrace(Result):
-    """Delay trace that was imported from a measurement.
+    """Delays of a real network, imported from the output of a measurement.
+
+    `import_trace` returns it. A link of a scenario can then have the same delays.
 
     Attributes:
         points: Send time of each message since the first one in s, and its delay in ms. The
@@ -257,10 +260,11 @@ class MeasuredTrace(Result):
         return np.array([ms for _, ms in self.points if math.isfinite(ms)])
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns statistics of the trace, with the keys of `trilat trace import --json`.
+        """Returns statistics of the trace as plain values, ready for JSON.
 
-        The statistics of the delays are left out if all messages were lost. The correlation is
-        the lag-one autocorrelation of the delays; 0 if all delays are equal.
+        The keys are those of `trilat trace import --json`. The statistics of the delays are
+        left out if all messages were lost. The correlation is that between the delays of
+        consecutive messages (the lag-one autocorrelation). It is 0 if all delays are equal.
         """
         is_lost = np.array([math.isinf(ms) for _, ms in self.points])
         # a burst begins where a lost message follows one that was not lost
@@ -351,7 +355,7 @@ class MeasuredTrace(Result):
 def import_trace(
     path: str | Path, form: str, *, way: str = "", column: str = "", every_s: float = 1.0
 ) -> MeasuredTrace:
-    """Imports a delay trace from the output of `irtt`, `ping` or `fping`, or from a table.
+    """Imports measured delays from the output of `irtt`, `ping` or `fping`, or from a table.
 
     >>> with open("table.csv", "w") as table:
     ...     print("t_s,rtt_ms", "0.0,20", "0.1,40", sep=chr(10), file=table)

@@ -74,7 +74,7 @@ def find_rest_bounds(scenario: Scenario, site: str, qd: Array | None = None) -> 
 
     Args:
         scenario: Description of the experiment. The site must have the stale rule "glide",
-            under which an arm is stopped by damping.
+            under which damping brings the arm to rest when the site stops.
         site: Name of the site whose arm stops.
         qd: Speed of each joint at the beginning of the stop, in rad/s, shape (n,). By default,
             the speed limits of the site.

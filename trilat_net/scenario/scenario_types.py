@@ -124,6 +124,10 @@ def _or_infinity(limit: Any) -> Any:
 class Limits(Frozen, frozen=True):
     """Limits of a site. Each limit is one number for all joints, or one number per joint.
 
+    Some limits depend on the stale rule of the site: its reaction if the samples of another
+    site are too old or missing. Under the rule "glide", a site does not end the run, but stops
+    its own arm.
+
     Attributes:
         tau_limit_nm: Largest control torque of a joint, in N m. A larger torque is cut off. By
             default, the efforts in the URDF file of a chain.
@@ -458,8 +462,10 @@ class Scenario(Frozen, frozen=True, dict=True):
     def beta(self) -> Array | None:
         """Weights of the sites in the energy function V of the stability proof, shape (N,).
 
+        The weights follow from the dominance factors, with which the sites follow each other.
         The vector is the left null vector of the matrix Upsilon, scaled to the sum 1, Eq. (20).
-        None if alpha is reducible, because the vector is not unique then.
+        None if the matrix alpha of dominance factors is reducible, because the vector is not
+        unique then.
         """
         if not dominance.is_irreducible(self.alpha):
             return None
@@ -502,7 +508,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         return hashlib.sha256(self.text.encode()).hexdigest()
 
     def assign_colours(self, colours: int) -> list[int]:
-        """Returns the index of a colour for each site, for figures.
+        """Chooses a colour for each site, for figures.
 
         The slave gets a fixed colour, so that it looks the same in the figures of all
         scenarios. Until a slave has been met, this colour is reserved for it. The other sites
@@ -623,8 +629,8 @@ class Scenario(Frozen, frozen=True, dict=True):
     def sites_may_return(self) -> bool:
         """True if sites may leave a session and return while it runs.
 
-        This requires the stale rule "glide" at every site: the remaining sites wait for the
-        site that left, and align with it again.
+        This requires the stale rule "glide" at every site, see `OnStale`. The remaining sites
+        then wait for the site that left, and align with it again when it returns.
         """
         return all(spec.on_stale.action == "glide" for spec in self.sites.values())
 
@@ -754,8 +760,8 @@ class Scenario(Frozen, frozen=True, dict=True):
     def gains(self, site: str) -> site_setup.Gains:
         """Returns the gains of a site's control law in the form of the simulation kernel.
 
-        Under the stale rule "glide", they include bounds of the parameters that an adaptive law
-        estimates.
+        An adaptive law estimates the parameters of the arm. Under the stale rule "glide", see
+        `OnStale`, the gains include bounds of these estimates.
 
         Args:
             site: Name of the site.

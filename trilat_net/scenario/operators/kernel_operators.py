@@ -77,8 +77,8 @@ class Pulse(ActorBase, frozen=True, tag="pulse"):
 class MovingSpring(ActorBase, frozen=True, kw_only=True):
     """Base of operators who pull the arm with a spring and a damper towards a moving target.
 
-    The target moves from a start to an end along a path with minimum jerk. The first four
-    fields of a subclass are, in this order: the end of the path; its start, by default the
+    The target moves from a start to an end along a smooth path, with minimum jerk. The first
+    four fields of a subclass are, in this order: the end of the path; its start, by default the
     start of the arm; the stiffness; the damping.
 
     Attributes:
@@ -281,6 +281,8 @@ class Multisine(TimedActor, frozen=True, tag="multisine"):
 class DeviceSettings(fields.Frozen, frozen=True, omit_defaults=True):
     """Settings of a haptic device or controller with which a person moves an arm.
 
+    A spring pulls the end effector of the arm to a target, and the device moves the target.
+
     Attributes:
         frame: Direction of each axis of the arm as the person sees it: "right", "left",
             "ahead", "back", "up" or "down". By default, right and up in the plane, and ahead,
@@ -318,12 +320,13 @@ class DeviceSettings(fields.Frozen, frozen=True, omit_defaults=True):
 class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
     """Operator who takes hold of the arm during a live session.
 
-    The operator uses a mouse, a haptic device or a program. Before, nobody holds the arm. In
-    virtual time nobody ever holds it, except when a log is run again in which somebody did.
+    The operator is a person with a mouse or a haptic device, or a program. Until the operator
+    takes hold, nobody holds the arm. In virtual time nobody ever holds it, except when a log is
+    run again in which somebody did.
 
-    The force is computed once per tick and held. In the mode "force", the operator commands the
-    force itself. The work of such a force has an error of first order in the tick period,
-    because only the arm resists it.
+    The force is computed once per tick and then constant until the next tick. In the mode
+    "force", the operator commands the force itself. The work of such a force has an error of
+    first order in the tick period, because only the arm resists it.
 
     Attributes:
         mode: "tip": A spring pulls the end effector towards a target that the operator moves.

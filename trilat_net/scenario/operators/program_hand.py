@@ -43,11 +43,11 @@ PROGRAM_KEYS = ("class", "rate_hz", "delay_ms", "process", "source_sha256", "set
 class ProgramHand(
     LiveHand, frozen=True, kw_only=True, tag="own", omit_defaults=True, rename={"code": "class"}
 ):
-    """Operator that is a program: a class of a user.
+    """Operator that is a program instead of a person: a user's class.
 
     The program receives what its site knows, and moves, turns or pushes the arm. It takes hold
     of the arm at its first action, and nobody else can hold that arm. Otherwise the same rules
-    apply as for a live operator.
+    apply as for a live operator, see `LiveHand`.
 
     Attributes:
         code: Class of the program, for example "my_policy:Reach".
