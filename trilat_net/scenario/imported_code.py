@@ -182,10 +182,14 @@ def allowing_any_settings(allowed: CodeConsents) -> Iterator[None]:
 
 
 def describe_new_settings(key: CodeKey) -> str:
-    """Describes how the arguments of refused code differ from arguments that were permitted.
+    """Explains why a user's class that was permitted before is refused with new arguments.
 
-    A user who has permitted a class may wonder why it is refused now. If several sets of
-    arguments were permitted, those with the fewest differences are compared.
+    A permission applies only to certain arguments of a class. The text states how the arguments
+    of the refused code differ from permitted ones. If several sets of arguments were permitted,
+    those with the fewest differences are compared.
+
+    Args:
+        key: The refused class, with the hash of its file and its arguments.
 
     Returns:
         Part of a sentence. Empty if the code was not permitted with any arguments.
@@ -230,9 +234,13 @@ LONGEST_SETTING = 300
 
 
 def describe_setting(value: Any) -> str:
-    """Returns the value of an argument as a JSON text, which contains no control characters.
+    """Returns the value of an argument as a text for messages.
 
-    A long text is shortened in the middle, because paths of files differ at their ends.
+    It is a JSON text, which contains no control characters. A long text is shortened in the
+    middle, because paths of files differ at their ends.
+
+    Args:
+        value: Value of the argument, of any type that JSON supports.
     """
     text = json.dumps(value, default=str)
     if len(text) <= LONGEST_SETTING:
@@ -387,7 +395,9 @@ def _find_spec(module: str) -> ModuleSpec | None:
 
 
 def import_class(key: CodeKey, path: str, method: str = "torque") -> Any:
-    """Imports a class of a user from the file that may run for it.
+    """Imports a user's class from the file that may run for it.
+
+    The file must be the one that a person permitted. It is checked before any of its code runs.
 
     Args:
         key: The class, with the hash of its file and its arguments.
@@ -529,7 +539,12 @@ def _execute(module: str, source: CodeSource) -> Any:
 
 
 def name_law_class(kind: type) -> str:
-    """Returns the name with which a scenario names a class, for example "mylaws:Spring".
+    """Returns the name with which a scenario names a user's class.
+
+    For example, the class Spring in the file mylaws.py has the name "mylaws:Spring".
+
+    Args:
+        kind: The class.
 
     Raises:
         ScenarioError: The class is not defined in a file, or not at the top level of its

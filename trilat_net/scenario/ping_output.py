@@ -107,7 +107,7 @@ class _Summary(NamedTuple):
 
 
 def read_ping(text: str, every_s: float) -> PingProbes:
-    """Returns the probes in the output of one run of `ping` or `fping`.
+    """Reads the round trips from the output of one run of `ping` or `fping`.
 
     The program that produced the output is recognised by its lines.
 

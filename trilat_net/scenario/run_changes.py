@@ -153,7 +153,7 @@ _ORDER_SENTENCES = {
 
 
 def describe_change(change: Change, ordered_by: str = "") -> str:
-    """Describes a change in a sentence without a full stop.
+    """Describes a change of a run to people, in a sentence without a full stop.
 
     An example is "m2 was stopped by the experimenter at 58.2 s".
 
@@ -196,10 +196,12 @@ def find_requester(sentence: str) -> str:
 
 
 def count_skipped_ticks(texts: Sequence[str]) -> int:
-    """Returns the number of ticks that a site missed just before a record.
+    """Returns how many ticks a site missed just before a record, because it was too late.
+
+    A record lists the changes of its tick, among them those that report missed ticks.
 
     Args:
-        texts: Texts of the changes in the record. Texts that cannot be read are ignored.
+        texts: JSON texts of the changes in the record. Texts that cannot be read are ignored.
     """
     skipped = 0
     for text in texts:
@@ -232,7 +234,7 @@ def to_core_change(scenario: Scenario, change: Change) -> CoreChange:
 
 
 def parse_core_change(scenario: Scenario, site: str, text: str) -> CoreChange:
-    """Parses the text of a change in a record of a site.
+    """Converts the text of a change in a record to the form of the simulation kernel.
 
     The record may come from an untrusted log, so the change is checked completely.
 

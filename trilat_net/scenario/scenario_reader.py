@@ -34,9 +34,10 @@ _MAX_NAME_LENGTH = 80
 
 
 def list_shipped() -> list[str]:
-    """Returns the names of the scenarios in the package, as `trilat scenario list` shows them.
+    """Returns the names of the example scenarios that the package contains.
 
-    Files whose names begin with an underscore are not listed.
+    `trilat scenario list` shows the same names. Files whose names begin with an underscore are
+    not listed.
 
     >>> "paper" in tn.list_shipped()
     True
@@ -50,7 +51,7 @@ def list_shipped() -> list[str]:
 
 
 def read_shipped(name: str) -> str:
-    """Returns the TOML text of a scenario in the package.
+    """Returns the TOML text of one of the example scenarios in the package.
 
     Args:
         name: Name of the scenario. The name of an unlisted file begins with an underscore.

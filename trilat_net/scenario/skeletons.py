@@ -107,7 +107,7 @@ def _is_other_module(module: str, file: Path) -> bool:
 
 
 def name_skeleton_class(module: str, kind: str = "law") -> str:
-    """Returns the name of the class in a skeleton.
+    """Returns the name of the class in a new file with an incomplete program.
 
     The modules mylaw and my_law contain the class MyLaw, and spring contains Spring.
 

@@ -288,19 +288,23 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
 
 
 class OwnDelay(LinkBase, frozen=True, kw_only=True):
-    """Delay model with a function of its own, in a file of this folder.
+    """Delay model whose delays are computed by a function in a file of this folder.
 
-    The keys of the model are numbers. A subclass defines `draw` and `_moments`. It also defines
-    `_reach_ms` if its longest delay is not three standard deviations above the mean.
+    A contributor adds a new model by adding such a file. The keys of the model are numbers. A
+    subclass defines `draw` and `_moments`. It also defines `_reach_ms` if its longest delay is
+    not three standard deviations above the mean.
     """
 
     def draw(self, now: Any) -> None:
-        """Computes the delay of a sample, and stores it in `now.drawn_us`, in microseconds.
+        """Computes the delay of one sample, and stores it in `now.drawn_us`, in microseconds.
 
-        This method is compiled. It may use `now.sample`, the number of the sample, and
-        `now.stamp_ns`, its send time. Random numbers must come from `core.delay.draw_pair`:
-        they are a function of the key of the link and an index, so that a repeated run draws
-        the same numbers (L4).
+        A sample is the state that a site publishes in one tick. This method is compiled. It may
+        use `now.sample`, the number of the sample, and `now.stamp_ns`, its send time. Random
+        numbers must come from `core.delay.draw_pair`: they are a function of the key of the
+        link and an index, so that a repeated run draws the same numbers (L4).
+
+        Args:
+            now: The sample, and the place for the result.
         """
         raise NotImplementedError
 

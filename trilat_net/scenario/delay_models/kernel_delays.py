@@ -273,6 +273,8 @@ class NoDelay(LinkBase, frozen=True, kw_only=True, tag="none"):
 class ConstantDelay(LinkBase, frozen=True, kw_only=True, tag="constant"):
     """Link with the same delay for every sample.
 
+    A sample is the state that a site publishes in one tick.
+
     Attributes:
         delay_ms: Delay, in ms. A delay of 0 still means one period, because the receiver uses a
             sample from its next tick on.

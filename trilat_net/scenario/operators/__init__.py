@@ -123,26 +123,30 @@ class SampledActor(TimedActor, frozen=True, kw_only=True):
 class OwnActor(SampledActor, frozen=True, kw_only=True):
     """Operator or environment whose torque is a function in a file of this folder.
 
-    Its keys are numbers, or vectors with one number per joint or axis. It acts on the joints.
-    If `at_tip` is True, it acts on the end effector: `act` and `effort` then receive the
-    position and velocity of the end effector in m and m/s, and return a force in N.
+    A contributor adds a new kind by adding such a file. Its keys are numbers, or vectors with
+    one number per joint or axis. It acts on the joints. If `at_tip` is True, it acts on the end
+    effector: `act` and `effort` then receive the position and velocity of the end effector in m
+    and m/s, and return a force in N.
     """
 
     at_tip: ClassVar[bool] = False
 
     def act(self, now: Any) -> None:
-        """Computes the torque or force, and stores it in `now.effort`.
+        """Computes the torque or force at one time, and stores it in `now.effort`.
 
-        The entries i below `now.coordinates` are set. The method is compiled, and is called in
-        every stage of the integrator. It may use `now.t_s`, `now.at` (angles or position) and
-        `now.speed`. The result must depend only on the keys and on `now`, and must have the
+        The method must set the entries i below `now.coordinates`. It is compiled, and is called
+        in every stage of the integrator. It may use `now.t_s`, `now.at` (angles or position)
+        and `now.speed`. The result must depend only on the keys and on `now`, and must have the
         same bits on every machine. Therefore only functions of `core.elementary` and `sqrt` are
         allowed.
+
+        Args:
+            now: Time and motion at which the torque is needed, and the place for the result.
         """
         raise NotImplementedError
 
     def effort(self, t_s: Array, position: Array, speed: Array) -> Array:
-        """Computes the same torques or forces as `act`, for many rows.
+        """Computes the same torques or forces as `act`, for many times and motions at once.
 
         This method is written independently of `act`, and a test compares the two. The
         linearisation of the control loop differentiates it by complex steps. Therefore it must
@@ -223,13 +227,19 @@ def resolve_operators(
     held_arm: HeldArm,
     path: str,
 ) -> list[fields.TomlTable]:
-    """Returns the complete tables of a site's operators or environments.
+    """Completes the tables of all operators, or of all environments, of a site.
+
+    Missing keys get their defaults, and numbers are drawn where the author stated a
+    distribution.
 
     Args:
         written: List of tables as its author wrote it.
         kinds: Classes that the list may contain, by name.
         held_arm: Arm of the site, on which the operators act.
         path: Path of the list, for error messages.
+
+    Returns:
+        One complete table for each operator or environment, in the order of the list.
 
     Raises:
         ScenarioError: A table is not valid.

@@ -182,7 +182,7 @@ class EndEffectorSpring(MovingSpring, frozen=True, tag="tip_spring"):
 
 
 class RecordedTorque(ActorBase, frozen=True, tag="recorded"):
-    """Operator whose torque was recorded as a table.
+    """Operator whose torque over time was recorded as a table, and is repeated.
 
     The torque is interpolated linearly between the points of the table. It is zero before the
     first and after the last point.
@@ -491,6 +491,8 @@ LIVE_KEYS = {
 class ViscousEnvironment(SampledActor, frozen=True, tag="viscous"):
     """Environment that resists the motion of the joints, like a viscous liquid.
 
+    The torque on a joint is the negative of its damping times its speed.
+
     Attributes:
         damping_nm_s_rad: Damping for each joint, in N m s/rad.
     """
@@ -511,7 +513,10 @@ class ViscousEnvironment(SampledActor, frozen=True, tag="viscous"):
 
 
 class Wall(SampledActor, frozen=True, tag="wall"):
-    """Wall that pushes the end effector out along its normal, and never pulls.
+    """Flat wall that pushes the end effector out along its normal, and never pulls.
+
+    The force is that of a spring and a damper. It is zero while the end effector does not touch
+    the wall.
 
     Attributes:
         point_m: A point of the surface, in m, one number per axis.
