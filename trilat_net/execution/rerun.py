@@ -461,7 +461,9 @@ def rerun(
     closed_loop: bool = False,
     progress: Progress | None = None,
 ) -> Rerun:
-    """Executes sites of a log again and compares them with the log, as `trilat rerun` does.
+    """Executes sites of a log again, usually with changed settings, and compares the results.
+
+    The corresponding command is `trilat rerun`.
 
     >>> result = tn.rerun(tn.simulate("two_sites", duration_s=0.1), ["s"], {"control.Kd": 5})
     >>> result.identical

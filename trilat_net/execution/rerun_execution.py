@@ -77,7 +77,8 @@ class ChangedValue(NamedTuple):
 class RerunRequest:
     """A checked request for a rerun: which sites of a log to execute again, and how.
 
-    `resolve_rerun_request` creates it.
+    `resolve_rerun_request` creates it. The sites that are not executed keep the records of the
+    log.
 
     Attributes:
         original: Scenario of the log.

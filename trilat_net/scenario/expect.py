@@ -243,13 +243,13 @@ END_WINDOW_S = 1.0
 class Expect(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True
 ):
-    """Expectations of every run of a scenario, for every seed of the random numbers.
+    """Conditions that every run of a scenario must satisfy, for every seed of the random numbers.
 
-    The synchronisation error of a site is e = q_i - q_id, Eq. (9): the difference between its
-    angles and its reference. |e| is taken for each joint. "Largest" and "smallest" refer to all
-    sites (or links), all joints and all ticks of the run. A run that diverged ends at that
-    tick. Its quantities are those of the part before, and the run fails unless `stable = false`
-    is expected.
+    `trilat test` checks them. The synchronisation error of a site is e = q_i - q_id, Eq. (9):
+    the difference between its joint angles q_i and its reference q_id. |e| is taken for each
+    joint. "Largest" and "smallest" refer to all sites (or links), all joints and all ticks of
+    the run. A run that diverged ends at that tick. Its quantities are those of the part before,
+    and the run fails unless `stable = false` is expected.
 
     Attributes:
         stable: True if the run must be stable, False if it must be unstable. A run whose

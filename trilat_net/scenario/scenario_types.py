@@ -365,7 +365,10 @@ def _join_number_list(match: re.Match[str]) -> str:
 
 
 class Scenario(Frozen, frozen=True, dict=True):
-    """An experiment in which every value of every site and link is explicit.
+    """Description of an experiment in which every value of every site and link is explicit.
+
+    A site is a process that runs one arm and its control loop, and a link is the directed
+    connection between two sites.
 
     >>> tn.load_scenario("paper").names
     ('m1', 'm2', 's')

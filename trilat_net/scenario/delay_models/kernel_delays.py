@@ -84,7 +84,9 @@ class UniformDelay(LinkBase, frozen=True, kw_only=True, tag="uniform"):
 
 
 class NormalDelay(LinkBase, frozen=True, kw_only=True, tag="normal"):
-    """Delay with a normal distribution. A negative delay is drawn again.
+    """Delay with a normal distribution, without negative delays.
+
+    If a negative delay is drawn, it is drawn again.
 
     Attributes:
         delay_ms: Mean of the normal distribution, before negative delays are excluded, in ms.
@@ -114,7 +116,7 @@ class NormalDelay(LinkBase, frozen=True, kw_only=True, tag="normal"):
 
 
 class MeanDeviationDelay(LinkBase, frozen=True, kw_only=True):
-    """Base of delay models whose keys are the mean and the standard deviation.
+    """Base of delay models that are described by a mean and a standard deviation.
 
     Attributes:
         delay_ms: Mean delay, in ms.
@@ -394,7 +396,7 @@ class TraceDelay(LinkBase, frozen=True, kw_only=True, tag="trace"):
 
 
 class NoInjectedDelay(LinkBase, frozen=True, kw_only=True, tag="measured"):
-    """Link of a live session without an injected delay.
+    """Link of a live session to which the program adds no delay.
 
     The receiver uses a sample as soon as it has arrived over the real network.
     """

@@ -134,7 +134,7 @@ class OwnActor(SampledActor, frozen=True, kw_only=True):
     def act(self, now: Any) -> None:
         """Computes the torque or force at one time, and stores it in `now.effort`.
 
-        The method must set the entries i below `now.coordinates`. It is compiled, and is called
+        The method sets the entries i below `now.coordinates`. It is compiled, and is called
         in every stage of the integrator. It may use `now.t_s`, `now.at` (angles or position)
         and `now.speed`. The result must depend only on the keys and on `now`, and must have the
         same bits on every machine. Therefore only functions of `core.elementary` and `sqrt` are
