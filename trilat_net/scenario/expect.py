@@ -243,7 +243,7 @@ END_WINDOW_S = 1.0
 class Expect(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True
 ):
-    """Conditions that every run of a scenario must satisfy, for every seed of the random numbers.
+    """Conditions that every run of a scenario must satisfy, for every random seed.
 
     `trilat test` checks them. The synchronisation error of a site is e = q_i - q_id, Eq. (9):
     the difference between its joint angles q_i and its reference q_id. |e| is taken for each
