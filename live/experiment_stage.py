@@ -168,13 +168,14 @@ class TrialWatch:
 
 @dataclass
 class StepRequest:
-    """A step that the users must complete.
+    """A step that the users are asked to complete now, such as a questionnaire.
 
     Attributes:
         step: The step.
-        from_ns: End of the users' rest, in ns. Earlier replies are refused.
-        replies: For each user who has completed the step, by site, the answers and the number
-            of the page that sent them.
+        from_ns: Time from which replies are accepted, in ns on the monotonic clock. The users
+            rest until then.
+        replies: For each user who has completed the step, by name of the site, the answers and
+            the number of the page that sent them.
     """
 
     step: Step

@@ -63,17 +63,28 @@ Count = Annotated[int, Meta(ge=0, lt=2**53)]
 class PageMessage(
     msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="do"
 ):
-    """A message of a page. Its field `do` names the kind."""
+    """Base class of the messages that a page sends to its server.
+
+    The field `do` of the JSON text names the kind of message.
+    """
 
 
 class Seen(PageMessage, frozen=True, kw_only=True, tag="seen"):
-    """The page has drawn the frame with the number `n`, so that the next frame may be sent."""
+    """The page states that it has drawn a frame, so that the next frame may be sent to it.
+
+    Attributes:
+        n: Number of the frame.
+    """
 
     n: Count
 
 
 class TakePart(PageMessage, frozen=True, kw_only=True, tag="control"):
-    """The page asks to hold arms and give orders (`want` is True), or no longer does so."""
+    """The page asks for the right to hold arms and give orders, or returns this right.
+
+    Attributes:
+        want: True to ask for the right, False to return it.
+    """
 
     want: bool
 
@@ -91,7 +102,7 @@ class AnswerPage(PageMessage, frozen=True, kw_only=True, tag="answer"):
 
 
 class StopArms(PageMessage, frozen=True, kw_only=True, tag="stop"):
-    """All arms must stop, while the session goes on."""
+    """The page orders all arms to stop at once. The session goes on."""
 
 
 class ReleaseArms(PageMessage, frozen=True, kw_only=True, tag="release"):
@@ -133,7 +144,11 @@ class SetShares(PageMessage, frozen=True, kw_only=True, tag="shares"):
 
 
 class MarkMoment(PageMessage, frozen=True, kw_only=True, tag="mark"):
-    """A text that the log keeps as an event at this moment."""
+    """The page orders that the log keeps a text as an event of this moment.
+
+    Attributes:
+        text: The text.
+    """
 
     text: Annotated[str, Meta(min_length=1, max_length=80)]
 
@@ -160,7 +175,7 @@ class MoveHand(PageMessage, frozen=True, kw_only=True, tag="hand"):
 
 
 class EndSession(PageMessage, frozen=True, kw_only=True, tag="end"):
-    """The session must end in an orderly way."""
+    """The page orders the session to end in an orderly way, so that its log is complete."""
 
 
 class DoStep(PageMessage, frozen=True, kw_only=True, tag="step"):
@@ -492,13 +507,14 @@ class OrderDesk:
     def queue_change(
         self, order: Order, sites: Collection[str], links: Collection[str], source: str = ""
     ) -> None:
-        """Queues a change of a link or of dominance factors.
+        """Queues an order that changes the settings of a link, or dominance factors.
 
-        The change replaces a waiting change of the same link or site. A change of an unknown
-        site or link is refused.
+        The order replaces one about the same link or site that still waits. An order about an
+        unknown link or site is refused and counted.
 
         Args:
-            order: New settings of a link, or new dominance factors of a site.
+            order: New settings of a link, or new dominance factors, which are the weights with
+                which a site follows its peers.
             sites: Names of the sites of the session.
             links: Names of the links of the session.
             source: Who sends the order, for the site's event.
@@ -574,7 +590,11 @@ class OrderDesk:
         self._enqueue(site, f"mark {text}", ChangeRequest(mark=text))
 
     def poll(self) -> None:
-        """Receives the replies of the sites, and sends each site its next waiting request."""
+        """Receives the replies of the sites to earlier orders, and sends the orders that wait.
+
+        Each site gets one order at a time, and the next one after its reply. If a site does not
+        reply in time, this is noted as its reply.
+        """
         now_ns = self._clock.monotonic_ns()
         for (site, channel), query in list(self._open_queries.items()):
             reply = query.inbox.poll()

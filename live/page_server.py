@@ -139,12 +139,20 @@ class Visitor(ServerConnection):
     _is_counted = False
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Adds the connection to those whose role is not known yet."""
+        """Notes a new connection, for which it is not known yet what it wants.
+
+        Args:
+            transport: The connection.
+        """
         super().connection_made(transport)
         self.strangers.add(self)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Removes the connection from those whose role is not known yet."""
+        """Notes that the connection was closed.
+
+        Args:
+            exc: Reason why it was closed. None if it was closed in order.
+        """
         self.strangers.remove(self)
         super().connection_lost(exc)
 
@@ -177,16 +185,19 @@ class Visitor(ServerConnection):
 
 
 class Page:
-    """A connected page, and what it has received so far.
+    """State of one page that is open in a browser: its rights, and what was sent to it.
+
+    The server sends frames, messages from which the page draws the session. A frame describes
+    the present state, so that a slow page may miss some.
 
     Attributes:
-        connection: WebSocket of the page.
+        connection: WebSocket connection to the page.
         number: Number of the page. Pages are counted from 1.
         role: Rights of the page's user, and the site whose user's view the page shows.
         hands: Connections with which the page holds and moves arms.
         takes_part: True if the page may give orders.
-        asks: Pages that must allow this page to take part, and the time of the request in ns.
-            None if the page has not requested it.
+        asks: The other pages that must allow this page to take part, and the time of its
+            request in ns. None if the page has not requested it.
         wake: Event that is set when there is a frame that the page has not received.
         drawn: Number of the last frame that the page has drawn.
         sent: Number of the last frame that was sent to the page.
@@ -195,9 +206,9 @@ class Page:
         points: Number of points of the plots that the page has received.
         energies: Number of points of the energy plot that the page has received.
         events: Number of events that the page has received.
-        greeted: True if the page has received the constants of the running session.
+        greeted: True if the page has received the description of the running session.
         limits: Limits of the page's message rates.
-        excess: Number of messages that exceeded the common limit of all messages.
+        excess: Number of messages that exceeded the common limit of all kinds of messages.
     """
 
     def __init__(
@@ -939,10 +950,10 @@ def _has_screen() -> bool:
 
 
 class PageAttendant(ExitStack):
-    """Serves the page of a session that this process runs itself.
+    """Serves the page of a session that runs in this process, such as one of `trilat live`.
 
-    The page is served while a `with` statement runs, so that it can show the report after the
-    session.
+    The page is served while a `with` statement runs. It stays open after the session, so that
+    it can show the report.
 
     Args:
         options: How the page is served.
@@ -1000,9 +1011,16 @@ class PageAttendant(ExitStack):
 def show_on_page(
     options: PageOptions, clock: Clock, session: str, say: Callable[[str], None], bus: Bus
 ) -> Iterator[tuple[SessionView, Callable[[], None]]]:
-    """Serves a page of a running session, in the form of a `SessionOnlooker`.
+    """Serves a page of a session that other processes run, for `trilat watch --page`.
 
-    The command `trilat watch --page` uses this function.
+    The function has the form of a `SessionOnlooker`.
+
+    Args:
+        options: How the page is served.
+        clock: Clock of this process.
+        session: Name of the session.
+        say: Function that prints a line for the user.
+        bus: Network connection that reaches the session.
 
     Yields:
         The state of the session, and a function that does nothing, because the server updates

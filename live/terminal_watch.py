@@ -108,10 +108,10 @@ class SessionWatch:
         self._as_site = as_site
 
     def update(self) -> None:
-        """Receives the messages that have arrived, and updates the text about the energy V.
+        """Receives the messages that have arrived, and checks the energy V of the session.
 
         V is the energy function of the stability proof. It must not rise, except by the energy
-        that people and walls supply.
+        that people and walls supply. The next `title` states the result.
         """
         view = self.view
         view.poll()

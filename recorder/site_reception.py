@@ -378,11 +378,11 @@ class SiteReception:
         self._event_bytes_left -= size
 
     def accept(self, channel: str, message: SiteMessage, received_ns: int) -> bool:
-        """Counts a message that the site published.
+        """Counts a message that the site published in the normal way, without a request.
 
         Args:
-            channel: Channel of the message.
-            message: The message.
+            channel: Name of the channel.
+            message: The message, decoded and checked by `read`.
             received_ns: Arrival of the message on the monotonic clock, in ns.
 
         Returns:
@@ -395,11 +395,11 @@ class SiteReception:
         return is_new
 
     def refill(self, channel: str, message: SiteMessage) -> bool:
-        """Counts a message that the site sent again on request.
+        """Counts a message that the site sent again from its buffer, because it was requested.
 
         Args:
-            channel: Channel of the message.
-            message: The message.
+            channel: Name of the channel.
+            message: The message, decoded and checked by `read`.
 
         Returns:
             True if the message is new. False if it was received before.

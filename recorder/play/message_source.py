@@ -252,7 +252,11 @@ class _MessageSorter:
         return self._waiting.memory
 
     def add(self, message: PlayedMessage) -> None:
-        """Adds a message. The messages must be added in the order of the file."""
+        """Adds a message to those that wait for their turn.
+
+        Args:
+            message: The next message in the order of the file.
+        """
         t_ns, channel, number, payload = message
         self._waiting.add(t_ns, channel, number, payload)
 

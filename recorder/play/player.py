@@ -146,7 +146,11 @@ class LatenessHistogram:
         self._counts = [0] * (LATENESS_LIMIT_US + 1)
 
     def add(self, late_ns: int) -> None:
-        """Counts one message by its lateness in ns."""
+        """Counts one message.
+
+        Args:
+            late_ns: Time from the deadline of the message to its publication, in ns.
+        """
         late_us = late_ns // 1000
         # Comparisons are faster than `min` and `max`, which matters for every message.
         self._counts[late_us if late_us < LATENESS_LIMIT_US else LATENESS_LIMIT_US] += 1

@@ -230,10 +230,10 @@ class SiteStandIns:
             bus.announce(liveliness_token(session, site, info.boot))
 
     def start_session(self, epoch_mono_ns: int) -> None:
-        """Announces the session as running.
+        """Announces the session as running, so that recorders and viewers join it.
 
         Args:
-            epoch_mono_ns: Time of tick 0 on the monotonic clock, in ns.
+            epoch_mono_ns: Start time of the session (tick 0) on the monotonic clock, in ns.
         """
         unix_ns = self._clock.unix_ns()
         epoch_unix_ns = unix_ns + epoch_mono_ns - self._clock.monotonic_ns()

@@ -86,13 +86,13 @@ _STEADY_QUATERNION = "a unit quaternion w, x, y, z, each nearest to the one befo
 
 
 class Column(NamedTuple):
-    """One column of a table.
+    """One column of a table that is exported from a log, with K rows.
 
     Attributes:
-        name: Name of the column, which ends in its unit.
+        name: Name of the column, which ends in its unit, such as "t_s".
         values: The values, shape (K,): numbers, or texts as objects.
         unit: Unit of the values. Empty for texts and counts.
-        meaning: Description of the values.
+        meaning: Description of the values for the reader of the table.
         source: Field of the message from which the values are taken.
         known: True for the rows that have a value, shape (K,). None if all rows have one.
     """
@@ -139,12 +139,13 @@ class Column(NamedTuple):
 
 @dataclass(frozen=True)
 class Table:
-    """Table of columns with equal lengths.
+    """A table that is exported from a log. Its columns have equal lengths.
 
     Attributes:
-        name: Name of the site, or "events".
-        kind: Kind of a site's table, one of `SITE_TABLE_KINDS`. Empty for other tables.
-        about: Description of a row.
+        name: Name of the site whose messages the table contains, or "events".
+        kind: What a row of a site's table is, one of `SITE_TABLE_KINDS`. Empty for other
+            tables.
+        about: Description of a row for the reader of the table.
         columns: The columns.
     """
 
@@ -169,7 +170,7 @@ class Table:
 
     @property
     def label(self) -> str:
-        """Name of the table that is suitable for a file: "m1_link", "events"."""
+        """Name of the table in the form of a file name, such as "m1_link" or "events"."""
         return f"{self.name}_{self.kind}" if self.kind else self.name
 
 
@@ -519,11 +520,14 @@ def _make_bodies_columns(site: SiteLog, bodies: Iterable[str]) -> Iterator[Colum
 
 
 def build_state_table(site: SiteLog, scenario: Scenario) -> Table:
-    """Builds the table of the records of a site, in the order of their ticks.
+    """Builds the table with the records of a site, one row per tick of its control loop.
 
     Args:
         site: Records of the site.
-        scenario: Scenario of the session.
+        scenario: Scenario of the session, which names the joints and parameters.
+
+    Returns:
+        The table, in the order of the ticks.
     """
     docs = read_field_docs(State)
     arm = scenario.arms[site.name]
@@ -763,9 +767,12 @@ def _to_text(value: str | Mapping[str, Any]) -> str:
 
 
 def to_pandas_frame(table: Table) -> "pandas.DataFrame":
-    """Converts a table to a pandas data frame.
+    """Converts a table of a log to a pandas data frame with the same columns.
 
     A missing value is None in a column of texts, and NaN in a column of numbers.
+
+    Args:
+        table: The table.
 
     Raises:
         UsageError: pandas is not installed.
@@ -780,7 +787,12 @@ def to_pandas_frame(table: Table) -> "pandas.DataFrame":
 
 
 def to_data_frame(table: Table) -> "polars.DataFrame":
-    """Converts a table to a polars data frame. A missing value is null.
+    """Converts a table of a log to a polars data frame with the same columns.
+
+    A missing value is null.
+
+    Args:
+        table: The table.
 
     Raises:
         UsageError: polars is not installed.

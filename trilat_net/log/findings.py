@@ -120,10 +120,10 @@ class Findings(dict[str, Finding]):
 
 
 class CheckReport(Result):
-    """Base class of results that consist of several checks.
+    """Base class of the results of commands that check a log in several respects.
 
     Attributes:
-        findings: One finding for each check.
+        findings: The result of each check.
     """
 
     findings: list[Finding]
@@ -137,8 +137,8 @@ class CheckReport(Result):
     def exit_code(self) -> int:
         """Exit code of a command that reports these checks.
 
-        1 if a check failed. Otherwise the exit code of `CodeWithheld` if a check was not
-        possible because of code that may not run. Otherwise 0.
+        It is 1 if a check failed. If no check failed, but one was not possible because of code
+        that may not run, it is the exit code of `CodeWithheld`. Otherwise it is 0.
         """
         if any(finding.judged and not finding.passed for finding in self.findings):
             return 1

@@ -386,11 +386,11 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @cached_property
     def unknown_ends(self) -> tuple[str, ...]:
-        """Names of the sites whose "end" event is not in the log.
+        """Names of the sites of which the log does not show when they ended.
 
-        Such a site may have executed more ticks than the log shows. The tuple is empty if the
-        recorder filtered out the events. It is also empty for a part of a log, because the
-        events may be in a later part.
+        A site publishes the event "end" when it ends. Without it, the site may have executed
+        more ticks than the log shows. The tuple is empty if the recorder did not record events.
+        It is also empty for a part of a log, because the events may be in a later part.
         """
         if self.part and len(self.sources) == 1:
             return ()
@@ -415,10 +415,11 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @cached_property
     def starts(self) -> dict[str, list[tuple[int, int]]]:
-        """Starts of each site that joined the running session, as (first tick, boot).
+        """Starts of each site that joined the session while it was running.
 
-        The boot is a random number that identifies one start of the process. Sites that were
-        present from the beginning and were never started again have no entry.
+        A start is a pair: the first tick, and a random number (boot) that identifies this start
+        of the process. Sites that were present from the beginning and were never started again
+        have no entry.
         """
         starts: dict[str, list[tuple[int, int]]] = {}
         for event in self.events:
@@ -737,16 +738,22 @@ class Log(Result, Mapping[str, SiteLog]):
         )
 
     def tables(self) -> Iterator[Table]:
-        """Yields every table, one at a time: the tables of each site, then the events."""
+        """Yields every table of the log, for example to export all of them.
+
+        The tables of each site come first, then that of the events. Only one of them is in
+        memory at a time.
+        """
         for site in self.sites:
             for kind in SITE_TABLE_KINDS:
                 yield self.table(site, kind)
         yield build_events_table(self.timed_events(), self.source)
 
     def frame(self, name: str, kind: str = "") -> "polars.DataFrame":
-        """Returns a table as a polars data frame, see `table`.
+        """Returns a table of the log as a polars data frame. `to_frame` returns a pandas frame.
 
-        `to_frame` returns a pandas frame.
+        Args:
+            name: Name of a site, or "events".
+            kind: Kind of a site's table, see `table`.
 
         Raises:
             UsageError: polars is not installed.

@@ -75,10 +75,12 @@ class FileCheck:
     def check_record(
         self, frame: mcap_records.RecordFrame, content: bytes, data: bytes
     ) -> None:
-        """Checks one record of the file.
+        """Checks one record of the file, and notes what the index must state about it.
+
+        Problems are added to `findings`.
 
         Args:
-            frame: Place of the record.
+            frame: Kind and place of the record.
             content: Content of the record.
             data: Unpacked records of a chunk. Empty for other records, and if the chunk cannot
                 be unpacked.

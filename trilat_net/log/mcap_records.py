@@ -74,19 +74,22 @@ _COMPRESSION_NAME = re.compile(
 
 
 class UnreadableRecord(Exception):  # noqa: N818 - describes a part of a file
-    """A part of a file makes no sense. The text states the reason. Used only within `log`."""
+    """Error that a part of a file makes no sense. Its text states the reason.
+
+    It is used only within the package `log`.
+    """
 
 
 class ChunkHead(NamedTuple):
-    """Head of a chunk, which describes the compressed records that follow.
+    """Head of a chunk, a block of compressed records, which describes these records.
 
     Attributes:
-        start_ns: First log time of the chunk's messages, in ns.
-        end_ns: Last log time of the chunk's messages, in ns.
+        start_ns: Arrival time of the earliest message in the chunk, in ns.
+        end_ns: Arrival time of the latest message in the chunk, in ns.
         size: Size of the unpacked records, in bytes.
-        crc: CRC-32 of the unpacked records. It is 0 if there is no checksum.
-        compression: Name of the compression. Empty if the records are not compressed.
-        data_offset: Offset of the compressed records in the content of the chunk.
+        crc: CRC-32 checksum of the unpacked records. It is 0 if there is no checksum.
+        compression: Name of the compression method. Empty if the records are not compressed.
+        data_offset: Offset of the compressed records in the content of the chunk, in bytes.
     """
 
     start_ns: int
@@ -220,11 +223,11 @@ def iterate_records(data: bytes | bytearray) -> Iterator[tuple[int, int, int]]:
 
 
 class RecordFrame(NamedTuple):
-    """Kind and place of a record in a file.
+    """Kind and place of a record in an MCAP file.
 
     Attributes:
         offset: Offset of the record's first byte in the file.
-        opcode: Kind of the record.
+        opcode: Number of the kind of record, such as chunk or metadata.
         length: Length of the record's content, in bytes.
     """
 
@@ -244,12 +247,12 @@ class RecordFrame(NamedTuple):
 
 
 class Damage(NamedTuple):
-    """Part of a file that cannot be read.
+    """A part of a file that cannot be read, and the reason.
 
     Attributes:
-        offset: Offset of the part's first byte.
+        offset: Offset of the part's first byte in the file.
         length: Length of the part, in bytes.
-        problem: Description of the problem.
+        problem: Description of the problem for the user.
     """
 
     offset: int
@@ -459,7 +462,11 @@ class RecordScanner:
         return crc
 
     def footer(self) -> records.Footer | None:
-        """Returns the footer of a finished file. None if the file is not finished."""
+        """Reads the footer of the file, which states where the index is.
+
+        Returns:
+            The footer. None if the file is not finished, so that it has none.
+        """
         content = self.read(max(0, self.size - FOOTER_BYTES) + RECORD_HEAD_BYTES, 20)
         return parse_record(Opcode.FOOTER, content) if self.ends else None
 

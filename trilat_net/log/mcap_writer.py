@@ -163,13 +163,16 @@ class McapWriter:
 
     @property
     def end_bytes(self) -> int:
-        """Upper bound of the bytes that `finish` will write, without the open chunk."""
+        """Largest number of bytes that `finish` may write, without the open chunk.
+
+        This much disk space must be reserved so that the file can be finished.
+        """
         summary_bytes = sum(map(len, self._summary.values()))
         return summary_bytes + 10 * len(self._counts) + _FIXED_END_BYTES
 
     @property
     def open_chunk_bytes(self) -> int:
-        """Upper bound of the bytes that the open chunk will take in the file."""
+        """Largest number of bytes that the chunk that is still open may need in the file."""
         if not self._open_chunk:
             return 0
         messages = self.messages - self._chain.messages
@@ -357,7 +360,7 @@ class McapWriter:
         self._open_chunk.clear()
 
     def finish(self) -> None:
-        """Completes the file.
+        """Completes the file, so that any program can read it.
 
         Writes the open chunk, the summary with the index and the statistics, a table of the
         offsets in the summary, the footer and the end mark, and flushes the stream.

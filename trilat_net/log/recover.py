@@ -112,7 +112,10 @@ class Recovery(Result):
         return not self.lost
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the result as plain values, with the keys of `trilat log recover --json`."""
+        """Returns the result of the recovery as plain values for JSON.
+
+        The keys are those of the output of `trilat log recover --json`.
+        """
         return {
             "file": self.path.as_posix(),
             "output": self.output.as_posix(),
@@ -165,10 +168,13 @@ class Recovery(Result):
 
 
 def recovered_path(path: Path) -> Path:
-    """Returns the default name of the new file.
+    """Chooses the name of the recovered file, if the user gives none.
 
     For an unfinished log run.mcap.active it is run.mcap, and for run.mcap it is
     run.recovered.mcap.
+
+    Args:
+        path: The damaged file.
     """
     if path.name.endswith(ACTIVE_SUFFIX) and path.name != ACTIVE_SUFFIX:
         return path.with_name(path.name.removesuffix(ACTIVE_SUFFIX))

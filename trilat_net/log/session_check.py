@@ -62,13 +62,13 @@ _ACCOUNTS_SINCE = 3
 
 @dataclass(frozen=True, repr=False)
 class LogCheckResult(CheckReport):
-    """Result of checking the files of one log.
+    """Result of checking the files of one log, as `check_file` returns it.
 
     Attributes:
         files: Names of the files.
-        findings: One finding for each check.
-        ours: True if the files are a log of trilat-net. Otherwise only their bytes were
-            checked.
+        findings: The result of each check, with the problems that it found.
+        ours: True if the files are a log of trilat-net. Otherwise they are other MCAP files, of
+            which only the bytes were checked.
     """
 
     files: list[str]
@@ -76,7 +76,10 @@ class LogCheckResult(CheckReport):
     ours: bool
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the result as plain values, with the keys of `trilat log check --json`."""
+        """Returns the result of all checks as plain values for JSON.
+
+        The keys are those of the output of `trilat log check --json`.
+        """
         kind = "trilat" if self.ours else "mcap"
         return {
             "files": self.files,
@@ -197,7 +200,9 @@ class ChannelCheck:
         return f"{self.member}/{self.kind}"
 
     def begin(self, file: str, channel: ChannelInfo) -> None:
-        """Starts the check of another file, and checks how the file describes the channel.
+        """Prepares the check of the channel's messages in a file.
+
+        It also checks how the file describes the channel: its schema, encoding and metadata.
 
         Args:
             file: Name of the file.
@@ -231,11 +236,13 @@ class ChannelCheck:
         return ""
 
     def check_message(self, stored: McapMessage, offset: int) -> None:
-        """Checks one message of the file.
+        """Checks one message: that it can be decoded, is in its place, and has a possible time.
+
+        Problems are added to the findings.
 
         Args:
             stored: The message, with its times and its sequence number in the file.
-            offset: Offset of the message, or of the chunk that contains it, in the file.
+            offset: Offset of the message in the file, or of the chunk that contains it.
         """
         kind: Any = CHANNEL_TYPES[self.kind]
         try:

@@ -65,11 +65,14 @@ class TornChunk(NamedTuple):
 
     @classmethod
     def read(cls, scanner: RecordScanner, offset: int) -> "TornChunk":
-        """Reads the chunk at an offset of a file.
+        """Reads a chunk that reaches beyond the end of a file, as far as it exists.
 
         Args:
             scanner: Scanner of the file.
-            offset: Offset of the chunk.
+            offset: Offset of the chunk in the file.
+
+        Returns:
+            The head of the chunk, and its compressed bytes up to the first doubtful page.
 
         Raises:
             UnreadableRecord: The head of the chunk makes no sense.

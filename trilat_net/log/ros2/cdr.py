@@ -124,12 +124,14 @@ def _format_floats(offset: int, count: int) -> tuple[str, int]:
 
 
 class JointStatePacker:
-    """Encoder of `sensor_msgs/msg/JointState` for fixed joints.
+    """Encodes messages of the type `sensor_msgs/msg/JointState` for one robot.
+
+    The layout of the messages is computed once, so that encoding is fast.
 
     Args:
         names: Names of the joints.
-        velocity: True if the messages contain velocities.
-        effort: True if the messages contain efforts.
+        velocity: True if the messages contain joint velocities.
+        effort: True if the messages contain joint torques.
     """
 
     def __init__(
@@ -179,10 +181,12 @@ class JointStatePacker:
 
 
 class TransformPacker:
-    """Encoder of `tf2_msgs/msg/TFMessage` for fixed frames.
+    """Encodes messages of the type `tf2_msgs/msg/TFMessage`, which contain poses of frames.
+
+    The layout of the messages is computed once, so that encoding is fast.
 
     Args:
-        frames: Pairs of the names of the parent frame and the child frame.
+        frames: For each pose, the names of the parent frame and of the child frame.
     """
 
     def __init__(self, frames: Sequence[tuple[str, str]]) -> None:
@@ -246,7 +250,7 @@ def pack_string(text: str) -> bytes:
 
 
 class RosLogLevel(IntEnum):
-    """Severity of a log line, with the numbers that ROS 2 defines."""
+    """Severity of a line in the log of ROS, with the numbers that ROS 2 defines."""
 
     INFO = 20
     WARN = 30
@@ -286,7 +290,12 @@ def pack_frame_vectors(stamp_ns: int, frame: str, *numbers: float) -> bytes:
 
 
 def pack_trigger_response(*, success: bool, text: str) -> bytes:
-    """Encodes the response of the service `std_srvs/srv/Trigger`."""
+    """Encodes the response of a ROS service of the type `std_srvs/srv/Trigger`.
+
+    Args:
+        success: True if the request was carried out.
+        text: Explanation for the caller of the service.
+    """
     return _HEAD + bytes([success]) + _pack_fields(1, text)
 
 
@@ -392,11 +401,11 @@ class CdrReader:
 
 
 class RosJoints(NamedTuple):
-    """Content of a `JointState`.
+    """State of a robot's joints, from a message of the type `JointState`.
 
     Attributes:
         stamp_ns: Time of the message on the sender's clock, in ns.
-        names: Names of the joints.
+        names: Names of the joints. The following values have the same order.
         position: Joint angles, in rad. Empty if they are not known.
         velocity: Joint velocities, in rad/s. Empty if they are not known.
         effort: Joint torques, in N m. Empty if they are not known.
@@ -410,7 +419,10 @@ class RosJoints(NamedTuple):
 
 
 def read_joint_state(payload: bytes) -> RosJoints:
-    """Decodes a `sensor_msgs/msg/JointState`.
+    """Decodes a `sensor_msgs/msg/JointState`, the usual message with the joints of a robot.
+
+    Args:
+        payload: The message.
 
     Raises:
         ValueError: The message cannot be decoded.

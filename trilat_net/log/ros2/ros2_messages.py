@@ -62,13 +62,13 @@ class Ros2Channel(NamedTuple):
 
 
 class StandardChannels:
-    """Numbers of the standard channels of a file, by topic.
+    """Registers the channels for viewers in a file, each when it is needed for the first time.
 
-    A channel is registered in the file when its number is needed for the first time.
+    It maps the topic of a channel to its number in the file.
 
     Args:
         file: The file.
-        known: Channels that can be registered, by topic.
+        known: Descriptions of the channels that may be registered, by topic.
     """
 
     def __init__(self, file: McapWriter, known: Mapping[str, Ros2Channel]) -> None:
@@ -140,7 +140,9 @@ def pack_event(event: Event, stamp_ns: int) -> Iterator[tuple[str, bytes]]:
 
 
 class ArrayChannel:
-    """A channel of `std_msgs/msg/Float64MultiArray`, whose arrays have a fixed shape.
+    """A channel for viewers whose messages are arrays of a fixed shape.
+
+    The messages have the ROS type `std_msgs/msg/Float64MultiArray`.
 
     Args:
         content: Description of the numbers.
@@ -148,7 +150,7 @@ class ArrayChannel:
         axes: Names of the entries along each axis of the array.
 
     Attributes:
-        channel: The channel with its metadata.
+        channel: Description of the channel, with its metadata.
         size: Number of entries of an array.
         pack: Function that encodes an array, from its numbers row by row.
     """

@@ -61,15 +61,15 @@ DIAGNOSTICS = "diagnostics"
 
 
 class RobotTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Settings in a names file for a real robot that is the arm of a site.
+    """Settings of a real robot that is the arm of a site, from the user's file of names.
 
     Attributes:
-        joints: Names that the robot gives the joints, in the order of the scenario. If empty,
-            the names are those of the scenario.
-        controller: The same names in the order of the robot's controller. If empty, the order
-            is that of the scenario.
-        safe: Command to the controller while the arm brakes, in the order of the controller. If
-            empty, it is zero.
+        joints: Names of the joints in the robot's messages, in the order of the scenario. If
+            empty, the names are those of the scenario.
+        controller: The same names in the order in which the robot's controller expects its
+            commands. If empty, the order is that of the scenario.
+        safe: Command to the controller while the arm brakes, a number per joint in the order of
+            the controller. If empty, it is zero.
     """
 
     joints: list[str] = []
@@ -78,12 +78,12 @@ class RobotTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class TopicTable(NamedTuple):
-    """Names of the topics in ROS 2, and the robots.
+    """States under which names the topics of a session appear in ROS 2.
 
     Attributes:
-        names: Names in ROS 2, by the name in trilat-net.
-        of_site: Names that differ at a site, by site and by the name in trilat-net.
-        robots: The robots, by site.
+        names: Name of each topic in ROS 2, by its name in trilat-net.
+        of_site: Names that differ at a site, by name of the site and by the name in trilat-net.
+        robots: Settings of the real robots, by name of the site.
     """
 
     names: Mapping[str, str]
