@@ -36,7 +36,10 @@ from .log_layout import PART, SCENARIO, SESSION, SITE_CHANNELS
 
 
 class RangeSet:
-    """Set of integers, stored as ranges (first, last) in ascending order.
+    """Set of integers, such as the numbers of missing messages, stored as ranges.
+
+    A range is a pair of its first and its last number. The ranges are in ascending order. Thus
+    long sequences of numbers need little memory.
 
     Args:
         max_ranges: Largest number of ranges. If there are more, the lowest ones are forgotten.
@@ -114,12 +117,16 @@ class RangeSet:
         return self._ranges[index]
 
     def find_from(self, number: int) -> tuple[int, int] | None:
-        """Returns the first range of numbers in the set that are at or above a number.
+        """Finds the first range of numbers in the set that are at or above a number.
 
         If a range of the set contains the number, only the part from the number on is returned.
 
+        Args:
+            number: Smallest number of interest.
+
         Returns:
-            The range (first, last). None if all numbers of the set are lower.
+            The first and the last number of the range. None if all numbers of the set are
+            lower.
         """
         # The range that starts at or below the number may contain it. If it does not, the next
         # range is entirely above the number.
@@ -138,17 +145,19 @@ SHOWN_GAPS = 20
 
 
 class Account:
-    """Counts of the messages of one channel, and the gaps in their numbers.
+    """Counts the messages of one channel, and knows which of their numbers are missing.
 
     Attributes:
         received: Number of messages that were received, without repetitions.
-        duplicate: Number of messages that arrived although their number had been received.
+        duplicate: Number of messages that arrived although a message with their number had been
+            received.
         reordered: Number of messages that arrived after a message with a higher number.
         refilled: Number of messages that were missing at first, and that the sender sent again
             from its memory.
-        unpublished: Number of numbers that never had a message. The sender skipped them, or was
+        unpublished: How many numbers never had a message. The sender skipped them, or was
             killed before it reached them and continued behind them after its next start.
-        last: Largest number that is known to exist. It is -1 before the first message.
+        last: Largest number of a message that is known to exist. It is -1 before the first
+            message.
         silence_ns: Longest time between two arrivals, in ns. It is 0 without arrival times.
     """
 
@@ -868,10 +877,13 @@ class SessionAccounts:
         return [site for site in self._rates_hz if site not in self._end_ticks]
 
     def describe_unfinished_sites(self) -> Iterator[str]:
-        """Yields a line for every site that may have executed more ticks than were recorded.
+        """Describes for the user which sites may have executed more ticks than were recorded.
 
-        These are the sites whose "end" event never arrived, and whose last recorded tick is not
-        the last tick of the scenario.
+        These are the sites that never published the event "end", and whose last recorded tick
+        is not the last tick of the scenario.
+
+        Yields:
+            A line for each of these sites.
         """
         for site in self.unknown_ends:
             topic = self._topic(site, topics.STATE)

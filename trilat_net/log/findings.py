@@ -35,7 +35,7 @@ class ProblemPlace(NamedTuple):
 
 @dataclass(slots=True)
 class Finding:
-    """Result of one check.
+    """Result of one check of a log or a run, with the problems that it found.
 
     Attributes:
         check: Name of the check. Every file is checked for "whole", "checksums", "records" and
@@ -44,8 +44,8 @@ class Finding:
             is the subject of the comparison.
         text: The result in one line.
         passed: True if the check passed.
-        judged: False if the check was not possible, because it would run code from outside that
-            the user has not permitted. The check has not passed then.
+        judged: True if the check could be made. It is False if the check would run code from
+            outside that the user has not permitted. The check has not passed then.
         places: The problems, at most `MAX_LISTED_PROBLEMS`.
         wrong: Number of problems, including those that are not stored.
     """

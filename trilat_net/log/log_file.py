@@ -53,9 +53,12 @@ class DiskReserve:
         self._is_possible = True
 
     def grow(self, size: int) -> None:
-        """Reserves at least `size` bytes in total.
+        """Reserves disk space, so that it cannot be used up by other programs.
 
         Nothing happens if this disk does not support it, or if the space was released before.
+
+        Args:
+            size: Number of bytes that must be reserved in total.
 
         Raises:
             OSError: The disk has no room.
@@ -110,12 +113,12 @@ SYNC_PERIOD_NS = 1_000_000_000
 
 
 class FileSync:
-    """Syncs the data of one file to the disk, so that they survive a loss of power.
+    """Forces the data of one file onto the disk (sync), so that they survive a loss of power.
 
     Args:
-        descriptor: Descriptor of the file.
-        durable: True to sync in every call, which blocks. Otherwise a thread syncs once a
-            second.
+        descriptor: Descriptor of the file in the operating system.
+        durable: True to sync in every call, which blocks the caller. Otherwise a thread syncs
+            once a second.
         now_ns: Function that returns the time in ns.
     """
 

@@ -30,7 +30,7 @@ _INDEX_HEAD_BYTES = 6
 
 
 class FileCheck:
-    """Check of one file, record by record.
+    """Checks the checksums, the records and the index of one MCAP file.
 
     The caller reads the file, passes each record to `check_record`, and calls `finish` at the
     end.
@@ -38,8 +38,8 @@ class FileCheck:
     Args:
         file: Name of the file.
         scanner: Scanner that finds the records of the file.
-        findings: Receives the problems under the names "whole" (damaged or missing parts),
-            "checksums", "records" and "index".
+        findings: Results of the checks, to which the problems are added under the names "whole"
+            (damaged or missing parts), "checksums", "records" and "index".
 
     Attributes:
         counts: Numbers of bytes, chunks and messages in the file, and of compared checksums

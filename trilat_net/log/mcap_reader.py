@@ -110,7 +110,7 @@ class ChannelInfo(NamedTuple):
 
 
 class McapMessage(NamedTuple):
-    """One message of a file.
+    """One message as an MCAP file contains it, still encoded.
 
     Attributes:
         topic: Topic of the channel. Empty if the file does not define the channel.
@@ -435,11 +435,11 @@ _LAST_SIGNED_NS = np.uint64((1 << 63) - 1)
 
 @dataclass(slots=True)
 class ChannelMessages:
-    """Messages of one topic, in the order of the file.
+    """Messages of one topic as a log contains them, still encoded, in the order of the file.
 
     Attributes:
-        payloads: The messages, encoded as published.
-        log_ns: Time of arrival of each message, in Unix time, in ns.
+        payloads: The K messages, as published.
+        log_ns: Time of arrival of each message at the recorder, in Unix time, in ns.
         publish_ns: Time of sending that each message states, in Unix time, in ns.
     """
 
@@ -477,19 +477,19 @@ def _clip_times(times: "array[int]") -> NDArray[np.int64]:
 
 @dataclass
 class LogContents:
-    """Contents of a log, which may consist of one file or of several parts.
+    """Contents of a log before its messages are decoded, from one file or from several parts.
 
     Attributes:
         sources: Names of the files.
-        session: Metadata of the session.
-        scenario: Text of the scenario.
+        session: Metadata of the session, such as its name and its start time.
+        scenario: Text of the scenario, encoded.
         metadata: All metadata, by name.
         channels: The messages, by topic.
         complete: True if all parts are present and finished, and can be read completely.
         ended: True if the last part was finished.
         damaged: A sentence for every part of a file that cannot be read.
-        chain: Result of comparing the log with its digests. For several files, the worst
-            result.
+        chain: Whether the log agrees with its digests, the checksums that reveal changes. For
+            several files, the worst result.
     """
 
     sources: tuple[str, ...]

@@ -240,12 +240,12 @@ class McapWriter:
     def add_message(
         self, channel_id: int, log_time: int, data: bytes, publish_time: int, sequence: int = 0
     ) -> None:
-        """Adds a message to the open chunk, and closes the chunk if it is large enough.
+        """Adds a message to the open chunk, and writes the chunk if it is large enough.
 
         Args:
-            channel_id: Number of the channel.
+            channel_id: Number of the channel, from `register_channel`.
             log_time: Time of the arrival, in ns.
-            data: Payload of the message.
+            data: Bytes of the message.
             publish_time: Time of the sending, in ns.
             sequence: Sequence number of the message.
         """
@@ -261,11 +261,13 @@ class McapWriter:
             self.flush()
 
     def add_metadata(self, name: str, data: Mapping[str, str]) -> None:
-        """Writes a metadata record. The messages of the open chunk follow it in the file.
+        """Writes a metadata record, a named map of texts, such as the facts about a session.
+
+        It precedes the messages of the open chunk in the file.
 
         Args:
             name: Name of the metadata.
-            data: The metadata.
+            data: The map.
         """
         content = pack_text(name) + pack_text_map(data)
         if name != DIGESTS:

@@ -172,12 +172,14 @@ def choose_nearest_vectors(turns: Array, references: Array) -> Array:
 
 
 def compute_continuous_vectors(turns: Array) -> Array:
-    """Returns rotation vectors of the same rotations that do not jump at half a turn.
+    """Computes rotation vectors of the same rotations that do not jump at half a turn.
 
-    The vectors may be up to a whole turn long. They jump at a whole turn instead.
+    A rotation vector is the axis of a rotation times its angle. A whole turn can be added
+    without changing the rotation. The resulting vectors may be up to a whole turn long. They
+    jump at a whole turn instead.
 
     Args:
-        turns: Rotation vectors in the order of time, shape (K, 3), in rad.
+        turns: K rotation vectors in the order of time, shape (K, 3), in rad.
 
     Returns:
         The rotation vectors, shape (K, 3), in rad.

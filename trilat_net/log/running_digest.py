@@ -51,11 +51,11 @@ class DigestState(StrEnum):
 
 
 class Integrity(NamedTuple):
-    """Result of comparing a log with its digests, with an explanation.
+    """States whether a log agrees with its digests, checksums that reveal changes.
 
     Attributes:
-        state: The result.
-        text: A sentence that explains it.
+        state: The result of the comparison.
+        text: A sentence for the user that explains it.
     """
 
     state: DigestState
@@ -63,15 +63,20 @@ class Integrity(NamedTuple):
 
     @property
     def passed(self) -> bool:
-        """False if something in the file was changed or removed."""
+        """True unless something in the file was changed or removed.
+
+        It is also True if the file has no digests or was not finished.
+        """
         return self.state is not DigestState.CHANGED
 
 
 class RunningDigest:
-    """Digests of one file, computed while the file is written or read.
+    """Computes the digests (SHA-256 checksums) of one file while it is written or read.
+
+    One digest covers the messages, and the other one everything that describes them.
 
     Attributes:
-        messages: Number of messages added.
+        messages: Number of messages added so far.
     """
 
     def __init__(self) -> None:

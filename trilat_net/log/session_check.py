@@ -141,22 +141,23 @@ def check_file(*files: str | Path, progress: Progress | None = None) -> LogCheck
 
 
 class ChannelCheck:
-    """Checks the messages of one channel: their numbers, schema and time stamps.
+    """Checks the messages of one channel of a session: their numbers, schema and time stamps.
 
     Args:
-        key: Session, member and channel. A member is a site, which runs one arm, or the
-            recorder.
+        key: Names of the session, of the member and of the channel. A member is a site, which
+            runs one arm, or the recorder.
         about: Metadata of the session.
         scenario: Scenario of the session. None if it cannot be read.
-        findings: Receives the problems.
-        accounts: Counts the messages of the session.
+        findings: Results of the checks, to which the problems are added.
+        accounts: Counts of received and missing messages of the session, to which the messages
+            are added.
 
     Attributes:
         member: Name of the member.
         kind: Name of the channel: "state" (records), "link" (statistics), "event" or "stats".
         rate_hz: Tick rate of the site, in Hz. It is 0 for the recorder.
         received: Number of messages, without repetitions.
-        boots: Random numbers that identify the starts of the member.
+        boots: Random numbers that identify the starts of the member's process.
         first: Number and sending time of the message with the lowest number. None if there is
             no message.
         last: Number and sending time of the message with the highest number. None if there is
@@ -358,13 +359,14 @@ def _parse_number(about: Mapping[str, str], key: str) -> int:
 
 
 class SessionCheck:
-    """Checks one session, in one file or in several parts.
+    """Checks one session, whose log is one file or several parts.
 
-    The caller passes the files to `read`, and calls `findings` at the end.
+    The caller passes the files to `read`, one after another, and then gets the results from
+    `findings`.
 
     Attributes:
-        ours: True if a file is a log of trilat-net.
-        channels: The checks of the channels, by topic.
+        ours: True if a file is a log of trilat-net, False for any other MCAP file.
+        channels: The check of each channel, by topic.
     """
 
     def __init__(self) -> None:

@@ -56,12 +56,13 @@ DecodeStates = Callable[[Sequence[bytes]], list[State]]
 
 
 def freeze(value: T) -> T:
-    """Makes an array read-only, so that a user cannot change a log by accident.
+    """Makes an array read-only, so that a user of a log cannot change its values by accident.
 
-    Arrays in tuples and in dictionaries are made read-only, too.
+    Args:
+        value: An array, or a tuple or dictionary of arrays, all of which are made read-only.
 
     Returns:
-        The same value.
+        The same object.
     """
     if isinstance(value, np.ndarray):
         value.setflags(write=False)

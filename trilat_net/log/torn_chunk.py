@@ -91,10 +91,13 @@ class TornChunk(NamedTuple):
         return cls(head, packed, begin + head.data_offset)
 
     def iterate_blocks(self) -> Iterator[list[InnerRecord]]:
-        """Yields the records of each block, until a block is damaged or incomplete.
+        """Unpacks the chunk block by block, as far as it is intact.
 
-        A record that continues in the next block is yielded with the block that contains its
-        end.
+        A block is a piece of the compressed data that can be unpacked as a whole. A record that
+        continues in the next block is yielded with the block that contains its end.
+
+        Yields:
+            The records of each block. Nothing if the first block is damaged or incomplete.
 
         Raises:
             UnreadableRecord: The unpacked bytes are not a record.

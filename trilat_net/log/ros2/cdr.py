@@ -222,13 +222,16 @@ class TransformPacker:
 
 
 def make_float_array_packer(*dimensions: tuple[str, int]) -> Callable[..., bytes]:
-    """Creates an encoder of `std_msgs/msg/Float64MultiArray` for a fixed shape.
+    """Creates a function that encodes arrays of a fixed shape for ROS 2.
+
+    The messages have the type `std_msgs/msg/Float64MultiArray`. Everything in a message except
+    its numbers is encoded once, here.
 
     Args:
-        dimensions: Label and size of each dimension.
+        dimensions: Label and size of each dimension of the array.
 
     Returns:
-        A function that encodes a message from the numbers, row by row.
+        A function that encodes a message from the numbers of an array, row by row.
     """
     sizes = [size for _, size in dimensions]
     count = math.prod(sizes)
@@ -274,11 +277,14 @@ def pack_log(stamp_ns: int, level: RosLogLevel, name: str, text: str) -> bytes:
 
 
 def pack_frame_vectors(stamp_ns: int, frame: str, *numbers: float) -> bytes:
-    """Encodes a `PoseStamped`, `TwistStamped` or `WrenchStamped`, depending on the numbers.
+    """Encodes a pose, velocity or force in a frame, as a stamped message of ROS 2.
+
+    The messages `PoseStamped`, `TwistStamped` and `WrenchStamped` of the ROS package
+    geometry_msgs have the same structure. They differ only in their numbers.
 
     Args:
         stamp_ns: Unix time of the message, in ns, 0 or more.
-        frame: Frame in which the vectors are given.
+        frame: Name of the frame in which the vectors are given.
         numbers: For a pose, x, y, z in m and the quaternion x, y, z, w. For a twist, the
             velocity in m/s and the angular velocity in rad/s. For a wrench, the force in N and
             the torque in N m.
@@ -401,7 +407,7 @@ class CdrReader:
 
 
 class RosJoints(NamedTuple):
-    """State of a robot's joints, from a message of the type `JointState`.
+    """State of a robot's joints, from a message of the type `sensor_msgs/msg/JointState`.
 
     Attributes:
         stamp_ns: Time of the message on the sender's clock, in ns.

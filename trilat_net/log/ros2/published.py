@@ -52,12 +52,15 @@ COMMON_TOPICS = {
 
 
 def list_topics(scenario: Scenario, session: str, table: TopicTable) -> Topics:
-    """Lists all topics that a session publishes, by their full names.
+    """Lists all ROS 2 topics under which a session is published.
 
     Args:
-        scenario: Scenario of the session.
+        scenario: Scenario of the session, its description in a TOML file.
         session: Name of the session.
         table: Names of the topics in ROS 2.
+
+    Returns:
+        The description of each topic, by its full name.
     """
     topics = {**COMMON_TOPICS}
     for name, channel in SESSION_CHANNELS.items():
@@ -70,18 +73,19 @@ def list_topics(scenario: Scenario, session: str, table: TopicTable) -> Topics:
 
 
 class SiteMessages:
-    """Encodes the messages of one site.
+    """Encodes everything that one site publishes as messages of ROS 2.
 
     Args:
         scenario: Scenario of the session.
-        site: Name of the site.
-        epoch_unix_ns: Unix time of tick 0, in ns. It is 0 in virtual time.
+        site: Name of the site, a process that runs one arm.
+        epoch_unix_ns: Start time of the session (tick 0), in Unix time, in ns. It is 0 in
+            virtual time.
 
     Attributes:
-        topics: Topics of the site by their names in trilat-net, without those of the session
-            and `/tf`.
-        frame: Frame in which the poses of the end effector are given.
-        description: Message of the topic `robot_description`.
+        topics: Description of each topic of the site, by its name in trilat-net. The topics of
+            the whole session and `/tf` are not included.
+        frame: Name of the frame in which the poses of the end effector are given.
+        description: Message of the topic `robot_description`, the model of the arm.
     """
 
     def __init__(self, scenario: Scenario, site: str, epoch_unix_ns: int) -> None:
@@ -185,16 +189,17 @@ class SiteMessages:
         shares: Sequence[float],
         is_wanted: IsWanted = lambda _topic: True,
     ) -> Iterator[tuple[str, bytes]]:
-        """Encodes the messages of a record.
+        """Encodes a record, the result of one tick of the site's control loop.
 
         Args:
-            record: The record. The calls must be in the order of the records' times.
+            record: The record. The records must be passed in the order of their times, because
+                the signs of quaternions depend on the previous record.
             shares: Dominance factors at the time of the record, the weights with which the site
                 follows its peers.
             is_wanted: Function that returns False for topics whose messages are not needed.
 
         Yields:
-            The name of the topic in trilat-net, and the message.
+            The name of the topic in trilat-net, and the message, for each wanted topic.
         """
         stamp_ns = self.stamp_ns(record)
         if is_wanted("joint_states"):

@@ -151,15 +151,18 @@ _PLANAR = (DEFINITIONS / "planar.urdf").read_text(encoding="utf-8")
 
 
 class RobotModel:
-    """The arm of one site as a tree of links, from a URDF or from the built-in planar arm.
+    """The arm of one site as a tree of rigid links, for viewers that draw it.
+
+    The model is built from the URDF of the arm, or from the built-in planar arm.
 
     Args:
         scenario: Scenario of the session.
-        site: Name of the site.
+        site: Name of the site that runs the arm.
 
     Attributes:
-        description: The URDF, with the site's name in the names of the links.
-        frames: Pairs of parent and child frame, from `WORLD` to the last link.
+        description: Text of the URDF, with the site's name in the names of the links.
+        frames: For each link, the names of its parent frame and its own frame, from `WORLD` to
+            the last link.
         shared: Pose in `WORLD` of the frame in which the scenario places the arm's base. All
             sites of the session exchange positions in this frame.
     """
@@ -197,10 +200,13 @@ class RobotModel:
         self.description = _describe_robot(root, site, site_number)
 
     def compute_transforms(self, q: Sequence[float]) -> list[Transform]:
-        """Computes the pose of each frame in its parent frame, in the order of `frames`.
+        """Computes where the links of the arm are, for given positions of its joints.
 
         Args:
             q: Positions of the joints, in rad or m.
+
+        Returns:
+            The pose of each frame in its parent frame, in the order of `frames`.
         """
         transforms: list[Transform] = [self._base]
         for joint in self._joints:

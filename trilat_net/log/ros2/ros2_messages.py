@@ -358,9 +358,13 @@ def _convert_to_ms(us: int) -> float:
 
 
 def read_ros2_channels(path: Path) -> dict[str, Ros2Channel]:
-    """Reads the standard channels of a finished file, by topic.
+    """Reads from a finished file which standard ROS 2 channels it contains.
 
-    The result is empty if the file has no readable index.
+    Args:
+        path: The file.
+
+    Returns:
+        The descriptions of the channels, by topic. Empty if the file has no readable index.
 
     Raises:
         LogError: The file cannot be opened.
@@ -387,15 +391,20 @@ SignalRow = Sequence[float]
 
 
 def stack_signals(records: Sequence[Record]) -> list[SignalRow]:
-    """Returns the values of each curve in some records.
+    """Collects the curves that viewers draw, from some records of a site.
 
-    The curves are q, q_des, qd, tau, e, tau_x, theta_hat, the numbers that the control law
-    sends, and the mode. The mode has only one value if all records have the same mode. If the
-    sites share the pose of the end effector, the joints have no reference: then q is repeated
-    in place of q_des, and e is x - x_des.
+    The curves are the joint positions q, their references q_des, the velocities qd, the
+    torques tau, the error e = q - q_des, the exogenous torque tau_x, the estimated parameters
+    theta_hat, the numbers that the control law sends, and the mode. If the sites share the pose
+    x of the end effector instead, the joints have no reference. Then q is repeated in place of
+    q_des, and e is x - x_des.
 
     Args:
         records: The records, at least one.
+
+    Returns:
+        The values of each curve, one per record. The mode has a single value if all records
+        have the same mode.
     """
     first = records[0]
     is_task_space = bool(first.x)

@@ -118,15 +118,18 @@ def make_session_name(text: str) -> str:
 
 
 def read_topic_table(source: str) -> TopicTable:
-    """Returns the names of a built-in convention, or of a TOML file.
+    """Reads under which names the topics of a session shall appear in ROS 2.
 
-    The file states which names differ from those of CRISP.
-
-    A line of the file is, for example, `joint_states = "arm/joint_states"`. A table `[sites.s]`
-    applies only to the site `s`, and may also contain the fields of a `RobotTable`.
+    The names are those of a convention, "crisp" or "crtk", or come from a TOML file. The file
+    states only the names that differ from those of CRISP. For example, the line
+    `joint_states = "arm/joint_states"` applies to all sites. A table `[sites.s]` applies only
+    to the site `s`, and may also contain the fields of a `RobotTable`.
 
     Args:
         source: "crisp", "crtk" or the path of a file.
+
+    Returns:
+        The names, and the settings of real robots.
 
     Raises:
         UsageError: The file cannot be read, or a name in it is not valid.
