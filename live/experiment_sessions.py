@@ -337,11 +337,13 @@ def _find_repeat_reason(watch: TrialWatch, result: SessionResult) -> str:
 def run_with_people(
     experiment: Experiment, options: PageOptions, say: Callable[[str], None]
 ) -> int:
-    """Continues an experiment with people on its page.
+    """Continues an experiment with people, from its first step that is not completed.
+
+    The experiment is shown on web pages, one for each participant and one for the experimenter.
 
     Args:
-        experiment: The experiment.
-        options: How the page is served.
+        experiment: The experiment, with its plan and the journals of completed steps.
+        options: How the pages are served.
         say: Function that prints a line for the user.
 
     Returns:

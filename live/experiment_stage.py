@@ -216,15 +216,15 @@ class Stage:
     def request_step(
         self, step: Step, rest_s: float = 0.0, done: Collection[str] = ()
     ) -> StepRequest:
-        """Requests that the users complete a step.
+        """Asks the users on their pages to complete a step, such as a questionnaire.
 
         Args:
             step: The step.
-            rest_s: Rest before the step, in s.
-            done: Sites of users who have completed the step already.
+            rest_s: Time that the users must rest before the step, in s.
+            done: Sites of the users who have completed the step already.
 
         Returns:
-            The request, which collects the replies.
+            The request, in which the replies of the users are collected.
         """
         rest_end_ns = self._clock.monotonic_ns() + int(rest_s * NS_PER_S)
         request = StepRequest(step, rest_end_ns)

@@ -296,13 +296,13 @@ def read_page_message(text: str | bytes) -> PageMessage:
 
 @dataclass(frozen=True, slots=True)
 class Role:
-    """The rights of a page's user, and the arms that the page shows.
+    """States who uses a page: which rights the user has, and which arms the page shows.
 
     Attributes:
         kind: An experimenter may do everything, a user may hold the arm of one site, and a
             watcher may only stop the arms.
-        site: Name of the site whose user's view is shown: the other arms with their delay.
-            Empty to show all arms without delay.
+        site: Name of the site whose user's view is shown, in which the other arms have their
+            delay. Empty to show all arms without delay.
     """
 
     kind: Literal["experimenter", "user", "watcher"] = "experimenter"
@@ -364,10 +364,10 @@ class RoleLinks:
         return f"{address}{query}#token={self._make_token(role)}"
 
     def find(self, query: str) -> Role | None:
-        """Returns the role that a link grants.
+        """Finds out which role a link grants to the page that was opened with it.
 
         Args:
-            query: Query part of a request, which contains the token.
+            query: Query part of the page's request. It contains the secret token of the link.
 
         Returns:
             The role. None if the token is not that of any role.
@@ -476,18 +476,18 @@ class _OpenQuery(NamedTuple):
 
 
 class OrderDesk:
-    """Sends the orders of all pages to the sites, and collects the replies.
+    """Sends the orders of all pages to the sites, and collects the replies of the sites.
 
     Args:
         bus: Network connection that reaches the session.
         clock: Clock of this process.
         session: Name of the session.
-        refused: Numbers of refused orders by reason, to which this object adds. None for new
-            ones.
+        refused: Numbers of refused orders by reason, to which this object adds. None to begin a
+            new count.
 
     Attributes:
-        replies: Replies that have not been read yet: name of the site, channel of the order,
-            whether it is accepted, and text.
+        replies: Replies that have not been read yet. Each contains the name of the site, the
+            channel of the order, whether the site accepted it, and a text.
         refused: Numbers of refused orders by reason.
     """
 

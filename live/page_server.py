@@ -241,14 +241,15 @@ class Page:
 
 @dataclass(frozen=True, slots=True)
 class PageOptions:
-    """Options of the command line that concern the page.
+    """States how the page of a session is served, as the options of the command line say.
 
     Attributes:
         host: Address at which the server listens.
-        port: Port at which the server listens. 0 for any free port.
-        insecure: True if an address outside this machine is allowed without encryption.
+        port: Port at which the server listens. 0 chooses any free port.
+        insecure: True if the user allows an address outside this machine without encryption.
         opens: True to open a browser, if there is one.
-        tls: Folder with the keys of a member, which are used for encryption. None for none.
+        tls: Folder with the keys of a member of the session, which are used for encryption.
+            None for no encryption.
     """
 
     host: str = "127.0.0.1"

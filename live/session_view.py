@@ -267,7 +267,10 @@ class SessionView:
         return min((self.silence_s(site) for site in running), default=0.0)
 
     def poll(self) -> None:
-        """Receives the messages that have arrived, and requests missing messages."""
+        """Receives the messages that have arrived, and requests those that are missing.
+
+        The owner of this object must call this regularly. It never waits.
+        """
         now_ns = self._clock.monotonic_ns()
         if not self.running:
             self._connect_to_sites()

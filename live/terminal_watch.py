@@ -49,15 +49,15 @@ def watch_session(
     say: Callable[[str], None],
     timeout_s: float,
 ) -> int:
-    """Shows a running session until it ends or a signal arrives.
+    """Connects to a running session and shows it until it ends or a signal arrives.
 
     Args:
         session: Name of the session.
-        connection: Network addresses and keys.
+        connection: Network addresses and keys with which the session is reached.
         clock: Clock of this process.
-        show: Function that shows the session.
+        show: Function that shows the session, in a terminal or on a page.
         say: Function that prints a line for the user.
-        timeout_s: Longest wait for a reply of a site, in s.
+        timeout_s: Longest time to wait for a reply of a site, in s.
 
     Returns:
         The exit code of the command.

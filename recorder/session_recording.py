@@ -145,7 +145,10 @@ class Recording:
         self._overflowed = 0
 
     def join_late(self, now_ns: int) -> None:
-        """Announces that the recorder joins a running session and requests earlier messages.
+        """Announces that the recorder has joined a session that is running.
+
+        It also requests the earlier messages, which the sites keep in their buffers for some
+        time.
 
         Args:
             now_ns: Present time on the monotonic clock, in ns.

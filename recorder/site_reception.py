@@ -126,11 +126,14 @@ class InboundQueue:
             self._queue.append(InboundMessage(key, payload, self._clock.monotonic_ns()))
 
     def drain(self, until_ns: int | None = None) -> Iterator[InboundMessage]:
-        """Removes waiting messages from the queue and yields them, the oldest one first.
+        """Removes waiting messages from the queue, so that they can be written.
 
         Args:
             until_ns: Messages that arrived after this time stay in the queue, in ns on the
                 monotonic clock. None removes all messages.
+
+        Yields:
+            The messages, the oldest one first.
         """
         queue = self._queue
         while queue and (until_ns is None or queue[0].mono_ns <= until_ns):
@@ -160,7 +163,7 @@ _LEAST_EVENT_BYTES = 128
 
 
 class SiteMessage(NamedTuple):
-    """A decoded message of a site.
+    """A message of a site after it was decoded, with its number.
 
     Attributes:
         number: Number of the message in its channel. It is -1 for an event without a number.
@@ -168,7 +171,7 @@ class SiteMessage(NamedTuple):
             number of an event.
         t_ns: Sending time after the start of the session, on the sender's clock, in ns. It is
             negative before the start.
-        content: The message.
+        content: The decoded message.
     """
 
     number: int

@@ -188,11 +188,11 @@ class MessageBatch:
 
 
 class BatchBuilder:
-    """Collects messages in the order of a file, and sorts them into play order.
+    """Collects messages in the order of a file, and sorts them into the order of playing.
 
     Args:
-        kept: Messages that were sorted before but not played yet. They precede the messages
-            that are added.
+        kept: Messages that were sorted before but not played yet. They count as if they had
+            been added first.
     """
 
     def __init__(self, kept: MessageBatch | None = None) -> None:

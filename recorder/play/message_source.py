@@ -104,11 +104,11 @@ class MessageSource:
     def start_reader(
         self, paths: Sequence[Path], selection: PlaySelection, *, loop: bool
     ) -> None:
-        """Starts the process that reads the messages.
+        """Starts the second process, which reads a long log while it is played.
 
         Args:
-            paths: The files.
-            selection: Which messages are played.
+            paths: The files of the log.
+            selection: Which messages are played, by channel and time.
             loop: True if the process reads the files again and again.
         """
         context = multiprocessing.get_context("spawn")
@@ -147,10 +147,10 @@ class MessageSource:
         return None
 
     def fill(self) -> bool:
-        """Reads some bytes from the reader process, without waiting.
+        """Reads some bytes from the pipe of the reader process, without waiting for them.
 
         Returns:
-            False if there is nothing to read now, or enough has been read in advance.
+            False if there is nothing to read now, or if enough has been read in advance.
 
         Raises:
             RuntimeFault: The reader process failed.

@@ -43,14 +43,15 @@ PROGRESS_EVERY_NS = 500_000_000
 
 @dataclass(frozen=True, slots=True)
 class PlayOptions:
-    """Options of a playback.
+    """States how a log is played, as the options of the command line say.
 
     Attributes:
         session: Name of the session in which the log is played.
-        rate: Seconds of the log per second. With `math.inf`, messages are played as fast as all
-            receivers accept them.
+        rate: Speed of the playback, in seconds of the log per second. With `math.inf`, messages
+            are played as fast as all receivers accept them.
         loop: True if the log is played again and again.
-        low_cpu: True if the player sleeps until a deadline, instead of polling the clock.
+        low_cpu: True if the player sleeps until a deadline, instead of polling the clock. This
+            needs less computing time, but is less precise.
         needs_recorder: True if the playback waits for a recorder before it starts.
     """
 
@@ -95,14 +96,14 @@ class PlaybackSummary(NamedTuple):
 
 @dataclass
 class Playback:
-    """One playback, which runs as a session with a name of its own.
+    """One playback of a log, which other programs see as a session with a name of its own.
 
     Attributes:
         bus: Network connection of the player.
-        clock: The clock.
+        clock: Clock of the player.
         header: Description of the recorded session.
-        source: Supplies the messages.
-        options: Options of the playback.
+        source: Supplies the messages in the order in which they are played.
+        options: How the log is played.
         stopped: Function that returns True if the playback must end.
         say: Function that prints a line for the user.
         show: Function that shows the progress to the user.

@@ -61,11 +61,12 @@ class PlaySelection:
     time: PlayTime = "publish"
 
     def accepts(self, topic: str, sites: Collection[str]) -> bool:
-        """Returns True if the messages of a channel are played.
+        """Finds out whether the messages of a channel are played.
 
         Args:
             topic: Topic of the channel, such as "/trilat/paper/m1/state".
-            sites: Names of the sites of the scenario.
+            sites: Names of the sites of the scenario. If the user selects no channel, theirs
+                are played.
         """
         key = topic.strip("/")
         parts = topics.parse_key(key)
@@ -255,11 +256,11 @@ class _PlayedChannel:
 
 
 class SessionReader:
-    """Reads the files of a session once, from the first to the last message.
+    """Reads the messages of a recorded session that are played, from the first to the last.
 
     Args:
-        paths: The files. Several files are the parts of a session, in their order.
-        selection: Which messages are played.
+        paths: The files of the log. Several files are the parts of a session, in their order.
+        selection: Which messages are played, by channel and time.
         progress: Function that is called now and then with the number of bytes read and their
             total.
 

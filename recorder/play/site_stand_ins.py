@@ -73,10 +73,13 @@ class _ChannelMessages(NamedTuple):
 
 
 class PlayedHistory:
-    """The messages that were played, by channel, so that they can be sent again.
+    """Stores the messages that were played, so that they can be sent again.
+
+    A recorder requests them if it has missed some.
 
     Args:
-        kept_ns: Duration of the log that is kept, in ns. None keeps all messages.
+        kept_ns: Duration of the log for which messages are stored, in ns. None to store all
+            messages.
 
     Attributes:
         next_numbers: Number after that of the last played message, by channel.

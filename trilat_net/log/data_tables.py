@@ -586,10 +586,13 @@ def _make_sample_columns(site: SiteLog, peer: str, rate_hz: int) -> Iterator[Col
 
 
 def build_arrivals_table(site: SiteLog, source: str, *, live: bool) -> Table:
-    """Builds the table of the peers' samples that arrived at a site, in the order of arrival.
+    """Builds the table of the samples that arrived at a site from its peers.
+
+    A sample is the state that a peer, another site, publishes in one tick. The table has one
+    row per sample, in the order of arrival.
 
     Args:
-        site: Records of the site.
+        site: Records of the receiving site, which list the arrivals.
         source: Name of the file for error messages.
         live: True if the session was live, so that the delays were measured. In virtual time
             they are the ages of the samples.
@@ -641,14 +644,17 @@ def build_arrivals_table(site: SiteLog, source: str, *, live: bool) -> Table:
 
 
 def build_link_table(site: SiteLog, timed: TimedMessages[LinkStats], source: str) -> Table:
-    """Builds the table of the statistics messages of a site, in the order of their ticks.
+    """Builds the table of a site's statistics about its links, one row per message.
 
     A field that is a map from peers to numbers becomes a column per peer.
 
     Args:
         site: Records of the site.
-        timed: The statistics messages, with their times.
+        timed: The statistics messages, with their times of arrival and sending.
         source: Name of the file for error messages.
+
+    Returns:
+        The table, in the order of the ticks.
 
     Raises:
         LogError: A number is out of range.

@@ -70,11 +70,11 @@ def describe_unfinished(path: Path) -> str:
 
 
 def part_path(path: Path, number: int) -> Path:
-    """Returns the file name of a part of a log, such as run-002.mcap for part 2 of run.mcap.
+    """Computes the file name of a part of a log, such as run-002.mcap for part 2 of run.mcap.
 
     Args:
         path: Name of the log.
-        number: Number of the part. 0 returns the name of the log.
+        number: Number of the part, from 1 on. For 0, the name of the log is returned.
     """
     return path.with_name(f"{path.stem}-{number:03}{path.suffix}") if number else path
 
@@ -102,7 +102,9 @@ def find_parts(path: Path) -> dict[int, Path]:
 
 @dataclass(frozen=True, slots=True)
 class ChannelFilter:
-    """Filter that selects the channels to record by Zenoh key expressions.
+    """States which channels of a session are recorded, by key expressions of Zenoh.
+
+    A key expression is the key of a channel, in which wildcards may stand for names.
 
     Attributes:
         include: Expressions of channels to record. If there are none, all channels are

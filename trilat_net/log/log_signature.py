@@ -164,15 +164,15 @@ def sign_log(
 def check_signatures(
     paths: Sequence[Path], key_file: Path, progress: Progress | None = None
 ) -> Finding:
-    """Checks that logs are those that the owner of a public key has signed.
+    """Checks that logs are exactly those that the owner of a public key has signed.
 
     Args:
-        paths: The logs. The file of the signature is beside each log.
-        key_file: File of the public key.
+        paths: The logs. The signature of a log is in a file beside it.
+        key_file: File of the public key of a signer whom the user trusts.
         progress: Function that is called after every record of a log.
 
     Returns:
-        The finding, with a problem for each log whose signature is missing or invalid.
+        The result, with a problem for each log whose signature is missing or invalid.
 
     Raises:
         LogError: A log cannot be read.

@@ -300,19 +300,20 @@ It is used for the accounts, and for the messages for viewers that follow from o
 
 @dataclass(frozen=True, slots=True)
 class LogStorage:
-    """Place where a log is stored, and its division into parts.
+    """States where a log is stored, and how it is divided into parts.
 
     Attributes:
-        path: Name of the log. Parts add their number to it.
+        path: Name of the log. The name of a part also contains its number.
         force: True if the log may replace an existing one.
-        durable: True if every flush also syncs the file to the disk.
+        durable: True if the file is forced onto the disk at every flush, so that a loss of
+            power does no harm.
         split_bytes: Largest size of a part, in bytes. None if it is not limited.
         split_ns: Longest duration of a part, in ns. None if it is not limited.
         carry_on: True to continue an existing log of this name with a new part. The existing
             log may be finished or not.
         choice: Filter of the channels that the log contains.
-        views_hz: Rate of the messages for viewers, in Hz, see `VizChannels`. With 0, the log
-            contains none.
+        views_hz: Rate of the additional messages for viewers, in Hz, see `VizChannels`. With 0,
+            the log contains none.
     """
 
     path: Path

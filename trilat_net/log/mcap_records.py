@@ -197,13 +197,14 @@ def _unpack(head: ChunkHead, data: memoryview) -> bytes:
 
 
 def iterate_records(data: bytes | bytearray) -> Iterator[tuple[int, int, int]]:
-    """Yields the places of the records in an unpacked chunk.
+    """Finds the records in an unpacked chunk, one after another.
 
     Args:
         data: The unpacked chunk.
 
     Yields:
-        The opcode of a record, the offset of its content, and the offset after its content.
+        The number of the record's kind, the offset of its content, and the offset after its
+        content.
 
     Raises:
         UnreadableRecord: The last record is incomplete.
@@ -500,14 +501,14 @@ def has_right_crc(attachment: bytes) -> bool:
 
 
 def parse_record(opcode: int, content: bytes) -> Any:
-    """Decodes a record with the `mcap` package.
+    """Decodes the content of a record with the `mcap` package.
 
     Args:
-        opcode: Kind of the record, which must be in `KINDS`.
+        opcode: Number of the kind of record, which must be in `KINDS`.
         content: Content of the record.
 
     Returns:
-        The record as an object of the package.
+        The record as an object of that package.
 
     Raises:
         UnreadableRecord: The content cannot be decoded.

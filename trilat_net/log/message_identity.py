@@ -19,10 +19,11 @@ AnyMessage = messages.State | messages.LinkStats | messages.Event | messages.Rec
 
 
 class MessageIdentity(NamedTuple):
-    """Identity of one message.
+    """States who sent a message, in which channel, with which number, and when.
 
     Attributes:
-        sender: Name of the member, a site or the recorder, that published the message.
+        sender: Name of the member of the session, a site or the recorder, that published the
+            message.
         channel: Name of the channel: "state" (records), "link" (statistics), "event" or
             "stats".
         number: Number of the message in its channel. It is -1 if the message states no number.
