@@ -63,13 +63,14 @@ class PageFiles:
         self.results |= {f"/{secret}/{path.name}": path for path in sendable}
 
     def find(self, path: str) -> Response | None:
-        """Returns the response to a request for a file.
+        """Finds the file that a browser requests.
 
         Args:
             path: Path of the requested address.
 
         Returns:
-            The response. None if there is no such file.
+            The response of the server, with the content of the file. None if there is no such
+            file.
         """
         result = self.results.get(path)
         if result is not None and result.is_file():

@@ -761,7 +761,7 @@ class PageServer:
 
     @property
     def experimenters(self) -> set[Page]:
-        """Open pages of experimenters."""
+        """The open pages of experimenters, who may control the session."""
         return {page for page in set(self._pages) if page.role.kind == "experimenter"}
 
     def _answer_request(self, page: Page, answer: AnswerPage) -> None:

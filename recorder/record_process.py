@@ -94,14 +94,14 @@ class Recorder:
         )
 
     def join(self, timeout_s: float | None) -> Epoch | None:
-        """Waits until the session begins, or joins it if it is running.
+        """Waits until the session begins. If it is running already, the recorder joins it.
 
         Args:
             timeout_s: Longest time to wait, in s. None does not limit it.
 
         Returns:
-            The common start time of the session and the boots of its members. None if the
-            recorder must end before the session begins.
+            The common start time of the session and the boots of its members, the numbers that
+            identify their starts. None if the recorder must end before the session begins.
 
         Raises:
             SessionError: The session did not begin in time.

@@ -412,7 +412,10 @@ class SiteReception:
         return is_new
 
     def check_sender(self, reply: Backfill) -> None:
-        """Checks that a reply to a request comes from this start of the site.
+        """Checks that a reply with missing messages comes from this start of the site.
+
+        Args:
+            reply: The reply of the site.
 
         Raises:
             WireError: The reply comes from another site, or from another start.

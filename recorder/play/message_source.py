@@ -185,7 +185,7 @@ class MessageSource:
                 self._ahead_bytes += len(item.batch.data)
 
     def restart(self) -> None:
-        """Starts the next round."""
+        """Supplies the messages again from the first one, when a log is played in a loop."""
         self.ended = False
         if self._batch is not None:
             self._ahead.append(ReadPiece(self._header.topics, self._batch))

@@ -156,9 +156,14 @@ class Playback:
     def play(self, start_ns: int | None) -> PlaybackSummary:
         """Plays the log to its end, and stays until all recorders have every message.
 
+        The process may be asked to end earlier by `stopped`.
+
         Args:
-            start_ns: Time at which the playback begins, in ns after the start of the recorded
-                session. None begins with the first message.
+            start_ns: Time in the log at which the playback begins, in ns after the start of the
+                recorded session. None begins with the first message.
+
+        Returns:
+            The result of the playback, for the summary that the user gets.
         """
         clock = self.clock
         options = self.options

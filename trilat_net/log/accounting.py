@@ -227,7 +227,10 @@ class Account:
             self.last = published - 1
 
     def mark_unpublished(self, first: int, published: int = 0) -> int:
-        """States that the sender published no messages in the gap just below a number.
+        """Notes that the missing numbers just below a number never had a message.
+
+        This happens when the sender skips numbers, or is killed and started again. The numbers
+        count as unpublished instead of missing.
 
         Args:
             first: First number after the gap: of the sender's next start, or after skipped
@@ -540,10 +543,11 @@ EVENTS_NUMBERED_SINCE = 3
 
 
 class SessionAccounts:
-    """Accounts of all numbered channels of a session.
+    """Counts the received and missing messages of all numbered channels of a session.
 
-    A recorder uses this class while it records, and the tools use it to count a log. The caller
-    passes every message. From the events, the class learns how many ticks the sites executed.
+    A recorder uses this class while it records, and the tools use it to count the messages of a
+    log. The caller passes every message. From the events, the class learns how many ticks the
+    sites executed.
 
     Args:
         session: Name of the session.
@@ -900,14 +904,15 @@ class SessionAccounts:
 def open_session_accounts(
     metadata: Mapping[str, Mapping[str, str]], attachments: Mapping[str, bytes]
 ) -> SessionAccounts | None:
-    """Creates empty accounts for the messages of a file.
+    """Creates the object that counts the messages of a file, before they are read.
 
     Args:
-        metadata: Metadata of the file, by name.
-        attachments: Attachments of the file, by name.
+        metadata: Metadata of the file, by name. They state the session.
+        attachments: Attachments of the file, by name. One of them is the scenario.
 
     Returns:
-        The accounts. None if the file is not a log of trilat-net.
+        The object, which has counted no message yet. None if the file is not a log of
+        trilat-net.
     """
     session_facts = metadata.get(SESSION, {})
     try:

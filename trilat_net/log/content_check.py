@@ -318,7 +318,9 @@ class ContentCheck:
                 raise UnreadableRecord(f"number {number} of {topic} was sent at another time")
 
     def check_origin(self, data: bytes) -> None:
-        """Checks that a chunk is not from another run in virtual time.
+        """Checks that a block of messages (chunk) is not from another run in virtual time.
+
+        A damaged file may contain blocks of another file.
 
         Args:
             data: The unpacked chunk.

@@ -374,7 +374,7 @@ class LogFile:
         self.size = 0
 
     def end(self, error: BaseException | None = None) -> None:
-        """Closes the file, and explains an error of the disk to the user.
+        """Closes the file, and turns an error of the disk into an explanation for the user.
 
         Args:
             error: The error that ended the writing. None if there was no error.

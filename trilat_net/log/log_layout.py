@@ -80,13 +80,15 @@ def part_path(path: Path, number: int) -> Path:
 
 
 def find_parts(path: Path) -> dict[int, Path]:
-    """Finds the existing files of a log, whether they are finished or not.
+    """Finds the existing files of a log that may be divided into parts.
+
+    Finished files and files that are still being recorded both count.
 
     Args:
-        path: Name of the log. It counts as part 1 if the file exists.
+        path: Name of the log. It counts as part 1 if a file of this name exists.
 
     Returns:
-        The files, by the number of the part.
+        The files, by the number of the part. Empty if there are none.
     """
     parts: dict[int, Path] = {}
     for file in (path, active_path(path)):

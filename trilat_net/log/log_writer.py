@@ -166,7 +166,7 @@ class LogWriter:
 
     @property
     def messages(self) -> int:
-        """Number of messages in the file."""
+        """Number of messages that were added to the file."""
         return self._file.messages
 
     @property
@@ -331,7 +331,9 @@ class LogStorage:
         return self.split_bytes is not None or self.split_ns is not None
 
     def find_first_part(self) -> tuple[int, str]:
-        """Finds out which part to write first, and checks that its name is free.
+        """Decides which part of the log to write first, and checks that its name is free.
+
+        The first part has a higher number if an existing log is continued.
 
         Returns:
             The number of the part, which is 0 for a log in a single file, and the name of the

@@ -395,7 +395,9 @@ class SessionCheck:
         self._chain_text = ""
 
     def read(self, file: str, stream: BinaryIO, progress: Progress | None = None) -> None:
-        """Checks every byte of a file, and its messages.
+        """Checks every byte of one file of the log, and its messages.
+
+        The problems are noted for `findings`.
 
         Args:
             file: Name of the file.

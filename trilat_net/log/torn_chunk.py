@@ -136,8 +136,9 @@ class TornChunk(NamedTuple):
 def find_doubtful_page(scanner: RecordScanner, begin: int, end: int) -> int:
     """Finds the first page in a part of a file that was probably not written correctly.
 
-    A page is doubtful if it contains only zeros, or if an equal page exists elsewhere in the
-    file before the end of the part.
+    A page is a block of bytes that the operating system writes as a whole. It is doubtful if it
+    contains only zeros, or if an equal page exists elsewhere in the file before the end of the
+    part.
 
     Args:
         scanner: Scanner of the file.

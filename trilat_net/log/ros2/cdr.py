@@ -323,7 +323,9 @@ class Diagnosis(NamedTuple):
 
 
 def pack_diagnostics(stamp_ns: int, diagnoses: Sequence[Diagnosis]) -> bytes:
-    """Encodes a `diagnostic_msgs/msg/DiagnosticArray`.
+    """Encodes the status of several components for the ROS topic `/diagnostics`.
+
+    The message has the type `diagnostic_msgs/msg/DiagnosticArray`.
 
     Args:
         stamp_ns: Unix time of the message, in ns, 0 or more.
@@ -461,11 +463,18 @@ def read_float_array(payload: bytes) -> tuple[float, ...]:
 
 
 def read_frame_vectors(payload: bytes, count: int) -> tuple[str, tuple[float, ...]]:
-    """Decodes the frame and the numbers of a `PoseStamped` or `WrenchStamped`.
+    """Decodes a pose or a force from a stamped message of ROS 2.
+
+    The message has the type `PoseStamped` or `WrenchStamped`.
 
     Args:
         payload: The message.
-        count: Number of numbers: 7 for a pose, 6 for a wrench.
+        count: Number of its numbers: 7 for a pose, 6 for a wrench.
+
+    Returns:
+        The name of the frame in which the vectors are given, and the numbers. Those of a pose
+        are x, y, z in m and the quaternion x, y, z, w. Those of a wrench are the force in N and
+        the torque in N m.
 
     Raises:
         ValueError: The message cannot be decoded.

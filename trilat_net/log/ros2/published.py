@@ -355,12 +355,16 @@ def _fill_rotation(values: Sequence[float]) -> list[float]:
 def pack_session_diagnostics(
     session: str, epoch_unix_ns: int, records: Sequence[State]
 ) -> bytes:
-    """Encodes a message for the topic `/diagnostics`, with a status for each site.
+    """Encodes the status of all sites of a session for the ROS topic `/diagnostics`.
 
     Args:
         session: Name of the session.
-        epoch_unix_ns: Unix time of tick 0, in ns. It is 0 in virtual time.
+        epoch_unix_ns: Start time of the session (tick 0), in Unix time, in ns. It is 0 in
+            virtual time.
         records: Newest record of each site that has published any.
+
+    Returns:
+        The message, with one status per site.
     """
     newest_ns = max((record.t_ns for record in records), default=0)
     diagnoses: list[cdr.Diagnosis] = []

@@ -412,10 +412,10 @@ class VizChannels:
             self._put(f"{VIZ_ROOT}{name}", data, log_ns, log_ns)
 
     def finish(self, log_ns: int) -> None:
-        """Writes everything that was not written yet.
+        """Writes the messages for viewers that were not written yet, at the end of the log.
 
         Args:
-            log_ns: Arrival time of the last message, in Unix time, in ns.
+            log_ns: Arrival time of the last message of the session, in Unix time, in ns.
         """
         for buckets in self._buckets:
             buckets.finish(log_ns)
