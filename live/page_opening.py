@@ -32,7 +32,10 @@ class BrowserOpening:
         self._folder: Path | None = None
 
     def open(self) -> None:
-        """Opens a browser, if there is one. Failures do not matter: the link is printed too."""
+        """Opens a browser at the link, if there is a browser.
+
+        Failures do not matter, because the link is also printed for the user.
+        """
         # A RuntimeError means that the user has no home directory.
         with suppress(OSError, webbrowser.Error, RuntimeError):
             webbrowser.open(self.write().as_uri())

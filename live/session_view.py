@@ -70,7 +70,11 @@ class Tail(Generic[T]):
         self.count = 0
 
     def add(self, entry: T) -> None:
-        """Adds an entry. If there are too many, the oldest is removed."""
+        """Adds an entry to the list. If there are too many, the oldest one is removed.
+
+        Args:
+            entry: The entry.
+        """
         self._entries.append(entry)
         self.count += 1
 
@@ -245,14 +249,23 @@ class SessionView:
         return self._finished or all(site.ended for site in self.sites.values())
 
     def finish(self) -> None:
-        """Marks the session as ended. The process that saw all sites end calls it."""
+        """Marks the session as ended.
+
+        The process that runs the session calls this when it has seen all sites end.
+        """
         self._finished = True
 
     def silence_s(self, site: SiteView) -> float:
-        """Returns for how long a running site has been silent, in s.
+        """Computes for how long no message of a running site has arrived.
 
         A silence shorter than `MIN_SILENCE_NS` counts as 0, because it is normal. A site that
         has ended is not silent.
+
+        Args:
+            site: The site.
+
+        Returns:
+            The duration, in s.
         """
         received_ns = site.reception.last_received_ns
         if received_ns is None or site.ended:

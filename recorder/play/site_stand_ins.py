@@ -303,10 +303,13 @@ class SiteStandIns:
         return not self.recorders - self._listening
 
     def have_stored(self, recorders: Collection[str]) -> bool:
-        """Returns True if each of the recorders has stored all messages of every site.
+        """Finds out whether recorders have stored all messages of every site.
 
         Args:
-            recorders: Boots of the recorders, as text.
+            recorders: Identifiers of the recorders' starts, as text.
+
+        Returns:
+            True if each of them has reported that.
         """
         for boot in recorders:
             stored_sites = self._stored.get(boot, set())

@@ -466,7 +466,7 @@ class Coverage(NamedTuple):
 
     Attributes:
         judged: Number of recorded or checked ticks, by name of the site.
-        expected: Number of all ticks that the site executed in the run, by name of the site.
+        expected: Number of all ticks of the site in the run, by name of the site.
     """
 
     judged: dict[str, int]

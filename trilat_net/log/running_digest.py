@@ -97,10 +97,13 @@ class RunningDigest:
         self.messages += messages
 
     def add_entry(self, opcode: int, content: bytes) -> None:
-        """Adds a record that describes the messages. Repeated records count once.
+        """Adds a record that describes the messages, such as a schema.
+
+        Repeated records count once.
 
         Args:
-            opcode: Kind of the record: header, metadata, attachment, schema or channel.
+            opcode: Number of the kind of record: header, metadata, attachment, schema or
+                channel.
             content: Content of the record.
         """
         self._descriptions.add(hashlib.sha256(bytes([opcode]) + content).digest())
