@@ -24,6 +24,8 @@ DARK_SITE_COLOURS = ("#79b0f2", "#f08a9b", "#e9bd4c", "#f2f2f2", "#9bd3f5", "#a3
 def list_site_colours(scenario: Scenario, colours: Sequence[str] = SITE_COLOURS) -> list[str]:
     """Returns the colours of a scenario's sites, in the order of the sites.
 
+    A site has the same colour in all figures and on all pages.
+
     Args:
         scenario: Scenario with the sites.
         colours: Palette, such as `SITE_COLOURS` or `DARK_SITE_COLOURS`.
@@ -41,6 +43,8 @@ PAGE_IN = 7.0
 class FigureSize(NamedTuple):
     """Width, type sizes and resolution of a figure.
 
+    They differ between the report on a screen and a printed paper.
+
     Attributes:
         width_in: Width of the figure, in inches.
         tick_pt: Type size of the numbers at the axes, in pt.
@@ -55,7 +59,7 @@ class FigureSize(NamedTuple):
 
     @property
     def narrow(self) -> bool:
-        """True if two panels beside each other have no room for long texts."""
+        """True if the figure is too narrow for two panels with long texts beside each other."""
         return self.width_in < 5.0
 
 
@@ -64,7 +68,7 @@ REPORT_SIZE = FigureSize(width_in=PAGE_IN, tick_pt=7.0, small_pt=6.0, dpi=200)
 
 
 def make_print_size(width_in: float) -> FigureSize:
-    """Returns the size of a figure in a paper, with type of 8 pt.
+    """Returns the size of a figure for a paper, with type of 8 pt.
 
     Args:
         width_in: Width in inches: 3.5 for one column, or 7 for two columns.

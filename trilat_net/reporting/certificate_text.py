@@ -44,7 +44,14 @@ _HOLDS = {True: "holds", False: "fails", None: "undecided"}
 
 
 def compose_certificate(certificate: Certificate) -> Iterator[Block]:
-    """Yields the judgement and its reasons, then tables of the premises and the energies."""
+    """Yields the text of a stability certificate.
+
+    The judgement and its reasons come first. Tables of the premises (the conditions of the
+    stability theorem) and of the energies follow.
+
+    Args:
+        certificate: Judgement whether a run was stable, with its reasons.
+    """
     for line in describe_certificate(certificate):
         yield MarkedText(MARKS[line.mark], line.text)
 
@@ -78,10 +85,14 @@ def _tabulate_premises(premises: Sequence[Premise]) -> TextTable:
 
 
 def compose_twins(twins: PushedTwins) -> Iterator[Block]:
-    """Yields the sizes for which a push acts linearly, and a line about each push.
+    """Yields the text about the pushed twins of a run.
 
     A push is a small disturbance of a twin, a second execution of the run. It shows whether
-    disturbances grow.
+    disturbances grow. The text states up to which size a push has a proportional effect, and
+    has a line about each push.
+
+    Args:
+        twins: The run and its twins.
     """
     if twins.linear is not None or not twins.growth.pushes:
         yield twins.headline()
@@ -92,7 +103,7 @@ def compose_twins(twins: PushedTwins) -> Iterator[Block]:
 
 
 class CertificateLine(NamedTuple):
-    """A sentence of a certificate.
+    """A sentence of a stability certificate, marked with what it says about stability.
 
     Attributes:
         mark: "ok" if the sentence supports that the run was stable, "FAIL" if it speaks against
@@ -105,11 +116,15 @@ class CertificateLine(NamedTuple):
 
 
 def describe_certificate(certificate: Certificate) -> list[CertificateLine]:
-    """Returns the judgement, and then its reasons, each as a marked sentence.
+    """Returns the judgement of a certificate, and then its reasons, each as a marked sentence.
 
-    The reasons are: V; the end of the run; the energy balance; the energies of the control
-    laws; the characteristic roots; the twins, which are repeated runs with a small push; and
-    the log itself. Reasons that do not exist for a run are left out.
+    The reasons are: the energy function V of the stability proof; the end of the run; the
+    energy balance; the energies that control laws declare; the characteristic roots; the twins,
+    which are repeated runs with a small push; and the log itself. Reasons that do not exist for
+    a run are left out.
+
+    Args:
+        certificate: Judgement whether a run was stable, with its reasons.
     """
     lines = _describe_verdict(certificate)
     if certificate.balance is not None:
@@ -175,7 +190,13 @@ def _describe_paper_weights(certificate: Certificate) -> str:
 
 
 def describe_judgement(certificate: Certificate) -> str:
-    """Returns the judgement in one line, with the reasons that leave it open."""
+    """Returns the judgement whether a run was stable, in one line.
+
+    If the judgement is open, the line states the reasons.
+
+    Args:
+        certificate: Judgement whether a run was stable, with its reasons.
+    """
     return "; ".join([certificate.headline(), *certificate.reasons])
 
 
@@ -208,10 +229,15 @@ def _mark_twins(twins: TwinGrowth) -> str:
 
 
 def describe_balance(balance: EnergyBalance) -> str:
-    """Returns a sentence about the part of V that the energy balance leaves unexplained.
+    """Returns a sentence about how well the energy balance explains the changes of V.
 
-    The controller acts only once per tick. The sentence therefore also says how small the
-    unexplained part is if the work of this sampling is accounted for.
+    V is the energy function of the stability proof. The part that dissipation and work leave
+    unexplained is the residual. The controller acts only once per tick, which the proof
+    neglects. The sentence therefore also says how small the residual is if the work of this
+    sampling is accounted for.
+
+    Args:
+        balance: The energy balance.
     """
     scale_j = balance.scale
     if scale_j <= ZERO_ENERGY_J:
@@ -226,10 +252,14 @@ def describe_balance(balance: EnergyBalance) -> str:
 
 
 def list_energies(balance: EnergyBalance) -> list[tuple[str, float]]:
-    """Returns V at the start, the energies that changed V, and V at the end, in J.
+    """Lists the energies of the balance of V, the energy function of the stability proof.
 
-    Energies below `MIN_ENERGY_SHARE` of the largest energy are left out. If there are more than
+    They are V at the start, the energies that changed V, and V at the end, in J. Energies below
+    `MIN_ENERGY_SHARE` of the largest energy are left out. If there are more than
     `MAX_LISTED_LINKS` links, their energies are summed.
+
+    Args:
+        balance: The energy balance.
 
     Returns:
         Name and energy of each entry.

@@ -77,7 +77,7 @@ PICTURE_SIDE = 4.0
 
 
 class PageCharts(NamedTuple):
-    """The charts of a page, as `ChartBuilder.build` returns them.
+    """The charts of a report's page, as `ChartBuilder.build` returns them.
 
     Attributes:
         data: Data that the scripts of the page draw.
@@ -90,7 +90,7 @@ class PageCharts(NamedTuple):
 
 
 class ChartBuilder:
-    """Computes the charts of the page of one log.
+    """Computes the charts of the page that reports a run, from the run's log.
 
     Args:
         log: Log of the run.

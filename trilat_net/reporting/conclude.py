@@ -42,10 +42,10 @@ class Conclusion(CheckReport):
 
     Attributes:
         verdict: Judgement whether the run was stable.
-        table: Table with a row per site.
+        table: Table with a row per site (a process that runs one arm).
         notes: Lines about users' control laws, arms, links, changes, modes and clocks, and
             about the stability certificate.
-        findings: Results of the checks of the log.
+        findings: Results of the checks of the log, one per check.
         paths: Files of the log, and files that were written.
     """
 
@@ -56,7 +56,11 @@ class Conclusion(CheckReport):
     paths: list[Path]
 
     def blocks(self) -> Iterator[Block]:
-        """Yields the verdict, the checks, the table of sites, the notes and the files."""
+        """Yields the parts of the text that `trilat report` prints.
+
+        They are the judgement about stability, the checks of the log, the table of sites, the
+        notes, and the paths of the files.
+        """
         yield MarkedText(MARKS[self.verdict.mark], f"stability: {self.verdict.text}")
         for finding in self.findings:
             failed = "FAIL" if finding.judged else "open"
@@ -85,7 +89,7 @@ class Conclusion(CheckReport):
         return [dict(zip(headers, row, strict=False)) for row in self.table.rows]
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the result as plain values, which `trilat report --json` prints."""
+        """Converts the result to plain values, as `trilat report --json` prints them."""
         return {
             "passed": self.passed,
             "verdict": self.verdict.text,
@@ -105,15 +109,12 @@ def conclude(
 ) -> Conclusion:
     """Checks the log of a finished run, and writes its page and summary into a folder.
 
-    A site is a process that runs one arm. In each tick, the period of its control loop, it
-    records its state.
-
     Args:
         log: Log that was opened from files.
         folder: Existing folder.
         progress: Function that is called with the number of drawn figures and of all figures.
-        min_coverage: Smallest fraction of every site's ticks that the stability judgement must
-            be based on.
+        min_coverage: Smallest fraction of the ticks (control periods) of each site that must be
+            recorded and checked for a judgement.
         png: True to write the figures as PNG files too.
 
     Returns:

@@ -104,7 +104,7 @@ class EpisodePicture:
         """Draws the edges of the bodies that a site's arm can touch.
 
         Args:
-            axes: The panel.
+            axes: Panel of the figure, as Matplotlib axes.
             site: Name of the site.
             bodies: Pose of each body by name, shape (7,) each.
         """
@@ -128,7 +128,7 @@ def _scale_panel(axes: Axes, points_m: Array) -> None:
     """Sets the axis limits of a panel to the reach of its arm, the sum of its links' lengths.
 
     Args:
-        axes: The panel.
+        axes: Panel of the figure, as Matplotlib axes.
         points_m: Base, joints and end effector in any pose, shape (L, 2) or (L, 3), in m.
     """
     lengths_m = np.linalg.norm(np.diff(points_m, axis=0), axis=1)
@@ -141,7 +141,7 @@ def _draw_arm(axes: Axes, points_m: Array, colour: str) -> None:
     """Draws the links, joints and base of an arm.
 
     Args:
-        axes: The panel.
+        axes: Panel of the figure, as Matplotlib axes.
         points_m: Base, joints and end effector in the picture, shape (L, 2), in m.
         colour: Colour of the arm.
     """

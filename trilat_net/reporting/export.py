@@ -178,7 +178,7 @@ def store_tables(
     """Stores every table of a log, and describes the export.
 
     Args:
-        log: The log.
+        log: Log of the run that is exported.
         written: Function that is called with the number of records of each table.
         choose_name: Function that returns the name of a table in the export.
         store: Function that stores a table under a name.
@@ -222,7 +222,7 @@ def describe_folder(log: Log, folder: Path, about: str) -> None:
     """Writes the files that explain an exported folder: a description and the scenario.
 
     Args:
-        log: The log.
+        log: Log of the run that is exported.
         folder: The exported folder.
         about: Description of the export, from `store_tables`.
     """
@@ -234,7 +234,7 @@ def name_inside(table: Table, name: str, separator: str) -> str:
     """Returns the name of a table inside an exported file.
 
     Args:
-        table: The table.
+        table: Table of the log, such as the records of a site.
         name: Name of the table's site, or of the table if it belongs to no site.
         separator: Text between `name` and the kind of the table. It is not used for tables of
             records, whose names have no kind.
@@ -243,5 +243,9 @@ def name_inside(table: Table, name: str, separator: str) -> str:
 
 
 def read_texts(column: Column) -> NDArray[Any]:
-    """Returns the texts of a column as an array of NumPy strings, shape (K,)."""
+    """Reads the texts of a column as an array of NumPy strings, shape (K,).
+
+    Args:
+        column: Column of a table with K rows.
+    """
     return np.array(column.values.tolist(), dtype=np.str_)

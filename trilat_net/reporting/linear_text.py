@@ -163,7 +163,8 @@ def tabulate_roots(analysis: LinearAnalysis) -> TextTable:
 def describe_zero_roots(analysis: LinearAnalysis) -> str:
     """Returns a sentence about the roots that are zero by the structure of the system.
 
-    Such roots belong to motions that neither grow nor decay, and do not count for stability.
+    For example, if all arms were moved to another common pose, nothing would bring them back.
+    Such roots do not count for the stability of the loop.
 
     Args:
         analysis: The analysis.

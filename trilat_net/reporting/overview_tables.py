@@ -29,9 +29,13 @@ _SIZE_UNITS = {"GB": 10**9, "MB": 10**6, "kB": 10**3}
 
 
 def compose_overview(overview: FileOverview) -> Iterator[Block]:
-    """Yields the contents of log files: session, tables, counts, origin and files.
+    """Yields the text that describes the contents of log files.
 
-    If the files are no log of trilat-net, only the channels and the files are described.
+    It has the session, the tables, the number of messages, the origin and the files. If the
+    files are no log of trilat-net, only the channels and the files are described.
+
+    Args:
+        overview: Contents of the files.
     """
     facts = overview.facts
     session: JsonObject | None = facts["session"]

@@ -26,7 +26,9 @@ The lines of references, true values and limits have the colour "limit".
 
 
 class ColumnTable(msgspec.Struct, frozen=True):
-    """A table of numbers at ticks of a site. Lines of charts refer to its columns.
+    """Numbers of a site over time, as the browser page gets them.
+
+    A table has one row per shown tick. The lines of charts refer to its columns.
 
     Attributes:
         rate_hz: Tick rate of the site, which converts ticks to times.
@@ -41,7 +43,7 @@ class ColumnTable(msgspec.Struct, frozen=True):
 
 
 class TableSeries(msgspec.Struct, frozen=True, kw_only=True):
-    """A line of a chart over time, which draws a column of a table.
+    """A line of a chart over time. It draws one column of a `ColumnTable`.
 
     Attributes:
         label: Name of the line in the legend.
@@ -59,7 +61,7 @@ class TableSeries(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class HistogramSeries(msgspec.Struct, frozen=True):
-    """A line of a histogram.
+    """A line of a histogram, which shows how often the times of a site lie in each bin.
 
     Attributes:
         label: Name of the line in the legend.
@@ -73,7 +75,7 @@ class HistogramSeries(msgspec.Struct, frozen=True):
 
 
 class DistributionSeries(msgspec.Struct, frozen=True):
-    """A line of a cumulative distribution.
+    """A line of a cumulative distribution, which shows the percentage of values up to each x.
 
     Attributes:
         label: Name of the line in the legend.
@@ -105,7 +107,7 @@ class StatedLine(msgspec.Struct, frozen=True, rename={"from_s": "from", "to_s": 
 
 
 class TimeChart(msgspec.Struct, frozen=True, kw_only=True, tag="time", tag_field="kind"):
-    """A chart over the time of the run.
+    """A chart of the page over the time of the run.
 
     Attributes:
         section: Key of the section of the page, as in `report.toml`.
@@ -113,12 +115,12 @@ class TimeChart(msgspec.Struct, frozen=True, kw_only=True, tag="time", tag_field
         unit: Unit of the values.
         series: Lines of the chart.
         sites: Names of the sites whose modes and changes are marked in the chart.
-        lines: Horizontal lines at stated values.
-        links: True if changes of links are also marked, and stated lines are drawn above the
-            series.
+        lines: Horizontal lines at values that the scenario states, such as a mean delay.
+        links: True if changes of links are also marked, and the horizontal lines are drawn
+            above the series.
         log: True for a logarithmic value axis.
         zero: True if the value axis begins at 0.
-        margin: Least space above the values, as a share of the largest value.
+        margin: Least space above the values, as a fraction of the largest value.
     """
 
     section: str
@@ -136,7 +138,9 @@ class TimeChart(msgspec.Struct, frozen=True, kw_only=True, tag="time", tag_field
 class HistogramChart(
     msgspec.Struct, frozen=True, kw_only=True, tag="histogram", tag_field="kind"
 ):
-    """A histogram: the number of ticks in bins of equal width on a logarithmic axis.
+    """A chart of the page that counts the ticks of each site by a time, such as the lateness.
+
+    The bins have equal width on a logarithmic axis.
 
     Attributes:
         section: Key of the section of the page, as in `report.toml`.
@@ -158,7 +162,7 @@ class HistogramChart(
 class DistributionChart(
     msgspec.Struct, frozen=True, kw_only=True, tag="distribution", tag_field="kind"
 ):
-    """Cumulative distributions of samples or ticks, in percent.
+    """A chart of the page with cumulative distributions of samples or ticks, in percent.
 
     Attributes:
         section: Key of the section of the page, as in `report.toml`.
@@ -219,7 +223,7 @@ class ChainArm(msgspec.Struct, frozen=True, kw_only=True, tag="chain", tag_field
 
 
 class MarkedChange(msgspec.Struct, frozen=True):
-    """A change during the run, such as another delay of a link.
+    """A change during the run that charts mark, such as another delay of a link.
 
     Attributes:
         n: Number in the table of changes.
@@ -235,7 +239,9 @@ class MarkedChange(msgspec.Struct, frozen=True):
 
 
 class ModeSpan(msgspec.Struct, frozen=True, array_like=True):
-    """An interval in which a site does not follow its peers. It is sent as a list.
+    """An interval in which a site did not follow its peers, which charts shade.
+
+    It is sent to the page as a list.
 
     Attributes:
         colour: Index of the site, on which its colour depends.
@@ -263,7 +269,7 @@ class Palettes(msgspec.Struct, frozen=True):
 
 
 class PageData(msgspec.Struct, frozen=True, kw_only=True):
-    """All data of a page.
+    """All numbers and texts that the scripts of a report's page draw.
 
     Attributes:
         end_s: End of the time axis, in s.
@@ -287,6 +293,6 @@ class PageData(msgspec.Struct, frozen=True, kw_only=True):
     bounds_m: list[float]
 
     def to_builtins(self) -> dict[str, Any]:
-        """Returns the data as dictionaries, lists and plain values, ready for JSON."""
+        """Converts the data to dictionaries, lists and plain values, ready for JSON."""
         plain: dict[str, Any] = msgspec.to_builtins(self)
         return plain

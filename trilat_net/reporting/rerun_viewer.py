@@ -78,7 +78,7 @@ def open_rerun(
     print_line: Callable[[str], None],
     run_command: RunCommand = _run_process,
 ) -> None:
-    """Shows a log, and returns when the viewer is closed.
+    """Shows a log in the viewer Rerun, and returns when the viewer is closed.
 
     Args:
         paths: File of the log, or its parts.
@@ -135,7 +135,13 @@ def _require_display(options: ViewerOptions) -> None:
 
 
 def make_application_id(path: Path) -> str:
-    """Returns the name of a log, with only the letters that Rerun allows for an application."""
+    """Returns the name under which Rerun stores the settings of a log's views.
+
+    It is the name of the log, with only the letters that Rerun allows.
+
+    Args:
+        path: Path of the log.
+    """
     stem = path.name.removesuffix(ACTIVE_SUFFIX).removesuffix(".mcap")
     return re.sub(r"[^A-Za-z0-9_-]", "-", stem).lstrip("-") or "log"
 
@@ -192,7 +198,9 @@ _SESSION_CHANNELS = (EVENTS, LINES, FRAMES, DIAGNOSTICS)
 
 
 class PlotCurves(NamedTuple):
-    """The curves of one channel in a plot. A channel is a series of messages with a topic.
+    """The curves that show the numbers of one channel in a plot.
+
+    A channel is a series of messages with a topic.
 
     Attributes:
         entity: Path under which Rerun stores the numbers of the channel.
@@ -206,7 +214,7 @@ class PlotCurves(NamedTuple):
 
 
 class CurvePlot(NamedTuple):
-    """A plot of one quantity of one site over time.
+    """A plot of one quantity of one site over time, on a page of the viewer.
 
     Attributes:
         title: Title of the plot, with its unit.
@@ -222,11 +230,13 @@ PlotPage = list[list[CurvePlot]]
 
 
 class PlotLayout(NamedTuple):
-    """The layout of all views of a log.
+    """The layout of all views in which Rerun shows a log: pages, plots and arms.
+
+    `build_plot_layout` creates it, and `save_blueprint` writes it for Rerun.
 
     Attributes:
         pages: Rows of plots on each page, by the name of the page.
-        lines: Topic of the event texts. Empty if the log has no such topic.
+        lines: Topic of the texts about events. Empty if the log has no such topic.
         arms: True if the arms are shown in space.
     """
 
@@ -472,9 +482,9 @@ def save_blueprint(layout: PlotLayout, application: str, path: Path) -> None:
     """Writes a layout as a blueprint, the file from which Rerun reads it.
 
     Args:
-        layout: The layout.
+        layout: The plots on each page, and what else is shown.
         application: Rerun's name of the recordings to which the layout applies.
-        path: The file.
+        path: The file to write.
 
     Raises:
         UsageError: Rerun is not installed.

@@ -77,7 +77,7 @@ class TextTable(NamedTuple):
 
     @property
     def titles(self) -> list[str]:
-        """Headers of the columns with their units."""
+        """Headers of the columns, each followed by its unit."""
         missing = len(self.headers) - len(self.units)
         units = [*self.units, *[""] * missing]
         columns = zip(self.headers, units, strict=False)
@@ -281,10 +281,10 @@ def _import_composer(result: Result) -> Callable[[Result], Iterable[Block]]:
 
 
 def summarize(result: Result) -> str:
-    """Renders a result as plain text, for example for `print`.
+    """Renders a result as plain text, for printing it in a Python session.
 
     Args:
-        result: The result.
+        result: Result of a command or function, which yields its text by `blocks`.
     """
     lines = []
     for block in compose(result):
@@ -296,6 +296,6 @@ def render_html(result: Result) -> str:
     """Renders a result as HTML with tables, for example for a notebook.
 
     Args:
-        result: The result.
+        result: Result of a command or function, which yields its text by `blocks`.
     """
     return "\n".join(block.html() for block in compose(result))

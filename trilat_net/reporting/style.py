@@ -98,7 +98,7 @@ _NARROW_RC: Any = {
 
 @contextmanager
 def styled_figure(form: FigureSize, height_in: float) -> Iterator[Figure]:
-    """Yields an empty figure in the common style, for use in a `with` statement.
+    """Provides an empty figure in the common style, for use in a `with` statement.
 
     The style applies only to what is drawn within the statement.
 
@@ -116,7 +116,7 @@ def styled_figure(form: FigureSize, height_in: float) -> Iterator[Figure]:
 
 
 class NotebookFigure(Figure):
-    """A figure that a Jupyter notebook displays as a picture.
+    """A Matplotlib figure that a Jupyter notebook displays as a picture.
 
     A plain Matplotlib figure that was made without pyplot would be displayed as its size in
     words.
@@ -138,7 +138,7 @@ def add_panels(figure: Figure, rows: int, columns: int, **options: Any) -> AxesG
     """Adds a grid of panels to a figure.
 
     Args:
-        figure: The figure.
+        figure: The Matplotlib figure.
         rows: Number of rows.
         columns: Number of columns.
         **options: Options of `Figure.subplots`.
@@ -151,7 +151,12 @@ def add_panels(figure: Figure, rows: int, columns: int, **options: Any) -> AxesG
 
 
 def site_colour(log: Log, site: str) -> str:
-    """Returns the colour of a site, the same in every figure."""
+    """Returns the colour of a site, which is the same in every figure.
+
+    Args:
+        log: Log with the site.
+        site: Name of the site.
+    """
     colours = list_site_colours(log.scenario)
     return colours[log.sites.index(site) % len(SITE_COLOURS)]
 
@@ -163,7 +168,7 @@ _THINNER_PT = 1.2
 
 
 def site_line(log: Log, site: str, width: float | None = None) -> LineOptions:
-    """Returns the options of the line of a site.
+    """Returns colour, dashes and width with which the lines of a site are drawn.
 
     Lines are solid until every colour is used. Further sites have the same colours with dashes.
 
@@ -188,7 +193,12 @@ def site_line(log: Log, site: str, width: float | None = None) -> LineOptions:
 
 
 def site_title(log: Log, site: str) -> str:
-    """Returns the name of a site with its role, for legends."""
+    """Returns the name of a site with its role, such as master or slave, for legends.
+
+    Args:
+        log: Log with the site.
+        site: Name of the site.
+    """
     return f"{site} ({log.scenario.sites[site].role})"
 
 
@@ -196,10 +206,10 @@ def plot_decimated(axes: Axes, tick: Ints, t_s: Array, values: Array, **options:
     """Draws a signal over time with fewer points, such that all extremes stay visible.
 
     Args:
-        axes: The panel.
+        axes: Panel of the figure, as Matplotlib axes.
         tick: Ticks of the values, shape (K,).
         t_s: Times of the values, in s, shape (K,).
-        values: The values, shape (K,).
+        values: Values of the signal, shape (K,).
         **options: Options of the line.
     """
     trace = decimate(tick, t_s, values[:, np.newaxis], BUCKETS_PER_PANEL)
@@ -207,7 +217,11 @@ def plot_decimated(axes: Axes, tick: Ints, t_s: Array, values: Array, **options:
 
 
 def positive(values: Array) -> Array:
-    """Returns values for a logarithmic axis: NaN instead of zero and negative values."""
+    """Replaces zero and negative values by NaN, as a logarithmic axis cannot show them.
+
+    Args:
+        values: The values.
+    """
     return np.where(values > 0.0, values, np.nan)
 
 
@@ -224,7 +238,7 @@ def plot_spread(axes: Axes, t_s: Array, values: Array, **options: Any) -> None:
     interval gives a point of the median and of the edges of the band.
 
     Args:
-        axes: The panel.
+        axes: Panel of the figure, as Matplotlib axes.
         t_s: Times of the values, in s, shape (K,).
         values: The values, shape (K,). NaN values are ignored.
         **options: Options of the line of the median. They must include a "color", which the
@@ -270,10 +284,13 @@ def set_plain_log_axis(axis: Axis, steps: Sequence[float] = (1.0, 2.0, 5.0)) -> 
 
 
 def name_joints(log: Log) -> list[str]:
-    """Returns the titles of the joints' panels: numbers, with names if these are unambiguous.
+    """Returns the titles of the joints' panels.
 
-    Names are added only if the arms are chains whose joints all have the same names. The arm
-    with the most joints decides the number of titles.
+    A title is the number of the joint. Names are added only if the arms are chains whose joints
+    all have the same names. The arm with the most joints decides the number of titles.
+
+    Args:
+        log: Log with the arms.
     """
     arms = [log.scenario.arms[site] for site in log.sites]
     longest = max(arms, key=lambda arm: arm.counts.joints)
@@ -291,7 +308,14 @@ def name_joints(log: Log) -> list[str]:
 
 
 def name_shared(log: Log) -> list[str]:
-    """Returns the titles of the coordinates that the sites exchange: joints, or task axes."""
+    """Returns titles for the coordinates that the sites exchange.
+
+    They are joints, or axes of the task space if the sites exchange poses of their end
+    effectors.
+
+    Args:
+        log: Log with the sites.
+    """
     arm = log.scenario.arms[log.sites[0]]
     if arm.shares_pose:
         return list(TASK_AXES[: arm.counts.shared])
@@ -299,7 +323,7 @@ def name_shared(log: Log) -> list[str]:
 
 
 def title_joints(log: Log, row: Sequence[Axes], titles: Sequence[str] = ()) -> None:
-    """Writes titles above a row of panels.
+    """Writes titles above a row of panels, one for each joint.
 
     Args:
         log: Log with the joints.
@@ -337,7 +361,9 @@ def flatten_rounding(axes: Axes) -> None:
 
 
 class JointPanels(NamedTuple):
-    """Panels of a figure that has a panel per joint, as `add_joint_panels` arranged them.
+    """Panels of a figure that shows each joint in a panel of its own.
+
+    `add_joint_panels` creates and arranges them.
 
     Attributes:
         joints: A panel per joint.
@@ -386,9 +412,9 @@ def add_joint_panels(
     wrists are much smaller than those of shoulders.
 
     Args:
-        figure: The figure.
+        figure: The Matplotlib figure.
         joints: Number of joints.
-        form: Size of the figure.
+        form: Width, type sizes and resolution of the figure.
         below: Name of the wide panel. Empty for no wide panel.
     """
     grid = arrange_joints(joints, form.narrow)
@@ -415,12 +441,20 @@ def add_joint_panels(
 
 
 def typeset(text: str) -> str:
-    """Returns a text with the signs ± and → in place of "+-" and "->" of the terminal."""
+    """Replaces "+-" and "->", as the terminal shows them, by the signs ± and →.
+
+    Args:
+        text: A text for the terminal.
+    """
     return text.replace("+-", "±").replace("->", " → ")
 
 
 def typeset_unit(unit: str) -> str:
-    """Returns a unit with ² in place of "^2"."""
+    """Replaces "^2" in a unit by the sign ².
+
+    Args:
+        unit: The unit, such as "rad/s^2".
+    """
     return unit.replace("^2", "²")
 
 
@@ -447,7 +481,7 @@ def add_legend(figure: Figure, entries: LegendEntries, **options: Any) -> None:
     """Adds a legend of lines above the panels of a figure.
 
     Args:
-        figure: The figure.
+        figure: The Matplotlib figure.
         entries: Text and line of each entry.
         **options: Options of `Figure.legend`.
     """
@@ -461,7 +495,7 @@ def place_legend(figure: Figure, handles: Sequence[Any], **options: Any) -> None
     """Adds a legend above the panels, with as many columns as fit the width of the figure.
 
     Args:
-        figure: The figure.
+        figure: The Matplotlib figure.
         handles: Matplotlib objects of the entries, which have a label.
         **options: Options of `Figure.legend`.
     """
@@ -479,7 +513,12 @@ def place_legend(figure: Figure, handles: Sequence[Any], **options: Any) -> None
 
 
 def site_legend_entries(log: Log, sites: Sequence[str]) -> list[LegendEntry]:
-    """Returns the entries of a legend of sites: name and role, and line of each site."""
+    """Returns the entries of a legend of sites: the name with the role, and the line.
+
+    Args:
+        log: Log with the sites.
+        sites: Names of the sites.
+    """
     return [(site_title(log, site), site_line(log, site)) for site in sites]
 
 
@@ -488,7 +527,12 @@ _EMPTY_FIGURE_CHARACTERS_PER_IN = 17
 
 
 def empty_figure(text: str, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns a figure that contains only a text: the reason why there is nothing to draw."""
+    """Returns a figure that contains only the reason why there is nothing to draw.
+
+    Args:
+        text: The reason.
+        form: Width, type sizes and resolution of the figure.
+    """
     characters = round(_EMPTY_FIGURE_CHARACTERS_PER_IN * form.width_in)
     lines = textwrap.wrap(text, characters)
     with styled_figure(form, 1.0) as figure:
@@ -497,7 +541,12 @@ def empty_figure(text: str, form: FigureSize = REPORT_SIZE) -> Figure:
 
 
 def annotate_empty_panel(axes: Axes, text: str) -> None:
-    """Writes the reason why a panel is empty into the panel."""
+    """Writes the reason why a panel is empty into the panel.
+
+    Args:
+        axes: Panel of the figure, as Matplotlib axes.
+        text: The reason.
+    """
     axes.text(0.5, 0.5, text, color=FAINT, transform=axes.transAxes, **_CENTRED)
 
 
@@ -521,7 +570,7 @@ def write_figure(figure: Figure, path: Path, dpi: int) -> None:
     """Writes a figure to a file.
 
     Args:
-        figure: The figure.
+        figure: The Matplotlib figure.
         path: The file. Its suffix determines the format, which is one of `FIGURE_FORMATS`.
         dpi: Resolution of a .png file.
 
@@ -537,7 +586,7 @@ def _render_figure(figure: Figure, kind: str, dpi: int) -> bytes:
     """Returns a figure as the bytes of a file that contains no date.
 
     Args:
-        figure: The figure.
+        figure: The Matplotlib figure.
         kind: Format of the file, one of `FIGURE_FORMATS`.
         dpi: Resolution of a PNG file.
     """
@@ -580,11 +629,14 @@ _CHANGE_NUMBER: dict[str, Any] = {
 
 
 def site_records(log: Log, values: Callable[[SiteLog], Array]) -> SiteSignal:
-    """Returns a signal for `TimeFigure.joint_row`.
+    """Computes a signal of every site from its records, for `TimeFigure.joint_row`.
 
     Args:
         log: Log with the records of the sites.
         values: Function that computes values, shape (K, J), from the K records of a site.
+
+    Returns:
+        The signal as a function of the site.
     """
 
     def read_signal(site: str) -> tuple[Ints, Array, Array]:
@@ -597,9 +649,12 @@ def site_records(log: Log, values: Callable[[SiteLog], Array]) -> SiteSignal:
 
 @contextmanager
 def time_figure(log: Log, form: FigureSize, height_in: float) -> Iterator["TimeFigure"]:
-    """Yields an empty figure of a log over time, for use in a `with` statement.
+    """Provides an empty figure over the time of a run, for use in a `with` statement.
 
-    See `styled_figure` for the arguments.
+    Args:
+        log: Log of the run.
+        form: Width of the figure and sizes of its texts.
+        height_in: Height of the figure, in inches.
     """
     with styled_figure(form, height_in) as figure:
         yield TimeFigure(log, form, figure)
@@ -612,12 +667,12 @@ class TimeFigure:
     `trace` or `joint_row`, and calls `finish` at the end.
 
     Args:
-        log: The log.
+        log: Log of the run.
         form: Width of the figure and sizes of its texts.
         figure: Empty Matplotlib figure.
 
     Attributes:
-        log: The log.
+        log: Log of the run.
         figure: The Matplotlib figure.
     """
 
@@ -631,10 +686,10 @@ class TimeFigure:
     def trace(
         self, axes: Axes, site: str, values: Array, width: float | None = None, **options: Any
     ) -> None:
-        """Draws values over the records of a site.
+        """Draws a line over time with one value for each record of a site.
 
         Args:
-            axes: The panel.
+            axes: Panel of the figure, as Matplotlib axes.
             site: Name of the site.
             values: A value per record, shape (K,).
             width: Width of the line, see `site_line`.
@@ -671,7 +726,7 @@ class TimeFigure:
         has a vertical line at each change that the sites applied.
 
         Args:
-            axes: The panel.
+            axes: Panel of the figure, as Matplotlib axes.
             sites: Names of the sites whose events are marked.
             link: Link whose changes alone are marked, such as "m1->s". Empty for all changes.
             numbered: True to write the number of each change, which the text below the panels
@@ -702,7 +757,7 @@ class TimeFigure:
         """Draws a vertical line at the time of a change.
 
         Args:
-            axes: The panel.
+            axes: Panel of the figure, as Matplotlib axes.
             at_s: Time of the change, in s.
             number: Number of the change as text. Empty to write no number.
         """
@@ -725,7 +780,9 @@ class TimeFigure:
         links: bool = False,
         title: str = "",
     ) -> None:
-        """Adds the time axes, the legend, and the text that explains the markers.
+        """Completes the figure: adds the time axes, the legend, and the text about the markers.
+
+        A figure function calls this last.
 
         Args:
             lowest: Lowest panel of each column, which gets a time axis.

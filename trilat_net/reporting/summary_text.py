@@ -338,6 +338,9 @@ def compose_recovery(recovery: Recovery) -> Iterator[Block]:
 
     The first line names the new file. A table lists which records were recovered, and which
     were lost or are missing.
+
+    Args:
+        recovery: Result of the recovery.
     """
     state = "was finished" if recovery.finished else "was not finished"
     yield f"{recovery.output}: recovered from {recovery.path}, which {state}"
@@ -363,10 +366,13 @@ def compose_recovery(recovery: Recovery) -> Iterator[Block]:
 
 
 def compose_rerun(rerun: Rerun) -> Iterator[Block]:
-    """Yields the result of a rerun, in which some sites of a log are executed again.
+    """Yields the result of executing some sites of a log again with changed settings.
 
     The text names the executed sites and the changed settings, and compares the motion of each
     site and the ages of the samples of each link with the log.
+
+    Args:
+        rerun: Result of the new execution.
     """
     request = rerun.request
     recorded = f"; {', '.join(request.recorded)} as recorded" if request.recorded else ""
@@ -458,10 +464,14 @@ def compose_doctor(report: Result) -> Iterator[Block]:
 
 
 def compose_ping(report: Result) -> Iterator[Block]:
-    """Yields tables of the round trips to the members of a session, and of the sites' links.
+    """Yields tables of the round trip times in a session.
 
-    A member is a process that takes part in the session: a site or a recorder. The second table
-    exists only if the sites have measured delays between each other.
+    One table has the times to the members, the processes that take part in the session: sites
+    and recorders. The other has the times between sites. It exists only if the sites have
+    measured them.
+
+    Args:
+        report: Result of the measurement.
     """
     facts = report.to_dict()
     members = facts["members"]
@@ -567,6 +577,9 @@ def compose_benchmark(benchmark: Result) -> Iterator[Block]:
     A transport is a way to send messages between two processes. The table has a row per
     transport, size of message and rate. The judgement compares the delay with the needs of a
     scenario.
+
+    Args:
+        benchmark: Result of the measurement.
     """
     facts = benchmark.to_dict()
     needs = facts["needs"]

@@ -44,15 +44,31 @@ Line feeds and tabs are not among them.
 
 
 def escape_controls(text: str) -> str:
-    """Returns a text in which control characters are spelled out, as in <U+001B>."""
+    """Replaces control characters of a text by their names, as in <U+001B>.
+
+    Otherwise a text from another program could control the terminal.
+
+    Args:
+        text: The text.
+    """
     return _CONTROLS.sub(lambda match: f"<U+{ord(match[0]):04X}>", text)
 
 
 class TextConsole(Console):
-    """A Rich console that spells out the control characters of all texts, also in tables."""
+    """Console of the package Rich that makes control characters of all texts visible.
+
+    A text from another program thus cannot control the terminal, not even in a table.
+    """
 
     def render_str(self, text: str, **options: Any) -> Text:
-        """Converts a text to the type of Rich, with control characters spelled out."""
+        """Converts a text to the type of Rich, with control characters replaced by their names.
+
+        Rich calls this for every text that it prints.
+
+        Args:
+            text: The text.
+            **options: Options of Rich.
+        """
         return super().render_str(escape_controls(text), **options)
 
 
@@ -72,10 +88,14 @@ _PIPE_WIDTH = 160
 
 
 def sanitize(text: object, most: int = 300) -> str:
-    """Returns the text of an object for a terminal.
+    """Makes a text from an unknown source fit for a terminal.
 
     Characters that cannot be printed become a replacement character. A text that is longer than
     `most` characters is cut off.
+
+    Args:
+        text: The text, or an object that is converted to a text.
+        most: Largest number of characters.
     """
     # One character more than the limit tells whether the text is too long.
     beginning = str(text)[: most + 1]
@@ -86,7 +106,9 @@ def sanitize(text: object, most: int = 300) -> str:
 
 
 def print_text(text: object, console: Console = out, head: str = "") -> None:
-    """Prints a sanitized line. Rich's markup in the text is not interpreted.
+    """Prints a text from an unknown source as a line.
+
+    The text is sanitized, and Rich's markup in it is not interpreted.
 
     Args:
         text: The line.
@@ -97,33 +119,57 @@ def print_text(text: object, console: Console = out, head: str = "") -> None:
 
 
 def print_note(text: object) -> None:
-    """Prints a note to standard error."""
+    """Prints a remark for the user to standard error, where it does not disturb results.
+
+    Args:
+        text: The remark.
+    """
     print_text(text, err, "note: ")
 
 
 def print_error(text: object) -> None:
-    """Prints an error to standard error."""
+    """Prints an error message to standard error.
+
+    Args:
+        text: The message.
+    """
     print_text(text, err, "error: ")
 
 
 def print_marked(mark: str, text: object) -> None:
-    """Prints a line behind a mark. The mark may have colours in Rich's markup."""
+    """Prints a line behind a mark that states a result, such as a green "ok".
+
+    Args:
+        mark: The mark, which may have colours in Rich's markup.
+        text: The line.
+    """
     out.print(f"{mark} {escape(sanitize(text, MAX_LETTERS))}", soft_wrap=True)
 
 
 def print_texts(texts: Iterable[object]) -> None:
-    """Prints several lines, each as `print_text` does."""
+    """Prints several texts from an unknown source, a line each, as `print_text` does.
+
+    Args:
+        texts: The texts.
+    """
     for text in texts:
         print_text(text)
 
 
 def print_paths(paths: Iterable[Path]) -> None:
-    """Prints the paths of files that were written, a line each."""
+    """Prints the paths of files that a command has written, a line each.
+
+    Args:
+        paths: The paths.
+    """
     print_texts(f"  {path}" for path in paths)
 
 
 def print_json(value: Any) -> None:
-    """Prints a value as JSON.
+    """Prints a value as JSON to standard output, for other programs.
+
+    Args:
+        value: Plain values, also in lists and dictionaries.
 
     Raises:
         ValueError: The value contains NaN or an infinite number.
@@ -133,13 +179,23 @@ def print_json(value: Any) -> None:
 
 
 def print_line(text: str) -> None:
-    """Prints a line and flushes it, so that a program that reads the output gets it at once."""
+    """Prints a line at once, so that a program that reads the output need not wait for it.
+
+    Args:
+        text: The line.
+    """
     sys.stdout.write(escape_controls(text) + "\n")
     sys.stdout.flush()
 
 
 def print_table(table: "TextTable") -> None:
-    """Prints a table. If the output is not a terminal, it is at least `_PIPE_WIDTH` wide."""
+    """Prints a table, as wide as the terminal permits.
+
+    If the output is not a terminal, it is at least `_PIPE_WIDTH` wide.
+
+    Args:
+        table: The table.
+    """
     console = out
     if not out.is_terminal:
         width = max(out.width, _PIPE_WIDTH)
@@ -148,7 +204,7 @@ def print_table(table: "TextTable") -> None:
 
 
 def print_result(result: "Result", *, as_json: bool = False) -> None:
-    """Prints a result as text, or as JSON.
+    """Prints the result of a command, as text for people or as JSON for programs.
 
     Args:
         result: The result of a command.
@@ -170,9 +226,12 @@ def print_result(result: "Result", *, as_json: bool = False) -> None:
 
 @contextmanager
 def lines_aside(aside: bool) -> Iterator[None]:
-    """Redirects standard output to standard error in a `with` statement, if `aside` is True.
+    """Redirects standard output to standard error in a `with` statement, if asked to.
 
     A command with the option --json uses this, so that its standard output contains only JSON.
+
+    Args:
+        aside: True to redirect the output. False to change nothing.
     """
     with redirect_stdout(sys.stderr) if aside else nullcontext():
         yield
@@ -183,7 +242,8 @@ def conclude_files(
 ) -> "tuple[Log, Conclusion]":
     """Checks a log that was just recorded, writes its report and prints the result.
 
-    If the user interrupts the drawing, a note gives the command that draws the report later.
+    If the user interrupts the drawing of figures, a note gives the command that draws the
+    report later.
 
     Args:
         paths: Files of the log.
@@ -283,7 +343,13 @@ def open_with_progress(first: Path, *more: Path, **allowed: Any) -> "Log":
 
 
 def warn_of_damage(log: "Log") -> None:
-    """Prints which parts of a log are damaged, and the command that recovers the rest."""
+    """Tells the user which parts of a log are damaged, and which command recovers the rest.
+
+    Nothing is printed for an intact log.
+
+    Args:
+        log: The log.
+    """
     for path in log.sources:
         warn_if_unfinished(Path(path))
     for problem in (*log.damaged[:_MAX_DAMAGED], *log.unreadable[:_MAX_DAMAGED]):
@@ -296,7 +362,13 @@ def warn_of_damage(log: "Log") -> None:
 
 
 def warn_user_laws(log: "Log") -> None:
-    """Prints which control laws of users a new execution of the log will run or may not run."""
+    """Tells the user which user-written control laws a new execution of the log will run.
+
+    It also names those that it may not run, because the user has not allowed it.
+
+    Args:
+        log: The log.
+    """
     from ..scenario.code_consent import find_user_laws
 
     for law in find_user_laws(log.scenario):
@@ -307,7 +379,12 @@ def warn_user_laws(log: "Log") -> None:
 
 
 def warn_if_unfinished(path: Path) -> None:
-    """Prints a note about a file without a proper end, and the command that recovers it.
+    """Tells the user if a log file has no proper end, and which command recovers it.
+
+    Nothing is printed for a complete file.
+
+    Args:
+        path: The file.
 
     Raises:
         LogError: The file cannot be read.

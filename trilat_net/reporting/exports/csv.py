@@ -20,7 +20,7 @@ def _write(log: Log, folder: Path, written: Written) -> None:
     """Writes the tables of a log, their description and the scenario into a folder.
 
     Args:
-        log: The log.
+        log: Log of the run that is exported.
         folder: Existing folder of the files.
         written: Function that is called with the number of records written since its last call.
     """

@@ -279,7 +279,7 @@ def _read_columns(
     A feature is a vector per frame, such as the state of the slave.
 
     Args:
-        log: The log.
+        log: Log of the run that is exported.
         rows: For each site, the index of each frame's record, shape (F,).
         program: Name of the user that is the program. Empty for the last user.
         actions: Kind of the actions, one of `ACTIONS`, or empty.
@@ -331,7 +331,7 @@ def _read_commands(
     """Returns the commands of every user.
 
     Args:
-        log: The log.
+        log: Log of the run that is exported.
         users: Names of the sites of the users.
         rows: For each site, the index of each frame's record, shape (F,).
         actions: Kind of the actions, one of `ACTIONS`, or empty.

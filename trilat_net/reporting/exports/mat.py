@@ -31,7 +31,7 @@ def _write(log: Log, path: Path, written: Written) -> None:
     """Writes the tables of a log as structs, their description and the scenario as texts.
 
     Args:
-        log: The log.
+        log: Log of the run that is exported.
         path: The file.
         written: Function that is called with the number of records written since its last call.
 

@@ -19,7 +19,7 @@ def _write(log: Log, path: Path, written: Written) -> None:
     """Writes the columns of a log as arrays, and their description and the scenario as texts.
 
     Args:
-        log: The log.
+        log: Log of the run that is exported.
         path: The file.
         written: Function that is called with the number of records written since its last call.
     """

@@ -62,7 +62,7 @@ def export_ros2(
     replaced.
 
     Args:
-        log: The log.
+        log: Log of the run that is exported.
         path: File of the bag.
         written: Function that is called with the number of records written since its last call.
         names: Names of the topics: "crisp", "crtk", or a file of names as for
@@ -119,7 +119,7 @@ class _SiteBag:
     """Converts the messages of one site for a bag.
 
     Args:
-        log: The log.
+        log: Log of the run that is exported.
         site: Name of the site.
         session: Name of the session in topics.
         table: Names of the topics.

@@ -77,7 +77,7 @@ def draw_sample_age(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
     Args:
         log: Log of the run.
-        form: Size of the figure.
+        form: Width, type sizes and resolution of the figure.
     """
     ages_ms = _read_ages_ms(log)
     stated = {
@@ -167,7 +167,7 @@ def draw_delay_distributions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure
 
     Args:
         log: Log of the run.
-        form: Size of the figure.
+        form: Width, type sizes and resolution of the figure.
     """
     links = measure_delay_distributions(log)
     x_ms = choose_delay_axis_ms(links)
@@ -252,7 +252,7 @@ def compute_cumulative_percent(values: Array, limits: Array) -> Array:
     """Returns the percentage of values that do not exceed each limit.
 
     Args:
-        values: The values, shape (K,).
+        values: The values to count, shape (K,).
         limits: The limits, shape (P,).
 
     Returns:
@@ -400,7 +400,7 @@ def draw_loop_timing(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
     Args:
         log: Log of the run.
-        form: Size of the figure.
+        form: Width, type sizes and resolution of the figure.
     """
     edges_us = choose_bin_edges_us(log)
     labels = ("wake-up after the deadline", "computing time of a tick")

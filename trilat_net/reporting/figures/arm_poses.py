@@ -148,7 +148,7 @@ def project_arm_m(arm: ArmModel, points: Array, *, onto_floor: bool = False) -> 
     """Projects points of an arm to the plane of a picture.
 
     Args:
-        arm: The arm.
+        arm: Model of the arm.
         points: Points in the frame of the base, in m, shape (..., 3). Those of a planar arm
             have the shape (..., 2), and are returned unchanged.
         onto_floor: True to return the shadows of the points on a floor at the base.
@@ -274,7 +274,7 @@ def draw_arms(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
     Args:
         log: Log of the run.
-        form: Size of the figure.
+        form: Width, type sizes and resolution of the figure.
     """
     times_s = choose_instants_s(log, _NARROW_INSTANTS if form.narrow else INSTANTS)
     poses = {site: [find_pose(log, site, t_s) for t_s in times_s] for site in log.sites}

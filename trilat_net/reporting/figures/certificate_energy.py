@@ -71,7 +71,7 @@ The panel "given" also shows the kind "taken", the energy that a law dissipated.
 def draw_functional(
     log: Log, certificate: Certificate, form: FigureSize = REPORT_SIZE
 ) -> Figure:
-    """Draws the energy function V of the stability proof and its energy balance over time, J.
+    """Draws the energy function V of the stability proof and its balance, in J over time.
 
     V decreases if the controllers dissipate more than the operators put in. The panels are,
     from the top: V and the contribution of each site; the parts of V; dissipation and work; and
@@ -81,7 +81,7 @@ def draw_functional(
     Args:
         log: Log of the run.
         certificate: Judgement whether the run was stable, which contains the balance.
-        form: Size of the figure.
+        form: Width, type sizes and resolution of the figure.
     """
     balance = certificate.balance
     if balance is None:
@@ -136,7 +136,7 @@ def draw_observed_energy(
     Args:
         log: Log of the run.
         observed: The declared energies, at least one.
-        form: Size of the figure.
+        form: Width, type sizes and resolution of the figure.
     """
     kinds = {curve.kind for curve in observed.curves}
     panel_kinds = [kind for kind in _OBSERVED_PANELS if kind in kinds]

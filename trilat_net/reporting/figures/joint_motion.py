@@ -60,13 +60,13 @@ explain_absent_operator = unless(site_signals.sites_with_operator, NO_OPERATOR)
     "operator_torques", "torque on the arms (Fig. 3)", explain_absent_operator, in_report=True
 )
 def draw_operator_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws the torques of the operators on the arms over time, in N m, as Fig. 3 of the paper.
+    """Draws the torques of the operators on the arms over time, as Fig. 3 of the paper.
 
-    An operator is the person or program that moves an arm.
+    An operator is the person or program that moves an arm. The torques are in N m.
 
     Args:
         log: Log of the run.
-        form: Size of the figure.
+        form: Width, type sizes and resolution of the figure.
     """
     return _draw_joints(
         log=log,
@@ -107,7 +107,7 @@ def draw_operator_displacement(
 
     Args:
         log: Log of the run.
-        form: Size of the figure.
+        form: Width, type sizes and resolution of the figure.
         twin: The run without operators. None to simulate it.
     """
     other = simulate_without_operators(log) if twin is None else twin
@@ -129,7 +129,7 @@ def draw_control_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
     Args:
         log: Log of the run.
-        form: Size of the figure.
+        form: Width, type sizes and resolution of the figure.
     """
     limits = list[Array]()
     for site in log.sites:
@@ -161,7 +161,7 @@ def _draw_joints(
 
     Args:
         log: Log of the run.
-        form: Size of the figure.
+        form: Width, type sizes and resolution of the figure.
         sites: Names of the sites that have the signal.
         signal: Function that returns the signal of a site.
         label: Label of the value axis.
@@ -204,7 +204,7 @@ def _add_joint_rows(
 
     Args:
         plot: The figure.
-        form: Size of the figure.
+        form: Width, type sizes and resolution of the figure.
         heads: Title of each quantity, used above a column.
         labels: Label of each quantity, used beside a row.
         sharey: "col" if the quantities of a joint share their value axis, otherwise "none".
@@ -239,7 +239,7 @@ def draw_operation(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
     Args:
         log: Log of the run.
-        form: Size of the figure.
+        form: Width, type sizes and resolution of the figure.
     """
     heads = ("torque on the arm (N m)", "joint angle (rad)")
     if form.narrow:
@@ -284,7 +284,7 @@ def draw_positions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
     Args:
         log: Log of the run.
-        form: Size of the figure.
+        form: Width, type sizes and resolution of the figure.
     """
     heads = [f"{site}: q (rad)" for site in log.sites]
     labels = heads if form.narrow else [f"angle of {site} (rad)" for site in log.sites]
@@ -323,7 +323,7 @@ def draw_tracking_errors(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
     Args:
         log: Log of the run.
-        form: Size of the figure.
+        form: Width, type sizes and resolution of the figure.
     """
     titles = style.name_shared(log)
     unit = site_signals.shared_unit(log)
@@ -367,7 +367,7 @@ def draw_settling(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
     Args:
         log: Log of the run.
-        form: Size of the figure.
+        form: Width, type sizes and resolution of the figure.
     """
     unit = site_signals.shared_unit(log)
     entries = []
@@ -436,7 +436,7 @@ def draw_parameter_estimates(log: Log, form: FigureSize = REPORT_SIZE) -> Figure
 
     Args:
         log: Log of the run.
-        form: Size of the figure.
+        form: Width, type sizes and resolution of the figure.
     """
     arm = log.scenario.arms[log.sites[0]]
     if arm.chain is not None:
@@ -506,7 +506,7 @@ def _draw_estimate(
         plot: The figure.
         sites: Names of the sites that have the parameter.
         index: Index of the parameter.
-        axes: The panel.
+        axes: Panel of the figure, as Matplotlib axes.
         width: Width of the lines, see `style.site_line`.
     """
     true_values = {}
@@ -534,7 +534,7 @@ def draw_phase_portrait(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
     Args:
         log: Log of the run.
-        form: Size of the figure.
+        form: Width, type sizes and resolution of the figure.
     """
     titles = style.name_shared(log)
     unit = site_signals.shared_unit(log)
@@ -586,7 +586,7 @@ def draw_end_effector_paths(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
     Args:
         log: Log of the run.
-        form: Size of the figure.
+        form: Width, type sizes and resolution of the figure.
     """
     mosaic = style.arrange_joints(len(_PLANES), form.narrow)
     row_in = 0.9 * form.width_in / len(mosaic[0])
@@ -613,7 +613,7 @@ def _draw_path(axes: Axes, path: Array, line: dict[str, Any]) -> None:
     """Draws a path with a ring at its start and a disc at its end.
 
     Args:
-        axes: The panel.
+        axes: Panel of the figure, as Matplotlib axes.
         path: Points of the path, shape (K, 2), K > 0.
         line: Options of the line.
     """
@@ -672,7 +672,7 @@ def draw_authority(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
     Args:
         log: Log of the run.
-        form: Size of the figure.
+        form: Width, type sizes and resolution of the figure.
     """
     owners = list_sites_with_changing_dominance(log)
     titles = style.name_joints(log)
@@ -726,7 +726,7 @@ def draw_contact(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
     Args:
         log: Log of the run.
-        form: Size of the figure.
+        form: Width, type sizes and resolution of the figure.
     """
     sites = list_sites_with_walls(log)
     with style.time_figure(log, form, 2.9) as plot:

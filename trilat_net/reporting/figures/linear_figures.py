@@ -55,8 +55,8 @@ def draw_port_impedance(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> 
     a panel of the phase. The panels of many joints are arranged in several rows.
 
     Args:
-        ports: Analysed ports.
-        size: Size of the figure.
+        ports: Analysis of the ports, the places at which operators hold the arms.
+        size: Width, type sizes and resolution of the figure.
     """
     if "unstable" in (ports.verdict, ports.clamped_verdict):
         return style.empty_figure("The loop is unstable: it has no impedance.", size)
@@ -121,7 +121,7 @@ def _plot_impedance(
     clamped.
 
     Args:
-        ports: Analysed ports.
+        ports: Analysis of the ports, the places at which operators hold the arms.
         responses: Impedances of the joint, at least one.
         magnitude: Panel of the magnitude.
         phase: Panel of the phase.
@@ -178,8 +178,8 @@ def draw_port_passivity(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> 
     under the best weights, which must be positive.
 
     Args:
-        ports: Analysed ports.
-        size: Size of the figure.
+        ports: Analysis of the ports, the places at which operators hold the arms.
+        size: Width, type sizes and resolution of the figure.
     """
     if ports.verdict == "unstable":
         return style.empty_figure(
@@ -320,7 +320,7 @@ def _plot_roots(axes: Axes, spectrum: Spectrum, mark: str, colour: str, label: s
     """Draws the roots of a spectrum and their complex conjugates.
 
     Args:
-        axes: The panel.
+        axes: Panel of the figure, as Matplotlib axes.
         spectrum: The roots, of which each complex pair is listed once.
         mark: Marker of Matplotlib.
         colour: Colour of the markers.
@@ -415,7 +415,7 @@ def _plot_case(axes: Axes, x: float, row: Mapping[str, Any], transport: int) -> 
     to the largest delay.
 
     Args:
-        axes: The panel.
+        axes: Panel of the figure, as Matplotlib axes.
         x: Position along the axis of cases.
         row: Row of the benchmark.
         transport: Number of the transport, on which its colour and its mark depend.

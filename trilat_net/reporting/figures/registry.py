@@ -68,7 +68,7 @@ def list_drawable_figures(log: Log) -> list[str]:
     """Lists the names of the figures for which a log has something to show.
 
     Args:
-        log: The log.
+        log: Log of the run.
     """
     return [name for name, entry in FIGURES.items() if not entry.absent(log)]
 
@@ -86,7 +86,7 @@ def write_figures(
     """Writes figures of a log to files, as for a paper.
 
     Args:
-        log: The log.
+        log: Log of the run.
         folder: Folder of the files. It is created if it does not exist.
         names: Names of figures. Empty for all figures for which the log has something to show.
         width_in: Width of the figures, 3.5 or 7 in.
@@ -160,9 +160,11 @@ def write_report_figures(
     Args:
         log: Log of the run.
         folder: Folder of the files. It is created if it does not exist.
-        twin: The same run without operators. None leaves out the figure `hands_moved`.
+        twin: The same run without operators, the people or programs that move the arms. None
+            leaves out the figure `hands_moved`.
         progress: Function that is called with the number of drawn figures and of all figures.
-        pushed: Growth of pushed twins, if the caller has computed it. None to compute it.
+        pushed: Growth of small pushes in repeated runs (pushed twins), if the caller has
+            computed it. None to compute it.
 
     Returns:
         The paths of the files.

@@ -98,7 +98,7 @@ def draw_overview(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
     Args:
         log: Log of the run.
-        form: Size of the figure.
+        form: Width, type sizes and resolution of the figure.
     """
     height_in = _NARROW_HEIGHT_IN if form.narrow else _HEIGHT_IN
     with style.time_figure(log, form, height_in) as plot:
@@ -133,7 +133,7 @@ def draw_overlay(logs: Mapping[str, Log], form: FigureSize = REPORT_SIZE) -> Fig
 
     Args:
         logs: Logs of the runs, by their names in the legend.
-        form: Size of the figure.
+        form: Width, type sizes and resolution of the figure.
 
     Raises:
         UsageError: There is no log, or the errors of the runs have different units.
@@ -223,7 +223,7 @@ def _scale_axis(axes: Axes, panel: _Panel, columns: list[Array]) -> None:
     """Scales the value axis of a panel to all of its lines.
 
     Args:
-        axes: The panel.
+        axes: Panel of the figure, as Matplotlib axes.
         panel: Quantity of the panel.
         columns: Values of each line. NaN values are ignored.
     """

@@ -93,7 +93,7 @@ def draw_twins(pushed: PushedTwins, form: FigureSize = REPORT_SIZE) -> Figure:
 
     Args:
         pushed: A run and its pushed twins.
-        form: Size of the figure.
+        form: Width, type sizes and resolution of the figure.
     """
     growth = pushed.growth
     if growth.twins is None or growth.worst is None:
@@ -179,7 +179,7 @@ def _draw_differences(
     """Draws the lines of all differences, and the growth rate of one push beside its lines.
 
     Args:
-        axes: The panel.
+        axes: Panel of the figure, as Matplotlib axes.
         pushed: A run and its pushed twins.
         lines: Lines of the differences.
         rated: Growth of the push whose rate is drawn.
@@ -241,7 +241,7 @@ def _draw_rate(
     or no clear trend.
 
     Args:
-        axes: The panel.
+        axes: Panel of the figure, as Matplotlib axes.
         pushed: A run and its pushed twins.
         rated: Growth of the push.
         t_s: Times of the differences, in s, shape (K,).
@@ -318,7 +318,7 @@ def _draw_speeds(axes: Axes, log: Log, twins: Twins, from_s: float) -> None:
     """Draws the speed of the fastest joint of every site of the run, in rad/s.
 
     Args:
-        axes: The panel.
+        axes: Panel of the figure, as Matplotlib axes.
         log: Log of the run.
         twins: Twins of the run, which also contain the speeds of the run.
         from_s: Start of the time axis, in s.
