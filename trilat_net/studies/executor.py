@@ -91,8 +91,8 @@ def run_batch(
     alone would take longer than running short items.
 
     Args:
-        function: The function.
-        items: The items.
+        function: Function of one item that returns its result.
+        items: The items, each of which is the argument of one call.
         required: Requirements on the worker, such as the version of the program. None if there
             are no requirements.
         allowed: Imported control laws that the user allowed to run.
@@ -125,8 +125,8 @@ class _Batch(NamedTuple):
     If the worker dies, the items are known from here and return to the queue.
 
     Attributes:
-        numbers: Numbers of the items.
-        items: The items.
+        numbers: Numbers of the items in the study, counted from 0.
+        items: The items, each of which is the argument of one call.
         executor: Executor that runs the items.
     """
 
@@ -142,9 +142,9 @@ class _Feed(Generic[T]):
     about `batch_s`. Items whose worker died come back to this queue.
 
     Args:
-        items: The items.
+        items: The items, each of which is the argument of one call.
         count: Number of items. None if it is not known.
-        workers: Number of workers.
+        workers: Number of workers that take items from the queue.
         batch_s: Intended duration of a batch, in s.
     """
 
@@ -204,7 +204,7 @@ class _Feed(Generic[T]):
         """Puts the items of a batch whose worker died back into the queue.
 
         Args:
-            batch: The batch.
+            batch: Batch whose worker died.
             losses: Number of losses that count for each item.
 
         Returns:
@@ -320,7 +320,7 @@ class WorkerPool:
 
         Args:
             function: Function at module level, so that another process can import it.
-            items: The items.
+            items: The items, each of which is the argument of one call.
             progress: Function that is called whenever an item has ended.
 
         Returns:
@@ -375,7 +375,7 @@ class WorkerPool:
 
         Args:
             future: Future of the batch.
-            batch: The batch.
+            batch: Batch whose worker died.
             feed: Queue of the items.
             lost: Function that returns the result of an item that killed its workers, see
                 `iterate_results`.

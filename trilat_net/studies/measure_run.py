@@ -160,7 +160,7 @@ def run_in_batches(
     """Runs a scenario in virtual time, and passes the records on batch by batch.
 
     Args:
-        scenario: The scenario.
+        scenario: Scenario to run: arms, control laws, links and duration.
         receivers: For each site, the function that receives its batches.
 
     Returns:
@@ -212,7 +212,7 @@ def run_compiled_in_batches(
     `run_in_batches`, but it does not report the samples in use.
 
     Args:
-        scenario: The scenario.
+        scenario: Scenario to run: arms, control laws, links and duration.
         receivers: For each site, the function that receives its batches.
 
     Returns:
@@ -240,7 +240,7 @@ def run_whole(scenario: Scenario) -> tuple[dict[str, RecordBatch], RunEnd]:
     """Runs a scenario in the compiled loop and keeps all records in memory.
 
     Args:
-        scenario: The scenario.
+        scenario: Scenario to run: arms, control laws, links and duration.
 
     Returns:
         The records of each site by its name, and the judgement of the end of the run, for
@@ -273,9 +273,9 @@ class WindowStats:
     [expect]. The statistics are updated batch by batch, so that no records need to be kept.
 
     Args:
-        window: The window.
+        window: Period of the run, with the limits that apply to it.
         scenario: Scenario of the run.
-        site: Name of the site.
+        site: Name of the site whose records are evaluated.
     """
 
     def __init__(self, window: ExpectWindow, scenario: Scenario, site: str) -> None:
@@ -405,7 +405,7 @@ class SiteStats:
 
     Args:
         scenario: Scenario of the run.
-        site: Name of the site.
+        site: Name of the site whose records are evaluated.
 
     Attributes:
         windows: Statistics within each window of [expect]. None for windows of other sites.
@@ -598,7 +598,7 @@ def compute_run_metrics(
     """Computes the metrics of a run from the statistics of its sites.
 
     Args:
-        scenario: The scenario.
+        scenario: Scenario to run: arms, control laws, links and duration.
         site_stats: Statistics of each site, in the order of the scenario.
         diverged_at_s: Time at which the first site left the limits of its arm, in s. None if
             no site did.
@@ -743,7 +743,7 @@ def measure_virtual_run(scenario: Scenario) -> RunMetrics:
     from a complete log, all records are kept.
 
     Args:
-        scenario: The scenario.
+        scenario: Scenario to run: arms, control laws, links and duration.
     """
     if scenario.expect.metrics:
         return measure_log(simulate_scenario(scenario))

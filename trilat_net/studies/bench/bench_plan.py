@@ -302,7 +302,7 @@ def build_settings(form: str, task: str, link: str, seed: int | None = None) -> 
     the link and the seed, but not the law.
 
     Args:
-        form: A key of `BASES`.
+        form: Kind of scenario in which the law runs, a key of `BASES`.
         task: A key of `TASKS`.
         link: A key of `LINKS`.
         seed: Seed of the run. None keeps the seed of the scenario.
@@ -354,8 +354,8 @@ class TunedGains(msgspec.Struct, frozen=True):
     smallest error.
 
     Attributes:
-        form: A key of `BASES`.
-        law: Name of the law.
+        form: Kind of scenario in which the law runs, a key of `BASES`.
+        law: Name of the control law.
         round_trip_ms: The round trip, in ms.
         gains: The selected gains by name. Empty if no candidate had the margin.
         settled: Number of candidates that came to rest at the pose.
@@ -396,7 +396,7 @@ def load_tuning_task(form: str, round_trip_ms: int) -> TuningScenario:
     """Loads the scenario in which the control laws of a form are tuned.
 
     Args:
-        form: A key of `BASES`.
+        form: Kind of scenario in which the law runs, a key of `BASES`.
         round_trip_ms: Round trip of the links, in ms.
     """
     settings = build_settings(form, TUNING_TASK, f"rtt{round_trip_ms}")
@@ -412,8 +412,8 @@ def fingerprint_tuning(form: str, law: str, round_trip_ms: int) -> str:
     were tuned for another experiment or another version of the law.
 
     Args:
-        form: A key of `BASES`.
-        law: Name of the law.
+        form: Kind of scenario in which the law runs, a key of `BASES`.
+        law: Name of the control law.
         round_trip_ms: Round trip of the tuning, in ms.
     """
     space = SEARCH_SPACES[law]
@@ -477,7 +477,7 @@ def _has_margin(form: str, round_trip_ms: int, search: CandidateSearch, candidat
     Delays are multiplied by `TUNING_MARGIN`, and the run lasts `MARGIN_LENGTHS` times as long.
 
     Args:
-        form: A key of `BASES`.
+        form: Kind of scenario in which the law runs, a key of `BASES`.
         round_trip_ms: Round trip of the tuning, in ms.
         search: The search that tried the candidate.
         candidate: Index of the candidate in the search. Its gains are used unchanged.
@@ -538,7 +538,7 @@ def _select_gains(form: str, round_trip_ms: int, search: CandidateSearch) -> Tun
     """Selects the gains of a search: the smallest error among the candidates with the margin.
 
     Args:
-        form: A key of `BASES`.
+        form: Kind of scenario in which the law runs, a key of `BASES`.
         round_trip_ms: Round trip of the tuning, in ms.
         search: The finished search of one law.
     """
@@ -594,9 +594,9 @@ class BenchCell(NamedTuple):
 
     Attributes:
         task: A key of `TASKS`.
-        law: Name of the law.
+        law: Name of the control law.
         link: A key of `LINKS`.
-        form: A key of `BASES`.
+        form: Kind of scenario in which the law runs, a key of `BASES`.
         tuned: Gains of the law for this link.
         seeds: Seeds of the runs, one run each.
     """
@@ -771,7 +771,7 @@ def explain_no_cell(law: str, form: str, task: str) -> str:
     """Returns the reason why a law does not run in a task, as the tables print it.
 
     Args:
-        law: Name of the law.
+        law: Name of the control law.
         form: Form in which the law runs, a key of `BASES`.
         task: A key of `TASKS`.
 
@@ -836,8 +836,8 @@ def _find_gains(
 
     Args:
         gains: All tuned gains, by form, law and round trip in ms.
-        form: A key of `BASES`.
-        law: Name of the law.
+        form: Kind of scenario in which the law runs, a key of `BASES`.
+        law: Name of the control law.
         delay_ms: Mean one-way delay of the link, in ms.
 
     Raises:

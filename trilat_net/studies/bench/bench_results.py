@@ -166,7 +166,7 @@ class BenchCellResult(NamedTuple):
     A cell has one run for each of its seeds.
 
     Attributes:
-        cell: The cell.
+        cell: The law, task, link and gains of the runs.
         runs: The runs, in the order of the seeds.
     """
 
@@ -302,7 +302,7 @@ class BenchResults(Result):
         """Yields the results of the cells of a task.
 
         Args:
-            task: The task.
+            task: Name of the task, a key of `TASKS`.
             law: The law of the cells. Empty selects all laws.
             link: The link of the cells. Empty selects all links.
         """
@@ -316,7 +316,7 @@ class BenchResults(Result):
 
         Args:
             task: Name of the task.
-            law: Name of the law.
+            law: Name of the control law.
             link: Name of the link.
 
         Returns:
@@ -338,7 +338,7 @@ def _confirm_run(runs: dict[tuple[str, int], BenchRun], cell: BenchCell, seed: i
 
     Args:
         runs: All runs by name of their cell in the journal, and by seed.
-        cell: The cell.
+        cell: The law, task, link and gains of the runs.
         seed: Seed of the run.
     """
     run = runs[cell.key, seed]
@@ -394,7 +394,7 @@ def name_law(law: str, form: str) -> str:
     """Returns the name of a law for tables, with a note if it runs with two sites.
 
     Args:
-        law: Name of the law.
+        law: Name of the control law.
         form: Form of the suite in which the law runs, a key of `BASES`.
     """
     return law if form == "three" else f"{law} (two sites)"
@@ -407,7 +407,7 @@ def tabulate_verdicts(results: BenchResults) -> TextTable:
     (open), and those over which it is not stable.
 
     Args:
-        results: The results.
+        results: Results of the suite or of a part of it.
     """
     tasks = results.plan.tasks
     rows = []
@@ -421,8 +421,8 @@ def _count_verdicts(results: BenchResults, law: str, form: str, task: str) -> st
     """Returns the numbers of links by verdict as an entry of the table of verdicts.
 
     Args:
-        results: The results.
-        law: Name of the law.
+        results: Results of the suite or of a part of it.
+        law: Name of the control law.
         form: Form in which the law runs.
         task: Name of the task.
 
@@ -444,7 +444,7 @@ def tabulate_properties(results: BenchResults, task: str) -> TextTable:
     number of links over which the slave did not touch the wall.
 
     Args:
-        results: The results.
+        results: Results of the suite or of a part of it.
         task: A task that ran.
     """
     headers = (
@@ -520,7 +520,7 @@ def tabulate_quantity(results: BenchResults, task: str, quantity: str) -> TextTa
     has no row.
 
     Args:
-        results: The results.
+        results: Results of the suite or of a part of it.
         task: A task that ran.
         quantity: A key of `QUANTITIES`.
     """
@@ -621,7 +621,7 @@ def describe_bench(results: BenchResults) -> Iterator[str]:
     They name the study, its runs, its tasks, and the laws that did not run.
 
     Args:
-        results: The results.
+        results: Results of the suite or of a part of it.
     """
     plan = results.plan
     cells = count_nouns(len(plan.cells), "cell")
@@ -656,7 +656,7 @@ def tabulate_gains(results: BenchResults) -> TextTable:
     because they are not stable when delays grow.
 
     Args:
-        results: The results.
+        results: Results of the suite or of a part of it.
     """
     tunings = {str(gains): gains for gains in _list_used_gains(results)}
     tunings |= {str(gains): gains for gains in results.plan.without}
@@ -682,7 +682,7 @@ def build_bench_page(
     """Builds the page of the results in Markdown.
 
     Args:
-        results: The results.
+        results: Results of the suite or of a part of it.
         command: The command that writes the page, which is shown at its top.
         pictures: Subject of each picture, by the name of its file in the folder of the page.
     """
@@ -713,7 +713,7 @@ def encode_runs(results: BenchResults) -> str:
     """Encodes all runs as a CSV table, one line per run.
 
     Args:
-        results: The results.
+        results: Results of the suite or of a part of it.
     """
     cells = {cell.name: cell for cell in results.plan.cells}
     rows = [

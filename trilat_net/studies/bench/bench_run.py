@@ -84,7 +84,7 @@ class _JudgedRun(NamedTuple):
     """A run with all of its records, and its judgement.
 
     Attributes:
-        scenario: The scenario. Its duration is that of the run.
+        scenario: Scenario of the run. Its duration is that of the run.
         records: All records of the run, by site.
         end: Analysis of the end of the run.
         twins: Growth of the small disturbances of the twins.

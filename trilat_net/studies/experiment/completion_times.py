@@ -146,7 +146,7 @@ def summarise_times(
     Args:
         rows: Trials, as for `find_unit_medians`.
         limit_s: Time limit of a trial, in s.
-        unit: "participant" or "pair".
+        unit: "participant" or "pair", which is sampled independently.
     """
     summaries: list[CompletionTime] = []
     for condition, medians_by_unit in find_unit_medians(rows, unit).items():
@@ -207,7 +207,7 @@ def compare_times(
 
     Args:
         rows: Trials, as for `find_unit_medians`.
-        unit: "participant" or "pair".
+        unit: "participant" or "pair", which is sampled independently.
 
     Returns:
         A comparison for each pair of conditions, in the order of the rows.

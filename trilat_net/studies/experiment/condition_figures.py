@@ -148,7 +148,7 @@ def _plot_times(
     """Draws completion times as a line, with an open marker for each time beyond the limit.
 
     Args:
-        axes: The panel.
+        axes: Panel of the figure, as Matplotlib axes.
         positions: Positions of the times along the horizontal axis.
         times_s: The times, in s. They are infinite beyond the limit.
         limit_s: Time limit of a trial, in s.

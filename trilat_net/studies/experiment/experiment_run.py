@@ -90,11 +90,11 @@ class Experiment(Result):
     `begin_experiment` and `open_experiment` create this object.
 
     Args:
-        folder: The folder.
+        folder: Folder with the plan, journals and logs of the experiment.
         plan: The protocol and its trials.
 
     Attributes:
-        folder: The folder.
+        folder: Folder with the plan, journals and logs of the experiment.
         plan: The protocol and its trials.
         unit: "pair" if two participants take part together, otherwise "participant".
     """
@@ -534,7 +534,7 @@ def list_log_problems(experiment: Experiment) -> Iterator[str]:
     """Finds finished trials whose log is missing or was changed since the trial.
 
     Args:
-        experiment: The experiment.
+        experiment: The experiment in its folder.
 
     Yields:
         A sentence for each such trial.

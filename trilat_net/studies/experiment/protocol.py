@@ -297,7 +297,7 @@ class ExperimentPlan(Result):
     `plan_experiment` creates this object from a protocol.
 
     Attributes:
-        protocol: The protocol.
+        protocol: Design of the experiment: conditions, task and participants.
         scenarios: Scenario of each condition, by name.
         trials: All trials in their order.
         digest: SHA-256 of protocol and scenarios, in hexadecimal digits.
@@ -394,7 +394,7 @@ class ExperimentPlan(Result):
         the earlier choices of the participant.
 
         Args:
-            planned: The trial.
+            planned: The trial in the plan.
             choices: Choices that participants have made so far.
         """
         scenario = self.scenarios[planned.condition]
@@ -410,7 +410,7 @@ class ExperimentPlan(Result):
         """Returns how long participants must at least rest before a trial, in s.
 
         Args:
-            planned: The trial.
+            planned: The trial in the plan.
         """
         training = self.protocol.training
         previous = self.trials[max(planned.number - 2, 0)]
@@ -487,7 +487,7 @@ def plan_experiment(
     """Plans the trials of a protocol.
 
     Args:
-        protocol: The protocol.
+        protocol: Design of the experiment: conditions, task and participants.
         folder: Folder to which the path of the protocol's scenario is relative.
         scenarios: Scenario of each condition. None loads them from the protocol's scenario.
 
@@ -682,7 +682,7 @@ def limit_forces(
 
     Args:
         scenario: Scenario of the condition.
-        protocol: The protocol.
+        protocol: Design of the experiment: conditions, task and participants.
         group: Pseudonyms of the participants.
 
     Returns:
@@ -790,7 +790,7 @@ def _draw_catches(protocol: Protocol, condition: str, group: int, block: int) ->
     """Draws which trials of a block are catch trials.
 
     Args:
-        protocol: The protocol.
+        protocol: Design of the experiment: conditions, task and participants.
         condition: Condition of the block.
         group: Index of the group.
         block: Index of the block.

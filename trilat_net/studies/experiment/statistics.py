@@ -61,7 +61,7 @@ def average_trials(
     independent.
 
     Args:
-        rows: Trials.
+        rows: Trials, as mappings from column names to values.
         measure: Name of the measure.
         unit: Key of the independently sampled unit: "participant" or "pair".
 
@@ -157,7 +157,7 @@ def summarise_conditions(
     Args:
         rows: Trials, as for `average_trials`.
         measure: Name of the measure.
-        unit: "participant" or "pair".
+        unit: "participant" or "pair", which is sampled independently.
         seed: Seed of the bootstrap.
     """
     means = average_trials(rows, measure, unit)
@@ -369,7 +369,7 @@ class MixedEffect(NamedTuple):
         condition: Name of the condition.
         estimate: Estimated difference from the first condition.
         error: Standard error of the estimate.
-        interval: 95 % interval of the estimate.
+        interval: 95 % confidence interval of the estimate.
         t: Estimate over its standard error.
         p: Two-sided p value of t.
     """

@@ -79,7 +79,7 @@ class TrialJudge:
     The records are passed on one after the other, as they arrive.
 
     Args:
-        trial: The trial.
+        trial: The trial, with its scenario, slave arm and goal.
 
     Attributes:
         goal: Goal of the trial.

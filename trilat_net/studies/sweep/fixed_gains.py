@@ -29,7 +29,7 @@ def describe_fixed_gains(plan: SweepPlan) -> list[str]:
     gains share a text. A text that applies to all sites names no site.
 
     Args:
-        plan: The sweep.
+        plan: The sweep: its scenario, axes, control laws and seeds.
     """
     texts = list[str]()
     first_values = [axis.override(0) for axis in plan.axes]
@@ -43,7 +43,7 @@ def _describe_laws(plan: SweepPlan, scenario: Scenario) -> Iterator[str]:
     """Yields one text for each combination of a law and its gains in a scenario.
 
     Args:
-        plan: The sweep.
+        plan: The sweep: its scenario, axes, control laws and seeds.
         scenario: Scenario of the sweep with one of its laws.
     """
     sites_of_law: dict[tuple[str, str], list[str]] = {}
@@ -62,7 +62,7 @@ def _format_gains(plan: SweepPlan, site: str, law: Any) -> Iterator[str]:
     """Yields the gains of a site's law that no axis of the sweep changes, with their values.
 
     Args:
-        plan: The sweep.
+        plan: The sweep: its scenario, axes, control laws and seeds.
         site: Name of the site.
         law: Control law of the site.
     """

@@ -217,7 +217,7 @@ def _index_rows(rows: Sequence[ResultRow], axes: Sequence[str]) -> dict[GridInde
     The values of an axis are numbered in rising order. Numbers come before texts.
 
     Args:
-        rows: The runs.
+        rows: The runs, one mapping from columns to values per run.
         axes: Keys of the axes.
     """
     ranks: dict[str, dict[Any, int]] = {}

@@ -126,7 +126,7 @@ def draw_stability_map(
     Args:
         plane: Measured part of the map.
         lines: Lines of each panel, in the order of the panels.
-        form: Size of the figure.
+        form: Width, type sizes and resolution of the figure.
         fixed: Gains that were not swept, one text per control law, for the caption.
     """
     count = len(plane.panels)
@@ -187,7 +187,7 @@ def _count_columns(panels: int, form: FigureSize) -> int:
 
     Args:
         panels: Number of panels.
-        form: Size of the figure.
+        form: Width, type sizes and resolution of the figure.
     """
     if panels == 1:
         return 1
@@ -230,7 +230,7 @@ def _write_caption(
     """Writes the caption at the bottom of a figure, and reserves the space for it.
 
     Args:
-        figure: The figure.
+        figure: The Matplotlib figure.
         caption: Lines of the caption.
         height_in: Height of the figure, in inches.
         shares_labels: True if the panels share a label. The layout engine moves panels but not
@@ -261,8 +261,8 @@ def _draw_panel(axes: Axes, plane: MapPlane, panel: MapPanel, lines: Sequence[Ma
 
     Args:
         axes: Where to draw.
-        plane: The map.
-        panel: The panel.
+        plane: The measured part of the map.
+        panel: Panel of the map, a grid of runs over x and y.
         lines: Lines of the panel.
     """
     axes.grid(visible=False)
@@ -345,7 +345,7 @@ def _draw_line(axes: Axes, plane: MapPlane, line: MapLine) -> None:
 
     Args:
         axes: Where to draw.
-        plane: The map.
+        plane: The measured part of the map.
         line: The line.
     """
     x = _extend_positions(plane.x)
@@ -441,7 +441,7 @@ def _set_scale(axes: Axes, plane: MapPlane) -> None:
 
     Args:
         axes: The panel in the figure.
-        plane: The map.
+        plane: The measured part of the map.
     """
     x = _compute_borders(plane.x)
     y = _compute_borders(plane.y)
@@ -492,9 +492,9 @@ def _draw_colour_bar(figure: Figure, grid: Sequence[Axes], plane: MapPlane) -> N
     The pointed ends of the bar of exponents stand for all exponents beyond its limits.
 
     Args:
-        figure: The figure.
+        figure: The Matplotlib figure.
         grid: All panels, beside which the bar stands.
-        plane: The map.
+        plane: The measured part of the map.
     """
     if plane.judged_by_twins:
         limit = _find_exponent_limit(plane)
@@ -551,8 +551,8 @@ def _draw_legend(figure: Figure, plane: MapPlane, lines: Sequence[Sequence[MapLi
     """Draws the legend: the classes or the edge of the classes, the hatching, and the lines.
 
     Args:
-        figure: The figure.
-        plane: The map.
+        figure: The Matplotlib figure.
+        plane: The measured part of the map.
         lines: Lines of each panel.
     """
     handles: list[Any] = []
@@ -689,8 +689,8 @@ def tabulate_edges(plane: MapPlane, panel: MapPanel, lines: Sequence[MapLine]) -
     the table is empty.
 
     Args:
-        plane: The map.
-        panel: The panel.
+        plane: The measured part of the map.
+        panel: Panel of the map, a grid of runs over x and y.
         lines: Lines of the panel.
     """
     theory = [line for line in lines if line.rank >= 0]

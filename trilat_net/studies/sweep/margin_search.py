@@ -205,7 +205,7 @@ class MarginItem(NamedTuple):
     The object can be pickled.
 
     Attributes:
-        plan: The sweep.
+        plan: The sweep: its scenario, axes, control laws and seeds.
         cell: The grid point.
         seed: Seed of the runs.
         range: Key and range of the search.

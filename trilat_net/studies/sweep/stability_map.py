@@ -915,7 +915,7 @@ def build_stability_map(
     Lines are computed only if the map has two numeric axes.
 
     Args:
-        results: Results of the sweep.
+        results: Results of the sweep: its plan and one row per run.
         commands: Commands that make the map, which its page shows.
         jobs: Number of worker processes for the linear analysis. None uses all cores.
         progress: Function that is called while the linear analysis runs.
@@ -987,8 +987,8 @@ def make_panel_loader(plan: SweepPlan, panel: MapPanel, x: str, y: str) -> Panel
     can be pickled, so that other processes can call it.
 
     Args:
-        plan: The sweep.
-        panel: The panel.
+        plan: The sweep: its scenario, axes, control laws and seeds.
+        panel: Panel of the map, a grid of runs over x and y.
         x: Scenario key of the horizontal axis.
         y: Scenario key of the vertical axis.
 
@@ -1009,7 +1009,7 @@ def load_grid_scenario(
     """Returns the scenario at a point of a panel, which may lie between the swept grid points.
 
     Args:
-        plan: The sweep.
+        plan: The sweep: its scenario, axes, control laws and seeds.
         fixed: Overrides KEY=VALUE that all points of the panel have in common.
         x: Scenario key of the horizontal axis.
         y: Scenario key of the vertical axis.

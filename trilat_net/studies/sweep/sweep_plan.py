@@ -691,7 +691,7 @@ def _check_axes(plan: SweepPlan, law_index: int) -> None:
     values, and the corners of the grid.
 
     Args:
-        plan: The sweep.
+        plan: The sweep: its scenario, axes, control laws and seeds.
         law_index: Index of the law.
 
     Raises:
@@ -734,7 +734,7 @@ def _load_cell(plan: SweepPlan, indices: Sequence[int]) -> Scenario:
     """Loads the scenario of a cell.
 
     Args:
-        plan: The sweep.
+        plan: The sweep: its scenario, axes, control laws and seeds.
         indices: Index of the law and of the value on each axis.
 
     Raises:
@@ -851,7 +851,7 @@ def build_sweep_command(plan: SweepPlan, *more: str) -> str:
     """Returns the command that runs a sweep. Options with default values are left out.
 
     Args:
-        plan: The sweep.
+        plan: The sweep: its scenario, axes, control laws and seeds.
         more: Further arguments of the command.
     """
     arguments = set_options(plan.overrides)

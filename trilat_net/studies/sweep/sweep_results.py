@@ -58,7 +58,7 @@ class SweepResults(Result):
     """Results of a finished sweep.
 
     Attributes:
-        plan: The sweep.
+        plan: The sweep: its scenario, axes, control laws and seeds.
         rows: One row per run, ordered by cell and then by seed.
     """
 
@@ -114,7 +114,7 @@ def build_result_rows(plan: SweepPlan, entries: Sequence[CellRun]) -> list[Resul
     """Builds the table of results from the finished runs of a sweep.
 
     Args:
-        plan: The sweep.
+        plan: The sweep: its scenario, axes, control laws and seeds.
         entries: The runs, in any order.
 
     Returns:
@@ -136,7 +136,7 @@ def _build_row(plan: SweepPlan, entry: CellRun, log: str) -> ResultRow:
     """Builds the row of a finished run.
 
     Args:
-        plan: The sweep.
+        plan: The sweep: its scenario, axes, control laws and seeds.
         entry: The run.
         log: Name of the log that the command in the row records.
     """
@@ -169,7 +169,7 @@ def build_sim_command(
     """Returns the command that simulates a run again and records its log.
 
     Args:
-        plan: The sweep.
+        plan: The sweep: its scenario, axes, control laws and seeds.
         overrides: Overrides KEY=VALUE that turn the swept scenario into that of the run.
         seed: Seed of the run.
         duration_s: Duration of the run, in s.
@@ -214,8 +214,8 @@ def encode_results(plan: SweepPlan, rows: Sequence[ResultRow]) -> str:
     """Returns the results as CSV text, with one line per run.
 
     Args:
-        plan: The sweep.
-        rows: The runs.
+        plan: The sweep: its scenario, axes, control laws and seeds.
+        rows: The runs, one mapping from columns to values per run.
     """
     column_types = _list_result_columns(plan)
     lines = []
@@ -318,7 +318,7 @@ def _read_row(line: Mapping[str, str], plan: SweepPlan) -> ResultRow:
 
     Args:
         line: Texts of the line, by column.
-        plan: The sweep.
+        plan: The sweep: its scenario, axes, control laws and seeds.
     """
     column_types = _list_result_columns(plan)
     row = {name: _parse_cell(line[name], kind) for name, kind in column_types.items()}
@@ -389,7 +389,7 @@ def collect_grid_points(results: SweepResults) -> list[GridPoint]:
     """Combines the runs of each cell, which differ only in their seeds, to one grid point.
 
     Args:
-        results: Results of the sweep.
+        results: Results of the sweep: its plan and one row per run.
 
     Returns:
         The grid points in the order of the cells.
@@ -428,8 +428,8 @@ def encode_grid_points(plan: SweepPlan, points: Sequence[GridPoint]) -> str:
     quantities with their intervals.
 
     Args:
-        plan: The sweep.
-        points: The grid points.
+        plan: The sweep: its scenario, axes, control laws and seeds.
+        points: The grid points, in the order of the lines.
     """
     column_types = _list_axis_columns(plan)
     column_types["runs"] = int
@@ -470,7 +470,7 @@ def describe_sweep_plan(plan: SweepPlan) -> list[str]:
     """Returns lines that tell the user how many runs a sweep has, and over which values.
 
     Args:
-        plan: The sweep.
+        plan: The sweep: its scenario, axes, control laws and seeds.
     """
     sizes = " x ".join(str(len(axis.texts)) for axis in plan.axes) or "1"
     laws = f" x laws {', '.join(plan.laws)}" if plan.laws else ""
@@ -504,7 +504,7 @@ def summarize_sweep(results: SweepResults) -> Iterator[str]:
     quantities that the sweep does not have are left out.
 
     Args:
-        results: Results of the sweep.
+        results: Results of the sweep: its plan and one row per run.
     """
     rows = results.rows
     counts = Counter(row["verdict"] for row in rows)
@@ -541,7 +541,7 @@ def _list_ranges(plan: SweepPlan, rows: Sequence[ResultRow]) -> list[str]:
 
     Args:
         plan: The sweep, whose requested metrics come first.
-        rows: The runs.
+        rows: The runs, one mapping from columns to values per run.
 
     Returns:
         Texts such as "RMS e 0.012 to 0.4 rad", without the quantities that no run has.
@@ -614,7 +614,7 @@ def build_reproduce_command(
     runs that file.
 
     Args:
-        results: Results of the sweep.
+        results: Results of the sweep: its plan and one row per run.
         row: The run.
         folder: Folder in which the file is written, if necessary.
 

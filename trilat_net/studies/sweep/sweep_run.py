@@ -77,7 +77,7 @@ def _build_folder(path: Path, plan: SweepPlan, facts: Mapping[str, Any]) -> Swee
 
     Args:
         path: Path of the folder.
-        plan: The sweep.
+        plan: The sweep: its scenario, axes, control laws and seeds.
         facts: The plan as plain values, with the arithmetic and the versions of the program.
     """
     study = hashlib.sha256(_encode_plan(facts).encode()).hexdigest()
@@ -93,7 +93,7 @@ def prepare_sweep_folder(plan: SweepPlan, path: Path | None) -> SweepFolder:
     """Prepares the folder of a sweep: a new one, or an existing one with finished runs.
 
     Args:
-        plan: The sweep.
+        plan: The sweep: its scenario, axes, control laws and seeds.
         path: Path of the folder. None creates a new folder with a default name.
 
     Raises:
@@ -249,8 +249,8 @@ class CellItem(NamedTuple):
     """One run of a sweep as an item for a worker process. It can be pickled.
 
     Attributes:
-        plan: The sweep.
-        cell: The cell.
+        plan: The sweep: its scenario, axes, control laws and seeds.
+        cell: The values of all axes and the control law of the run.
         seed: Seed of the run.
     """
 
@@ -317,7 +317,7 @@ def estimate_sweep(
     """Estimates the duration of a sweep by running a few cells that are spread over the grid.
 
     Args:
-        plan: The sweep.
+        plan: The sweep: its scenario, axes, control laws and seeds.
         done: Finished runs, as pairs of cell number and seed. They need not be run any more.
         jobs: Number of worker processes of the sweep. None stands for all cores.
     """
@@ -362,7 +362,7 @@ def refuse_oversized_sweep(
     """Refuses a sweep of more than `MAX_RUNS` runs or `MAX_SWEEP_S` seconds.
 
     Args:
-        plan: The sweep.
+        plan: The sweep: its scenario, axes, control laws and seeds.
         expected: Estimated duration of the sweep.
         jobs: Number of worker processes. None stands for all cores.
 
@@ -464,7 +464,7 @@ def _run_cells(
     Only the first run of a cell shows whether anything in the cell is random.
 
     Args:
-        plan: The sweep.
+        plan: The sweep: its scenario, axes, control laws and seeds.
         journal: Journal, to which the runs are added.
         pool: Workers that execute the runs.
         progress: Function that is called as for `run_sweep`.

@@ -135,7 +135,7 @@ def compute_consensus_pose(scenario: Scenario, t_s: Array) -> Array:
     factors.
 
     Args:
-        scenario: The scenario.
+        scenario: Scenario in which the laws are compared.
         t_s: Times, shape (K,), in s.
 
     Returns:
@@ -187,7 +187,7 @@ def _list_springs(scenario: Scenario, t_s: Array) -> Iterator[_SpringHistory]:
     """Yields the operators of all sites that pull like a spring.
 
     Args:
-        scenario: The scenario.
+        scenario: Scenario in which the laws are compared.
         t_s: Times, shape (K,), in s.
     """
     for name, spec in scenario.sites.items():
@@ -563,7 +563,7 @@ def _measure_torques(scenario: Scenario, records: Sequence[RecordBatch]) -> tupl
     """Returns the effort, and the fraction of the joint torques that were at their limit.
 
     Args:
-        scenario: The scenario.
+        scenario: Scenario in which the laws are compared.
         records: Records of each site.
 
     Returns:
@@ -614,7 +614,7 @@ class TuningScenario(NamedTuple):
 
     Attributes:
         experiment: Scenario as its author wrote it.
-        overrides: Overrides KEY=VALUE.
+        overrides: Overrides KEY=VALUE of the scenario, as on the command line.
         scenario: Scenario with the overrides.
     """
 
@@ -661,7 +661,7 @@ class TuningScenario(NamedTuple):
         Args:
             space: The law and the ranges of its gains.
             knowledge: Information about the arm's model that the law gets.
-            gains: Values of the gains.
+            gains: Values of the gains, by their names.
         """
         return self.with_controls(space.controls(self.scenario, knowledge, gains))
 
@@ -724,7 +724,7 @@ def load_tuning_scenario(
 
     Args:
         source: Name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
-        overrides: Overrides KEY=VALUE.
+        overrides: Overrides KEY=VALUE of the scenario, as on the command line.
 
     Raises:
         ScenarioError: The scenario does not exist, or is not valid with the overrides.

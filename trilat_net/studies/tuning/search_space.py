@@ -81,8 +81,8 @@ class ModelInformation(NamedTuple):
         ones times `gravity`.
 
         Args:
-            scenario: The scenario.
-            site: Site of the arm.
+            scenario: Scenario in which the laws are compared.
+            site: Name of the site that runs the arm.
         """
         arm = build_arm_rows(scenario, site)
         theta = np.where(arm.gravity_parameters, arm.theta * self.gravity, 0.0)
@@ -94,8 +94,8 @@ class ModelInformation(NamedTuple):
         The parameters of inertia are not limited, because nothing is known about them.
 
         Args:
-            scenario: The scenario.
-            site: Site of the arm.
+            scenario: Scenario in which the laws are compared.
+            site: Name of the site that runs the arm.
 
         Returns:
             Lower and upper limits of the P parameters, shape (P,) each.
@@ -189,9 +189,9 @@ class SearchSpace(NamedTuple):
         produces a torque becomes a list with one value per joint, see `weigh_joints`.
 
         Args:
-            scenario: The scenario.
+            scenario: Scenario in which the laws are compared.
             knowledge: Information about the arm's model that the law gets.
-            gains: Values of the gains.
+            gains: Values of the gains, by their names.
         """
         longest_ms = 0.5 * _find_longest_round_trip_ms(scenario)
         tables = {}
@@ -221,10 +221,10 @@ class SearchSpace(NamedTuple):
         """Returns the table [control] of one site, where each gain is a single number.
 
         Args:
-            scenario: The scenario.
+            scenario: Scenario in which the laws are compared.
             site: Name of the site.
             knowledge: Information about the arm's model that the law gets.
-            gains: Values of the gains.
+            gains: Values of the gains, by their names.
             longest_ms: Half of the longest round trip between two sites, in ms.
         """
         if self.kind is None:  # a user's law
@@ -297,7 +297,7 @@ def weigh_joints(scenario: Scenario) -> list[float]:
     `second_order`, or 2 under `digital`.
 
     Args:
-        scenario: The scenario.
+        scenario: Scenario in which the laws are compared.
 
     Returns:
         The fractions, at most 1, with two significant digits. Empty for planar arms.

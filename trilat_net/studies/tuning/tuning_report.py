@@ -142,7 +142,7 @@ def tabulate_front(
     effort. A * marks the candidates that are also on the common front of all laws.
 
     Args:
-        tuned: The comparison.
+        tuned: Result of the comparison of control laws.
         search: Search of the law.
         most: Largest number of rows. Of a longer front, evenly spread points are shown, with
             the first and the last one.
@@ -413,7 +413,7 @@ def write_tuning(tuned: TuningResult, folder: Path) -> list[Path]:
     and PDF.
 
     Args:
-        tuned: The comparison.
+        tuned: Result of the comparison of control laws.
         folder: The folder.
 
     Returns:
