@@ -359,7 +359,11 @@ def _draw_poses(scenario: Scenario, count: int, seed: int) -> Array:
 
 
 class _GainSearch:
-    """Search for the edge of stability of equal arms along the ray of gains.
+    """Search for the edge of stability of equal arms whose gains grow along a ray.
+
+    The stiffness is K = k m for each joint, where m is the inertia of the joint and k a common
+    parameter in 1/s^2. The edge is the least k at which small motions of the linearised loop
+    grow.
 
     Args:
         scenario: Scenario of the loop, see `_build_loop`.
@@ -559,10 +563,10 @@ class _GainSearch:
         return edge, worst_pose
 
     def find_edge(self) -> dict[str, Any]:
-        """Finds the edge and the sampled-data limit, see `ArmGains.edge`.
+        """Finds the k above which small motions grow, see `ArmGains.edge`.
 
-        The pose in which the edge is lowest is determined with a constant delay. The edges with
-        varying delays and in continuous time are computed in this pose only.
+        The pose in which this edge is lowest is determined with a constant delay. The edges
+        with varying delays and in continuous time are computed in this pose only.
         """
         constant, pose = self.find_least_edge(
             self.constant_conditions, self._poses, self._least_k
@@ -625,10 +629,11 @@ class _GainSearch:
     def confirm(
         self, law: Any, share: float | None, pose: Array, push: Array
     ) -> dict[str, Any]:
-        """Runs the loop from a pose with the first arm displaced, until motions decay or grow.
+        """Checks gains by a simulation, in which motions must decay or grow as predicted.
 
-        The first duration is a few time constants of the slowest motion. It is doubled as long
-        as the trend of the motions is undecided.
+        The first arm starts displaced from the pose of the others. The first duration is a few
+        time constants of the slowest motion. It is doubled as long as the trend of the motions
+        is undecided.
 
         Args:
             law: Control law with its gains.

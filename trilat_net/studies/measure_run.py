@@ -159,6 +159,9 @@ def run_in_batches(
 ) -> tuple[float | None, int]:
     """Runs a scenario in virtual time, and passes the records on batch by batch.
 
+    Long runs thus need little memory. Virtual time means that a simulated clock replaces the
+    real one.
+
     Args:
         scenario: Scenario to run: arms, control laws, links and duration.
         receivers: For each site, the function that receives its batches.
@@ -554,20 +557,23 @@ class LinkAge(msgspec.Struct, frozen=True):
 
 
 class RunMetrics(msgspec.Struct, frozen=True, kw_only=True):
-    """Metrics of one run. The docstring of `Expect` defines each of them.
+    """Metrics of one run, which are compared with the expectations of its scenario.
 
-    A metric is None if the run cannot give it, because it is too short or because the event
-    did not happen. The metrics `end_...` concern the last second of the run.
+    The docstring of `Expect` defines each metric. A metric is None if the run cannot give it,
+    because it is too short or because the event did not happen. The metrics `end_...` concern
+    the last second of the run. A link "j->i" leads from site j to site i.
 
     Attributes:
         simulated_s: Duration of the run in its own time, in s.
-        end: Judgement of the end of the run.
-        ages: Ages of the samples in use, by link "j->i".
-        late_samples: Number of samples that arrived too late to be used as their link planned.
-        missing: Number of ticks without a record.
-        windows: Ranges of the quantities within each window. Empty for a window that ends after
-            the run.
-        metrics: Metrics of `docs/metrics.md` that the scenario limits.
+        end: Judgement of the end of the run, for example whether the arms came to rest.
+        ages: Ages of the samples in use (the states that a site received from a peer), by link
+            "j->i".
+        late_samples: Number of samples that arrived too late to be used at the time that their
+            link planned.
+        missing: Number of ticks (control periods) without a record, over all sites.
+        windows: Ranges of the quantities within each window, a part of the run with limits of
+            its own. Empty for a window that ends after the run.
+        metrics: Those metrics of `docs/metrics.md` for which the scenario states a limit.
     """
 
     simulated_s: float
@@ -818,13 +824,14 @@ class ExpectationResult(msgspec.Struct, frozen=True):
     Such a limit is called an expectation and has a key in the scenario's table [expect].
 
     Attributes:
-        key: Key of [expect], or the name of a requirement that every run must meet.
-        held: True if the expectation is met.
+        key: Key in the table [expect], or the name of a requirement that every run must meet.
+        held: True if the run met the expectation.
         measured: Measured value as a text with its unit.
         limit: Limit as a text with its unit.
-        margin: Distance to the limit as a fraction of the limit, negative beyond the limit.
-            None if the expectation has no such number.
-        value: Measured number in the unit of the limit. None if there is no such number.
+        margin: Distance of the measured value to the limit as a fraction of the limit, negative
+            beyond the limit. None if the expectation is not about a number.
+        value: Measured number in the unit of the limit. None if the expectation is not about a
+            number.
     """
 
     key: str

@@ -110,7 +110,9 @@ class TrialResult(NamedTuple):
 
 
 class Trial(NamedTuple):
-    """A scenario with one seed, ready to be run and checked.
+    """A scenario with one seed, which can be run and compared with its expectations.
+
+    `trials` creates these objects, for example as parameters of a test.
 
     Attributes:
         scenario: The scenario.
@@ -136,7 +138,7 @@ class Trial(NamedTuple):
 
     @property
     def look(self) -> str:
-        """The command that simulates the same run and writes its log, for inspection."""
+        """The command that simulates the same run and records its log, for inspection."""
         arguments = ["--seed", str(self.scenario.seed), "-o", f"{self}.mcap"]
         return format_command("sim", self.source, *arguments, *set_options(self.overrides))
 
@@ -285,9 +287,9 @@ def list_assignments(overrides: Mapping[str, Any], prefix: str = "") -> Iterator
 def evaluate_live_log(
     trial: Trial, log_file: Path, problems: Sequence[str], wall_s: float
 ) -> TrialResult:
-    """Evaluates a live trial from its log.
+    """Compares the run of a live session with the expectations of its scenario.
 
-    To the expectations of the scenario, two are added: that the session ended in order, and
+    Two expectations are added to those of the scenario: that the session ended in order, and
     that all records are the same bit for bit when they are computed again.
 
     Args:
@@ -295,6 +297,9 @@ def evaluate_live_log(
         log_file: Log of the session, which may be missing.
         problems: Problems of the session. Empty if the session ended in order.
         wall_s: Duration of the session, in s.
+
+    Returns:
+        The result. If the log cannot be read, it contains the reason instead of outcomes.
     """
     existing_log = log_file if log_file.exists() else None
     try:

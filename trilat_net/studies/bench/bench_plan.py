@@ -590,7 +590,10 @@ MAX_BENCH_SEEDS = 1000
 
 
 class BenchCell(NamedTuple):
-    """A cell of the suite: a law in a task over a link, with its gains and seeds.
+    """A cell of the suite: a control law in a task over a link, with its gains and seeds.
+
+    The suite compares control laws in several tasks and over links with different delays and
+    losses.
 
     Attributes:
         task: A key of `TASKS`.

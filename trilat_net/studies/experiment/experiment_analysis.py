@@ -600,9 +600,11 @@ class ExperimentAnalysis(Result):
         }
 
     def blocks(self) -> Iterator[Block]:
-        """Yields the text: completion, measures, missing numbers, and the methods paragraph.
+        """Yields the parts of the text that `trilat experiment analyse` prints.
 
-        With a single unit there are no comparisons, and one table has all measures.
+        They are the completion of trials, the measures and their comparisons, missing numbers,
+        and the methods paragraph. With a single participant or pair there are no comparisons,
+        and one table has all measures.
         """
         yield from self._write_time_blocks()
         units = {row[self.unit] for row in self.rows}

@@ -131,7 +131,7 @@ def sparc(
 
 
 def path_length_m(places: ArrayLike) -> float:
-    """Returns the length of a path, in m.
+    """Computes the length of a sampled path, in m, as the sum of its straight segments.
 
     Args:
         places: Positions along the path, in m, shape (K, D).
@@ -167,7 +167,9 @@ def movement_time_s(
 
 
 def energy_j(force: ArrayLike, velocity: ArrayLike, rate_hz: float) -> float:
-    """Returns the work of a force f on a body with velocity v, the integral of f'v, in J.
+    """Computes the work of a force on a moving body, in J.
+
+    The work is the integral of f'v over time, where f is the force and v the velocity.
 
     Args:
         force: Force on the body, in N, shape (K, D).
@@ -209,7 +211,7 @@ class Throughput(NamedTuple):
 
     @property
     def bits_s(self) -> float:
-        """The throughput, in bit/s."""
+        """The throughput in bit/s: the index of difficulty over the mean movement time."""
         return self.difficulty_bits / self.time_s
 
 
@@ -302,7 +304,7 @@ def find_internal_force(first: ArrayLike, second: ArrayLike) -> Array:
 
 
 class PairMeasures(NamedTuple):
-    """Forces and work of two users on a shared object in a trial.
+    """Forces and work of two users who move a shared object together in a trial.
 
     Args:
         internal_rms_n: RMS of the force that cancels, over all axes and samples, in N.

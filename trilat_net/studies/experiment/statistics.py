@@ -551,6 +551,9 @@ def power(d_z: float, number: int, *, alpha: float = 0.05) -> float:
         number: Number of units.
         alpha: Significance level.
 
+    Returns:
+        The power, from 0 to 1.
+
     Raises:
         UsageError: There are fewer than two units, or alpha is not between 0 and 1.
     """

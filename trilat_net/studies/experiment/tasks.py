@@ -71,7 +71,7 @@ class TrialTask(Frozen, frozen=True, tag_field="kind"):
         return False
 
     def make_goal(self, start_m: Array, number: int, seed: int) -> "TrialGoal":
-        """Returns the goal of a trial.
+        """Creates the goal of one trial, which states the target and decides when the trial ends.
 
         Args:
             start_m: Position of the slave's end effector at the start, shape (2,) or (3,), in
@@ -395,7 +395,7 @@ class _ReachGoal(_DwellGoal):
 
 
 class ContactTrial(TrialTask, frozen=True, tag="contact"):
-    """The task to press a wall with a force.
+    """The task to press a wall with a given force, and to hold the force for some time.
 
     Attributes:
         axis: Axis of the arm's base frame along which the target is drawn, from 0.

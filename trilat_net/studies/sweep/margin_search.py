@@ -184,7 +184,7 @@ def _bisect(
 
 
 class SearchRange(NamedTuple):
-    """Key and range of a search for edges.
+    """Key of a scenario along which edges of stability are searched, and the searched range.
 
     Attributes:
         key: Scenario key along which edges are searched.

@@ -68,7 +68,9 @@ def classify_end(end: RunEnd) -> CellClass:
 
 
 class CellResult(msgspec.Struct, frozen=True):
-    """Result of one run of a cell.
+    """Result of one run of a sweep: its class, and what was measured in it.
+
+    Below, e is the error of a site against its reference, and qd the velocity of a joint.
 
     Attributes:
         verdict: Class of the cell.
@@ -395,7 +397,7 @@ def apply_diff(parts: Iterable[str | Sequence[int]], base: str) -> str:
 
 
 class CellRun(msgspec.Struct, frozen=True):
-    """A finished run of a cell, as the journal of a sweep stores it.
+    """A finished run of a sweep with its result, as the journal of the sweep stores it.
 
     Attributes:
         cell: Number of the cell.

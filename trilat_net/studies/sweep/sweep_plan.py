@@ -322,10 +322,11 @@ class SweepPlan(NamedTuple):
     """Everything that determines a sweep: scenario, axes, laws and seeds.
 
     `plan_sweep` creates this object and checks it. A sweep runs a scenario for every
-    combination of the values of its axes, called a cell, with one or several seeds.
+    combination of the values of its axes and of a control law, called a cell, with one or
+    several seeds.
 
     Attributes:
-        written: Scenario as its author wrote it.
+        written: Scenario as its author wrote it, without overrides and default values.
         overrides: Overrides KEY=VALUE that apply to all cells.
         base: Scenario with `overrides`, with all default values filled in.
         axes: Swept axes. The last one changes fastest from cell to cell.
@@ -333,8 +334,10 @@ class SweepPlan(NamedTuple):
             If there are no swept laws, all cells have the laws of the scenario.
         seeds: Seeds with which each cell is run. A cell in which nothing is random is run with
             the first seed only, since all others would give the same run.
-        longest_s: Longest duration to which an undecided run is extended, in s.
-        judge: Way to judge a run, a name of `JUDGES`.
+        longest_s: Longest duration to which a run is extended while its result is undecided, in
+            s.
+        judge: How a run is judged, a name of `JUDGES`: by its end, or by repeated runs with a
+            small push.
         metrics: Keys of further metrics from `docs/metrics.md` that are measured in each run.
     """
 

@@ -55,7 +55,10 @@ canonical text of the scenario that was run.
 
 @dataclass(frozen=True, repr=False)
 class SweepResults(Result):
-    """Results of a finished sweep.
+    """Results of a finished sweep, as a table with one row per run.
+
+    A run belongs to a cell, which is a combination of the values of all axes and of a control
+    law. The runs of a cell differ in their seeds.
 
     Attributes:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -331,15 +334,16 @@ GRID_POINTS_FILE = "places.csv"
 
 
 class GridPoint(NamedTuple):
-    """The combined results of one cell over all its seeds.
+    """The results of all runs of one cell of a sweep, which differ only in their seeds.
 
     Attributes:
-        cell: Number of the cell.
+        cell: Number of the cell, from 0.
         law: Control laws of the sites.
         values: Value of the cell on each axis.
-        counts: Number of runs of each class, in the order of `CellClass`.
-        means: Mean, with interval, of each quantity of `list_totals` over the runs that stayed
-            within the limits of their arms. None for fewer than two runs.
+        counts: Number of runs of each class, such as converged or diverged, in the order of
+            `CellClass`.
+        means: Mean, with its 95 % interval, of each quantity of `list_totals`, over the runs
+            that stayed within the limits of their arms. None for fewer than two such runs.
     """
 
     cell: int

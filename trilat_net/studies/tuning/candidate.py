@@ -62,9 +62,12 @@ _POSE_SAMPLES_HZ = 100.0
 
 
 def check_comparable(scenario: Scenario) -> None:
-    """Refuses a scenario in which control laws cannot be compared fairly.
+    """Checks that control laws can be compared fairly in a scenario.
 
-    A fair comparison needs a pose that all arms could reach.
+    The comparison needs a pose that all arms could reach.
+
+    Args:
+        scenario: The scenario in which laws are to be compared.
 
     Raises:
         ScenarioError: The scenario is refused. The message states the reason and a remedy.
@@ -612,6 +615,8 @@ def _rms(values: Array) -> float:
 class TuningScenario(NamedTuple):
     """The scenario in which control laws are compared, with the overrides that produced it.
 
+    The overrides are kept so that commands can name the scenario as the user did.
+
     Attributes:
         experiment: Scenario as its author wrote it.
         overrides: Overrides KEY=VALUE of the scenario, as on the command line.
@@ -681,7 +686,7 @@ class TuningScenario(NamedTuple):
 
 
 class CandidateItem(NamedTuple):
-    """Work for a worker process: the runs of one candidate.
+    """The runs of one candidate (a control law with chosen gains), as an item for a worker.
 
     Attributes:
         runs: For each seed, the canonical texts of the scenario and of its twin.

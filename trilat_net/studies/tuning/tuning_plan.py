@@ -124,15 +124,18 @@ def find_pareto_front(points: Sequence[ObjectivePoint | None]) -> list[int]:
 
 
 def compute_crowding(points: Sequence[ObjectivePoint]) -> list[float]:
-    """Returns the crowding distance of each point of a front, large for isolated points.
+    """Computes how isolated each point of a front is, so that gaps of the front can be refined.
 
-    The distance is half the perimeter of the box between the two neighbours of the point, where
-    each side is relative to the span of the front. The distance of the first and the last point
-    is infinite. Source: Deb, Pratap, Agarwal and Meyarivan, "A fast and elitist multiobjective
-    genetic algorithm: NSGA-II", IEEE Trans. Evolutionary Computation 6 (2002).
+    The crowding distance of a point is half the perimeter of the box between its two
+    neighbours, where each side is relative to the span of the front. It is infinite for the
+    first and the last point. Source: Deb, Pratap, Agarwal and Meyarivan, "A fast and elitist
+    multiobjective genetic algorithm: NSGA-II", IEEE Trans. Evolutionary Computation 6 (2002).
 
     Args:
         points: Points of the front, in the order of rising effort.
+
+    Returns:
+        The distance of each point, large for isolated points.
     """
     if len(points) < 3:
         return [float("inf")] * len(points)
@@ -163,8 +166,9 @@ CandidateGains = dict[str, float]
 class CandidateSearch:
     """Search for the best gains of one control law, in several rounds.
 
-    In each round, the caller runs the candidates of `propose_candidates` and passes their
-    scores to `record_scores`.
+    A candidate is one choice of values of the gains. In each round, the caller runs the
+    candidates of `propose_candidates` and passes their scores to `record_scores`. The result is
+    the Pareto front of the law: the best compromises between the objective and the effort.
 
     Args:
         space: The law and the ranges of its gains.
@@ -365,7 +369,9 @@ class PaperGainsResult(NamedTuple):
 
 
 class TuningPlan(NamedTuple):
-    """A comparison of tuned control laws that was checked and is ready to run.
+    """A comparison of control laws by searching the best gains of each, ready to run.
+
+    `plan_tuning` creates this object and checks it. `run` executes the searches.
 
     Attributes:
         base: Scenario in which the laws are compared.
@@ -525,7 +531,7 @@ _EDGE = 1.02
 
 @dataclass(frozen=True, repr=False)
 class TuningResult(Result):
-    """Result of a comparison of tuned control laws.
+    """Result of a comparison of control laws, each with the best gains that a search found.
 
     Attributes:
         plan: The comparison.
