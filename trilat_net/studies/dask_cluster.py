@@ -218,7 +218,7 @@ class DaskCluster:
 
     @property
     def executor(self) -> Executor:
-        """Executor that runs functions on the workers of the cluster."""
+        """Interface of the standard library to run functions on the workers of the cluster."""
         executor: Executor = self._client.get_executor(pure=False)
         return executor
 

@@ -375,7 +375,7 @@ class WorkerPool:
 
         Args:
             future: Future of the batch.
-            batch: Batch whose worker died.
+            batch: The batch that ended.
             feed: Queue of the items.
             lost: Function that returns the result of an item that killed its workers, see
                 `iterate_results`.

@@ -123,7 +123,7 @@ class EpisodeTask(Protocol):
     """Bound of the numbers of the goal. It must never change."""
 
     def begin(self, random: np.random.Generator, scene: Scene) -> None:
-        """Draws the goal of a new episode.
+        """Draws the goal of a new episode. The environment calls this once per episode.
 
         Args:
             random: Source of random numbers.
@@ -201,10 +201,14 @@ class ReachTask:
         self._last_s = scene.t_s
 
     def judge(self, scene: Scene) -> Judgement:
-        """Returns the reward of a step, and whether the end effector stayed long enough.
+        """Computes the reward of a step, and whether the end effector stayed long enough.
 
         Args:
             scene: State after the step.
+
+        Returns:
+            The judgement. It ends the episode once the end effector has stayed at the goal for
+            `stay_s`.
         """
         from_goal_m = scene.end_effector_m[self._site] - self.goal
         distance_m = float(np.linalg.norm(from_goal_m))

@@ -119,7 +119,7 @@ class HandImpedance(Result):
     responses: tuple[SineResponse, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the hand as plain values, which `trilat linear --operators` reads."""
+        """Converts the result to plain values, as `trilat linear --operators` reads them."""
         return {
             "site": self.site,
             "segments": self.segments,

@@ -88,7 +88,7 @@ class LogComparison(Result):
                     yield f"{name}: no {row.quantity.name}: {entry.why}"
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns plain values, with the keys of `trilat compare --json`."""
+        """Converts the comparison to plain values, as `trilat compare --json` prints it."""
         logs = []
         for name, log in zip(self.metrics.columns, self.logs, strict=True):
             entry = {

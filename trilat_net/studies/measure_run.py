@@ -505,7 +505,10 @@ class SiteStats:
 
     @property
     def link_ages(self) -> list["LinkAge"]:
-        """Ages of the samples in use, one entry per peer, in the order of the peers."""
+        """Ages of the samples in use, one entry per peer, in the order of the peers.
+
+        A peer is another site whose samples (published states) this site receives.
+        """
         sums_ms = self._age_sum_ms.tolist()
         record_counts = self._age_records.tolist()
         largest_ms = self.age_max_ms.tolist()
@@ -535,7 +538,7 @@ class SiteStats:
 
     @property
     def tau_x(self) -> Array:
-        """Torque of operator and environment in the last record, shape (n,), in N m."""
+        """Torque of operator and environment on the arm in the last record, in N m, shape (n,)."""
         if not self._tail:
             return np.zeros(1)
         last_tau_x: Array = self._tail[-1].tau_x[-1]

@@ -293,10 +293,10 @@ def evaluate_live_log(
     that all records are the same bit for bit when they are computed again.
 
     Args:
-        trial: The trial.
+        trial: The trial, with its scenario.
         log_file: Log of the session, which may be missing.
-        problems: Problems of the session. Empty if the session ended in order.
-        wall_s: Duration of the session, in s.
+        problems: Problems of the session, as sentences. Empty if the session ended in order.
+        wall_s: Duration of the session in real time, in s.
 
     Returns:
         The result. If the log cannot be read, it contains the reason instead of outcomes.
@@ -507,7 +507,7 @@ class TrialReport(Result):
         return f"{held} of {count_nouns(len(self.results), 'run')} as expected"
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the results as plain values, with the keys of `trilat test --json`."""
+        """Converts the results to plain values, as `trilat test --json` prints them."""
         runs = [
             {
                 "scenario": result.trial.source,

@@ -91,7 +91,7 @@ def _collect_fields(results: BenchResults, name: str) -> dict[str, Array]:
 
 
 def draw_bench(results: BenchResults, name: str) -> Figure:
-    """Draws a figure of the results.
+    """Draws one of the figures that compare the control laws of the suite.
 
     Args:
         results: The results of the suite.

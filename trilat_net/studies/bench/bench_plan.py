@@ -618,7 +618,10 @@ class BenchCell(NamedTuple):
 
     @property
     def inputs(self) -> str:
-        """Digest of everything that determines the runs: scenario, task, link and gains."""
+        """Digest of everything that determines the runs: scenario, task, link and gains.
+
+        Stored runs with another digest are out of date and are not used.
+        """
         parts = (
             _load_base_text(self.form),
             build_settings(self.form, self.task, self.link),
@@ -664,12 +667,12 @@ class BenchPlan(NamedTuple):
 
     @property
     def tasks(self) -> list[str]:
-        """Tasks of the cells, in the order of the cells."""
+        """Names of the tasks of the cells, in the order of the cells, without duplicates."""
         return list(dict.fromkeys(cell.task for cell in self.cells))
 
     @property
     def links(self) -> list[str]:
-        """Links of the cells, in the order of the cells."""
+        """Names of the links of the cells, in the order of the cells, without duplicates."""
         return list(dict.fromkeys(cell.link for cell in self.cells))
 
     @property
@@ -678,7 +681,10 @@ class BenchPlan(NamedTuple):
         return sum(len(cell.seeds) for cell in self.cells)
 
     def cell(self, name: str) -> BenchCell:
-        """Returns the cell with a name, as in "contact/wave/rtt272".
+        """Returns the cell with a name.
+
+        Args:
+            name: Name of the cell, as in "contact/wave/rtt272": task, law and link.
 
         Raises:
             UsageError: No cell has that name.

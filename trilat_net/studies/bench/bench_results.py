@@ -175,7 +175,7 @@ class BenchCellResult(NamedTuple):
 
     @property
     def stable(self) -> int:
-        """Number of runs that are judged stable."""
+        """Number of runs of the cell that are judged stable."""
         return self.count(Stability.STABLE)
 
     def count(self, stability: Stability) -> int:
@@ -195,7 +195,10 @@ class BenchCellResult(NamedTuple):
 
     @property
     def masked(self) -> bool:
-        """True if the slave should touch a wall but did not in at least one run."""
+        """True if the slave should touch a wall, but did not in at least one run.
+
+        The numbers of such a cell are not shown, see `BenchRun.masked`.
+        """
         return any(run.masked for run in self.runs)
 
     @property
@@ -281,13 +284,13 @@ class BenchResults(Result):
             yield tabulate_round_trips(self)
 
     def headline(self) -> str:
-        """Returns the result in one line: the study and the numbers of cells and runs."""
+        """Returns a sentence with the name of the study and the numbers of cells and runs."""
         cells = count_nouns(len(self.places), "cell")
         runs = count_nouns(len(self.runs), "run")
         return f"{self.plan.study}: {cells}, {runs}"
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns plain values, with the keys of `trilat bench --json`."""
+        """Converts the results to plain values, as `trilat bench --json` prints them."""
         entries = [
             msgspec.to_builtins(gains) | {"outcome": "settled"}
             for gains in _list_used_gains(self)

@@ -89,7 +89,11 @@ class CompletionComparison(NamedTuple):
 
 
 def is_completed(row: Row) -> bool:
-    """Returns True if a trial was completed. A row without `succeeded` counts as completed."""
+    """Tells whether a trial was completed, so that its time is known.
+
+    Args:
+        row: The trial. A row without the key `succeeded` counts as completed.
+    """
     return str(row.get(SUCCESS, 1)).strip() not in ("0", "0.0", "False")
 
 

@@ -533,10 +533,13 @@ class ExperimentAnalysis(Result):
         return figures
 
     def compose_page(self, figures: Sequence[str]) -> str:
-        """Returns the text of the analysis with its figures, as Markdown.
+        """Composes the Markdown page that reports the analysis.
 
         Args:
             figures: Names of the PNG files beside the page.
+
+        Returns:
+            The text of the page.
         """
         protocol = self._experiment.plan.protocol
         parts = [f"# {protocol.title or protocol.name}"]

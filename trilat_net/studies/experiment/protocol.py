@@ -309,7 +309,7 @@ class ExperimentPlan(Result):
     digest: str
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns a summary of the plan, which `trilat experiment check --json` prints."""
+        """Summarises the plan as plain values, as `trilat experiment check --json` prints it."""
         protocol = self.protocol
         uncounted = [trial for trial in self.trials if trial.practice or trial.catch]
         return {

@@ -54,7 +54,10 @@ class TrialTask(Frozen, frozen=True, tag_field="kind"):
 
     @property
     def longest_s(self) -> float:
-        """Longest duration of a trial after its target appears, in s."""
+        """Longest duration of a trial after its target appears, in s.
+
+        A trial that lasts longer has failed, unless every trial lasts exactly that long.
+        """
         raise NotImplementedError
 
     @property
@@ -71,7 +74,7 @@ class TrialTask(Frozen, frozen=True, tag_field="kind"):
         return False
 
     def make_goal(self, start_m: Array, number: int, seed: int) -> "TrialGoal":
-        """Creates the goal of one trial, which states the target and decides when the trial ends.
+        """Creates the goal of one trial: it states the target and decides when the trial ends.
 
         Args:
             start_m: Position of the slave's end effector at the start, shape (2,) or (3,), in
@@ -247,7 +250,10 @@ class ReachTrial(TrialTask, frozen=True, tag="reach"):
         return self.handover_s is not None
 
     def render_instructions(self, slave: str) -> str:
-        """Returns the instructions, with the limits of the corridor and the handover."""
+        """Returns the text that tells participants what to do.
+
+        It includes the limits of the corridor and the handover, if the task has them.
+        """
         text = super().render_instructions(slave)
         if self.corridor_m is not None:
             limit_mm = 500.0 * self.corridor_m
@@ -268,7 +274,14 @@ class ReachTrial(TrialTask, frozen=True, tag="reach"):
         return self.timeout_s + second_appears_s
 
     def make_goal(self, start_m: Array, number: int, seed: int) -> TrialGoal:  # noqa: ARG002 - the order is fixed
-        """Returns the goal of a trial: a target of the ring, and the target after it."""
+        """Creates the goal of a trial: a target of the ring, and the target after it.
+
+        Args:
+            start_m: Position of the slave's end effector at the start, in m, the centre of the
+                ring.
+            number: Number of the target, from 0.
+            seed: Seed of the trial.
+        """
         target_m = self._place_target_m(start_m, number)
         next_target_m = self._place_target_m(start_m, number + 1)
         return _ReachGoal(self, start_m, [target_m, next_target_m])
@@ -424,11 +437,11 @@ class ContactTrial(TrialTask, frozen=True, tag="contact"):
 
     @property
     def longest_s(self) -> float:
-        """The time-out, in s."""
+        """Time after which a trial has failed, in s, counted from the appearance of its target."""
         return self.timeout_s
 
     def make_goal(self, start_m: Array, number: int, seed: int) -> TrialGoal:  # noqa: ARG002 - there is one wall
-        """Returns the goal of a trial: where the wall is, and with which force to press it."""
+        """Creates the goal of a trial: where the wall is, and with which force to press it."""
         return _ContactGoal(self, start_m)
 
 
@@ -497,7 +510,7 @@ class TrackTrial(TrialTask, frozen=True, tag="track"):
 
     @property
     def has_limit(self) -> bool:
-        """False: every trial lasts `duration_s`."""
+        """False, because every trial lasts `duration_s` and none fails."""
         return False
 
     @property
@@ -507,11 +520,11 @@ class TrackTrial(TrialTask, frozen=True, tag="track"):
 
     @property
     def longest_s(self) -> float:
-        """Duration of a trial, in s."""
+        """Duration of every trial after its target appears, in s."""
         return self.duration_s
 
     def make_goal(self, start_m: Array, number: int, seed: int) -> TrialGoal:  # noqa: ARG002 - the seed draws the path
-        """Returns the goal of a trial: a path that begins at the start."""
+        """Creates the goal of a trial: a path of the target that begins at the slave's position."""
         random = np.random.default_rng(seed)
         phases = random.uniform(0.0, 2.0 * math.pi, len(self.frequencies_hz))
         return _TrackGoal(self, start_m, phases)

@@ -383,7 +383,7 @@ class SweepMargins(Result):
 
     @property
     def command(self) -> str:
-        """The command that repeats the search."""
+        """The command that repeats the search, for the page of results."""
         low = format_override_value(self.within.low)
         high = format_override_value(self.within.high)
         tolerance = format_override_value(self.within.tolerance)
@@ -434,7 +434,7 @@ class SweepMargins(Result):
         return TextTable(tuple(heads), rows)
 
     def blocks(self) -> Iterator[TextTable]:
-        """Yields the table of the edges."""
+        """Yields the text that `trilat sweep --margin` prints, which is the table of the edges."""
         yield self.table()
 
     def headline(self) -> str:
@@ -448,7 +448,7 @@ class SweepMargins(Result):
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns plain values, with the keys of `trilat sweep --margin --json`."""
+        """Converts the result to plain values, as `trilat sweep --margin --json` prints it."""
         return {
             "command": self.command,
             "scenario_sha256": self.plan.base.sha256,
@@ -476,7 +476,10 @@ class SweepMargins(Result):
         }
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns one row per edge, and one per grid point without edges, as plain values."""
+        """Converts the result to a table of plain values, one row per edge.
+
+        A grid point without edges has one row, too.
+        """
         rows = list[dict[str, Any]]()
         for point in self.to_dict()["places"]:
             columns = {

@@ -83,7 +83,7 @@ class SweepResults(Result):
         return self.rows
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the results as plain values, with the keys of `trilat sweep --json`."""
+        """Converts the results to plain values, as `trilat sweep --json` prints them."""
         runs = [dict(row) for row in self.rows]
         return {"plan": self.plan.facts(), "runs": runs}
 
@@ -596,10 +596,10 @@ def _summarize_seeds(results: SweepResults) -> Iterator[str]:
 
 
 def list_next_commands(folder: Path) -> list[str]:
-    """Returns commands that a user may want to run after a sweep.
+    """Suggests commands with which a user can continue after a sweep.
 
     Args:
-        folder: Folder of the sweep.
+        folder: Folder of the sweep, which the commands name.
     """
     command = format_command("sweep", str(folder))
     return [

@@ -496,7 +496,7 @@ def describe_sweep_speed(speed: FinishedSweep) -> str:
     """Returns a sentence on how fast the runs were computed in relation to real time.
 
     Args:
-        speed: The finished sweep.
+        speed: The finished sweep, with the simulated and the real time of its runs.
     """
     processes = count_nouns(speed.jobs, "process")
     wall_time = format_wall_time(speed.wall_s)

@@ -124,7 +124,7 @@ def find_pareto_front(points: Sequence[ObjectivePoint | None]) -> list[int]:
 
 
 def compute_crowding(points: Sequence[ObjectivePoint]) -> list[float]:
-    """Computes how isolated each point of a front is, so that gaps of the front can be refined.
+    """Computes how isolated each point of a front is, so that gaps can be refined.
 
     The crowding distance of a point is half the perimeter of the box between its two
     neighbours, where each side is relative to the span of the front. It is infinite for the
@@ -260,10 +260,10 @@ class CandidateSearch:
     def record_scores(
         self, gains: Sequence[CandidateGains], scores: Sequence[CandidateScore]
     ) -> None:
-        """Records the scores of the candidates of a round.
+        """Stores the scores of a round, from which the next round is proposed.
 
         Args:
-            gains: The candidates.
+            gains: The candidates that were run.
             scores: Their scores, in the same order.
         """
         self.tried += gains
@@ -558,7 +558,7 @@ class TuningResult(Result):
         return f"{self.plan.base.scenario.name}: points on the front: {fronts}"
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns plain values, with the keys of `trilat compare --tune --json`."""
+        """Converts the result to plain values, as `trilat compare --tune --json` prints it."""
         printed = []
         for result in self.printed:
             facts = msgspec.to_builtins(result.score)

@@ -164,7 +164,13 @@ def tabulate_front(
 
 
 def tabulate_paper_gains(tuned: TuningResult) -> TextTable:
-    """Returns a table with one row per variant of the gains that the paper prints."""
+    """Returns a table that shows how the gains perform that the paper prints.
+
+    It has one row per variant of these gains, with and without information about the model.
+
+    Args:
+        tuned: Result of the comparison of control laws.
+    """
     rows = []
     for result in tuned.printed:
         score = result.score
@@ -255,7 +261,16 @@ def list_class_meanings() -> list[str]:
 
 
 def build_tuning_page(tuned: TuningResult) -> str:
-    """Returns the comparison as a Markdown page, with a command for each point of a front."""
+    """Composes the Markdown page that reports a comparison of control laws.
+
+    The page contains, for each point of a front, the command that repeats its run.
+
+    Args:
+        tuned: Result of the comparison of control laws.
+
+    Returns:
+        The text of the page.
+    """
     scenario = tuned.plan.base.scenario
     parts = [
         f"# {scenario.name}: laws compared fairly",
