@@ -538,7 +538,7 @@ class SiteStats:
 
     @property
     def tau_x(self) -> Array:
-        """Torque of operator and environment on the arm in the last record, in N m, shape (n,)."""
+        """Torque of operator and environment in the last record, in N m, shape (n,)."""
         if not self._tail:
             return np.zeros(1)
         last_tau_x: Array = self._tail[-1].tau_x[-1]

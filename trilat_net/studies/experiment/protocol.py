@@ -309,7 +309,7 @@ class ExperimentPlan(Result):
     digest: str
 
     def to_dict(self) -> dict[str, Any]:
-        """Summarises the plan as plain values, as `trilat experiment check --json` prints it."""
+        """Summarises the plan in plain values, which `trilat experiment check --json` prints."""
         protocol = self.protocol
         uncounted = [trial for trial in self.trials if trial.practice or trial.catch]
         return {

@@ -437,7 +437,7 @@ class ContactTrial(TrialTask, frozen=True, tag="contact"):
 
     @property
     def longest_s(self) -> float:
-        """Time after which a trial has failed, in s, counted from the appearance of its target."""
+        """Time from the appearance of the target after which a trial has failed, in s."""
         return self.timeout_s
 
     def make_goal(self, start_m: Array, number: int, seed: int) -> TrialGoal:  # noqa: ARG002 - there is one wall
@@ -524,7 +524,13 @@ class TrackTrial(TrialTask, frozen=True, tag="track"):
         return self.duration_s
 
     def make_goal(self, start_m: Array, number: int, seed: int) -> TrialGoal:  # noqa: ARG002 - the seed draws the path
-        """Creates the goal of a trial: a path of the target that begins at the slave's position."""
+        """Creates the goal of a trial: a path that begins at the slave's position.
+
+        Args:
+            start_m: Position of the slave's end effector at the start, in m.
+            number: Number of the target, which is not used.
+            seed: Seed of the random numbers that determine the path.
+        """
         random = np.random.default_rng(seed)
         phases = random.uniform(0.0, 2.0 * math.pi, len(self.frequencies_hz))
         return _TrackGoal(self, start_m, phases)

@@ -434,7 +434,7 @@ class SweepMargins(Result):
         return TextTable(tuple(heads), rows)
 
     def blocks(self) -> Iterator[TextTable]:
-        """Yields the text that `trilat sweep --margin` prints, which is the table of the edges."""
+        """Yields the text that the command prints, which is the table of the edges."""
         yield self.table()
 
     def headline(self) -> str:
