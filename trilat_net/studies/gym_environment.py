@@ -176,6 +176,10 @@ class ReachTask:
 
         The centre of the sphere is the position of the end effector at the start.
 
+        Args:
+            random: Source of random numbers.
+            scene: State at the start of the episode.
+
         Raises:
             UsageError: None of the drawn positions is within reach.
         """

@@ -388,7 +388,11 @@ class TunedGains(msgspec.Struct, frozen=True):
 
 
 def format_settings(settings: Settings) -> list[str]:
-    """Returns overrides as texts KEY=VALUE, as the command line accepts them."""
+    """Converts overrides to texts KEY=VALUE, as the command line accepts them.
+
+    Args:
+        settings: Values by key of the scenario.
+    """
     return [f"{key}={format_toml_value(value)}" for key, value in settings.items()]
 
 
@@ -428,7 +432,10 @@ def fingerprint_tuning(form: str, law: str, round_trip_ms: int) -> str:
 
 
 def read_gains(path: Path = GAINS_FILE) -> dict[tuple[str, str, int], TunedGains]:
-    """Reads the tuned gains of a file.
+    """Reads gains that were tuned before from a file.
+
+    Args:
+        path: The file.
 
     Returns:
         The gains by form, law and round trip in ms. Empty if there is no file.

@@ -381,7 +381,10 @@ UNSTABLE_MARK = "!"
 
 
 def list_quantities(results: BenchResults) -> list[tuple[str, str]]:
-    """Lists the tables of quantities that are printed.
+    """Lists the tables that are printed: one for each task and measured quantity.
+
+    Args:
+        results: Results of the suite or of a part of it.
 
     Returns:
         Pairs of a task that ran and a key of `QUANTITIES`.
@@ -568,12 +571,15 @@ def _describe_result(result: BenchCellResult, quantity: str) -> str:
 
 
 def tabulate_round_trips(results: BenchResults) -> TextTable:
-    """Returns a table that shows how the error of each law grows with delay and with losses.
+    """Returns a table of how the error of each law grows with delay and with losses.
 
     A row is a task and a law. The columns have the error at the shortest round trip, the ratio
     of the errors at the longest and the shortest round trip, and the ratio of the errors with
     and without losses. The published study that this part of the suite repeats reports these
     effects.
+
+    Args:
+        results: Results of the suite or of a part of it.
     """
     rows = []
     for task in results.plan.tasks:

@@ -479,6 +479,9 @@ class ExperimentAnalysis(Result):
 
         Afterwards, `paths` lists the written files.
 
+        Args:
+            folder: Folder of the files.
+
         Returns:
             This analysis.
         """

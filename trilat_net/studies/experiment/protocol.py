@@ -309,7 +309,11 @@ class ExperimentPlan(Result):
     digest: str
 
     def to_dict(self) -> dict[str, Any]:
-        """Summarises the plan in plain values, which `trilat experiment check --json` prints."""
+        """Summarises the plan, as `trilat experiment check --json` prints it.
+
+        Returns:
+            Plain values, ready for JSON.
+        """
         protocol = self.protocol
         uncounted = [trial for trial in self.trials if trial.practice or trial.catch]
         return {

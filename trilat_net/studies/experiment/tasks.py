@@ -352,10 +352,13 @@ class _ReachGoal(_DwellGoal):
         position_m: Array,
         force_n: Array,  # noqa: ARG002
     ) -> dict[str, float]:
-        """Returns the largest distance from the target during the handover, in mm.
+        """Computes how steady the end effector stayed at the target during the handover.
 
-        While one user hands the slave over to the other, its end effector should stay at the
-        target. The distance tells how steady it stayed. Empty without a handover.
+        The measure is the largest distance from the target, in mm, while one user hands the
+        slave over to the other.
+
+        Returns:
+            The measure by its name. Empty without a handover.
         """
         has_begun = after_s >= self._handover_s
         is_handover = has_begun & (after_s < self._second_appears_s)
@@ -465,9 +468,13 @@ class _ContactGoal(_DwellGoal):
         position_m: Array,  # noqa: ARG002
         force_n: Array,
     ) -> dict[str, float]:
-        """Returns the mean of the force that had to be held, and the RMS of its error, in N.
+        """Computes how well the force was held at the end of the trial.
 
-        Both are taken over the time for which the force had to be held at the end of the trial.
+        The measures are the mean of the force and the RMS of its error, both in N, over the
+        time for which the force had to be held.
+
+        Returns:
+            The measures by their names.
         """
         is_dwell = after_s >= after_s[-1] - self._dwell_s
         held_n = force_n[is_dwell]

@@ -276,6 +276,9 @@ def format_range_axis(search_range: SearchRange) -> str:
     """Returns the text of a sweep axis that consists of the two ends of a range.
 
     If a sweep is planned with this axis, the scenario is checked at both ends.
+
+    Args:
+        search_range: Key and range of a search.
     """
     low = format_override_value(search_range.low)
     high = format_override_value(search_range.high)

@@ -320,6 +320,10 @@ def find_map_edges(plane: MapPlane, panel: MapPanel) -> list[tuple[float, Stabil
     A column has an edge wherever the majority of the runs changes between stable and not
     stable from one decided grid point to the next.
 
+    Args:
+        plane: The measured part of the map.
+        panel: Panel of the map, a grid of runs over x and y.
+
     Returns:
         Pairs of the x value of a column and an edge along y. The edges of a column are in
         rising order.
@@ -372,7 +376,10 @@ class StabilityCriterion(NamedTuple):
 
 
 def evaluate_criterion(scenario: Scenario) -> StabilityCriterion | None:
-    """Evaluates the stability condition in closed form that covers a scenario.
+    """Evaluates a stability condition in closed form, known from theory, for a scenario.
+
+    Args:
+        scenario: The scenario, which must meet all hypotheses of the condition.
 
     Returns:
         The condition. None if the scenario violates a hypothesis of every known condition, for

@@ -202,6 +202,9 @@ def measure_exponent(scenario: Scenario) -> float | None:
     and the run changes as exp(exponent t), see `analysis.twin_growth`. The exponent is the
     largest rate of all twins over the judged part of the run.
 
+    Args:
+        scenario: Scenario of the run.
+
     Returns:
         The exponent in 1/s, negative if disturbances decay. None if no push moved anything.
     """

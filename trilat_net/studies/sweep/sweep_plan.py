@@ -897,5 +897,8 @@ def format_override_value(value: float) -> str:
     """Returns the text of a number that parses back to exactly this number.
 
     Whole numbers have no decimal point.
+
+    Args:
+        value: The number.
     """
     return repr(value).removesuffix(".0")

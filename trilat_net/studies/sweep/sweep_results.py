@@ -194,6 +194,10 @@ def reproduction_duration_s(plan: SweepPlan, outcome: CellResult) -> float:
     A run that diverged, that is, left the limits of its arms, ended before its planned
     duration. It is started with the planned duration, and will end early again. Every
     extension of an undecided run doubles the planned duration.
+
+    Args:
+        plan: The sweep: its scenario, axes, control laws and seeds.
+        outcome: Result of the run.
     """
     if outcome.diverged_s is None:
         return outcome.ran_s
@@ -385,6 +389,9 @@ def list_totals(plan: SweepPlan) -> list[str]:
     """Lists the keys of the quantities that are averaged over the seeds of a cell.
 
     These are the totals that every run computes, and the metrics that the sweep requested.
+
+    Args:
+        plan: The sweep: its scenario, axes, control laws and seeds.
     """
     return list(dict.fromkeys((*RunTotals._fields, *plan.metrics)))
 

@@ -117,6 +117,9 @@ def build_twin(scenario: Scenario) -> Scenario | None:
     depends only on the dominance factors (the weights with which the arms follow one another)
     and on the targets.
 
+    Args:
+        scenario: Scenario of the candidate.
+
     Returns:
         The twin. None if the scenario has no such walls and operators, so that no twin is
         needed.
@@ -291,13 +294,16 @@ _POSE_SAMPLES = 2000
 
 
 def check_final_posture(log: Log) -> list[str]:
-    """Returns warnings about the end of a log, one sentence each.
+    """Warns if the end of a run says little about its control law.
 
-    They warn if the run is shorter than planned, and if arms hang down or fell, since the
-    errors and torques of such arms are small but say nothing about a control law.
+    The warnings concern a run that is shorter than planned, and arms that hang down or fell.
+    The errors and torques of such arms are small, but not because of the control law.
+
+    Args:
+        log: Log of the run.
 
     Returns:
-        The warnings. Empty if the log is complete and its arms did not fall.
+        The warnings, one sentence each. Empty if the log is complete and its arms did not fall.
 
     Raises:
         LogError: A record cannot be read.

@@ -37,10 +37,13 @@ _MAX_FRONT_ROWS = 8
 
 
 def compose_tuning(tuned: TuningResult) -> Iterator[Block]:
-    """Yields the text of a comparison for the terminal.
+    """Yields the text that reports a comparison of control laws on the terminal.
 
     The text contains a table of the laws, the meanings of the classes, the fronts, the gains
     that the paper prints, notes, and commands that repeat the best runs.
+
+    Args:
+        tuned: Result of the comparison of control laws.
     """
     yield tabulate_laws(tuned)
     yield from (f"  {line}" for line in list_class_meanings())
@@ -80,8 +83,12 @@ def compose_tuning(tuned: TuningResult) -> Iterator[Block]:
 def tabulate_laws(tuned: TuningResult) -> TextTable:
     """Returns a table that summarises the search of each law in a row.
 
-    The row has the number of candidates and of candidates of each class, the number of points
-    on the law's front and on the common front of all laws, and the two ends of the front.
+    A row has the number of candidates (choices of gains), the number of candidates of each
+    class, such as stable or diverged, the number of points on the law's Pareto front and on the
+    common front of all laws, and the two ends of the front.
+
+    Args:
+        tuned: Result of the comparison of control laws.
     """
     classes = list(reversed(CandidateClass))
     objective = f"{tuned.plan.objective} {tuned.plan.objective.unit}"
@@ -116,9 +123,13 @@ def _format_front_ends(search: CandidateSearch) -> list[str]:
 
 
 def tabulate_search(plan: TuningPlan) -> TextTable:
-    """Returns a table of the search spaces, with one row per gain.
+    """Returns a table of the gains that are tuned, with the ranges in which they are searched.
 
-    The information that a law gets about the model of the arm is named in its first row.
+    There is a row per gain. The information that a law gets about the model of the arm is named
+    in its first row.
+
+    Args:
+        plan: The comparison.
     """
     rows = []
     for space in plan.spaces:
@@ -207,10 +218,13 @@ def _format_mean(mean: float | None, half: float | None) -> str:
 
 
 def describe_procedure(plan: TuningPlan) -> list[str]:
-    """Returns the conditions that are the same for all laws, as one sentence each.
+    """Describes what is the same for all compared laws, as one sentence each.
 
     They are the candidates, the scenario, the model information that laws get, the objectives,
     and further conditions that apply only to some comparisons.
+
+    Args:
+        plan: The comparison.
     """
     scenario = plan.base.scenario
     sampled = (plan.budget + 1) // 2
@@ -322,9 +336,13 @@ _LABELS = {Objective.ERROR: "error (rad)", Objective.SETTLING: "settling time (s
 
 
 def draw_front(tuned: TuningResult) -> Figure:
-    """Draws the fronts of all laws in one panel, with error against effort.
+    """Draws the Pareto fronts of all laws in one panel, with error against effort.
 
-    The axes are logarithmic if all numbers are positive.
+    The Pareto front of a law contains the best compromises between both. The axes are
+    logarithmic if all numbers are positive.
+
+    Args:
+        tuned: Result of the comparison of control laws.
     """
     with style.styled_figure(REPORT_SIZE, _HEIGHT_IN) as figure:
         figure.set_figwidth(FRONT_WIDTH_IN)
