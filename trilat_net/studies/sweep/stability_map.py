@@ -379,7 +379,7 @@ def evaluate_criterion(scenario: Scenario) -> StabilityCriterion | None:
     """Evaluates a stability condition in closed form, known from theory, for a scenario.
 
     Args:
-        scenario: The scenario, which must meet all hypotheses of the condition.
+        scenario: The scenario to which the condition is applied.
 
     Returns:
         The condition. None if the scenario violates a hypothesis of every known condition, for
