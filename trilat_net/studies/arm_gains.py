@@ -119,21 +119,23 @@ class ArmGains(Result):
         arm: File name of the arm's URDF.
         law: Name of the control law.
         sites: Number of arms.
-        rate_hz: Tick rate, in Hz.
-        delay: Description of the delay.
+        rate_hz: Tick rate of the control loop, in Hz.
+        delay: Description of the delay of the links, in words.
         age_ms: Constant age of samples that stands for the delay, in ms.
         margin: Factor by which the stiffness lies below the edge.
         damping: Damping ratio of the gains.
         joints: For each joint, the inertia m, the gains with their unit, and the position error
             at which the effort limit of the joint is reached.
-        edge: Values of k at the edge, in 1/s^2: of the sampled loop with the delays in use, of
-            the sampled loop with a constant delay, and in continuous time, where None means
-            that there is no edge. Further the k from which the damping makes a motion swing
-            from tick to tick; the frequency, motion and pose at the edge; and whether the delay
-            or the tick rate bounds K.
-        runs: Runs with the gains, whose `share` is None, and runs at fractions `share` of k at
-            the edge. Each has the measured growth rate of the largest speed, which is None if
-            the motions were not small, and the growth rate that the roots predict.
+        edge: Values of k at the edge, in 1/s^2. There are three: of the sampled loop with the
+            delays in use, of the sampled loop with a constant delay, and in continuous time.
+            None means that there is no edge. Further entries are the k from which the damping
+            makes a motion swing from tick to tick; the frequency, motion and pose at the edge;
+            and whether the delay or the tick rate limits K.
+        runs: Simulated runs that check the gains. The entry `share` is None for the gains
+            themselves. For the other runs it is the value of k as a fraction of that at the
+            edge. Each run has two growth rates: one that was measured from the largest speed,
+            which is None if the motions were not small, and one that the roots of the loop
+            predict.
         agree: True if all runs behave as the roots predict, and the run with the gains decays.
         line: The gains as a line to paste above the tables of a scenario.
         curve: Pairs of a delay, in s, and k at the edge in the same pose. Empty unless

@@ -248,7 +248,10 @@ class BenchCellResult(NamedTuple):
 
 
 class BenchResults(Result):
-    """The results of a suite, or of a part of it.
+    """The results of a suite, or of a part of it, as tables and as text.
+
+    The suite runs control laws in several tasks over several links. A cell is a law in a task
+    over a link, and has one run per seed.
 
     Attributes:
         plan: Plan of the suite.

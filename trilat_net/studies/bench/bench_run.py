@@ -81,7 +81,10 @@ class BenchRunItem(NamedTuple):
 
 
 class _JudgedRun(NamedTuple):
-    """A run with all of its records, and its judgement.
+    """A run of the suite with all of its records, and the judgement whether it is stable.
+
+    The judgement takes twins into account: repeated runs with a small disturbance, which show
+    whether disturbances grow.
 
     Attributes:
         scenario: Scenario of the run. Its duration is that of the run.

@@ -144,15 +144,15 @@ def path_length_m(places: ArrayLike) -> float:
 def movement_time_s(
     speed: ArrayLike, rate_hz: float, *, share: float = ONSET_SHARE
 ) -> float | None:
-    """Returns the duration of a movement, in s.
+    """Computes the duration of a movement from its speed, in s.
 
-    The movement lasts from the first to the last sample whose speed is at least `share` of the
-    peak speed.
+    The movement lasts from the first to the last sample whose speed is at least a given
+    fraction of the peak speed.
 
     Args:
         speed: Speed, in m/s or rad/s, shape (K,).
         rate_hz: Samples per second.
-        share: Share of the peak speed at which the movement starts and ends.
+        share: Fraction of the peak speed at which the movement starts and ends.
 
     Returns:
         The duration. None at rest.

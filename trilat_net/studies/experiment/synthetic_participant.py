@@ -39,16 +39,20 @@ DELAY_MARGIN = 0.7
 
 
 class ParticipantModel(Frozen, frozen=True):
-    """Mean parameters of synthetic participants, who differ from each other.
+    """Parameters of synthetic participants, which are models of people.
+
+    They are mean values, from which `draw` derives participants who differ from each other. The
+    duration of a movement follows Fitts's law: it grows with the index of difficulty,
+    log2(distance / width + 1).
 
     Attributes:
         reaction_s: Time from what the participant sees to the reaction, in s.
         fitts_a_s: Duration of a movement of no difficulty, in s.
         fitts_b_s: Additional duration for each bit of the index of difficulty, in s.
-        noise: Standard deviation of a movement's end, as a share of the movement's length.
+        noise: Standard deviation of a movement's end, as a fraction of the movement's length.
         crossover_rad_s: Rate at which a moving target is followed without a delay, in rad/s.
-        learning: Share by which a first trial is slower than a practised trial.
-        practised: Number of trials after which half of this share is gone.
+        learning: Fraction by which a first trial is slower than a practised trial.
+        practised: Number of trials after which half of the fraction `learning` is gone.
         spread: Standard deviation of the logarithm of a participant's parameters.
     """
 

@@ -199,8 +199,8 @@ def measure_exponent(scenario: Scenario) -> float | None:
     """Measures the growth exponent of a run, the rate at which small disturbances grow.
 
     A twin is a second execution of the run with a small push. The difference between the twin
-    and the run changes as exp(exponent t), see `analysis.twin_growth`. The exponent is the
-    largest rate of all twins over the judged part of the run.
+    and the run changes as exp(exponent t), where t is the time, see `analysis.twin_growth`.
+    Several twins are run, and the largest of their rates is returned.
 
     Args:
         scenario: Scenario of the run.

@@ -442,10 +442,16 @@ def average_scores(scores: Sequence[CandidateScore]) -> CandidateScore:
 def measure_candidate(text: str, twin_text: str | None) -> CandidateScore:
     """Runs a candidate and its twin, and scores the candidate.
 
+    The twin is the same run without walls and without operators that have no target pose, see
+    `build_twin`. It shows at which pose the arms would come to rest.
+
     Args:
         text: Canonical text of the candidate's scenario.
-        twin_text: Canonical text of the twin's scenario. None if there is no twin, so that the
-            candidate's own run is judged.
+        twin_text: Canonical text of the twin's scenario. None if there is no twin. The final
+            pose is then taken from the candidate's own run.
+
+    Returns:
+        The score of the candidate.
     """
     run = _measure_run(parse_scenario(text))
     twin = run if twin_text is None else _measure_run(parse_scenario(twin_text))
