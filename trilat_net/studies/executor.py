@@ -267,7 +267,9 @@ class WorkerPool:
         lost: Callable[[T], R] | None = None,
         count: int | None = None,
     ) -> Iterator[tuple[int, R]]:
-        """Runs a function on each item, and yields the results as the items end.
+        """Runs a function on each item with all workers, and yields each result as it arrives.
+
+        The order of the results may differ from that of the items.
 
         Args:
             function: Function at module level, so that another process can import it.
@@ -277,7 +279,7 @@ class WorkerPool:
             count: Number of items, if it is known.
 
         Yields:
-            The number of an item and its result.
+            The number of an item, counted from 0, and its result.
 
         Raises:
             RunFailed: An item killed its workers, or no workers are left.

@@ -100,9 +100,10 @@ class MissingAnswers(NamedTuple):
 
 
 class ExperimentAnalysis(Result):
-    """The statistics of an experiment.
+    """The statistics of an experiment: comparisons of its conditions, and texts for a paper.
 
-    Creating this object computes everything except the figures.
+    Creating this object computes everything except the figures, which `write` draws. A unit is
+    a participant or a pair, whichever is sampled independently.
 
     Args:
         experiment: The experiment in its folder.
@@ -110,11 +111,12 @@ class ExperimentAnalysis(Result):
 
     Attributes:
         unit: "participant" or "pair", which is sampled independently.
-        rows: Trials that count. With a training, only those after it.
+        rows: Trials that count, as a table. With a training, only those after it.
         learning_rows: Trials that count, in all phases of a training.
-        throughput_rows: Throughput of each unit and condition.
-        gain_rows: Gain by a training, of each unit and condition.
-        threshold_rows: Threshold by a staircase, of each unit and condition.
+        throughput_rows: Throughput (speed and accuracy in one number) of each unit and
+            condition.
+        gain_rows: Improvement by a training, of each unit and condition.
+        threshold_rows: Threshold of perception by a staircase, of each unit and condition.
         means: For each measure, the mean under each condition. `completion_s` is included only
             if all trials were completed.
         comparisons: For each measure, the comparison of each pair of conditions.

@@ -200,7 +200,8 @@ def measure_exponent(scenario: Scenario) -> float | None:
 
     A twin is a second execution of the run with a small push. The difference between the twin
     and the run changes as exp(exponent t), where t is the time, see `analysis.twin_growth`.
-    Several twins are run, and the largest of their rates is returned.
+    Several twins are run, and the largest of their rates over the later part of the run, by
+    which runs are judged, is returned.
 
     Args:
         scenario: Scenario of the run.
