@@ -159,14 +159,16 @@ def schedule_deliveries(
 ) -> None:
     """Computes the due times of all samples up to `sample` that have none yet.
 
-    The last model whose first stamp is not after the stamp of a sample applies to the sample.
+    A due time is the time at which the simulated link delivers the sample. The last model of
+    the link whose first stamp is not after the stamp of a sample applies to the sample.
 
     Args:
-        sample: the newest sample to schedule.
-        link: the row of the link.
-        models: its models, see `LinkArrays`.
-        dues: the due times, which replace those of the oldest samples, see `LinkArrays`.
-        points: the site's traces and outages.
+        sample: Index of the newest sample to schedule.
+        link: Row of the link; changed.
+        models: Models of the link's delay and loss, see `LinkArrays`.
+        dues: Written: the due times, which replace those of the oldest samples, see
+            `LinkArrays`.
+        points: Delay traces and outages of the site.
     """
     kept = dues.shape[0]
     while link.scheduled < sample:

@@ -68,7 +68,10 @@ def compiled(law: T) -> T:
 
 
 def is_compiled(law: Any) -> bool:
-    """Returns True if the `torque` of a law will be compiled; False if Numba is disabled."""
+    """Returns True if the `torque` method of a law is compiled when a site is built.
+
+    The law's class must be marked with `compiled`. If Numba is disabled, nothing is compiled.
+    """
     config: Any = numba.config
     return bool(getattr(law, "is_compiled", False)) and not config.DISABLE_JIT
 
@@ -94,7 +97,7 @@ def law_stage(
     channel: ChannelArrays,
     sent: Array,
 ) -> None:
-    """Computes stage 6 of a tick, the torque, by a compiled law.
+    """Computes the torque of one tick by a compiled law (stage 6 of a tick).
 
     The row's field `asked` is 1 while the law runs. An exception that is raised meanwhile comes
     from the law.
@@ -103,12 +106,12 @@ def law_stage(
         k: The tick.
         t_ns: Nominal time of the tick, ns since the epoch, the common start of the session.
         address: Address of the law's machine code.
-        law: Numbers of the law, the remembered ones first.
-        site: Row of the site.
+        law: Numbers of the law, those that it keeps from tick to tick first; changed.
+        site: Row of the site, in which the torque is written.
         links: Rows of the site's links.
         chain: Rows of the chain of joints, or None for the planar arm.
         channel: Vectors that the peers' laws sent.
-        sent: Vectors that this law sends; written.
+        sent: Written: the vectors that this law sends.
 
     Raises:
         FloatingPointError: A result is not finite.
@@ -338,16 +341,18 @@ def _explain_attribute(name: str, law: Any, location: str) -> str:
 
 
 class CompiledLaw:
-    """Compiled law at its site.
+    """A user's compiled control law, with the arrays of the site that it controls.
+
+    `plug_law` creates the object. The site calls `compute` once per tick.
 
     Args:
         law: An instance of the law's class.
         setup: Setup of the site.
         arrays: Arrays of the site; their vectors may be longer than the site's.
-        sent: Sent vectors in the site's record, see `LawChannel`.
+        sent: Vectors that the law sends, in the site's record, see `LawChannel`.
 
     Attributes:
-        row: Numbers of the law, the remembered ones first.
+        row: Numbers of the law, those that it keeps from tick to tick first.
         address: Address of its machine code.
 
     Raises:
@@ -398,7 +403,7 @@ class CompiledLaw:
         arrays.site["remembered"] = self._remembered
 
     def bind(self) -> None:
-        """Compiles the stage that `compute` calls.
+        """Compiles the function with which `compute` calls the law.
 
         The compilation takes seconds. Without this call, the first tick would wait for it.
         """
@@ -418,11 +423,14 @@ class CompiledLaw:
         )
 
     def compute(self, k: int, t_ns: int) -> list[float]:
-        """Computes stage 6 of a tick, see `law_stage`, and returns the law's memory.
+        """Computes the torque of one tick (stage 6), see `law_stage`.
 
         Args:
             k: The tick.
-            t_ns: Nominal time of the tick, ns since the epoch.
+            t_ns: Nominal time of the tick, ns since the epoch, the common start of the session.
+
+        Returns:
+            The memory of the law after the tick, which the record contains.
 
         Raises:
             LawFailed: The law failed.
@@ -439,12 +447,19 @@ class CompiledLaw:
 
     @property
     def memory(self) -> list[float]:
-        """Numbers that the law keeps from tick to tick, as they are now."""
+        """Numbers that the law keeps from tick to tick, as they are now.
+
+        A record contains them, so that `restore` can continue the run from there.
+        """
         memory: list[float] = self.row[: self._remembered].tolist()
         return memory
 
     def restore(self, memory: Sequence[float]) -> None:
-        """Restores the law from its memory, as a record contains it."""
+        """Restores the law to its state after a tick, from the record of that tick.
+
+        Args:
+            memory: Numbers that `memory` returned after the tick.
+        """
         self.row[: self._remembered] = memory
 
     def find_failure(self, error: Exception) -> LawFailed | None:

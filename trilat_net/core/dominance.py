@@ -125,8 +125,8 @@ def find_balancing_weights(alpha: Array) -> Array | None:
 def perron_vector(alpha: Array) -> Array:
     """Returns the weights beta of the sites in the energy function of the stability proof.
 
-    They are the positive solution of beta' Upsilon = 0 with the sum 1. The method is the
-    elimination of Grassmann, Taksar and Heyman (1985). It contains no subtraction, so that each
+    They are the positive solution of beta' = beta' alpha with the sum 1, which the paper writes
+    as beta' Upsilon = 0. The method is the elimination of Grassmann, Taksar and Heyman (1985). It contains no subtraction, so that each
     entry is accurate to a few units in the last place even if the dominance factors differ by
     many orders of magnitude.
 

@@ -75,7 +75,7 @@ class LawChannel(NamedTuple):
     peers: int = 0
 
     def select_vectors(self, *, per_peer: bool) -> tuple[SentVector, ...]:
-        """Returns the vectors of one kind.
+        """Returns the vectors that go to all peers, or those that go to each peer alone.
 
         Args:
             per_peer: True: the vectors that go to each peer alone; false: those that go to all.
@@ -83,7 +83,7 @@ class LawChannel(NamedTuple):
         return tuple(vector for vector in self.vectors if vector.per_peer is per_peer)
 
     def count_numbers(self, *, per_peer: bool) -> int:
-        """Returns the count of numbers in the vectors of one kind.
+        """Returns how many numbers the vectors of one kind have together.
 
         Args:
             per_peer: True: numbers that go to each peer alone; false: numbers that go to all.
@@ -92,18 +92,18 @@ class LawChannel(NamedTuple):
 
     @property
     def received_size(self) -> int:
-        """Count of the numbers that one peer receives."""
+        """Count of the numbers that one peer receives with each sample."""
         return sum(vector.length for vector in self.vectors)
 
     @property
     def record_size(self) -> int:
-        """Count of the numbers that a record contains."""
+        """Count of the numbers that the law sends in one tick, which its record contains."""
         to_all = self.count_numbers(per_peer=False)
         to_each = self.count_numbers(per_peer=True)
         return to_all + self.peers * to_each
 
     def find_columns(self, vectors: Sequence[SentVector]) -> list[int]:
-        """Returns the index of each number of a law among the numbers that a peer receives.
+        """Returns where the numbers that a peer's law reads stand among those that it receives.
 
         Args:
             vectors: The vectors that the law of the peer reads.
@@ -124,7 +124,7 @@ class LawChannel(NamedTuple):
         return columns
 
     def entries(self, peers: Sequence[str]) -> Iterator[SentEntry]:
-        """Yields an entry for each number of a record, in order.
+        """Yields a description of each number that a record of this law contains, in order.
 
         Args:
             peers: Names of the site's peers, in scenario order.
@@ -138,10 +138,10 @@ class LawChannel(NamedTuple):
                     yield SentEntry(vector, peer, n)
 
     def select_for_peer(self, sent: Sequence[float], peer_index: int) -> Sequence[float]:
-        """Returns the numbers of a record that a peer receives.
+        """Returns those of the sent numbers that one peer receives.
 
         Args:
-            sent: Numbers of the record.
+            sent: All numbers that the law sent in a tick, as the record contains them.
             peer_index: Index of the peer among the sender's peers.
         """
         to_all = self.count_numbers(per_peer=False)
@@ -153,7 +153,7 @@ class LawChannel(NamedTuple):
 
 
 def join_received(channels: Sequence[LawChannel]) -> tuple[SentVector, ...]:
-    """Returns the vectors that a law may receive from any of its peers, each name once.
+    """Returns all vectors that a law may receive from its peers, each name once.
 
     Args:
         channels: Vectors that the laws of the peers send.

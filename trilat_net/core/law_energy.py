@@ -91,7 +91,10 @@ class LawEnergies(NamedTuple):
 
 
 def sum_work(tau: Array, q: Array) -> Array:
-    """Returns the work of held torques from the first tick up to each tick, shape (K,), J.
+    """Returns the work of a joint torque since the first tick, for each tick, J, shape (K,).
+
+    A torque is held from each tick to the next. Its work in this period is the torque times the
+    step of the joint angles, summed over the joints. The first number is 0.
 
     Args:
         tau: Torque held from each tick to the next, shape (K, n), N m.

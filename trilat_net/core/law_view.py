@@ -44,16 +44,16 @@ def _update_model(s: Row, chain: RowArray | None) -> None:
 def update_law_view(
     k: int, t_ns: int, site: RowArray, links: RowArray, chain: RowArray | None
 ) -> None:
-    """Writes the parts of a law's input that no stage has written: time, model and peers.
+    """Prepares the input of a user's law for one tick: time, arm model and peers.
 
-    The torque becomes NaN, so that the check after the law finds a torque that the law has not
-    written.
+    These are the parts of the input that no earlier stage of the tick has written. The torque
+    becomes NaN, so that the check after the law finds a torque that the law has not written.
 
     Args:
         k: The tick.
-        t_ns: Nominal time of the tick, ns since the epoch.
-        site: Row of the site.
-        links: Rows of the site's links.
+        t_ns: Nominal time of the tick, ns since the epoch, the common start of the session.
+        site: Row of the site; written.
+        links: Rows of the site's links; written.
         chain: Rows of the chain of joints, or None for the planar arm.
     """
     s: Row = site[0]
@@ -95,15 +95,15 @@ def _name_vectors(vectors: Sequence[SentVector], numbers: list[float]) -> Simple
 
 
 class PlainLaw:
-    """Law in plain Python at its site.
+    """A user's control law in plain Python, with the arrays of the site that it controls.
 
-    The law receives lists, and its results are written into the site's row.
+    In each tick the law receives lists, and its results are written into the site's row.
 
     Args:
         law: The law.
         setup: Setup of the site.
         arrays: Arrays of the site; their vectors may be longer than the site's.
-        sent: Sent vectors in the site's record, see `LawChannel`.
+        sent: Vectors that the law sends, in the site's record, see `LawChannel`.
     """
 
     def __init__(self, law: UserLaw, setup: SiteSetup, arrays: SiteArrays, sent: Array) -> None:
@@ -141,18 +141,24 @@ class PlainLaw:
         self._peer_size = channel.count_numbers(per_peer=True)
 
     def bind(self) -> None:
-        """Compiles the leaf that `compute` calls, before the first tick needs it."""
+        """Compiles the function that prepares the law's input.
+
+        Without this call, the first tick would wait for the compilation.
+        """
         a = self._arrays
         self._update = bind_leaf(update_law_view, 0, 0, a.site, a.links, a.chain)
 
     def compute(self, k: int, t_ns: int) -> list[float]:
-        """Computes stage 6 of a tick, the torque, and returns the law's memory.
+        """Computes the torque of one tick (stage 6), by a call of the user's law.
 
         Torque, estimate and sent vectors are written into the site's arrays.
 
         Args:
             k: The tick.
-            t_ns: Nominal time of the tick, ns since the epoch.
+            t_ns: Nominal time of the tick, ns since the epoch, the common start of the session.
+
+        Returns:
+            The memory of the law after the tick, which the record contains.
 
         Raises:
             LawFailed: The law failed.
@@ -169,11 +175,18 @@ class PlainLaw:
 
     @property
     def memory(self) -> list[float]:
-        """Numbers that the law keeps from tick to tick, as they are now."""
+        """Numbers that the law keeps from tick to tick, as they are now.
+
+        A record contains them, so that `restore` can continue the run from there.
+        """
         return read_memory(self._law)
 
     def restore(self, memory: Sequence[float]) -> None:
-        """Restores the law from its memory, as a record contains it."""
+        """Restores the law to its state after a tick, from the record of that tick.
+
+        Args:
+            memory: Numbers that `memory` returned after the tick.
+        """
         restore_law(self._law, self._setup.name, memory)
 
     def _read(self, k: int) -> LawInput:

@@ -35,18 +35,24 @@ from .vectors import Array, IntArray, Points, Row, RowArray, put
 
 @cache
 def link_dtype(shared: int) -> np.dtype[np.void]:
-    """Returns the layout of a link's row for samples of `shared` coordinates, see `LinkRow`.
+    """Returns the NumPy data type of the row that stores the state of a link, see `LinkRow`.
 
-    A site has one row per peer, in scenario order.
+    A link is the connection from one peer. A site has one row per peer, in scenario order.
+
+    Args:
+        shared: Number of coordinates that sites share, the length of the row's vectors.
     """
     return row_dtype("link", {"shared": shared})
 
 
 @cache
 def sample_dtype(shared: int) -> np.dtype[np.void]:
-    """Returns the layout of a calendar's pages for samples of `shared` coordinates.
+    """Returns the NumPy data type of a waiting sample, see `SampleRow`.
 
-    A calendar has a power of two of pages. See `SampleRow`.
+    Samples wait in the calendar of their link, a ring whose number of pages is a power of two.
+
+    Args:
+        shared: Number of coordinates that sites share, the length of the sample's vectors.
     """
     return row_dtype("sample", {"shared": shared})
 
@@ -141,8 +147,7 @@ def release_tick(tick: int, rate_hz: int, link: LinkArrays) -> int:
 
     Returns:
         The tick. LOST if the link loses the sample, or if the sample is so old that the link
-            has
-        forgotten its due time.
+        has forgotten its due time.
     """
     row: LinkRow = link.state[0]
     dues = link.dues
@@ -212,20 +217,20 @@ def accept_sample(
     sent: Array,
     link: LinkArrays,
 ) -> None:
-    """Files one arrival of a peer in its link, or counts the reason for which it is not used.
+    """Stores a sample that arrived until its delay has passed, or counts why it is not used.
 
     A late sample, which arrives after its due time, is used at the present tick if no newer
     sample is in use: see `release < k` below.
 
     Args:
-        k: the present tick of the receiver.
-        rate_hz: the tick rate of the receiver, Hz.
-        tick: the sample's stamp, a tick of the peer.
-        q: joint angles or pose of the peer.
-        qd: its derivative.
-        tau_x: the exogenous torque of the peer.
-        sent: the numbers that the peer's law sent; ignored if the receiver's law ignores them.
-        link: the arrays of the link.
+        k: Present tick of the receiver.
+        rate_hz: Tick rate of the receiver, Hz.
+        tick: Stamp of the sample, a tick of the peer.
+        q: Joint angles or pose of the peer, rad or m.
+        qd: Derivative of q.
+        tau_x: Exogenous torque of the peer, N m.
+        sent: Numbers that the peer's law sent; ignored if the receiver's law ignores them.
+        link: Arrays of the link; written.
     """
     row: LinkRow = link.state[0]
     dues = link.dues
@@ -273,16 +278,16 @@ def accept_sample(
 
 @leaf
 def release_sample(k: int, rate_hz: int, link: LinkArrays) -> None:
-    """Brings the newest sample that tick k releases into use.
+    """Puts into use the newest sample of a peer whose delay has passed in tick k.
 
-    If tick k releases no sample, the last sample stays in use. Every tick must be released
-    once, in order. The deliveries of all samples with a stamp up to t_k are scheduled here, so
-    that the first sample after a long silence costs no more than any other.
+    If there is no such sample, the last sample stays in use. Every tick must be released once,
+    in order. The deliveries of all samples with a stamp up to the time t_k of the tick are
+    scheduled here, so that the first sample after a long silence costs no more than any other.
 
     Args:
-        k: the tick of the receiver.
-        rate_hz: the tick rate of the receiver, Hz.
-        link: the arrays of the link.
+        k: Tick of the receiver.
+        rate_hz: Tick rate of the receiver, Hz.
+        link: Arrays of the link; written.
     """
     row: LinkRow = link.state[0]
     row.new = 0

@@ -103,17 +103,17 @@ class HandReach(NamedTuple):
 
 
 class HandRules(NamedTuple):
-    """The limits of a live hand.
+    """Limits of a live hand, a person or program that moves an arm during the run.
 
     Attributes:
-        size: count of the target's numbers: one per axis, or one per joint.
-        rate_hz: tick rate of the site, Hz.
-        speed_limit: largest speed of the target, m/s or rad/s.
-        starts_at_arm: true: the target starts at the arm's pose; false: the target is a force,
+        size: Count of the target's numbers: one per axis, or one per joint.
+        rate_hz: Tick rate of the site, Hz.
+        speed_limit: Largest speed of the target, m/s or rad/s.
+        starts_at_arm: True: the target starts at the arm's pose; false: the target is a force,
             which starts at 0.
-        max_goal_norm: largest norm of an accepted goal, m, rad or N.
-        acceleration_limit: largest acceleration of the target, m/s^2 or rad/s^2; inf: no limit.
-        reach: the reachable goals.
+        max_goal_norm: Largest norm of an accepted goal, m, rad or N.
+        acceleration_limit: Largest acceleration of the target, m/s^2 or rad/s^2; inf: no limit.
+        reach: The reachable goals.
     """
 
     size: int
@@ -126,14 +126,14 @@ class HandRules(NamedTuple):
 
 
 class HandCommand(NamedTuple):
-    """One message of a hand.
+    """One message by which a person or program moves an arm.
 
     Attributes:
-        source: the sender, a random number above 0.
-        number: number of the sender's target; a repeated number means an unchanged target.
-        grip: false releases the arm.
-        target: the goal, m or rad, or the force, N.
-        sent_ns: time of sending by the sender's clock, ns.
+        source: The sender, a random number above 0.
+        number: Number of the sender's target; a repeated number means an unchanged target.
+        grip: False releases the arm.
+        target: The goal, m or rad, or the force, N.
+        sent_ns: Time of sending by the sender's clock, ns.
     """
 
     source: int
@@ -207,13 +207,13 @@ class HandInForce(NamedTuple):
 
 
 class HandStep(NamedTuple):
-    """The result of a tick of a hand.
+    """Result of `advance_hand`: what the person or program that moves an arm does in a tick.
 
     Attributes:
-        memory: the state for the next tick.
-        vector: the action in the tick, see `HandInForce`.
-        refused: a reason for each message that had no effect.
-        changes: changes of the holder in order: the source, and TAKEN, RELEASED or SILENT.
+        memory: State for the next tick.
+        vector: Action in the tick, see `HandInForce`.
+        refused: A reason for each message that had no effect.
+        changes: Changes of the holder in order: the source, and TAKEN, RELEASED or SILENT.
     """
 
     memory: HandMemory
@@ -223,12 +223,20 @@ class HandStep(NamedTuple):
 
 
 def count_hand_numbers(size: int) -> int:
-    """Returns the length of a record's field `hand` for a target of `size` numbers."""
+    """Returns the length of the field `hand` of a record, which contains a `HandInForce`.
+
+    Args:
+        size: Count of the numbers of a target.
+    """
     return 3 + 2 * size
 
 
 def empty_hand_vector(size: int) -> list[float]:
-    """Returns the field `hand` of a record while nobody holds the arm."""
+    """Returns the field `hand` of a record while nobody holds the arm.
+
+    Args:
+        size: Count of the numbers of a target.
+    """
     return [0.0, -1.0, 0.0, *[0.0] * (2 * size)]
 
 
@@ -297,12 +305,12 @@ def _move_target(rules: HandRules, memory: HandMemory) -> HandMemory:
 
 @leaf
 def find_stopping_speed(distance: float, acceleration: float, h_s: float) -> float:
-    """Returns the largest speed from which a target can stop at a distance, Eq. (L1).
+    """Returns the largest speed from which a target can stop within a distance, Eq. (L1).
 
     Args:
-        distance: distance to the goal, m or rad.
-        acceleration: largest acceleration, m/s^2 or rad/s^2.
-        h_s: period of the ticks, s.
+        distance: Distance to the goal, m or rad.
+        acceleration: Largest acceleration, m/s^2 or rad/s^2.
+        h_s: Period of the ticks, s.
     """
     speed_step = acceleration * h_s
     D = distance / (speed_step * h_s)
@@ -329,21 +337,22 @@ def glide(
     rate: Array,
     rows: Array,
 ) -> float:
-    """Computes the actions of a held arm in ticks without a message.
+    """Computes how the target of a held arm moves in a series of ticks without a message.
 
-    The result equals that of `advance_hand`, bit for bit, and is compiled.
+    The result equals that of `advance_hand`, bit for bit, but one compiled call computes all of
+    the ticks.
 
     Args:
-        first: the first tick.
-        rate_hz: tick rate of the site, Hz.
-        grip: firmness of the grip before, 0 to 1.
-        arrives_ns: time at which the target arrives at the goal, ns since the epoch.
-        speed_limit: largest speed of the target, m/s or rad/s.
-        acceleration: largest acceleration of the target, m/s^2 or rad/s^2; inf: no limit.
-        goal: the goal, shape (size,).
-        target: the target before; changed, shape (size,).
-        rate: its velocity before; changed, shape (size,).
-        rows: written: one row per tick as `HandInForce`, except number and source.
+        first: The first tick.
+        rate_hz: Tick rate of the site, Hz.
+        grip: Firmness of the grip before, 0 to 1.
+        arrives_ns: Time at which the target arrives at the goal, ns since the epoch.
+        speed_limit: Largest speed of the target, m/s or rad/s.
+        acceleration: Largest acceleration of the target, m/s^2 or rad/s^2; inf: no limit.
+        goal: The goal, shape (size,).
+        target: The target before; changed, shape (size,).
+        rate: Its velocity before; changed, shape (size,).
+        rows: Written: one row per tick as `HandInForce`, except number and source.
 
     Returns:
         The firmness of the grip afterwards.

@@ -166,14 +166,16 @@ def _redistribute_shares(links: RowArray) -> bool:
 
 @leaf
 def regroup(t_ns: int, site: SiteRow, links: RowArray) -> None:
-    """Drops lost peers, restores peers that returned, and redistributes the dominance factors.
+    """Adapts the dominance factors of a site to peers that are lost or have returned.
 
-    Before the call `alpha` of a link is the planned factor, afterwards the factor in force.
+    A dominance factor is the weight with which the site follows a peer. The factors of lost
+    peers are redistributed to the others. Before the call `alpha` of a link is the planned
+    factor, afterwards the factor in force.
 
     Args:
         t_ns: Time, ns since the epoch, the common start of the session.
-        site: Row of the site.
-        links: Rows of the site's links.
+        site: Row of the site; changed.
+        links: Rows of the site's links; changed.
     """
     site.regrouped = 0
     for j in range(links.shape[0]):

@@ -113,9 +113,14 @@ class HandProgram(Protocol):
     """
 
     def act(self, now: HandView) -> Sequence[float] | None:
-        """Returns the target of the end effector, m, or of the joints, rad, or a force, N.
+        """Decides what the program does with the arm, from what the site knows at a tick.
 
-        None releases the arm.
+        Args:
+            now: State of the arm, its target and its peers.
+
+        Returns:
+            The target of the end effector, m, or of the joints, rad, or a force, N, as the
+            program's mode says. None releases the arm.
         """
 
 
@@ -146,7 +151,7 @@ class OwnHand:
         self._newest = -1
 
     def is_decision_tick(self, k: int) -> bool:
-        """Returns True if the program decides at tick `k`."""
+        """Returns True if the program is asked for a decision at tick `k`."""
         return k % self.period_ticks == 0
 
     def find_next_event(self, k: int) -> int:
@@ -155,7 +160,7 @@ class OwnHand:
         return min([next_decision, *(due for due, _ in self._due if due > k)])
 
     def build_view(self, k: int, arrays: SiteArrays, layout: Layout) -> HandView:
-        """Returns the program's view at tick `k`, which the site has not computed yet.
+        """Returns what the program may know at tick `k`, before the site computes this tick.
 
         Args:
             k: The tick.
@@ -212,12 +217,12 @@ class OwnHand:
         return tuple(peers)
 
     def accept_decision(self, k: int, goal: Sequence[float] | None) -> None:
-        """Schedules the decision that is based on the view of tick `k`.
+        """Schedules a decision of the program, which acts after the delay of the program.
 
         A decision that is older than the newest one is ignored.
 
         Args:
-            k: Tick of the view.
+            k: Tick of the view on which the decision is based.
             goal: Target or force; None releases the arm.
 
         Raises:
@@ -267,11 +272,14 @@ class OwnHand:
         self._due.append((due, command))
 
     def advance_to(self, k: int, read_angles: Callable[[], Sequence[float]]) -> HandStep:
-        """Returns the program's action in tick `k`, see `advance_hand`.
+        """Advances the target of the program to tick k, and returns the action in this tick.
 
         Args:
             k: The tick after that of the previous call.
             read_angles: Function that returns the joint angles, rad.
+
+        Returns:
+            The action and the state after the tick, as from `advance_hand`.
         """
         commands = []
         while self._due and self._due[0][0] <= k:

@@ -194,9 +194,13 @@ class UserLaw(Protocol):
     """
 
     def torque(self, now: LawInput) -> Sequence[float] | None:
-        """Returns the torque of each joint, N m, or writes `now.tau` and returns None.
+        """Computes the torque of each joint in one tick, N m, which is limited afterwards.
 
-        The torque is limited afterwards.
+        Args:
+            now: State of the arm and its peers, and the places for the results.
+
+        Returns:
+            The torque. None if the law wrote it to `now.tau` instead.
         """
 
 
@@ -244,7 +248,11 @@ def call_law(
 
 
 class LawResults(NamedTuple):
-    """Results of a law in a tick: torque, estimate, memory and sent numbers."""
+    """Results of a user's law in one tick, as `call_law` returns them.
+
+    They are the torque of each joint, the estimate of the arm's parameters, the memory that the
+    law keeps for the next tick, and the numbers that it sends to its peers.
+    """
 
     torque: list[float]
     theta_hat: list[float]
@@ -253,7 +261,7 @@ class LawResults(NamedTuple):
 
 
 def check_results(law: UserLaw, site: str, tick: int, results: LawResults) -> None:
-    """Refuses results that are not finite, and a memory that is too large.
+    """Checks that the results of a law are finite and that its memory is not too large.
 
     Args:
         law: The law, for the error.
@@ -262,7 +270,7 @@ def check_results(law: UserLaw, site: str, tick: int, results: LawResults) -> No
         results: Results of the law.
 
     Raises:
-        LawFailed: The first problem.
+        LawFailed: A check fails. The error states the first problem.
     """
     count = len(results.memory)
     if count > MAX_LAW_MEMORY:
@@ -281,12 +289,12 @@ def check_results(law: UserLaw, site: str, tick: int, results: LawResults) -> No
 def describe_failure(
     law: UserLaw, site: str, tick: int | None, error: BaseException
 ) -> LawFailed:
-    """Returns the failure of a law that raised an exception.
+    """Returns the error by which a site reports that its control law raised an exception.
 
     Args:
         law: The law.
         site: Name of the site.
-        tick: The tick; None outside of a tick.
+        tick: The tick. None if the exception was raised outside of a tick.
         error: The exception.
     """
     problem = _one_line(error)
@@ -326,12 +334,19 @@ def _fill(value: Any, numbers: Iterator[float]) -> Any:
 
 
 def list_remembered(law: Any) -> tuple[str, ...]:
-    """Returns the names of the attributes that a law remembers; () for a law without memory."""
+    """Returns the names of the attributes that a law keeps from tick to tick.
+
+    The law's class lists them in `remembers`. Empty for a law without memory.
+    """
     return tuple(getattr(law, "remembers", ()))
 
 
 def read_memory(law: Any) -> list[float]:
-    """Returns the memory of a law: by its method `memory`, or its remembered attributes."""
+    """Returns the numbers that a law keeps from tick to tick.
+
+    They come from the law's method `memory` if it has one, otherwise from the attributes that
+    its class lists in `remembers`.
+    """
     if callable(getattr(law, "memory", None)):
         return [float(value) for value in law.memory()]
     numbers: list[float] = []
@@ -341,7 +356,10 @@ def read_memory(law: Any) -> list[float]:
 
 
 def write_memory(law: Any, memory: Sequence[float]) -> None:
-    """Restores a law from its memory: by its method `recall`, or its remembered attributes.
+    """Restores the numbers that a law keeps from tick to tick.
+
+    They are passed to the law's method `recall` if it has one, otherwise written into the
+    attributes that its class lists in `remembers`.
 
     Args:
         law: The law, which is changed.
