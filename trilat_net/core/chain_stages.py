@@ -157,10 +157,14 @@ def put_gravity_torque(s: Row, chain: RowArray, q: Array, torque: Array) -> None
 
 @leaf
 def update_model(s: Row, chain: RowArray) -> None:
-    """Writes the arm's model for a plugged law, after `place_joints`.
+    """Computes the model of a chain for a user's law, after `place_joints`.
 
-    The model is G and, if the law needs it, M and the bias torque: C qd + G with friction, less
-    the torque of the stops.
+    The model consists of the gravity torque G. If the law asks for them, it also contains the
+    inertia matrix M and the bias torque C qd + G with friction, less the torque of the stops.
+
+    Args:
+        s: Row of the site; written.
+        chain: Rows of the joints.
     """
     put_gravity(s, chain, s.known, s.G)
     if s.needs_model != 0:

@@ -60,7 +60,10 @@ class DelayKind(IntEnum):
 
 
 class TraceEnd(IntEnum):
-    """The continuation of a trace after its last point: hold its delay, or start again."""
+    """What a trace, a table of delays by time, does after its last point.
+
+    It holds the last delay, or starts again.
+    """
 
     HOLD = 0
     LOOP = 1
@@ -291,12 +294,14 @@ def trace_delay_us(stamp_ns: int, model: Row, points: Points) -> int:
 
 @leaf
 def draw_pair(now: Row, index: int, attempt: int) -> tuple[float, float]:
-    """Returns two uniform numbers for the function of a CUSTOM model.
+    """Returns two uniform random numbers for a user's compiled function of delays.
+
+    Calls with the same arguments return the same numbers, in each process.
 
     Args:
-        now: the input of that function.
-        index: the index of the draw, usually the sample.
-        attempt: the attempt of a method that rejects draws.
+        now: Input of that function.
+        index: Index of the draw, usually the sample.
+        attempt: Attempt of a method that rejects draws, from 0.
     """
     return uniforms(np.uint64(now.key), index, DELAY, attempt)
 
@@ -330,6 +335,6 @@ def custom_delay_us(
 
 @leaf
 def clamp_delay_us(delay_us: float) -> int:
-    """Returns a delay rounded to whole microseconds, from 0 to `MAX_DELAY_US`."""
+    """Returns a delay in whole microseconds, limited to the range from 0 to `MAX_DELAY_US`."""
     rounded_us = math.floor(delay_us + 0.5)
     return int(min(max(rounded_us, 0.0), float(MAX_DELAY_US)))

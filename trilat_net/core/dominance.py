@@ -57,10 +57,13 @@ def find_row_problem(row: Array, site: int) -> str | None:
 
 
 def find_reach(alpha: Array) -> NDArray[np.bool_]:
-    """Returns the sites that each site reaches along links with a dominance factor above 0.
+    """Returns which sites each site follows, directly or through other sites.
+
+    A site follows another one if its dominance factor, the weight of that site, is above 0.
 
     Args:
-        alpha: Dominance matrix, shape (N, N).
+        alpha: Dominance matrix, shape (N, N): row i contains the weights with which site i
+            follows the other sites.
 
     Returns:
         Shape (N, N): true at [i, j] if site i follows site j, directly or through others.
@@ -126,9 +129,9 @@ def perron_vector(alpha: Array) -> Array:
     """Returns the weights beta of the sites in the energy function of the stability proof.
 
     They are the positive solution of beta' = beta' alpha with the sum 1, which the paper writes
-    as beta' Upsilon = 0. The method is the elimination of Grassmann, Taksar and Heyman (1985). It contains no subtraction, so that each
-    entry is accurate to a few units in the last place even if the dominance factors differ by
-    many orders of magnitude.
+    as beta' Upsilon = 0. The method is the elimination of Grassmann, Taksar and Heyman (1985).
+    It contains no subtraction, so that each entry is accurate to a few units in the last place
+    even if the dominance factors differ by many orders of magnitude.
 
     Args:
         alpha: Irreducible dominance matrix, shape (N, N), see `is_irreducible`.

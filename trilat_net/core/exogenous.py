@@ -512,15 +512,18 @@ def _end_effector_torque(
 def source_torque(
     t_s: float, q: Vector, qd: Vector, lengths: Vector, actor: Row, table: TorqueTable
 ) -> SourceTorque:
-    """Returns the torque of one actor ON the planar arm, N m, and its wall force, N.
+    """Returns the torque with which one operator or environment acts on the planar arm.
 
     Args:
-        t_s: Time since the epoch, s.
+        t_s: Time since the epoch, the common start of the session, s.
         q: Joint angles, rad.
         qd: Joint velocities, rad/s.
         lengths: Lengths of the two links, m.
-        actor: Row of the actor.
-        table: Tables of all actors.
+        actor: Row of the operator or environment.
+        table: Tables of all operators and environments.
+
+    Returns:
+        The torque ON the arm, N m, and the force of the wall if the actor is one, N.
     """
     if not actor.start_s <= t_s < actor.end_s:
         return 0.0, 0.0, 0.0
@@ -552,16 +555,18 @@ def torque_on_arm(
     table: TorqueTable,
     sampled: int,
 ) -> SourceTorque:
-    """Returns the torque of the actors ON the planar arm, -tau_x of Eq. (8).
+    """Returns the torque with which operators and environments act on the planar arm.
+
+    This torque ON the arm is -tau_x of Eq. (8).
 
     Args:
-        t_s: time since the epoch, s.
-        q: joint angles, rad.
-        qd: joint velocities, rad/s.
-        lengths: lengths of the two links, m.
-        actors: operators and environments.
-        table: their tables.
-        sampled: 1: the actors that are held over a tick; 0: the others.
+        t_s: Time since the epoch, the common start of the session, s.
+        q: Joint angles, rad.
+        qd: Joint velocities, rad/s.
+        lengths: Lengths of the two links, m.
+        actors: Rows of operators and environments.
+        table: Their tables.
+        sampled: 1: only those whose torque is held over a tick; 0: only the others.
     """
     total_0 = 0.0
     total_1 = 0.0
@@ -718,18 +723,20 @@ def put_torque_on_chain(
     sampled: int,
     torque: Array,
 ) -> float:
-    """Writes the torque of the actors ON a chain, after `place_joints`.
+    """Computes the torque with which operators and environments act on a chain of joints.
+
+    `place_joints` must have been called for the same positions.
 
     Args:
-        t_s: time since the epoch, s.
-        q: joint positions, shape (n,).
-        qd: joint velocities, shape (n,).
-        tip: the end effector in the last link's frame, m.
-        chain: the chain's rows.
-        actors: operators and environments.
-        table: their tables.
-        sampled: 1: the actors that are held over a tick; 0: the others.
-        torque: written, shape (n,), N m.
+        t_s: Time since the epoch, the common start of the session, s.
+        q: Joint positions, shape (n,), rad or m.
+        qd: Joint velocities, shape (n,), rad/s or m/s.
+        tip: Position of the end effector in the last link's frame, m.
+        chain: Rows of the joints.
+        actors: Rows of operators and environments.
+        table: Their tables.
+        sampled: 1: only those whose torque is held over a tick; 0: only the others.
+        torque: Written: the torque ON the arm, shape (n,), N m.
 
     Returns:
         The largest force of a wall, N.

@@ -84,9 +84,10 @@ def _build_setup(name: str, peer: str, q0: tuple[float, float]) -> SiteSetup:
 
 @cache
 def compute_fingerprint() -> str:
-    """Returns sixteen hexadecimal digits that identify this platform's arithmetic.
+    """Returns a fingerprint of the arithmetic of this platform, sixteen hexadecimal digits.
 
-    They are a hash of many sines and cosines and of a short run of two sites.
+    It is a hash of many sines and cosines and of a short run of two sites. Two platforms with
+    the same fingerprint can be expected to compute the same bits.
     """
     angles = np.linspace(-12.0, 12.0, 4001)
     results = np.empty((2, len(angles)))

@@ -50,7 +50,11 @@ class RecentRecords(NamedTuple):
 
 @cache
 def sums_dtype(joints: int) -> np.dtype[np.void]:
-    """Returns the layout of a site's sums over its records, see `SumsRow`."""
+    """Returns the NumPy data type of the sums over all records of a site, see `SumsRow`.
+
+    Args:
+        joints: Number of joints of the arm, the length of the sums' vectors.
+    """
     return row_dtype("sums", {"joints": joints})
 
 
@@ -58,13 +62,14 @@ _DIVERGED = int(Mode.DIVERGED)
 
 
 def max_over_joints(buckets: Array) -> Array:
-    """Returns the largest |e| and the largest |qd| over the joints, per bucket of time.
+    """Returns the peaks of the position error e and the joint speed qd over all joints.
 
     Args:
-        buckets: Peaks of a site, see `run_until`, shape (K, 3 n).
+        buckets: Peaks of each joint of a site in K intervals of time, shape (K, 3 n), see
+            `run_until`.
 
     Returns:
-        Shape (K, 2), rad and rad/s.
+        The largest |e|, rad, and the largest |qd|, rad/s, per interval, shape (K, 2).
     """
     joints = buckets.shape[1] // 3
     peaks: Array = buckets[:, : 2 * joints].reshape(-1, 2, joints).max(axis=2)
@@ -377,13 +382,13 @@ def _update_sums(
 
 
 class LawArrays(NamedTuple):
-    """The users' laws of all sites.
+    """Compiled control laws that users wrote, for all sites of a fused run.
 
     Attributes:
-        addresses: the address of the machine code of each site's law, shape (N,), see
-            `CompiledLaw`; 0: the law has none.
-        rows: the numbers of each law, shape (N, most).
-        sent: the numbers that each law sends, shape (N, most).
+        addresses: Address of the machine code of each site's law, shape (N,), see
+            `CompiledLaw`; 0: the kernel computes the law.
+        rows: Numbers of each law, shape (N, most).
+        sent: Numbers that each law sends, shape (N, most).
     """
 
     addresses: IntArray
@@ -454,7 +459,7 @@ def sense_site(
     arrays: SiteArrays,
     chain: RowArray | None,
 ) -> None:
-    """Runs stages 1 to 5 of the next tick of a site.
+    """Computes the part of a site's next tick before its control law (stages 1 to 5).
 
     The peers' records arrive as in the recorded run, or without delay if there is no recorded
     run. The remaining arguments are those of `run_until`.
@@ -534,7 +539,7 @@ def finish_site(
     chain: RowArray | None,
     laws: LawArrays | None,
 ) -> int:
-    """Runs stages 6 to 8 of the next tick of a site, and adds its record to peaks and sums.
+    """Completes a site's next tick (stages 6 to 8), and adds its record to peaks and sums.
 
     Args:
         i: Index of the site.

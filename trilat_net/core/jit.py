@@ -92,9 +92,10 @@ _ships = _SHIPPED.is_dir()
 
 
 def is_core_cached() -> bool:
-    """Returns True if machine code of this version of the core is stored.
+    """Returns True if the core need not be compiled, because its machine code is stored.
 
-    The whole tick is compiled last, so the presence of its code is sufficient.
+    The code must be of this version of the core. The whole tick is compiled last, so the
+    presence of its code is sufficient.
     """
     folders = [_CACHE, _SHIPPED if _ships else None]
     for folder in folders:
@@ -440,12 +441,13 @@ class _Leaf(CPUDispatcher):
 
 
 def bind_leaf(function: Callable[P, R], *arguments: P.args, **_: P.kwargs) -> Callable[P, R]:
-    """Returns a leaf compiled for the types of these arguments.
+    """Returns a compiled function that no longer checks the types of its arguments.
 
-    Calls of the result no longer check types, which saves time in each tick.
+    Leaving out the check saves time in each tick. The function is compiled for the types of
+    the given arguments, and must be called with arguments of these types.
 
     Args:
-        function: The leaf.
+        function: The function, which `leaf` decorates.
         *arguments: Arguments of the types with which the result is called.
     """
     if _config.DISABLE_JIT:
@@ -482,15 +484,15 @@ class _NamedCache(_LeafCache):
 def compile_named(
     function: Callable[..., None], name: str, signature: Any, **options: Any
 ) -> Any:
-    """Compiles a closure for a signature, or loads the closure that was compiled by this name.
+    """Compiles a function that has variables of an outer function, and stores it under a name.
 
-    The name is part of the symbols of the machine code: no two closures may have the same name
-    in any process.
+    If a function with this name was compiled before, it is loaded. The name is part of the
+    symbols of the machine code: no two such functions may have the same name in any process.
 
     Args:
-        function: The closure.
-        name: Name of the closure.
-        signature: Signature of the closure, as Numba has it.
+        function: The function.
+        name: Name of the function.
+        signature: Signature of the function, as Numba has it.
         **options: Options of `numba.njit`.
     """
     function.__qualname__ = name

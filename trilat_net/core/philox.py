@@ -37,7 +37,12 @@ DrawKey = np.uint64
 
 
 def link_key(seed: int, link: str) -> int:
-    """Returns the 64-bit key of the draws of a link, whose name is like "m1->s"."""
+    """Returns the key from which all random numbers of a link follow, 64 bits.
+
+    Args:
+        seed: Seed of the scenario.
+        link: Name of the link, like "m1->s".
+    """
     digest = hashlib.sha256(f"{seed}/{link}".encode()).digest()
     return int.from_bytes(digest[:8], "little")
 
@@ -46,17 +51,18 @@ def link_key(seed: int, link: str) -> int:
 def philox(
     c0: np.uint64, c1: np.uint64, c2: np.uint64, c3: np.uint64, k0: np.uint64, k1: np.uint64
 ) -> PhiloxWords:
-    """Returns four random 32-bit words.
+    """Returns four random 32-bit words for a counter and a key, by the Philox generator.
 
-    All words are 32-bit numbers in uint64, so that products keep their upper halves.
+    The same arguments always give the same words, so that no generator has a state. All words
+    are 32-bit numbers in uint64, so that products keep their upper halves.
 
     Args:
-        c0: lowest word of the 128-bit counter.
-        c1: second word of the counter.
-        c2: third word of the counter.
-        c3: highest word of the counter.
-        k0: lower word of the 64-bit key.
-        k1: upper word of the key.
+        c0: Lowest word of the 128-bit counter.
+        c1: Second word of the counter.
+        c2: Third word of the counter.
+        c3: Highest word of the counter.
+        k0: Lower word of the 64-bit key.
+        k1: Upper word of the key.
     """
     for _ in range(_ROUNDS):
         product_0 = _M0 * c0

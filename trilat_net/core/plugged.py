@@ -85,7 +85,11 @@ def digest_sibling_sources(function: Callable[..., Any]) -> str:
 
 
 def find_address(compiled: Any) -> int:
-    """Returns the address of a function's machine code, compiled for one signature."""
+    """Returns the address of a compiled function, at which machine code can call it.
+
+    Args:
+        compiled: Function that Numba compiled for one signature.
+    """
     result = compiled.get_compile_result(compiled.nopython_signatures[0])
     return int(result.library.get_pointer_to_function(result.fndesc.llvm_func_name))
 

@@ -48,13 +48,21 @@ _GAINS = tuple(name for name in Gains._fields if name not in _OTHER_GAINS)
 
 @cache
 def site_dtype(layout: Layout) -> np.dtype[np.void]:
-    """Returns the layout of a site's row, see `SiteRow`."""
+    """Returns the NumPy data type of the row that stores a site, see `SiteRow`.
+
+    Args:
+        layout: Lengths of the site's vectors.
+    """
     return row_dtype("site", layout.axes(), chain=layout.chain)
 
 
 @cache
 def arrival_dtype(shared: int) -> np.dtype[np.void]:
-    """Returns the layout of an arrival with vectors of `shared` numbers, see `ArrivalRow`."""
+    """Returns the NumPy data type of a sample as it arrives at a site, see `ArrivalRow`.
+
+    Args:
+        shared: Number of coordinates that sites share, the length of the sample's vectors.
+    """
     return row_dtype("arrival", {"shared": shared})
 
 
@@ -107,7 +115,13 @@ class TickBuffers(NamedTuple):
 
 
 def build_tick_buffers(setup: SiteSetup) -> TickBuffers:
-    """Returns empty buffers for the input and output of a tick of a site."""
+    """Returns empty buffers for the arrivals and the record of one tick.
+
+    A site creates them once and uses them in all ticks.
+
+    Args:
+        setup: Setup of the site, which determines the lengths of vectors.
+    """
     layout = setup.layout
     largest_received = 0
     if setup.law_factory is not None:
@@ -175,9 +189,11 @@ def build_site_arrays(
 
 
 def needed_pages(setup: SiteSetup) -> int:
-    """Returns the number of pages of a calendar that the delays of a setup need.
+    """Returns the number of pages that each calendar of a site needs.
 
-    Senders may be up to `_NEAR_NS` ahead of the site.
+    Samples wait in the calendar of their link until their delay has passed, so its length
+    follows from the longest delay of the setup. Senders may be up to `_NEAR_NS` ahead of the
+    site.
 
     Args:
         setup: Setup of the site.
@@ -187,11 +203,12 @@ def needed_pages(setup: SiteSetup) -> int:
 
 
 def links_bytes(setup: SiteSetup, pages: int) -> int:
-    """Returns the memory of a site's links, bytes.
+    """Returns the memory that the links of a site take, bytes.
 
     Args:
         setup: Setup of the site.
-        pages: Number of pages of each calendar.
+        pages: Number of pages of each calendar, in which samples wait until their delay has
+            passed.
     """
     numbers = 0
     if setup.law_factory is not None:
@@ -264,18 +281,20 @@ class CalendarSizer:
         self.newest = [-1] * len(self.newest)
 
     def add_model(self, peer: int, model: LinkModel) -> None:
-        """Takes the delays of another model of a link into account.
+        """Takes into account that the delays of a link will follow another model.
 
         Args:
-            peer: Index of the peer.
-            model: The model.
+            peer: Index of the peer at the other end of the link.
+            model: The new model of the link's delays.
         """
         longest_us = max_delay_us([model], [None])
         self._delay_us[peer] = max(self._delay_us[peer], longest_us)
         self.newest[peer] = -1
 
     def make_room(self, arrays: SiteArrays, k: int, peer: int, tick: int) -> SiteArrays:
-        """Returns the arrays with pages for a peer's sample, if its stamp is in range.
+        """Returns arrays in which there is room for a sample of a peer.
+
+        A sample whose stamp is out of range gets no room, and is refused later.
 
         Args:
             arrays: Arrays of the site at tick k.
@@ -452,12 +471,12 @@ def _share_tables(sites: Sequence[SiteArrays]) -> None:
 
 
 def select_site(stacked: SiteArrays, i: int, layout: Layout) -> SiteArrays:
-    """Returns the arrays of one site of a stack, as views.
+    """Returns the arrays of one site of several stacked sites, as views.
 
     The rows may be longer than the site's layout.
 
     Args:
-        stacked: Arrays of all sites.
+        stacked: Arrays of all sites, see `stack_site_arrays`.
         i: Index of the site.
         layout: Layout of the site.
     """

@@ -124,7 +124,12 @@ class RestGains(NamedTuple):
     deceleration: Vector = (math.inf,)
 
     def vectors(self) -> dict[str, Vector]:
-        """Returns the gains for the core: B, k B with k = 1 / (4 time_s), and deceleration."""
+        """Returns the gains in the form in which the row of a site stores them.
+
+        Returns:
+            By name the damping B, the product k B with k = 1 / (4 time_s), and the
+            deceleration.
+        """
         integral = tuple(float(B) / (4.0 * self.time_s) for B in self.damping)
         return {
             "damping": self.damping,
@@ -250,7 +255,7 @@ class Layout(NamedTuple):
     def lengths(self) -> dict[str, int]:
         """Returns the lengths of the vectors of a record by name, in their order.
 
-        Vectors that the site does not have are left out.
+        A record is the result of one tick. Vectors that the site does not have are left out.
         """
         n = self.joints
         m = self.shared
@@ -263,7 +268,7 @@ class Layout(NamedTuple):
         return lengths
 
     def columns(self) -> dict[str, slice]:
-        """Returns the columns of each vector in the row of floats that a tick computes.
+        """Returns where each vector of a record stands in the floats that a tick computes.
 
         Vectors that are inputs of the tick have no columns.
         """
@@ -277,10 +282,12 @@ class Layout(NamedTuple):
         }
 
     def count_life_memory(self, peers: int, *, degrades: bool = False) -> int:
-        """Returns the count of numbers of `session_life` in a record's field `mem`.
+        """Returns how many numbers the rule `glide` keeps in a record's field `mem`.
 
-        In task space they contain the pose and the velocities of `rest_columns`. The numbers of
-        a site that degrades end with `gone` of its peers.
+        By this rule, explained in `session_life`, an arm comes to rest while a peer is silent.
+        In task space the numbers contain the pose and the velocities of `rest_columns`. The
+        numbers of a site that degrades, which means that it goes on without lost peers, end
+        with `gone` of its peers.
 
         Args:
             peers: Number of peers.
@@ -302,10 +309,10 @@ class Layout(NamedTuple):
         return slice(first, first + 2 * self.joints * self.task)
 
     def list_lost_peers(self, mem: Sequence[float], peers: Sequence[str]) -> list[str]:
-        """Returns the names of the peers that a degrading site has lost, from its record.
+        """Returns the names of the peers without which a site goes on, from its record.
 
         Args:
-            mem: Field `mem` of the record.
+            mem: Field `mem` of the record, the numbers that the site keeps from tick to tick.
             peers: Names of the site's peers, in scenario order.
         """
         end = self.count_life_memory(len(peers), degrades=True)
@@ -464,12 +471,15 @@ class SiteSetup(NamedTuple):
 
     @property
     def received_vectors(self) -> tuple[SentVector, ...]:
-        """Vectors that the law reads from each peer; zero if the peer does not send them."""
+        """Vectors that the control law of the site reads from each peer.
+
+        A vector that a peer does not send is zero.
+        """
         channels = [link.channel for link in self.links]
         return join_received([*channels, self.channel])
 
     def law_context(self) -> LawContext:
-        """Returns the facts that a user's law receives when it is created."""
+        """Returns the facts about the site that a user's law receives when it is created."""
         return LawContext(
             site=self.name,
             rate_hz=self.rate_hz,

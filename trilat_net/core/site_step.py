@@ -181,7 +181,9 @@ class Site:
             )
 
     def apply_change(self, command: CoreChange, t_ns: int) -> None:
-        """Applies a change, or adds it to the planned ones; other planned changes stay planned.
+        """Applies a command from outside, for example a change of a link.
+
+        A change with a later start is added to the planned changes, which stay planned.
 
         Args:
             command: The change.
@@ -408,7 +410,10 @@ class Site:
         return memory
 
     def counts(self) -> tuple[LinkCounts, ...]:
-        """Returns the counts of samples of each link since the start, in scenario order."""
+        """Returns counts of the samples that arrived, came late or were lost, for each link.
+
+        The links are in scenario order. `LinkCounts` explains the counts.
+        """
         return tuple(
             LinkCounts(*(int(link[field]) for field in LinkCounts._fields))
             for link in self._links
@@ -428,10 +433,10 @@ class Site:
         return None if release == LOST else release
 
     def is_measured(self, peer: int) -> bool:
-        """Returns True if the link from this peer injects no delay, so that no sample is late.
+        """Returns True if a link has no simulated delay, so that no sample can be late on it.
 
         Args:
-            peer: Index of the peer.
+            peer: Index of the peer from which the link comes.
         """
         link: Row = self._links[peer]
         return bool(self._arrays.models[peer, link.model]["kind"] == DelayKind.MEASURED)
@@ -445,9 +450,9 @@ class Site:
         return int(self._links[peer]["rate_hz"])
 
     def restore_state(self, before: TickRecord, last: TickRecord) -> None:
-        """Restores the arm and its controller after `step(last.tick)` from two records.
+        """Restores the state of the site, without its links, after a tick that was recorded.
 
-        `restore_links` restores the links.
+        `restore_links` restores the links. After both, the next call of `step` continues the run.
 
         Args:
             before: Record of the tick before the last one; any record if that is tick 0.
@@ -511,9 +516,9 @@ class Site:
     def restore_links(
         self, k: int, in_use: Sequence[Arrival | None], waiting: Sequence[Arrival]
     ) -> None:
-        """Restores the links before tick `k`.
+        """Restores the links before tick `k`, from samples in use and samples that still wait.
 
-        The memory of a channel is not restored but computed again: it is a function of the
+        The memory of a link's model is not restored but computed again: it is a function of the
         samples before k (L4).
 
         Args:

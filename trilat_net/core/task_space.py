@@ -40,26 +40,32 @@ TINY = 1e-12
 
 @leaf
 def has_orientation(s: Row) -> bool:
-    """Returns True if the sites agree on an orientation in addition to a position."""
+    """Returns True if the sites share poses, a position and an orientation.
+
+    It is False if they share only positions, or joint angles.
+    """
     is_pose: bool = s.task != 0 and s.shared == POSE
     return is_pose
 
 
 @leaf
 def count_linear_coordinates(s: Row) -> int:
-    """Returns the number of leading coordinates that may be subtracted from one another.
+    """Returns the number of shared coordinates for which a difference is a plain subtraction.
 
-    These are all coordinates except those of an orientation.
+    They come first, and are all coordinates except those of an orientation.
     """
     return POSITION if has_orientation(s) else s.q_des.shape[0]
 
 
 @leaf
 def update_pose(s: Row, chain: RowArray) -> None:
-    """Writes the pose x, its velocity xd, the Jacobian J and the derivative of J.
+    """Computes the motion of the end effector from that of the joints.
+
+    The pose x, its velocity xd, the Jacobian J and the derivative of J are written into the row
+    of the site.
 
     Args:
-        s: Row of the site, with q and qd.
+        s: Row of the site, with q and qd; written.
         chain: Rows of the chain, after `place_joints`.
     """
     position = place_end_effector(chain, s.tip)
@@ -134,14 +140,15 @@ def _update_jacobian_rate(s: Row, chain: RowArray, tip: Three) -> None:
 
 @leaf
 def update_orientation_reference(s: Row, links: RowArray) -> None:
-    """Writes the orientation of the reference and its angular velocity.
+    """Computes the orientation that the end effector follows, and its angular velocity.
 
     The reference is the site's own orientation R_i, turned back by the weighted differences
-    from its peers, sum_j alpha_ij Log(R_i R_j'). The velocity sum_j alpha_ij w_j is exact only
-    if the orientations agree.
+    from its peers, sum_j alpha_ij Log(R_i R_j'). Here alpha_ij is the weight of peer j, R_j its
+    orientation and Log the rotation vector. The velocity sum_j alpha_ij w_j of the peers'
+    angular velocities w_j is exact only if the orientations agree.
 
     Args:
-        s: Row of the site, with its pose.
+        s: Row of the site, with its pose; written.
         links: Rows of the site's links.
     """
     orientation = rotation_matrix(three(s.x[3:]))
@@ -258,10 +265,15 @@ def _update_axis_errors(s: Row) -> None:
 
 @leaf
 def update_task_errors(s: Row) -> None:
-    """Writes e and ed of the followed axes, v and a of the joints, and r.
+    """Computes the errors in task space and the reference motion of the joints.
 
-    The equations are those at the head of this module. The arrays `stage_q` and `stage_qd` of
-    the integrator serve as work space for Jd' y and J' y.
+    These are the errors e and ed of the followed axes, the reference velocity v and
+    acceleration a of the joints, and the filtered error r. The equations are those at the head
+    of this module. The arrays `stage_q` and `stage_qd` of the integrator serve as work space
+    for Jd' y and J' y.
+
+    Args:
+        s: Row of the site; written.
     """
     n = s.joints
     m = s.shared
@@ -313,14 +325,16 @@ def update_task_errors(s: Row) -> None:
 
 @leaf
 def add_task_torque(s: Row, gains: Array, values: Array, factor: float, torque: Array) -> None:
-    """Adds the joint torque of a force in the task, factor J' (gains * values).
+    """Adds the joint torque that exerts a force at the end effector.
+
+    The torque is factor J' (gains * values), where J is the Jacobian of the end effector.
 
     Args:
-        s: the site's row.
-        gains: gain per coordinate of the task.
-        values: value per coordinate of the task.
-        factor: factor of the force.
-        torque: changed, shape (n,), N m.
+        s: Row of the site, with J.
+        gains: Gain per coordinate of the task.
+        values: Value per coordinate of the task.
+        factor: Factor of the force.
+        torque: Changed: the sum, shape (n,), N m.
     """
     for i in range(s.joints):
         for j in range(s.shared):
@@ -330,7 +344,11 @@ def add_task_torque(s: Row, gains: Array, values: Array, factor: float, torque: 
 
 @leaf
 def update_wrench(s: Row) -> None:
-    """Writes the wrench at the end effector that corresponds to tau_x, (J J')^-1 J tau_x."""
+    """Computes the force and torque at the end effector that correspond to tau_x.
+
+    The wrench is (J J')^-1 J tau_x, where J is the Jacobian of the end effector and tau_x the
+    exogenous torque of the joints. It is written into the row of the site.
+    """
     b = s.b
     # b = J tau_x; `on_arm` is -tau_x.
     for j in range(s.shared):

@@ -83,7 +83,14 @@ def is_positive_definite(theta: Array) -> bool:
 
 @leaf
 def inertia(theta: Vector, q: Vector) -> tuple[Pair, Pair]:
-    """Returns M(q), two rows, kg m^2 (Section IV of the paper; Property 1)."""
+    """Returns the inertia matrix M(q) of the arm, two rows, kg m^2.
+
+    See Section IV of the paper, and its Property 1.
+
+    Args:
+        theta: Parameters of the arm, shape (5,).
+        q: Joint angles, rad.
+    """
     _, c2 = sincos(q[1])
     m11 = theta[0] + 2.0 * theta[1] * c2
     m12 = theta[2] + theta[1] * c2
@@ -178,7 +185,15 @@ def forward_dynamics(theta: Vector, g: float, q: Vector, qd: Vector, torque: Vec
 
 @leaf
 def forward_kinematics(lengths: Vector, q: Vector) -> tuple[Pair, Pair]:
-    """Returns the positions (x, y) of the elbow and the end effector from the base, m."""
+    """Returns the positions of the elbow and the end effector for the joint angles.
+
+    Args:
+        lengths: Lengths of the two links, m.
+        q: Joint angles, rad.
+
+    Returns:
+        The position (x, y) of the elbow and that of the end effector, from the base, m.
+    """
     s1, c1 = sincos(q[0])
     s12, c12 = sincos(q[0] + q[1])
     elbow_x = lengths[0] * c1
@@ -190,7 +205,15 @@ def forward_kinematics(lengths: Vector, q: Vector) -> tuple[Pair, Pair]:
 
 @leaf
 def end_effector_jacobian(lengths: Vector, q: Vector) -> tuple[Pair, Pair]:
-    """Returns the end effector's Jacobian, m/rad, with rows x and y and a column per joint."""
+    """Returns the Jacobian of the end effector, which maps joint velocities to its velocity.
+
+    Args:
+        lengths: Lengths of the two links, m.
+        q: Joint angles, rad.
+
+    Returns:
+        Rows x and y, with a column per joint, m/rad.
+    """
     s1, c1 = sincos(q[0])
     s12, c12 = sincos(q[0] + q[1])
     inner_x = lengths[0] * c1

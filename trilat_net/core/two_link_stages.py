@@ -21,10 +21,14 @@ _ADAPTIVE = int(Law.ADAPTIVE)
 
 @leaf
 def update_errors(s: Row) -> None:
-    """Writes the errors e and ed, the filtered error r, the regressor of Eq. (12) and Y' r.
+    """Computes the errors of the planar arm, and the products that its control law needs.
+
+    These are the errors e and ed, the filtered error r, the regressor Y of Eq. (12), which
+    gives a torque if it is multiplied by parameters of the arm, and Y' r. All are written into
+    the row.
 
     Args:
-        s: Row of the site, with q, qd and the reference.
+        s: Row of the site, with q, qd and the reference; written.
     """
     q = pair(s.q)
     qd = pair(s.qd)
@@ -114,7 +118,11 @@ def put_gravity(s: Row, theta: Array, torque: Array) -> None:
 
 @leaf
 def update_model(s: Row) -> None:
-    """Writes the arm's model for a plugged law: G and, if the law needs it, M and C qd + G."""
+    """Computes the model of the planar arm for a user's law.
+
+    The model consists of the gravity torque G. If the law asks for them, it also contains the
+    inertia matrix M and the bias torque C qd + G, where C is the Coriolis matrix.
+    """
     put_gravity(s, s.known, s.G)
     if s.needs_model != 0:
         q = pair(s.q)
@@ -195,7 +203,7 @@ def update_external_torque(
 
 @leaf
 def add_scaled(x: Vector, step_s: float, rate: Vector) -> Pair:
-    """Returns x + step_s * rate."""
+    """Returns x + step_s * rate, a linear step of two numbers over the duration `step_s`."""
     return x[0] + step_s * rate[0], x[1] + step_s * rate[1]
 
 
