@@ -31,10 +31,13 @@ _ADAPTIVE = int(Law.ADAPTIVE)
 
 @leaf
 def place_chain(s: Row, chain: RowArray) -> None:
-    """Updates the frames of the joints and, in task space, the end effector's pose.
+    """Updates the frames of the joints and, in task space, the pose of the end effector.
+
+    The other functions of this module use the results, so it is called after each change of the
+    joint positions.
 
     Args:
-        s: Row of the site.
+        s: Row of the site, with its settings and its state; written in task space.
         chain: Rows of the joints; written.
     """
     place_joints(chain, s.q)
@@ -44,12 +47,14 @@ def place_chain(s: Row, chain: RowArray) -> None:
 
 @leaf
 def update_errors(s: Row, chain: RowArray) -> None:
-    """Writes the errors e and ed, the filtered error r, and the reference motion v and a.
+    """Computes the errors of a chain, and the reference motion that its control law needs.
 
-    For the adaptive law, Y' r is written as well, which drives the estimate, Eq. (15).
+    These are the errors e and ed, the filtered error r, and the reference velocity v and
+    acceleration a. For the adaptive law Y' r is computed as well, the product of the regressor
+    and the filtered error, which drives the estimate of the parameters, Eq. (15).
 
     Args:
-        s: Row of the site.
+        s: Row of the site, with its settings and its state; written.
         chain: Rows of the joints, after `place_chain`.
     """
     if s.task:
@@ -77,7 +82,7 @@ def advance_estimate(s: Row, gain_s: float, Yr: Vector) -> None:
     """Advances the estimate of the arm's parameters by a step of Eq. (15), within its box.
 
     Args:
-        s: Row of the site.
+        s: Row of the site, with its settings and its state.
         gain_s: Duration of the step, s.
         Yr: Y' r, shape (P,).
     """
@@ -89,10 +94,14 @@ def advance_estimate(s: Row, gain_s: float, Yr: Vector) -> None:
 
 @leaf
 def update_torque(s: Row, chain: RowArray) -> None:
-    """Writes the torque of the site's law, within its limits.
+    """Computes the torque of the site's control law, within its limits.
 
-    The law is Eq. (13) with its robust term, or the law of known gravity
+    The law is the adaptive law, Eq. (13), with its robust term, or a law of known gravity
     (`control.damped_torque`).
+
+    Args:
+        s: Row of the site, in which the torque is written.
+        chain: Rows of the joints, after `place_chain`.
     """
     if s.law == _ADAPTIVE:
         inverse_dynamics(chain=chain, theta=s.theta_hat, v=s.v, a=s.a, torque=s.tau)
@@ -126,15 +135,16 @@ def update_torque(s: Row, chain: RowArray) -> None:
 
 @leaf
 def put_gravity(s: Row, chain: RowArray, theta: Array, torque: Array) -> None:
-    """Writes the gravity torque for these parameters, after `place_joints`.
+    """Computes the torque that holds the chain against gravity, for the given parameters.
 
-    It is the torque of the inverse dynamics without motion.
+    It is the torque of the inverse dynamics without motion. `place_joints` must have been
+    called for the present positions.
 
     Args:
-        s: Row of the site.
+        s: Row of the site, with its settings and its state.
         chain: Rows of the joints.
         theta: Inertial parameters, shape (10 n,).
-        torque: Written, shape (n,), N m.
+        torque: Written: the torque, shape (n,), N m.
     """
     zeros = s.zeros
     propagate_motion(chain=chain, gravity=s.gravity, qd=zeros, v=zeros, a=zeros)
@@ -143,13 +153,13 @@ def put_gravity(s: Row, chain: RowArray, theta: Array, torque: Array) -> None:
 
 @leaf
 def put_gravity_torque(s: Row, chain: RowArray, q: Array, torque: Array) -> None:
-    """Writes the gravity torque G(q) of the true parameters.
+    """Computes the gravity torque G(q) of the true parameters of the arm.
 
     Args:
-        s: Row of the site.
+        s: Row of the site, with its settings and its state.
         chain: Rows of the joints.
-        q: Joint positions, shape (n,).
-        torque: Written, shape (n,), N m.
+        q: Joint angles, shape (n,), rad.
+        torque: Written: the torque, shape (n,), N m.
     """
     place_joints(chain, q)
     put_gravity(s, chain, s.theta, torque)
@@ -184,17 +194,17 @@ def put_source_torque(
     sampled: int,
     torque: Array,
 ) -> None:
-    """Writes the torque of the actors with this `sampled` ON the arm, N m.
+    """Computes the torque of operators and environments ON the arm, the held part or the rest.
 
     Args:
-        t_s: time since the epoch, s.
-        s: the site's row.
-        chain: the chain's rows.
+        t_s: Time since the epoch, the common start of the session, s.
+        s: Row of the site, with its settings and its state.
+        chain: Rows of the joints.
         state: q and qd of the arm, shape (2 n,).
-        actors: operators and environments.
-        table: their recorded torques.
-        sampled: 1: the actors that are held over a tick; 0: the others.
-        torque: written, shape (n,), N m.
+        actors: Rows of operators and environments.
+        table: Their numbers, for example recorded torques.
+        sampled: 1: only those whose torque is held over a tick; 0: only the others.
+        torque: Written: the torque, shape (n,), N m.
     """
     place_joints(chain, state)
     qd = state[chain.shape[0] :]
@@ -215,14 +225,17 @@ def put_source_torque(
 def update_external_torque(
     t_s: float, s: Row, chain: RowArray, actors: TorqueSourceRows, table: TorqueTable
 ) -> None:
-    """Writes the torque of operators and environments, its held part, and the wall force.
+    """Computes the torque that operators and environments exert in a tick.
+
+    The whole torque, the part of it that is held over the tick, and the force of the walls are
+    written into the row of the site.
 
     Args:
-        t_s: Time since the epoch, s.
-        s: Row of the site.
-        chain: Rows of the joints.
-        actors: Operators and environments.
-        table: Their tables.
+        t_s: Time since the epoch, the common start of the session, s.
+        s: Row of the site; written.
+        chain: Rows of the joints, after `place_chain`.
+        actors: Rows of operators and environments.
+        table: Their numbers, for example recorded torques.
     """
     place_joints(chain, s.q)
     held_n = put_torque_on_chain(
@@ -267,8 +280,8 @@ def _put_acceleration(
         t_s: Time of the stage, s since the epoch.
         s: Row of the site, with `stage_q` and `stage_qd`.
         chain: Rows of the joints.
-        actors: Operators and environments.
-        table: Their tables.
+        actors: Rows of operators and environments.
+        table: Their numbers, for example recorded torques.
     """
     place_joints(chain, s.stage_q)
     put_torque_on_chain(
@@ -321,18 +334,21 @@ def advance_arm(
     actors: TorqueSourceRows,
     table: TorqueTable,
 ) -> bool:
-    """Advances q and qd by one period under the torque `s.u` (Runge-Kutta, fourth order).
+    """Simulates the motion of the arm in one period (Runge-Kutta method of fourth order).
+
+    The torque `s.u` is held over the period. The joint positions q and velocities qd at its end
+    are written into the row of the site.
 
     Args:
         t_s: Time at the beginning of the period, s since the epoch.
         h_s: The period, s.
-        s: Row of the site.
+        s: Row of the site; written.
         chain: Rows of the joints.
-        actors: Operators and environments.
-        table: Their tables.
+        actors: Rows of operators and environments.
+        table: Their numbers, for example recorded torques.
 
     Returns:
-        False if the result is not finite; q and qd are unchanged then.
+        False if the result is not finite. Then q and qd are unchanged.
     """
     n = chain.shape[0]
     for i in range(n):

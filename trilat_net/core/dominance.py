@@ -277,10 +277,10 @@ _ACT_BRAKE = int(StaleAction.BRAKE)
 
 @leaf
 def any_peer_stale(t_ns: int, age_ns: int, links: RowArray) -> bool:
-    """Returns True if the sample in use of a peer that the site follows is too old.
+    """Returns True if the last sample of some peer that the site follows is too old.
 
-    Before the first sample of a peer its age is the time since the epoch, the common start of
-    the session.
+    A peer from which no sample is in use counts as if its last sample were of the epoch, the
+    common start of the session.
 
     Args:
         t_ns: Time, ns since the epoch.
@@ -297,15 +297,16 @@ def any_peer_stale(t_ns: int, age_ns: int, links: RowArray) -> bool:
 
 @leaf
 def update_stale_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
-    """Applies the rule for stale peers: changes the mode, and the reference for the mode.
+    """Changes the mode and the reference of a site when a peer falls silent or returns.
 
     A peer is stale if its last sample is too old. In HOLD the reference is that of the previous
-    tick, in BRAKE the pose of the arm. In RETURN it is q_held + s (q_des - q_held), with
-    s = 3 x^2 - 2 x^3 and x the part of `return_ns` that has passed.
+    tick, in BRAKE the pose of the arm. In RETURN it is q_held + s (q_des - q_held), where
+    q_held is the reference before the return, s = 3 x^2 - 2 x^3, and x is the part of
+    `return_ns` that has passed.
 
     Args:
-        t_ns: Time, ns since the epoch.
-        site: Row of the site, with the peers' reference.
+        t_ns: Time, ns since the epoch, the common start of the session.
+        site: Row of the site, with the peers' reference; changed.
         links: Rows of the site's links.
     """
     if site.on_stale == _USE or site.mode == _DIVERGED:
@@ -342,18 +343,20 @@ def update_stale_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
 
 @leaf
 def update_reference(t_ns: int, site: SiteRow, links: RowArray, ramps: Array) -> None:
-    """Writes the reference, its derivative and the reflected torque.
+    """Computes the reference of a site, which the arm follows, from the samples of its peers.
 
         q_des  = sum_j alpha_ij q_j                                  Eq. (6)
         qd_des = sum_j (alpha_ij qd_j + alpha_ij' q_j)
         felt   = -sum_j alpha_ij tau_x_j
 
     Here q_j, qd_j and tau_x_j are the position, velocity and exogenous torque in the sample of
-    peer j. The order of the sums is that of the scenario: their bits depend on it.
+    peer j, alpha_ij is the weight of this peer and alpha_ij' its derivative. The torque `felt`
+    is that of operators and environments on the peers' arms. The sums have the order of the
+    scenario, on which their bits depend.
 
     Args:
-        t_ns: Time, ns since the epoch.
-        site: Row of the site.
+        t_ns: Time, ns since the epoch, the common start of the session.
+        site: Row of the site; written.
         links: Rows of the site's links.
         ramps: Changes of the dominance factors, see `apply_ramps`.
     """

@@ -144,16 +144,17 @@ class HandCommand(NamedTuple):
 
 
 class HandMemory(NamedTuple):
-    """State of a live hand from tick to tick.
+    """State of a live hand, a person or program that moves an arm, from tick to tick.
 
     Attributes:
         source: Sender that holds the arm; 0: nobody, though a grip may still fade.
         number: Number of the newest accepted message; -1 without a message.
         grip: Firmness of the grip, 0 to 1.
-        target: Position of the target, m or rad, or the force, N.
+        target: Position of the target, which the arm follows, m or rad, or the force, N.
         rate: Velocity of the target.
-        goal: Goal of the target.
-        arrives_ns: Time at which the target arrives at the goal, ns since the epoch.
+        goal: Position to which the target moves, or the force.
+        arrives_ns: Time at which the target arrives at the goal, ns since the epoch, the common
+            start of the session.
         sent_ns: Time of sending of the goal's message, ns.
         received_ns: Time of the tick that accepted the newest message, ns since the epoch.
         before: The last sender that released the arm, and the number of its last message.
@@ -172,14 +173,16 @@ class HandMemory(NamedTuple):
 
 
 class HandInForce(NamedTuple):
-    """The action of a hand in a tick, in the order of the record's field `hand`.
+    """What a live hand, a person or program that moves an arm, does in one tick.
+
+    The fields are in the order of the record's field `hand`.
 
     Attributes:
-        grip: firmness of the grip, 0 to 1.
-        number: number of the newest message that the hand follows; -1: nobody holds the arm.
-        source: the holder of the arm; 0: nobody.
-        target: the target, or the force, in the tick.
-        rate: velocity of the target.
+        grip: Firmness of the grip, 0 to 1.
+        number: Number of the newest message that the hand follows; -1: nobody holds the arm.
+        source: Sender that holds the arm; 0: nobody.
+        target: Position that the arm follows, m or rad, or the force, N, in the tick.
+        rate: Velocity of the target.
     """
 
     grip: float
@@ -190,10 +193,10 @@ class HandInForce(NamedTuple):
 
     @classmethod
     def read(cls, vector: Sequence[float]) -> "HandInForce":
-        """Returns the action that the field `hand` of a record describes.
+        """Returns what a live hand did in a tick, from the record of that tick.
 
         Args:
-            vector: Numbers of the field.
+            vector: Numbers of the record's field `hand`.
         """
         size = (len(vector) - 3) // 2
         grip, number, source, *numbers = vector
@@ -247,10 +250,11 @@ def advance_hand(
     commands: Sequence[HandCommand],
     locate: Callable[[], Sequence[float]],
 ) -> HandStep:
-    """Returns the action of a live hand in a tick, and the state for the next tick.
+    """Computes what a live hand, a person or program that moves an arm, does in a tick.
 
-    The steps are: move the target by one period; accept the messages; release a silent hand;
-    choose the velocity of the target.
+    The hand holds the arm at a target, which moves to the goal of the newest message. The steps
+    are: move the target by one period; accept the messages; release a silent hand; choose the
+    velocity of the target.
 
     Args:
         rules: Limits of the hand.
@@ -258,6 +262,9 @@ def advance_hand(
         t_ns: Nominal time of the tick, ns since the epoch, the common start of the session.
         commands: Messages received since the previous tick, in order.
         locate: Function that returns the arm's pose now, in the coordinates of the target.
+
+    Returns:
+        The action in the tick, and the state for the next tick.
     """
     refused: list[str] = []
     changes: list[tuple[int, str]] = []

@@ -42,7 +42,7 @@ def _can_drop(lost: int, t_ns: int, site: SiteRow, links: RowArray) -> bool:
 
     Args:
         lost: Index of the peer.
-        t_ns: Time, ns since the epoch.
+        t_ns: Time, ns since the epoch, the common start of the session.
         site: Row of the site.
         links: Rows of the site's links.
     """

@@ -101,7 +101,7 @@ def _all_heard(t_ns: int, silence_ns: int, links: RowArray) -> bool:
     with a dominance factor of zero are not followed.
 
     Args:
-        t_ns: Time, ns since the epoch.
+        t_ns: Time, ns since the epoch, the common start of the session.
         silence_ns: Longest time without a sample, ns.
         links: Rows of the site's links.
     """
@@ -132,7 +132,7 @@ def _start_alignment(t_ns: int, site: SiteRow, reason: int, q: Array, qd: Array)
     """Starts an alignment, unless the peers are farther away than the limit.
 
     Args:
-        t_ns: Time, ns since the epoch.
+        t_ns: Time, ns since the epoch, the common start of the session.
         site: Row of the site, with the peers' reference in q_des and qd_des.
         reason: Reason of the change of mode.
         q: Reference from which the site aligns.
@@ -173,7 +173,7 @@ def _leave_rest(t_ns: int, site: SiteRow, reason: int) -> None:
     """Starts an alignment from the reference of an arm at rest.
 
     Args:
-        t_ns: Time, ns since the epoch.
+        t_ns: Time, ns since the epoch, the common start of the session.
         site: Row of the site.
         reason: Reason of the change of mode.
     """
@@ -262,7 +262,7 @@ def _apply_order(t_ns: int, site: SiteRow) -> None:
     all other orders have no effect.
 
     Args:
-        t_ns: Time, ns since the epoch.
+        t_ns: Time, ns since the epoch, the common start of the session.
         site: Row of the site, with the order and the number of missed ticks.
     """
     order = site.order
@@ -303,7 +303,7 @@ def _update_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
     """Changes the mode for a fault of the motion, or for silent or returning peers.
 
     Args:
-        t_ns: Time, ns since the epoch.
+        t_ns: Time, ns since the epoch, the common start of the session.
         site: Row of the site.
         links: Rows of the site's links.
     """
@@ -369,7 +369,7 @@ def _find_offset(t_ns: int, duration_s: float, site: SiteRow, i: int) -> tuple[f
     The polynomial is that at the top of this module.
 
     Args:
-        t_ns: Time, ns since the epoch.
+        t_ns: Time, ns since the epoch, the common start of the session.
         duration_s: Duration T of the alignment, s.
         site: Row of the site.
         i: The coordinate.
@@ -391,7 +391,7 @@ def _add_offset(t_ns: int, site: SiteRow) -> None:
     Linear coordinates are added. An orientation is composed with the turn of the offset.
 
     Args:
-        t_ns: Time, ns since the epoch.
+        t_ns: Time, ns since the epoch, the common start of the session.
         site: Row of the site, with the peers' reference.
     """
     duration_s = _alignment_s(site)

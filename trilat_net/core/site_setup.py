@@ -71,14 +71,15 @@ class StaleAction(IntEnum):
 
 
 class StaleRule(NamedTuple):
-    """Condition under which a peer is stale, and the action of the site.
+    """When a peer counts as stale (silent for too long), and what the site then does.
 
     Attributes:
         action: Action of the site while a peer is stale.
         age_ns: Largest age of the sample in use, ns; for GLIDE the largest time since a sample
             of the peer came into use.
         return_ns: Duration of the return to the peers, ns.
-        align_speed: For GLIDE, the largest speed of an alignment, rad/s (of a position m/s).
+        align_speed: For GLIDE, the largest speed of an alignment, in which the arm moves to its
+            peers, rad/s (of a position m/s).
         align_limit: For GLIDE, the longest distance of an alignment, rad (of a position m).
         degrades: For GLIDE, true: the site goes on without a lost peer, see `lost_peers`.
     """
@@ -160,18 +161,19 @@ class LinkSetup(NamedTuple):
         rate_hz: Tick rate of the peer, Hz.
         q0: Start pose of the peer, rad, or of its end effector; in use until the first sample
             is due (L7).
-        key: Key of the link's random numbers, see `link_key`.
+        key: Key from which the random numbers of the link follow, see `link_key`.
         models: Models of the delay in the order of their first stamps; the first one applies
             from stamp 0.
-        traces: Per model the points of its trace, shape (n, 2), see `Points`, or None.
+        traces: Per model the points of its trace, a table of delays by time, shape (n, 2), see
+            `Points`, or None.
         outages: Interruptions of the link: pairs of first stamp and end, ns.
         channel: Numbers that the peer's law sends besides its motion.
-        index_at_peer: Index of the site among the peers of its peer, in scenario order.
+        index_at_peer: Index of this site among the peers of the peer, in scenario order.
         speed_limit: Largest speeds of the peer's joints, rad/s, beyond which its samples are
             dropped; (): no limit.
         bit: Bit of the peer in sets of sites, which are integers with a bit per site.
         followed: Set of the sites that the peer follows.
-        dispensable: True: a site that degrades may go on without the peer.
+        dispensable: True: the site may go on without the peer if the peer is lost.
     """
 
     peer: str

@@ -452,7 +452,7 @@ class Site:
     def restore_state(self, before: TickRecord, last: TickRecord) -> None:
         """Restores the state of the site, without its links, after a tick that was recorded.
 
-        `restore_links` restores the links. After both, the next call of `step` continues the run.
+        `restore_links` restores the links. After both calls `step` continues the run.
 
         Args:
             before: Record of the tick before the last one; any record if that is tick 0.

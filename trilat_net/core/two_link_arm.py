@@ -68,10 +68,10 @@ def theta_from_links(links: ArmLinks) -> Array:
 
 
 def is_positive_definite(theta: Array) -> bool:
-    """Returns True if M(q) is positive definite in any pose, with a margin (Property 1).
+    """Returns True if the inertia matrix M(q) is positive definite in any pose (Property 1).
 
-    The determinant of M, theta_1 theta_3 - theta_3^2 - theta_2^2 cos^2 q_2, is smallest for the
-    stretched arm.
+    Otherwise the parameters describe no real arm. The check has a margin. The determinant of M,
+    theta_1 theta_3 - theta_3^2 - theta_2^2 cos^2 q_2, is smallest for the stretched arm.
 
     Args:
         theta: Parameters of the arm, shape (5,).
@@ -99,7 +99,9 @@ def inertia(theta: Vector, q: Vector) -> tuple[Pair, Pair]:
 
 @leaf
 def gravity(theta: Vector, g: float, q: Vector) -> Pair:
-    """Returns the gravity torque G(q), N m.
+    """Returns the gravity torque G(q) of the planar arm, N m per joint.
+
+    A torque of this size holds the arm.
 
     Args:
         theta: Parameters of the arm, shape (5,).
@@ -148,19 +150,20 @@ def regressor(g: float, q: Vector, qd: Vector, v: Vector, a: Vector) -> tuple[Fi
 
 @leaf
 def forward_dynamics(theta: Vector, g: float, q: Vector, qd: Vector, torque: Vector) -> Pair:
-    """Returns the joint accelerations, rad/s^2, Eq. (8).
+    """Returns the joint accelerations that a torque causes, rad/s^2, Eq. (8).
 
         qdd = M^-1 (torque - C qd - G)
 
-    Cramer's rule is written out. An integration step needs four evaluations, and the sines take
-    most of their time.
+    M is the inertia matrix, C the Coriolis matrix and G the gravity torque. Cramer's rule is
+    written out. An integration step needs four evaluations, and the sines take most of their
+    time.
 
     Args:
-        theta: the arm's parameters, shape (5,).
-        g: gravitational acceleration, m/s^2.
-        q: joint angles, rad.
-        qd: joint velocities, rad/s.
-        torque: the whole torque on the joints, tau - tau_x, N m.
+        theta: Parameters of the arm, shape (5,).
+        g: Gravitational acceleration, m/s^2.
+        q: Joint angles, rad.
+        qd: Joint velocities, rad/s.
+        torque: The whole torque on the joints, tau - tau_x, N m.
     """
     s1, c1 = sincos(q[0])
     s2, c2 = sincos(q[1])

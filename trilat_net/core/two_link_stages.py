@@ -50,7 +50,7 @@ def advance_estimate(s: Row, gain_s: float, Yr: Vector) -> None:
     """Advances the estimate of the arm's parameters by a step of Eq. (15), within its box.
 
     Args:
-        s: Row of the site.
+        s: Row of the site, with its settings and its state.
         gain_s: Duration of the step, s.
         Yr: Y' r, shape (5,).
     """
@@ -60,10 +60,13 @@ def advance_estimate(s: Row, gain_s: float, Yr: Vector) -> None:
 
 @leaf
 def update_torque(s: Row) -> None:
-    """Writes the torque of the site's law, within its limits.
+    """Computes the torque of the site's control law, within its limits.
 
-    The law is Eq. (13) with its robust term, or the law of known gravity
+    The law is the adaptive law, Eq. (13), with its robust term, or a law of known gravity
     (`control.damped_torque`).
+
+    Args:
+        s: Row of the site, in which the torque is written.
     """
     if s.law == _ADAPTIVE:
         Y = (five(s.Y[0]), five(s.Y[1]))
@@ -96,20 +99,25 @@ def update_torque(s: Row) -> None:
 
 @leaf
 def put_gravity_torque(s: Row, torque: Array) -> None:
-    """Writes the gravity torque G(q) of this tick, N m."""
+    """Computes the gravity torque G(q) of the true parameters of the arm.
+
+    Args:
+        s: Row of the site, with its settings and its state.
+        torque: Written: the torque, shape (2,), N m.
+    """
     put_gravity(s, s.theta, torque)
 
 
 @leaf
 def put_gravity(s: Row, theta: Array, torque: Array) -> None:
-    """Writes the gravity torque for these parameters, N m.
+    """Computes the torque that holds the planar arm against gravity, for the given parameters.
 
-    The last columns of the regressor are g cos q_1 and g cos(q_1 + q_2).
+    The last two columns of the regressor, g cos q_1 and g cos(q_1 + q_2), belong to gravity.
 
     Args:
         s: Row of the site, after `update_errors`.
         theta: Parameters of the arm, shape (5,).
-        torque: Written, shape (2,).
+        torque: Written: the torque, shape (2,), N m.
     """
     inner = s.Y[0, 3] * theta[3]
     outer = s.Y[1, 4] * theta[4]
@@ -147,16 +155,16 @@ def put_source_torque(
     sampled: int,
     torque: Array,
 ) -> None:
-    """Writes the torque of the actors with this `sampled` ON the arm, N m.
+    """Computes the torque of operators and environments ON the arm, the held part or the rest.
 
     Args:
-        t_s: time since the epoch, s.
-        s: the site's row.
+        t_s: Time since the epoch, the common start of the session, s.
+        s: Row of the site, with its settings and its state.
         state: q and qd of the arm, shape (4,).
-        actors: operators and environments.
-        table: their recorded torques.
-        sampled: 1: the actors that are held over a tick; 0: the others.
-        torque: written, shape (2,), N m.
+        actors: Rows of operators and environments.
+        table: Their numbers, for example recorded torques.
+        sampled: 1: only those whose torque is held over a tick; 0: only the others.
+        torque: Written: the torque, shape (2,), N m.
     """
     q = (state[0], state[1])
     qd = (state[2], state[3])
@@ -176,13 +184,16 @@ def put_source_torque(
 def update_external_torque(
     t_s: float, s: Row, actors: TorqueSourceRows, table: TorqueTable
 ) -> None:
-    """Writes the torque of operators and environments, its held part, and the wall force.
+    """Computes the torque that operators and environments exert in a tick.
+
+    The whole torque, the part of it that is held over the tick, and the force of the walls are
+    written into the row of the site.
 
     Args:
-        t_s: Time since the epoch, s.
-        s: Row of the site.
-        actors: Operators and environments.
-        table: Their tables.
+        t_s: Time since the epoch, the common start of the session, s.
+        s: Row of the site; written.
+        actors: Rows of operators and environments.
+        table: Their numbers, for example recorded torques.
     """
     q = pair(s.q)
     qd = pair(s.qd)
@@ -231,8 +242,8 @@ def _acceleration(
         theta: Parameters of the arm, shape (5,).
         g: Gravitational acceleration, m/s^2.
         lengths: Lengths of the two links, m.
-        actors: Operators and environments.
-        table: Their tables.
+        actors: Rows of operators and environments.
+        table: Their numbers, for example recorded torques.
     """
     on_arm = torque_on_arm(
         t_s=t_s, q=q, qd=qd, lengths=lengths, actors=actors, table=table, sampled=0
@@ -327,17 +338,20 @@ def rk4_step(
 def advance_arm(
     t_s: float, h_s: float, s: Row, actors: TorqueSourceRows, table: TorqueTable
 ) -> bool:
-    """Advances q and qd by one period under the torque `s.u`.
+    """Simulates the motion of the arm in one period (Runge-Kutta method of fourth order).
+
+    The torque `s.u` is held over the period. The joint angles q and velocities qd at its end
+    are written into the row of the site.
 
     Args:
         t_s: Time at the beginning of the period, s since the epoch.
         h_s: The period, s.
-        s: Row of the site.
-        actors: Operators and environments.
-        table: Their tables.
+        s: Row of the site; written.
+        actors: Rows of operators and environments.
+        table: Their numbers, for example recorded torques.
 
     Returns:
-        False if the result is not finite; q and qd are unchanged then.
+        False if the result is not finite. Then q and qd are unchanged.
     """
     q, qd = rk4_step(
         t_s=t_s,

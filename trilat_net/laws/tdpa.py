@@ -58,8 +58,8 @@ def book_leader_work(now: LawInput, j: int, i: int, torque: float, step: float) 
     Args:
         now: Inputs and outputs of the law in this tick. Its sum E_led of peer j is increased by
             positive work.
-        j: The peer that follows.
-        i: The joint.
+        j: Index of the peer that follows.
+        i: Index of the joint.
         torque: Torque of the coupling, N m.
         step: Motion of the joint, rad.
 
@@ -147,8 +147,8 @@ def limit_leader_torque(law: Any, now: LawInput, j: int, i: int) -> None:
     Args:
         law: The law, whose torque F_now of the coupling is written.
         now: Inputs and outputs of the law in this tick.
-        j: The peer that follows.
-        i: The joint.
+        j: Index of the peer that follows.
+        i: Index of the joint.
     """
     n = now.joints
     h = now.h_s
@@ -211,10 +211,10 @@ def find_known_energy(law: Any, now: LawInput, j: int, i: int) -> float:
     than planned.
 
     Args:
-        law: The law.
+        law: The law, with its energy accounts.
         now: Inputs and outputs of the law in this tick.
-        j: The peer that is followed.
-        i: The joint.
+        j: Index of the peer that is followed.
+        i: Index of the joint.
     """
     index = j * now.joints + i
     moved_J = law.E_moved[index]
@@ -233,8 +233,8 @@ def limit_follower_velocity(
     Args:
         law: The law, whose velocity v_led of the coupling is written.
         now: Inputs and outputs of the law in this tick.
-        j: The peer that is followed.
-        i: The joint.
+        j: Index of the peer that is followed.
+        i: Index of the joint.
         force: Part of the following force that belongs to the peer, N m.
         price: Expected cost of the period beyond the work of the peer's velocity, J.
 
@@ -267,9 +267,9 @@ def compute_drift_velocity(
     peers' velocities. The power of a correction with speed v is linear v + square v^2.
 
     Args:
-        law: The law.
+        law: The law, with its energy accounts.
         now: Inputs and outputs of the law in this tick.
-        i: The joint.
+        i: Index of the joint.
         error: Difference between the peers' position and the goal, rad.
         available_J: Energy that remains in all couplings together, J.
 
@@ -303,10 +303,10 @@ def find_affordable_velocity(law: Any, now: LawInput, j: int, i: int, force: flo
     """Returns the velocity by which peer j moves the goal, reduced to the known energy, rad/s.
 
     Args:
-        law: The law.
+        law: The law, with its energy accounts.
         now: Inputs and outputs of the law in this tick.
-        j: The peer that is followed.
-        i: The joint.
+        j: Index of the peer that is followed.
+        i: Index of the joint.
         force: The following force of the joint, N m.
     """
     index = j * now.joints + i
@@ -443,9 +443,9 @@ def follow_peers(law: Any, now: LawInput, i: int) -> None:
     compensation from the energy that remains; settle torque and goal.
 
     Args:
-        law: The law.
+        law: The law, with its energy accounts.
         now: Inputs and outputs of the law in this tick.
-        i: The joint.
+        i: Index of the joint.
     """
     n = now.joints
     h = now.h_s

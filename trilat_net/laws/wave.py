@@ -118,7 +118,7 @@ def conceal_wave(law: Any, index: int, energy: float, h: float) -> float:
     the next sample, so its integral is subtracted from the owed integral.
 
     Args:
-        law: The law.
+        law: The law, with its energy accounts.
         index: Index of the line and joint in the law's lists.
         energy: The known energy that has not been played, J.
         h: The period, s.
@@ -149,10 +149,10 @@ def receive_wave(law: Any, now: LawInput, j: int, i: int, missed: float) -> floa
     decides which wave is played if a sample is late or lost.
 
     Args:
-        law: The law.
+        law: The law, with its energy accounts.
         now: Inputs and outputs of the law in this tick.
         j: Index of the peer at the other end of the line.
-        i: The joint.
+        i: Index of the joint.
         missed: Number of samples between the sample in use and the previous one; -1 if there
             is no new sample.
 
@@ -215,7 +215,7 @@ def follow_wave(law: Any, now: LawInput, j: int, i: int, v: float) -> float:
     are given at the top of this module.
 
     Args:
-        law: The law.
+        law: The law, with its energy accounts.
         now: Inputs and outputs of the law in this tick.
         j: Index of the peer at the other end of the line.
         i: Index of the joint.
@@ -252,9 +252,9 @@ def close_wave_period(law: Any, now: LawInput, i: int) -> None:
     initialises the springs and H.
 
     Args:
-        law: The law.
+        law: The law, with its energy accounts.
         now: Inputs and outputs of the law in this tick.
-        i: The joint.
+        i: Index of the joint.
     """
     H = now.to_all.H
     spring = 0.0
@@ -284,10 +284,10 @@ def send_waves(law: Any, now: LawInput, i: int, committed: float) -> None:
     """Reduces the waves of a joint to the energy in the account H, and books their energy.
 
     Args:
-        law: The law.
+        law: The law, with its energy accounts.
         now: Inputs and outputs of the law in this tick, with the waves that the end would like
             to send.
-        i: The joint.
+        i: Index of the joint.
         committed: Energy that the coming period needs besides the waves, J.
     """
     h = now.h_s
